@@ -22,7 +22,6 @@ _COMMANDS = {
     "export": ("export", "Export", "Write the policy of a run to an ONNX or .pt2 file."),
     "plan": ("plan", "Plan", "Control a task with a planner, and report rewards, success and planning times."),
     "view": ("view", "View", "Show a task, a policy, a planner or saved episodes in a browser."),
-    "warmup": ("warmup", "Warmup", "Compile a task's kernels ahead of time, and print the memory of a world."),
     "bench": ("bench", "Bench", "Run an experiment or another program of bench/."),
 }
 """The module of each command, its class, and its line in the help. A command's module is imported once it is named:
@@ -38,7 +37,6 @@ $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
 $ lyceum-warp export runs/hopper-20260101-120000 --to policy.onnx
 $ lyceum-warp plan reach --real-time
 $ lyceum-warp view reach --mppi
-$ lyceum-warp warmup hopper --device cuda:0
 $ lyceum-warp bench throughput --short
 
 lyceum-warp COMMAND --help describes a command and its options.

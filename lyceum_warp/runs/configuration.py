@@ -97,6 +97,7 @@ class Configuration:
         try:
             # earlier releases accepted options as --param and stored them under "params", or had no "physics"
             words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
+            words.pop("unroll", None)  # their option, which changed no numbers
             base = EnvOptions(
                 engine=config["engine"], device=config["device"], nworld=config["nworld"], seed=config["seed"]
             )  # fmt: skip

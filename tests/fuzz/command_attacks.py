@@ -42,7 +42,6 @@ SMALL: dict[str, dict[str, tuple[str, ...]]] = {
         "--steps": ("2",), "--samples": ("2",), "--horizon": ("2",), "--out": ("out",), "--no-video": (),
         "--no-plot": (),
     },
-    "warmup": {"--nworld": ("2",)},
     "bench": {},
 }  # fmt: skip
 """Commands with flags that make them short."""

@@ -25,7 +25,7 @@ FEW = {
     },
     "command_attacks.py": {
         "tasks": 1, "new": 3, "check": 4, "train": 8, "train --resume good": 3, "train --from good": 3, "eval": 4,
-        "export": 2, "plan": 4, "view": 4, "warmup": 2, "bench": 1,
+        "export": 2, "plan": 4, "view": 4, "bench": 1,
     },
 }  # fmt: skip
 """The number of cases of each kind, for every program of attacks."""

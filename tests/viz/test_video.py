@@ -114,7 +114,7 @@ def test_a_machine_that_cannot_draw_is_reported_with_a_fix(
     with pytest.raises(video.NoVideoError, match=message) as caught:
         video.write_video(env, env.get_state(), tmp_path / "video.mp4")
     assert "\n" not in str(caught.value)
-    mp4 = recorder(env.model, tmp_path / "video.mp4")
+    mp4 = video_of(env.model, tmp_path / "video.mp4")
     with pytest.raises(video.NoVideoError, match=message):
         mp4.close()
     with pytest.raises(video.NoVideoError, match=message):
@@ -144,7 +144,7 @@ def shot(x: float, **changes: Any) -> Shot:
     return Shot(**values | changes)
 
 
-def recorder(model: mujoco.MjModel, out: Path, *, fps: float = 30.0, most_waiting: int = 1000) -> video.Recorder:
+def video_of(model: mujoco.MjModel, out: Path, *, fps: float = 30.0, most_waiting: int = 1000) -> video.Recorder:
     return video.Recorder(model, out, size=SMALL, fps=fps, most_waiting=most_waiting)
 
 
@@ -152,7 +152,7 @@ def test_shots_are_drawn_one_by_one_with_their_model_ghosts_and_lines(model: muj
     small, red = {"geom_size": np.array([[0.1, 0, 0], [0.1, 0, 0]])}, (1.0, 0.0, 0.0, 1.0)
 
     def write() -> Path:
-        mp4 = recorder(model, tmp_path / "video.mp4", fps=25)
+        mp4 = video_of(model, tmp_path / "video.mp4", fps=25)
         for each in (
             shot(0.0), shot(0.0, model_fields=small), shot(0.0), shot(0.5),
             shot(0.0, ghosts=[(shot(1.5)["pose"], red)]),
@@ -174,7 +174,7 @@ def test_shots_that_come_too_fast_are_dropped_and_the_video_keeps_its_length(
     model: mujoco.MjModel, tmp_path: Path
 ) -> None:
     def write() -> Path:
-        mp4 = recorder(model, tmp_path / "video.mp4", most_waiting=2)
+        mp4 = video_of(model, tmp_path / "video.mp4", most_waiting=2)
         for i in range(10):
             mp4.add(shot(0.1 * i))
         assert mp4.added == 10 and mp4.dropped in (7, 8)  # the process may have taken one
@@ -198,7 +198,7 @@ def test_cancel_kills_a_process_that_hangs(
         return started[-1]
 
     monkeypatch.setattr(drawing.subprocess, "Popen", hanging)
-    mp4 = recorder(model, tmp_path / "video.mp4")
+    mp4 = video_of(model, tmp_path / "video.mp4")
     mp4.add(shot(0.0))
     while not started:
         time.sleep(0.01)
@@ -212,13 +212,13 @@ def test_a_cancelled_or_empty_video_leaves_the_old_file(model: mujoco.MjModel, t
     pytest.importorskip("imageio_ffmpeg")
     out = tmp_path / "video.mp4"
     out.write_text("old")
-    mp4 = recorder(model, out)
+    mp4 = video_of(model, out)
     mp4.add(shot(0.0))
     mp4.cancel()
     with pytest.raises(video.NoVideoError, match="video.mp4 was cancelled"):
         mp4.close()
     with pytest.raises(video.NoVideoError, match="has no pose|cannot draw"):
-        recorder(model, out).close()
+        video_of(model, out).close()
     assert out.read_text() == "old" and [file.name for file in tmp_path.iterdir()] == ["video.mp4"]
 
 
