@@ -89,12 +89,6 @@ def _run(argv: list[str]) -> int:
         close = difflib.get_close_matches(name, _COMMANDS, 1)
         hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(_COMMANDS)}"
         raise ValueError(f"there is no command {name!r}: {hint}")
-    if old := [word for word in words if word.startswith("--config.")]:
-        flag = old[0].partition("=")[0]
-        raise ValueError(
-            f"{flag} was a flag of rsl-rl, which ppo has replaced: give --algorithm ppo, whose flags have no prefix "
-            f"(lyceum-warp {name} --help)"
-        )
     module, kind, _ = _COMMANDS[name]
     command = getattr(importlib.import_module(f"lyceum_warp.cli.{module}"), kind)
     # the words after the name of a program of bench/ belong to that program

@@ -1,6 +1,12 @@
 """Show a task, a policy, a planner or episodes: lyceum-warp view."""
 
+import contextlib
 import dataclasses
+import json
+import os
+import signal
+import sys
+import threading
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,13 +27,14 @@ from lyceum_warp.runs.checkpoints import check_sizes
 from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.support.interrupts import Interrupted, signals
 from lyceum_warp.support.validate import whole_number
-from lyceum_warp.viewer.follow import Follower, Parent, wait_for_run
+from lyceum_warp.viewer.follow import Follower, wait_for_run
 from lyceum_warp.viewer.session.clock import Watcher
 from lyceum_warp.viewer.show import view
 
 _RUN_WORLDS = 16
 _WAIT = 10.0  # seconds that --follow waits for a run
 _LONG = 1e9
+_NICE = 10  # niceness of the process of `lw.RunViewer`
 
 
 @optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)")
@@ -85,13 +92,13 @@ class View:
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        return self.show()
+        return self.show(_WAIT)
 
-    def show(self, parent: Parent | None = None) -> int:
+    def show(self, seconds: float) -> int:
         """Show it until the viewer is closed; returns the exit code.
 
         Args:
-            parent: The program that started this one. The viewer ends with it.
+            seconds: Maximum time that --follow waits for the run.
         """
         _check(self)
         torch.set_num_threads(1)
@@ -100,17 +107,17 @@ class View:
             if getattr(self, flag) and kind not in fits:
                 raise ValueError(f"--{flag} needs a {' or a '.join(fits)}, and {self.what[0]} is not one: leave it out")
         shown: dict[str, Any] = {name: getattr(self, name) for name in ("paused", "host", "port")}
-        watchers: list[Watcher] = [] if parent is None else [_Ends(parent)]
+        watchers: list[Watcher] = []
         if kind == "episodes":
             episodes = load_episodes(self.what)
             env = _episodes_env(self, episodes)
             unique = len({file.name for file in episodes}) == len(episodes)
             named = {file.name if unique else str(file): episode for file, episode in episodes.items()}
-            view(env, episodes=named, watchers=watchers, **shown)
+            view(env, episodes=named, **shown)
             return 0
         controllers: dict[str, Any] = {}
         if kind == "run":
-            run = _run(self, parent)
+            run = _run(self, seconds)
             env = _run_worlds(self, run)
             if self.follow:
                 follower = Follower(run, device=env.obs.device)
@@ -180,15 +187,13 @@ def _planner(options: View, env: Env) -> MPPI:
     return MPPI(env.task.task, config, seed=options.seed, params=env.given_params, **words)
 
 
-def _run(options: View, parent: Parent | None) -> Run:
+def _run(options: View, seconds: float) -> Run:
     folder = Path(options.what[0])
     if not options.follow:
         return Run.open(folder)
     if options.which != "last":
         raise ValueError(f"--follow shows the newest policy, not {options.which!r}: leave out one of them")
-    if parent is None:
-        return wait_for_run(folder, seconds=_WAIT)
-    return wait_for_run(folder, seconds=_LONG, going_on=lambda: not parent.ended.is_set())
+    return wait_for_run(folder, seconds=seconds)
 
 
 def _run_worlds(options: View, run: Run) -> Env:
@@ -197,27 +202,23 @@ def _run_worlds(options: View, run: Run) -> Env:
     return run_worlds(run, options.place, params, nworld=nworld, task=options.task, trust=options.trust)
 
 
-class _Ends:
-    """Ends the viewer with the program that started it."""
-
-    def __init__(self, parent: Parent) -> None:
-        self._parent = parent
-
-    def __call__(self) -> list[str]:
-        if self._parent.ended.is_set():
-            raise Interrupted(0)
-        return []
-
-
 def attached() -> None:
     """Run the subprocess of ``lw.RunViewer``, which reads its job from stdin and ends with its parent."""
-    parent = Parent()
-    job = parent.job
+    with contextlib.suppress(OSError, AttributeError):  # not on Windows
+        os.nice(_NICE)
+    job = json.loads(sys.stdin.readline())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         with signals():
-            View(what=(job["folder"],), follow=True, **job["options"]).show(parent)
+            View(what=(job["folder"],), follow=True, **job["options"]).show(_LONG)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
-        if not parent.ended.is_set():
-            note(f"the viewer of {job['folder']} ended: {' '.join(str(error).split())}")
+        note(f"the viewer of {job['folder']} ended: {' '.join(str(error).split())}")
     except Interrupted:
         pass
+
+
+def _end_with_parent() -> None:
+    """Wait for EOF, which follows the end of the parent, even by SIGKILL; then end this process."""
+    with contextlib.suppress(OSError, ValueError):
+        sys.stdin.read()
+    os.kill(os.getpid(), signal.SIGTERM)

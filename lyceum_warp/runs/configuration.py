@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import logging
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -30,13 +29,6 @@ log = logging.getLogger(__name__)
 
 ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig)}
 """The algorithms of the command line and config.json, by name: the classes of the learner and its hyperparameters."""
-
-_RSL_RL = {
-    "num_steps_per_env": "num_steps", "num_learning_epochs": "epochs", "num_mini_batches": "minibatches",
-    "clip_param": "clip", "use_clipped_value_loss": "clip_value_loss", "value_loss_coef": "value_coef",
-    "normalize_advantage_per_mini_batch": "whiten_minibatches", "random_start": "stagger",
-}  # fmt: skip
-"""New names of hyperparameters of the former algorithm rsl-rl."""
 
 
 def describe(learner: Learner) -> dict[str, Any]:
@@ -88,7 +80,7 @@ class Configuration:
 
     @classmethod
     def of(cls, run: Run) -> "Configuration":
-        """Read the configuration of a run. The former algorithm rsl-rl becomes ppo.
+        """Read the configuration of a run.
 
         Raises:
             ValueError: A value is missing or not valid.
@@ -103,15 +95,9 @@ class Configuration:
             )  # fmt: skip
             options, params = EnvOptions.split(words, base)
             name: str = config["algorithm"]
-            entry: Any = config.get(name)
-            if name == "rsl-rl":  # of an earlier release
-                renamed = {_RSL_RL.get(old, old): value for old, value in entry.items()}
-                known = {field.name for field in dataclasses.fields(PPOConfig)}
-                init = {"log_std": math.log(entry.get("init_std", 1.0))}
-                name, entry = "ppo", {new: value for new, value in renamed.items() if new in known} | init
             return cls(
                 task=config["task"], params=params, options=options, algorithm=name,
-                hyperparameters=ALGORITHMS[name][1](**entry) if name in ALGORITHMS else None,
+                hyperparameters=ALGORITHMS[name][1](**config[name]) if name in ALGORITHMS else None,
                 seed=config.get(f"{name}_seed"), threads=config["threads"],
             )  # fmt: skip
         except (KeyError, TypeError, AttributeError, ValueError) as error:

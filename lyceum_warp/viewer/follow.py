@@ -9,7 +9,6 @@ import json
 import os
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -19,8 +18,6 @@ import torch
 from lyceum_warp.algos.policy import acting
 from lyceum_warp.runs.checkpoints import read_checkpoint
 from lyceum_warp.runs.folder import Run, load
-
-_NICE = 10  # niceness of the process of `RunViewer`
 
 
 class Follower:
@@ -71,13 +68,12 @@ class Follower:
         return found.st_mtime_ns, found.st_ino, found.st_size
 
 
-def wait_for_run(folder: Path, *, seconds: float, going_on: Any = lambda: True) -> Run:
+def wait_for_run(folder: Path, *, seconds: float) -> Run:
     """Wait until a run has a policy.
 
     Args:
         folder: The run's folder.
         seconds: Maximum time.
-        going_on: Called now and then; the wait ends if it returns False.
 
     Raises:
         FileNotFoundError: There is no run, or it has no policy.
@@ -91,7 +87,7 @@ def wait_for_run(folder: Path, *, seconds: float, going_on: Any = lambda: True) 
             problem = f"the run in {folder} has no policy yet: train it first"
         except FileNotFoundError as error:
             problem = str(error)
-        if time.monotonic() >= end or not going_on():
+        if time.monotonic() >= end:
             raise FileNotFoundError(problem)
         time.sleep(0.2)
 
@@ -131,34 +127,18 @@ class RunViewer:
 
     def close(self) -> None:
         """End the process. A second call does nothing."""
-        assert self._process.stdin is not None
-        with contextlib.suppress(OSError):
-            self._process.stdin.close()  # the process ends
+        self._process.terminate()
         try:
             self._process.wait(10.0)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
 
     def __enter__(self) -> "RunViewer":
         return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()
-
-
-class Parent:
-    """The program that started this process: reads the job from its pipe, and notices EOF."""
-
-    def __init__(self) -> None:
-        with contextlib.suppress(OSError, AttributeError):  # not on Windows
-            os.nice(_NICE)
-        self.job: dict[str, Any] = json.loads(sys.stdin.readline())
-        self.ended = threading.Event()
-        threading.Thread(target=self._listen, daemon=True, name="lyceum_warp parent").start()
-
-    def _listen(self) -> None:
-        with contextlib.suppress(OSError, ValueError):
-            while sys.stdin.read(1):
-                pass
-        self.ended.set()

@@ -3,6 +3,9 @@
 import contextlib
 import importlib
 import re
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -83,6 +86,39 @@ def test_a_run_with_a_viewer_has_the_same_numbers_to_the_bit(tmp_path: Path, cap
     assert alone[0] == shown[0]
     for one, other in zip(alone[1], shown[1], strict=True):
         assert torch.equal(one, other)
+
+
+PROGRAM = """
+import sys, time
+import lyceum_warp as lw
+viewer = lw.RunViewer(sys.argv[1])
+print(viewer._process.pid, flush=True)
+time.sleep({seconds})
+viewer.close()
+"""
+
+
+def runs(process: int) -> bool:
+    """Whether a process runs; one that ended and is not waited for does not."""
+    with contextlib.suppress(FileNotFoundError):
+        return Path(f"/proc/{process}/cmdline").read_bytes() != b""
+    return False
+
+
+@pytest.mark.parametrize("kill", [pytest.param(True, marks=pytest.mark.long), False])
+def test_a_viewer_ends_with_its_program_also_while_it_waits_for_the_run(kill: bool, tmp_path: Path) -> None:
+    """A program that is killed, and one that closes the viewer at once."""
+    command = [sys.executable, "-c", PROGRAM.format(seconds=60 if kill else 0), str(tmp_path / "run")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
+        assert program.stdout is not None
+        viewer = int(program.stdout.readline())
+        if kill:
+            program.send_signal(signal.SIGKILL)
+    end = time.monotonic() + 60
+    while runs(viewer) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not runs(viewer)
+    assert kill or program.returncode == 0
 
 
 def test_train_shows_its_run_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

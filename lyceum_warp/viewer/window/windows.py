@@ -1,7 +1,5 @@
 """Draw the windows of the panel with ImGui."""
 
-import functools
-import textwrap
 from collections.abc import Callable
 from typing import Any
 
@@ -239,9 +237,8 @@ class Windows:
             imgui.TextWrapped(self._actions.status.video)
 
     def _messages(self) -> None:
-        columns = int(imgui.GetContentRegionAvail().x / imgui.CalcTextSize("n" * 10).x * 10)
         for message in self._actions.messages:
-            imgui.TextUnformatted(wrapped(message, max(columns, 10)))
+            imgui.TextWrapped(message)
         if self._actions.scroll_down:
             imgui.SetScrollHereY(1.0)
             self._actions.scroll_down = False
@@ -294,12 +291,6 @@ def combo(label: str, names: Any, now: int) -> int | None:
     """Draw a list of choices; return the index of a new choice."""
     changed, chosen = imgui.Combo(label, now, list(names))
     return int(chosen) if changed and chosen != now else None
-
-
-@functools.lru_cache(maxsize=1000)
-def wrapped(text: str, columns: int) -> str:
-    """Wrap a text at spaces, which ImGui does not."""
-    return textwrap.fill(text, columns)
 
 
 def speed_name(speed: float) -> str:
