@@ -34,9 +34,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "5 iterations": limits(5),
     "4 iterations": limits(4),
     "4, line search 6": limits(4, 6),
-    "4, line search 6, unrolled": limits(4, 6) | {"unroll": True},
     "3 iterations": limits(3),
-    "3, line search 6, unrolled": limits(3, 6) | {"unroll": True},
     "Euler": {"integrator": "euler"},
     "Euler, 4 iterations": {"integrator": "euler"} | limits(4),
     "implicitfast": {"integrator": "implicitfast"},
@@ -44,7 +42,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }
 """Options of ``lw.make``."""
 
-ON_A_GPU = ("unroll", "deterministic")
+ON_A_GPU = ("deterministic",)
 """Options with an effect on a GPU only."""
 
 

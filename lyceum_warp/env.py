@@ -157,8 +157,6 @@ class Env:
             physics=options.physics, params=params,
         )  # fmt: skip
         self.timestep = self.task.timestep
-        if options.nvtx and not torch.backends.cuda.is_built():
-            raise ValueError("nvtx=True marks phases through torch, whose build here is without CUDA: leave it out")
         self.engine = open_engine(
             options.engine, self.task.model, self.nworld, self.device, self.task.fields, dynamics=self.task.dynamics,
             initial=self.task.initial, reserved=own_bytes_per_world(self.task), **options.for_engine(),

@@ -91,10 +91,6 @@ class PhysicsOptions:
     deterministic: bool = _for_engine(False)
     """Make two runs on a CUDA device equal to the bit. Costs 5 to 18 times the time and 5 to 7 times the memory on
     hopper, half_cheetah and humanoid. Runs on the CPU are always equal to the bit."""
-    unroll: bool = _for_engine(False)
-    """Unroll the solver's iterations in the Warp engine, instead of a loop that ends once every world has converged.
-    The numbers stay the same. Needs a solver limit of at most 20 iterations; with 4 it gained 3 to 5 % on half_cheetah
-    and humanoid and lost 1 to 2 % on hopper. The C engine ignores it."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -102,7 +98,7 @@ class PhysicsOptions:
             _whole(self, name, low)
         _one_of("friction cone", self.cone, CONES)
         _one_of("integrator", self.integrator, INTEGRATORS)
-        _flags(self, "deterministic", "unroll")
+        _flags(self, "deterministic")
         if self.solver is not None:
             object.__setattr__(self, "solver", _checked_limits(self.solver) or None)
 
@@ -141,9 +137,6 @@ class EnvOptions:
     """Steps after which an episode is truncated, 0 for never; by default the task's."""
     graphs: bool = True
     """Whether launches are captured as graphs and replayed. False is for debugging and changes no numbers."""
-    nvtx: bool = False
-    """Whether to mark the phases of a step (act, physics, judge, restart, refresh, observe) for NVIDIA's profilers.
-    Each phase is then a separate graph."""
     model: ModelSource | None = None
     """A model that replaces the task's: a file or an MjSpec."""
     fields: Collection[str] = ()
@@ -163,7 +156,7 @@ class EnvOptions:
         if self.model is not None and not isinstance(self.model, mujoco.MjModel):  # which has an error of its own
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         check_kind("physics", self.physics, PhysicsOptions, _PHYSICS_EXAMPLE)
-        _flags(self, "autoreset", "graphs", "nvtx")
+        _flags(self, "autoreset", "graphs")
         for option, example in (("fields", "sensordata"), ("dynamics", "body_mass")):
             names = getattr(self, option)
             if not isinstance(names, list | tuple | Set) or not all(isinstance(name, str) for name in names):

@@ -158,7 +158,7 @@ def train(
             board = shown.enter_context(TensorBoard(run.folder, run.config)) if tensorboard else None
             seed = evaluation_seed(env.options.seed + 1)
             videos = Videos(
-                learner, run.folder / "videos", video_every, seed, board, camera=camera, note=display.note,
+                learner, run.folder / "videos", video_every, seed, camera=camera, note=display.note,
                 progress=display.work,
             )  # fmt: skip
             shown.enter_context(display.training(run, learner, iterations))

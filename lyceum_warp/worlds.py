@@ -52,7 +52,6 @@ class Worlds(WorldArrays):
     def __init__(self, task: BoundTask, engine: Engine, options: EnvOptions) -> None:
         super().__init__(task, engine)
         self.first_world = options.first_world
-        self._nvtx = options.nvtx
         self._workers = self._make_workers()
         self._programs: dict[tuple[int, bool, bool], Programs] = {}
         horizon = task.task.horizon if options.horizon is None else options.horizon
@@ -66,10 +65,7 @@ class Worlds(WorldArrays):
         self.horizon, self.autoreset = horizon, autoreset
         key = (horizon, autoreset, graphs)
         if key not in self._programs:
-            capture = Graphs(
-                self.device, enabled=graphs, capture_engine=self.engine.capturable, nvtx=self._nvtx,
-                workers=self._workers,
-            )  # fmt: skip
+            capture = Graphs(self.device, enabled=graphs, capture_engine=self.engine.capturable, workers=self._workers)
             self._programs[key] = Programs(
                 capture,
                 step=capture.sequence(self._phases_of_a_graph() if graphs else self.step_phases()),
@@ -109,7 +105,7 @@ class Worlds(WorldArrays):
 
     def _phases_of_a_graph(self) -> list[Phase]:
         """``step_phases`` for a step that is one graph, in which parts are skipped if they concern no world."""
-        if not self.engine.capturable or self._nvtx:
+        if not self.engine.capturable:
             return self.step_phases()
         restart = self._restart_phases(self.restarting, randomly=True)
         show = self._refresh_phases(self.restarting), self._observe_phases()

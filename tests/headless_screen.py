@@ -61,8 +61,6 @@ def frame_of(model: mujoco.MjModel, data: mujoco.MjData, status: Status | None =
 
 
 class HeadlessViewer(viewer_protocol.Viewer):
-    dropped = ""
-
     def prepare_next_frame(self) -> bool:
         return True
 
@@ -70,8 +68,7 @@ class HeadlessViewer(viewer_protocol.Viewer):
         pass
 
     def get_drop_file(self) -> str:
-        dropped, self.dropped = self.dropped, ""
-        return dropped
+        return ""
 
     def upload_image(self, *arguments: Any) -> int:
         return 0

@@ -21,8 +21,7 @@ _COMMANDS = {
     "eval": ("evaluate", "Eval", "Evaluate the policy of a run, and print statistics of its episodes."),
     "export": ("export", "Export", "Write the policy of a run to an ONNX or .pt2 file."),
     "plan": ("plan", "Plan", "Control a task with a planner, and report rewards, success and planning times."),
-    "view": ("view", "View", "Show a task, a policy, a planner or saved episodes in a browser or a window."),
-    "warmup": ("warmup", "Warmup", "Compile a task's kernels ahead of time, and print the memory of a world."),
+    "view": ("view", "View", "Show a task, a policy, a planner or saved episodes in a browser."),
     "bench": ("bench", "Bench", "Run an experiment or another program of bench/."),
 }
 """The module of each command, its class, and its line in the help. A command's module is imported once it is named:
@@ -38,7 +37,6 @@ $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
 $ lyceum-warp export runs/hopper-20260101-120000 --to policy.onnx
 $ lyceum-warp plan reach --real-time
 $ lyceum-warp view reach --mppi
-$ lyceum-warp warmup hopper --device cuda:0
 $ lyceum-warp bench throughput --short
 
 lyceum-warp COMMAND --help describes a command and its options.
@@ -91,12 +89,6 @@ def _run(argv: list[str]) -> int:
         close = difflib.get_close_matches(name, _COMMANDS, 1)
         hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(_COMMANDS)}"
         raise ValueError(f"there is no command {name!r}: {hint}")
-    if old := [word for word in words if word.startswith("--config.")]:
-        flag = old[0].partition("=")[0]
-        raise ValueError(
-            f"{flag} was a flag of rsl-rl, which ppo has replaced: give --algorithm ppo, whose flags have no prefix "
-            f"(lyceum-warp {name} --help)"
-        )
     module, kind, _ = _COMMANDS[name]
     command = getattr(importlib.import_module(f"lyceum_warp.cli.{module}"), kind)
     # the words after the name of a program of bench/ belong to that program

@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any
 
 from lyceum_warp.cli.arguments import given, optional_flags
-from lyceum_warp.runs.configuration import ALGORITHMS, algorithm_of
+from lyceum_warp.runs.configuration import ALGORITHMS
 
 _DEFAULTS: dict[str, list[str]] = {}
 for _algorithm, (_, _config) in ALGORITHMS.items():
@@ -29,9 +29,11 @@ class Hyperparameters:
             algorithm: Name of the algorithm.
 
         Raises:
-            ValueError: A value is not valid, or the algorithm has no such hyperparameter.
+            ValueError: There is no such algorithm, it has no such hyperparameter, or a value is not valid.
         """
-        values, (_, kind) = given(self), algorithm_of(algorithm)
+        if algorithm not in ALGORITHMS:
+            raise ValueError(f"there is no algorithm {algorithm!r}: use {' or '.join(ALGORITHMS)}")
+        values, (_, kind) = given(self), ALGORITHMS[algorithm]
         for name in values.keys() - kind.__dataclass_fields__.keys():
             fitting = " or ".join(
                 other for other, (_, config) in ALGORITHMS.items() if name in config.__dataclass_fields__

@@ -107,7 +107,7 @@ def given(flags: Any) -> dict[str, Any]:
     return {name: value for name, value in vars(flags).items() if value != fields[name].default}
 
 
-NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "nvtx", "model", "fields", "dynamics", "physics")
+NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "model", "fields", "dynamics", "physics")
 """Options of an environment without a generated flag. Commands define nworld, seed and the model themselves,
 ``Physics`` has the flags of ``physics``, and the others are only for Python."""
 

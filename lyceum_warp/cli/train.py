@@ -217,12 +217,7 @@ class Train:
         if source is not None and self.algorithm is None and algorithm not in ALGORITHMS:
             raise ValueError(
                 f"the run in {source.folder} was trained by {algorithm!r}, a learner of a program: resume it there, by "
-                "lw.train(..., resume=True)"
-            )
-        if source is not None and self.resume is not None and (old := source.config["algorithm"]) != algorithm:
-            raise ValueError(
-                f"the run in {source.folder} was trained by {old}, which {algorithm} has replaced: begin a new run "
-                f"with its policy (train --from {source.folder})"
+                "lw.train(..., resume=True), or begin a new run with its policy, by --from and --algorithm"
             )
         known = base.hyperparameters if algorithm == base.algorithm else None
         return dataclasses.replace(

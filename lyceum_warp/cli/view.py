@@ -1,6 +1,12 @@
 """Show a task, a policy, a planner or episodes: lyceum-warp view."""
 
+import contextlib
 import dataclasses
+import json
+import os
+import signal
+import sys
+import threading
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,14 +27,14 @@ from lyceum_warp.runs.checkpoints import check_sizes
 from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.support.interrupts import Interrupted, signals
 from lyceum_warp.support.validate import whole_number
-from lyceum_warp.viewer.follow import Follower, Parent, wait_for_run
+from lyceum_warp.viewer.follow import Follower, wait_for_run
 from lyceum_warp.viewer.session.clock import Watcher
-from lyceum_warp.viewer.session.stage import check_world
-from lyceum_warp.viewer.show import chosen_graphics, view
+from lyceum_warp.viewer.show import view
 
 _RUN_WORLDS = 16
 _WAIT = 10.0  # seconds that --follow waits for a run
 _LONG = 1e9
+_NICE = 10  # niceness of the process of `lw.RunViewer`
 
 
 @optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)")
@@ -43,14 +49,14 @@ class Place:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View:
-    """Show a task, a policy, a planner or episodes, in a browser or in a window.
+    """Show a task, a policy, a planner or episodes in a browser.
 
     With a task the viewer shows its worlds, lets you push bodies with the mouse, and with --mppi runs a planner in real
     time. With a run it shows the run's policy, and with --follow the newest policy while the run trains. Files of
     episodes, or a folder of lyceum-warp plan, are played back.
 
     The viewer is a web page. The command prints its address, which contains a secret, and over ssh the command that
-    forwards the port. With --gfx native it is a window, on a machine with a display.
+    forwards the port.
 
     $ lyceum-warp view hopper
     $ lyceum-warp view runs/hopper-20260101-120000 --which best
@@ -71,60 +77,47 @@ class View:
     """The task of a run or of episodes, a name or a file, if it is not found."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of worlds: by default 16 for a run, 1 otherwise."""
-    world: int = 0
-    """Number of the first shown world."""
     seed: int = 0
     """Seed of the initial states."""
     paused: bool = False
     """Whether to start paused."""
-    trace: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """The site or body whose path is drawn for each of the planner's samples; by default the task's choice."""
-    gfx: Annotated[str, tyro.conf.arg(metavar="web|native")] = "web"
-    """web for a page in a browser, native for a window on this machine's screen."""
     host: str = "127.0.0.1"
     """Address on which the page is served. Other machines can reach the page only with another address than this."""
     port: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Port of the page; by default the first free port from 8080 on."""
-    browser: bool = False
-    """Whether to open the page in this machine's browser."""
     param: ParamWords = ()
     trust: Trust = False
-    fps: float = 30.0
-    """Maximal number of frames per second."""
     place: tyro.conf.OmitArgPrefixes[Place] = dataclasses.field(default_factory=Place)
     planner: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        return self.show()
+        return self.show(_WAIT)
 
-    def show(self, parent: Parent | None = None) -> int:
+    def show(self, seconds: float) -> int:
         """Show it until the viewer is closed; returns the exit code.
 
         Args:
-            parent: The program that started this one. The viewer ends with it.
+            seconds: Maximum time that --follow waits for the run.
         """
-        chosen_graphics(self.gfx)
         _check(self)
         torch.set_num_threads(1)
         kind = _kind(self.what)
         for flag, fits in (("follow", ("run",)), ("mppi", ("task", "run")), ("trust", ("run",))):
             if getattr(self, flag) and kind not in fits:
                 raise ValueError(f"--{flag} needs a {' or a '.join(fits)}, and {self.what[0]} is not one: leave it out")
-        shown: dict[str, Any] = {
-            name: getattr(self, name) for name in ("world", "paused", "trace", "gfx", "host", "port", "browser", "fps")
-        }
-        watchers: list[Watcher] = [] if parent is None else [_Ends(parent)]
+        shown: dict[str, Any] = {name: getattr(self, name) for name in ("paused", "host", "port")}
+        watchers: list[Watcher] = []
         if kind == "episodes":
             episodes = load_episodes(self.what)
             env = _episodes_env(self, episodes)
             unique = len({file.name for file in episodes}) == len(episodes)
             named = {file.name if unique else str(file): episode for file, episode in episodes.items()}
-            view(env, episodes=named, watchers=watchers, **shown)
+            view(env, episodes=named, **shown)
             return 0
         controllers: dict[str, Any] = {}
         if kind == "run":
-            run = _run(self, parent)
+            run = _run(self, seconds)
             env = _run_worlds(self, run)
             if self.follow:
                 follower = Follower(run, device=env.obs.device)
@@ -176,14 +169,12 @@ def _episodes_env(options: View, episodes: dict[Path, Trajectory]) -> Env:
     """A world for the playback of episodes."""
     if options.nworld is not None and options.nworld > 1:
         raise ValueError(f"--nworld {options.nworld} has no effect for episodes: leave it out")
-    check_world(options.world, 1)
     return episode_env(episodes, task=options.task, **parameters(options.param, options))
 
 
 def _task_worlds(options: View) -> Env:
     params = parameters(options.param, options)
     nworld = options.nworld or 1
-    check_world(options.world, nworld)
     if options.mppi and nworld == 1:  # the plant itself
         return Env(options.what[0], autoreset=False, nthread=1, **params)
     return Env(options.what[0], nworld=nworld, **given(options.place), **params)
@@ -196,45 +187,38 @@ def _planner(options: View, env: Env) -> MPPI:
     return MPPI(env.task.task, config, seed=options.seed, params=env.given_params, **words)
 
 
-def _run(options: View, parent: Parent | None) -> Run:
+def _run(options: View, seconds: float) -> Run:
     folder = Path(options.what[0])
     if not options.follow:
         return Run.open(folder)
     if options.which != "last":
         raise ValueError(f"--follow shows the newest policy, not {options.which!r}: leave out one of them")
-    if parent is None:
-        return wait_for_run(folder, seconds=_WAIT)
-    return wait_for_run(folder, seconds=_LONG, going_on=lambda: not parent.ended.is_set())
+    return wait_for_run(folder, seconds=seconds)
 
 
 def _run_worlds(options: View, run: Run) -> Env:
     nworld = options.nworld or _RUN_WORLDS
-    check_world(options.world, nworld)
     params = parameters(options.param, options)
     return run_worlds(run, options.place, params, nworld=nworld, task=options.task, trust=options.trust)
 
 
-class _Ends:
-    """Ends the viewer with the program that started it."""
-
-    def __init__(self, parent: Parent) -> None:
-        self._parent = parent
-
-    def __call__(self) -> list[str]:
-        if self._parent.ended.is_set():
-            raise Interrupted(0)
-        return []
-
-
 def attached() -> None:
     """Run the subprocess of ``lw.RunViewer``, which reads its job from stdin and ends with its parent."""
-    parent = Parent()
-    job = parent.job
+    with contextlib.suppress(OSError, AttributeError):  # not on Windows
+        os.nice(_NICE)
+    job = json.loads(sys.stdin.readline())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         with signals():
-            View(what=(job["folder"],), follow=True, **job["options"]).show(parent)
+            View(what=(job["folder"],), follow=True, **job["options"]).show(_LONG)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
-        if not parent.ended.is_set():
-            note(f"the viewer of {job['folder']} ended: {' '.join(str(error).split())}")
+        note(f"the viewer of {job['folder']} ended: {' '.join(str(error).split())}")
     except Interrupted:
         pass
+
+
+def _end_with_parent() -> None:
+    """Wait for EOF, which follows the end of the parent, even by SIGKILL; then end this process."""
+    with contextlib.suppress(OSError, ValueError):
+        sys.stdin.read()
+    os.kill(os.getpid(), signal.SIGTERM)

@@ -25,7 +25,7 @@ from lyceum_warp.controllers.episode_collector import (
 )
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
-from lyceum_warp.support.validate import check_kind, positive_number, whole_number
+from lyceum_warp.support.validate import check_kind, positive_number
 
 # all in seconds
 _SPIN = 0.0005  # the last part of a wait, which polls the clock instead of sleeping
@@ -41,7 +41,6 @@ def control_async(
     *,
     period: float | None = None,
     steps: int | None = None,
-    seconds: float | None = None,
     seed: int | None = None,
     reset: bool = True,
     on_step: OnStep | None = None,
@@ -76,7 +75,6 @@ def control_async(
         controller: Called in the second thread; see ``lw.Controller``. It plans in an environment of its own.
         period: Wall time between steps, seconds; by default the plant's time step, which is real time.
         steps: Steps after which to stop if the episode has not ended.
-        seconds: Wall time after which to stop if the episode has not ended.
         seed: Seed of the initial state and of the controller.
         reset: Whether to reset the plant and the controller first. With False the run continues from the plant's state
             and the controller's last plan.
@@ -98,9 +96,6 @@ def control_async(
     period = positive_number("period", env.timestep if period is None else period, "seconds")
     if period > threading.TIMEOUT_MAX:
         raise ValueError(f"period must be at most {threading.TIMEOUT_MAX:g} seconds, not {period!r}")
-    if seconds is not None:
-        ticks = max(1, math.ceil(min(2**31 - 1, positive_number("seconds", seconds, "seconds") / period - 1e-9)))
-        steps = ticks if steps is None else min(whole_number("steps", steps, low=1), ticks)
     checked = CheckedController(controller, env)
     limit, first = begin_episode(env, checked, steps, seed, reset=reset)
     _capture_graphs(env)

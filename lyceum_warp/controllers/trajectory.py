@@ -235,7 +235,7 @@ def provenance(env: Env) -> dict[str, Any]:
     }  # fmt: skip
 
 
-_PLACEMENT = ("engine", "device", "nthread", "nworld", "seed", "first_world", "autoreset", "graphs", "nvtx", "fields")
+_PLACEMENT = ("engine", "device", "nthread", "nworld", "seed", "first_world", "autoreset", "graphs", "fields")
 """Options that change neither the physics nor the states."""
 
 

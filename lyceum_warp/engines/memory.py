@@ -15,12 +15,6 @@ class NotEnoughMemoryError(ValueError):
     """A number of worlds does not fit into the free memory of a device."""
 
 
-def most_worlds(bytes_per_world: float, device: wp.Device) -> int | None:
-    """The largest number of worlds that fits into the free memory of a device, or None if that is unknown."""
-    free = free_memory(device)
-    return None if free is None else _most(bytes_per_world, free)
-
-
 def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: str = "", held: int = 0) -> None:
     """Refuse a batch that does not fit into the free memory, before its arrays are allocated.
 

@@ -17,7 +17,6 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 
-import torch
 import warp as wp
 
 from lyceum_warp.graphs.workers import Workers
@@ -37,7 +36,7 @@ class Phase:
     """
 
     name: str
-    """Name of the phase's range in a profiler."""
+    """Name, by which the rules of an environment find it."""
     run: Callable[[], object]
     """Takes no arguments."""
     engine: bool = False
@@ -54,15 +53,13 @@ class Graphs:
         device: Where the launches run; Warp captures graphs on the CPU, too.
         enabled: False calls every phase directly.
         capture_engine: Whether calls into the engine are made of launches.
-        nvtx: Whether to mark each phase as a range for NVIDIA's profilers.
         workers: Threads that replay the graphs of phases with ``by_world``; by default only the caller's.
     """
 
     def __init__(
-        self, device: wp.Device, *, enabled: bool = True, capture_engine: bool = True, nvtx: bool = False,
-        workers: Workers | None = None,
-    ) -> None:  # fmt: skip
-        self.device, self.enabled, self.capture_engine, self.nvtx = device, enabled, capture_engine, nvtx
+        self, device: wp.Device, *, enabled: bool = True, capture_engine: bool = True, workers: Workers | None = None
+    ) -> None:
+        self.device, self.enabled, self.capture_engine = device, enabled, capture_engine
         self._workers = workers
         self._graphs: weakref.WeakSet[_Graph] = weakref.WeakSet()
 
@@ -81,11 +78,9 @@ class Graphs:
                 if together and self._workers is not None and together[0].by_world != phase.by_world:
                     close()
                 together.append(phase)
-                if self.nvtx:
-                    close()
             else:
                 close()
-                calls.append(_Range(phase.name, phase.run) if self.nvtx else phase.run)
+                calls.append(phase.run)
         close()
         return tuple(calls)  # type: ignore[arg-type]
 
@@ -101,7 +96,7 @@ class Graphs:
         functions = [phase.run for phase in phases]
         graph = _Graph(self.device, functions, self._workers if phases[0].by_world else None)
         self._graphs.add(graph)
-        return _Range(phases[0].name, graph) if self.nvtx else graph
+        return graph
 
 
 SECONDS_A_THREAD = 5e-4
@@ -189,17 +184,3 @@ class _Graph:
 def _alone(replay: Callable[[], object]) -> None:
     with TILES_ON_CPU:
         replay()
-
-
-class _Range:
-    """A call that is marked as a range for NVIDIA's profilers."""
-
-    def __init__(self, name: str, call: Callable[[], object]) -> None:
-        self._name, self._call = name, call
-
-    def __call__(self) -> None:
-        torch.cuda.nvtx.range_push(self._name)
-        try:
-            self._call()
-        finally:
-            torch.cuda.nvtx.range_pop()

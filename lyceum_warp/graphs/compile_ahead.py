@@ -10,7 +10,6 @@ import dataclasses
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import warp as wp
@@ -20,7 +19,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from lyceum_warp.graphs.rehearsal import rehearse
 from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.support.upstream import is_compiled
-from lyceum_warp.support.warp_log import start_warp
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,13 +69,6 @@ def _load(module: Any, block: int, device: wp.Device) -> tuple[str, float]:
 def _block(device: wp.Device, block: int | None) -> int:
     """The block size of a launch; on the CPU it is always 1."""
     return 1 if device.is_cpu else block or 256
-
-
-def cached() -> dict[Path, int]:
-    """The compiled modules in Warp's cache, and their sizes in bytes."""
-    start_warp()  # finds the cache's folder
-    files = Path(wp.config.kernel_cache_dir or "").glob("*/*")
-    return {path: path.stat().st_size for path in files if path.suffix in (".o", ".ptx", ".cubin")}
 
 
 class _Report:

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import logging
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -30,24 +29,6 @@ log = logging.getLogger(__name__)
 
 ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig)}
 """The algorithms of the command line and config.json, by name: the classes of the learner and its hyperparameters."""
-
-_RSL_RL = {
-    "num_steps_per_env": "num_steps", "num_learning_epochs": "epochs", "num_mini_batches": "minibatches",
-    "clip_param": "clip", "use_clipped_value_loss": "clip_value_loss", "value_loss_coef": "value_coef",
-    "normalize_advantage_per_mini_batch": "whiten_minibatches", "random_start": "stagger",
-}  # fmt: skip
-"""New names of hyperparameters of the former algorithm rsl-rl."""
-
-
-def algorithm_of(name: str) -> tuple[Any, Any]:
-    """The classes of an algorithm and its hyperparameters.
-
-    Raises:
-        ValueError: There is no such algorithm.
-    """
-    if name not in ALGORITHMS:
-        raise ValueError(f"there is no algorithm {name!r}: use {' or '.join(ALGORITHMS)}")
-    return ALGORITHMS[name]
 
 
 def describe(learner: Learner) -> dict[str, Any]:
@@ -99,7 +80,7 @@ class Configuration:
 
     @classmethod
     def of(cls, run: Run) -> "Configuration":
-        """Read the configuration of a run. The former algorithm rsl-rl becomes ppo.
+        """Read the configuration of a run.
 
         Raises:
             ValueError: A value is missing or not valid.
@@ -108,20 +89,15 @@ class Configuration:
         try:
             # earlier releases accepted options as --param and stored them under "params", or had no "physics"
             words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
+            words.pop("unroll", None)  # their option, which changed no numbers
             base = EnvOptions(
                 engine=config["engine"], device=config["device"], nworld=config["nworld"], seed=config["seed"]
             )  # fmt: skip
             options, params = EnvOptions.split(words, base)
             name: str = config["algorithm"]
-            entry: Any = config.get(name)
-            if name == "rsl-rl":  # of an earlier release
-                renamed = {_RSL_RL.get(old, old): value for old, value in entry.items()}
-                known = {field.name for field in dataclasses.fields(PPOConfig)}
-                init = {"log_std": math.log(entry.get("init_std", 1.0))}
-                name, entry = "ppo", {new: value for new, value in renamed.items() if new in known} | init
             return cls(
                 task=config["task"], params=params, options=options, algorithm=name,
-                hyperparameters=ALGORITHMS[name][1](**entry) if name in ALGORITHMS else None,
+                hyperparameters=ALGORITHMS[name][1](**config[name]) if name in ALGORITHMS else None,
                 seed=config.get(f"{name}_seed"), threads=config["threads"],
             )  # fmt: skip
         except (KeyError, TypeError, AttributeError, ValueError) as error:
@@ -153,29 +129,24 @@ class Configuration:
             FileNotFoundError: The task or its model is missing.
         """
         with contextlib.nullcontext() if run is None else run.settings():
-            return self._learner(team, run, networks, note, task, trust)
-
-    def _learner(
-        self, team: Team, run: Run | None, networks: tuple[Any, Any], note: Callable[[str], None], task: str | None,
-        trust: bool,
-    ) -> Learner:  # fmt: skip
-        learner, _ = algorithm_of(self.algorithm)
-        if self.threads < 1:
-            raise ValueError(f"threads must be at least 1, not {self.threads}")
-        torch.set_num_threads(self.threads)
-        nworld = team.share(self.options.nworld)
-        own = {"nworld": nworld, "first_world": team.rank * nworld, "device": team.device or self.options.device}
-        options = self.options.changed(own)
-        if options.nthread is None and team.neighbours > 1 and engine_name(options.engine, options.device) == "mujoco":
-            options = options.changed({"nthread": max(1, cpu_cores() // team.neighbours)})
-        if run is None:
-            assert self.task is not None
-            env = Env(self.task, options, **self.params)
-        else:
-            # rank 0 checks the run; other machines may have no record of it
-            env = run_env(run, options, self.params, note=note, task=task, trust=trust or not team.leads)
-        seed = self.options.seed if self.seed is None else self.seed
-        return learner(env, *networks, self.hyperparameters, seed=seed, team=team)
+            if self.threads < 1:
+                raise ValueError(f"threads must be at least 1, not {self.threads}")
+            torch.set_num_threads(self.threads)
+            nworld = team.share(self.options.nworld)
+            own = {"nworld": nworld, "first_world": team.rank * nworld, "device": team.device or self.options.device}
+            options = self.options.changed(own)
+            engine = engine_name(options.engine, options.device)
+            if options.nthread is None and team.neighbours > 1 and engine == "mujoco":
+                options = options.changed({"nthread": max(1, cpu_cores() // team.neighbours)})
+            if run is None:
+                assert self.task is not None
+                env = Env(self.task, options, **self.params)
+            else:
+                # rank 0 checks the run; other machines may have no record of it
+                env = run_env(run, options, self.params, note=note, task=task, trust=trust or not team.leads)
+            seed = self.options.seed if self.seed is None else self.seed
+            learner: Learner = ALGORITHMS[self.algorithm][0](env, *networks, self.hyperparameters, seed=seed, team=team)
+            return learner
 
 
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:

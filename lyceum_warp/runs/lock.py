@@ -56,7 +56,7 @@ class RunLock:
             file.truncate(0)
             file.write(self._own)
             file.flush()
-            self._touch()
+            os.utime(self._path, (time.time(),) * 2)  # of this host, not of a file server
         self._thread.start()
         return self
 
@@ -91,11 +91,7 @@ class RunLock:
         while not self._ended.wait(BEAT):
             with contextlib.suppress(OSError), self._file("r+") as file:
                 if file.read() == self._own:
-                    self._touch()
-
-    def _touch(self) -> None:
-        now = time.time()  # of this host, not of a file server
-        os.utime(self._path, (now, now))
+                    os.utime(self._path, (time.time(),) * 2)
 
     @contextlib.contextmanager
     def _file(self, mode: str) -> Iterator[IO[str]]:

@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -36,32 +35,30 @@ def append_row(path: Path, row: Mapping[str, Any]) -> None:
         csv.writer(file).writerow(map(row.get, columns))  # None becomes an empty cell
 
 
-def read_metrics(path: Path) -> list[dict[str, float | None]]:
+def read_metrics(path: Path, *, lines: list[str] | None = None) -> list[dict[str, float | None]]:
     """Read the rows. An empty cell is None.
+
+    Args:
+        path: The table.
+        lines: Lines to read in place of the table's.
 
     Raises:
         ValueError: A cell is not a number, or the rows differ in length.
     """
-    return _rows(path, _text(path))
-
-
-def _text(path: Path) -> str:
+    reader = csv.DictReader(_lines(path) if lines is None else lines, strict=True)
     try:
-        with path.open(newline="") as file:
-            return file.read()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not a table of metrics: {error}") from error
-
-
-def _rows(path: Path, text: str) -> list[dict[str, float | None]]:
-    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
-    try:
-        rows = []
-        for row in reader:
-            rows.append({key: float(cell) if cell else None for key, cell in row.items()})
-        return rows
+        return [{key: float(cell) if cell else None for key, cell in row.items()} for row in reader]
     except (ValueError, TypeError, csv.Error) as error:
         raise ValueError(f"{path} is not a table of metrics: line {reader.line_num}: {error}") from error
+
+
+def _lines(path: Path) -> list[str]:
+    """The lines of the table, with their ends."""
+    try:
+        with path.open(newline="") as file:
+            return file.readlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not a table of metrics: {error}") from error
 
 
 def cut_rows(path: Path, iteration: int) -> None:
@@ -76,7 +73,7 @@ def cut_rows(path: Path, iteration: int) -> None:
     """
     if not path.exists():
         return
-    lines = _text(path).splitlines(keepends=True)
+    lines = _lines(path)
     header = next(csv.reader(lines[:1]), [])
     column = header.index("iteration") if "iteration" in header else None
     kept = []
@@ -86,7 +83,7 @@ def cut_rows(path: Path, iteration: int) -> None:
             number = float(next(csv.reader([line]))[column]) if i and column is not None else i
         if line.endswith("\n") and (i == 0 or number <= iteration):
             kept.append(line)
-    _rows(path, "".join(kept))
+    read_metrics(path, lines=kept)
     if kept != lines:
         with replaced(path) as temporary:
             temporary.write_text("".join(kept), newline="")

@@ -69,7 +69,8 @@ class Saver:
             The return that selects the best policy; None if the iteration has none.
         """
         assert self.run is not None
-        self._check_lock()
+        if self._lock is not None:
+            self._lock.check()
         append_row(self.run.metrics, iteration.row())
         learner, name = self.learner, self.learner.best_by
         score = getattr(iteration, name)
@@ -91,10 +92,6 @@ class Saver:
             write_content(path, self._before)
         return score
 
-    def _check_lock(self) -> None:
-        if self._lock is not None:
-            self._lock.check()
-
     def due(self) -> bool:
         """Whether it is time to save."""
         if self.save_every:
@@ -108,7 +105,8 @@ class Saver:
         state = learner.state_dict()  # gathers the worlds of all ranks
         with learner.team.together():
             if self.run is not None:
-                self._check_lock()
+                if self._lock is not None:
+                    self._lock.check()
                 self.run.save(policy_content(learner.iteration, learner.policy, learner.value), state)
         self.saved, self._when = learner.iteration, time.perf_counter()
         self._seconds = self._when - start

@@ -1,4 +1,4 @@
-"""View worlds interactively, in a browser or in a window: two processes, a folder for each.
+"""View worlds interactively in a browser: two processes, a folder for each.
 
 =================  ====================================================================================================
 ``show.py``        ``lw.view``: open a session and its window

@@ -9,7 +9,6 @@ import json
 import os
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -19,8 +18,6 @@ import torch
 from lyceum_warp.algos.policy import acting
 from lyceum_warp.runs.checkpoints import read_checkpoint
 from lyceum_warp.runs.folder import Run, load
-
-_NICE = 10  # niceness of the process of `RunViewer`
 
 
 class Follower:
@@ -57,7 +54,7 @@ class Follower:
             self._seen = stamp
             return [f"the policy of {self.run.folder} was not read: {str(error).splitlines()[0]}"]
         self._seen, self.iteration = stamp, content["iteration"]
-        return [f"policy of iteration {self.iteration}{self._return()}"]
+        return [f"policy of iteration {self.iteration}"]
 
     def _read(self) -> dict[str, Any]:
         return read_checkpoint(self.run.policy_file(), self.device, parts=("iteration", "policy"))
@@ -70,23 +67,13 @@ class Follower:
             return None
         return found.st_mtime_ns, found.st_ino, found.st_size
 
-    def _return(self) -> str:
-        """The last return in the run's table, as text."""
-        with contextlib.suppress(FileNotFoundError, ValueError, IndexError):
-            row = self.run.rows()[-1]
-            for name in ("mean_return", "return_mean"):
-                if (value := row.get(name)) is not None and value == value:
-                    return f", return {value:.6g}"
-        return ""
 
-
-def wait_for_run(folder: Path, *, seconds: float, going_on: Any = lambda: True) -> Run:
+def wait_for_run(folder: Path, *, seconds: float) -> Run:
     """Wait until a run has a policy.
 
     Args:
         folder: The run's folder.
         seconds: Maximum time.
-        going_on: Called now and then; the wait ends if it returns False.
 
     Raises:
         FileNotFoundError: There is no run, or it has no policy.
@@ -100,7 +87,7 @@ def wait_for_run(folder: Path, *, seconds: float, going_on: Any = lambda: True) 
             problem = f"the run in {folder} has no policy yet: train it first"
         except FileNotFoundError as error:
             problem = str(error)
-        if time.monotonic() >= end or not going_on():
+        if time.monotonic() >= end:
             raise FileNotFoundError(problem)
         time.sleep(0.2)
 
@@ -114,7 +101,7 @@ class RunViewer:
 
     Args:
         folder: The run's folder, which need not exist yet.
-        options: Further flags of ``lyceum-warp view`` by name, such as ``gfx="web"``, ``port=8080``, ``nworld=64``.
+        options: Further flags of ``lyceum-warp view`` by name, such as ``port=8080``, ``nworld=64``.
     """
 
     def __init__(self, folder: str | Path, **options: Any) -> None:
@@ -140,34 +127,18 @@ class RunViewer:
 
     def close(self) -> None:
         """End the process. A second call does nothing."""
-        assert self._process.stdin is not None
-        with contextlib.suppress(OSError):
-            self._process.stdin.close()  # the process ends
+        self._process.terminate()
         try:
             self._process.wait(10.0)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
 
     def __enter__(self) -> "RunViewer":
         return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()
-
-
-class Parent:
-    """The program that started this process: reads the job from its pipe, and notices EOF."""
-
-    def __init__(self) -> None:
-        with contextlib.suppress(OSError, AttributeError):  # not on Windows
-            os.nice(_NICE)
-        self.job: dict[str, Any] = json.loads(sys.stdin.readline())
-        self.ended = threading.Event()
-        threading.Thread(target=self._listen, daemon=True, name="lyceum_warp parent").start()
-
-    def _listen(self) -> None:
-        with contextlib.suppress(OSError, ValueError):
-            while sys.stdin.read(1):
-                pass
-        self.ended.set()

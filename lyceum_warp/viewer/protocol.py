@@ -8,8 +8,6 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-Graphics: TypeAlias = Literal["web", "native"]
-
 Mode: TypeAlias = Literal["passive", "controller", "playback"]
 
 WorldChoice: TypeAlias = int | Literal["next", "previous", "best", "worst", "last_ended"]
@@ -74,16 +72,12 @@ class Ghost:
 class SetGhosts:
     """Choose which ghosts are drawn."""
 
-    worlds: tuple[int, ...] = ()
-    """Other worlds, at most ``MOST_GHOSTS``."""
-    episodes: tuple[int, ...] = ()
-    """Other episodes, at the same step, at most ``MOST_GHOSTS``."""
+    worlds: int = 0
+    """Number of other worlds, at most ``MOST_GHOSTS``: those after the shown one."""
+    episodes: int = 0
+    """Number of other episodes, at the same step, at most ``MOST_GHOSTS``: those after the shown one."""
     burst: int = 0
-    """Number of states along the trajectory, at most ``MOST_BURST``."""
-    fade: float = 1.0
-    """Factor of opacity from each state of the burst to the next."""
-    doppler: bool = False
-    """Whether past states are red and future states blue."""
+    """Number of states along the trajectory, past red and future blue, at most ``MOST_BURST``."""
     plan: bool = True
     """Whether the plan's final pose and the samples' traces are drawn."""
 
@@ -264,21 +258,18 @@ class Opening:
     """The first message to the window process."""
 
     scene: Scene
-    graphics: Graphics
     host: str
     """Address that the page is served on."""
     port: int | None
     """Port of the page; None for the first free port from 8080."""
-    browser: bool
-    """Whether to open the page in a browser on this machine."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Opened:
     """The window is open."""
 
-    address: str = ""
-    """The page's address with its token; empty for a native window."""
+    address: str
+    """The page's address with its token."""
     instructions: tuple[str, ...] = ()
     """Lines to print."""
 

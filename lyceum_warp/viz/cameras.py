@@ -32,7 +32,7 @@ class FreeCamera:
 
 
 CameraChoice: TypeAlias = str | int | FreeCamera | mujoco.MjvCamera | None
-"""A camera of the model by name or index, a free camera ("free" or -1 for MuJoCo's default), or None for the default
+"""A camera of the model by name or index, a free camera ("free" for MuJoCo's default), or None for the default
 of a video: the model's first tracking camera, else its first camera fixed to the world, else a camera that follows the
 first body."""
 
@@ -54,7 +54,7 @@ def find_camera(model: mujoco.MjModel, camera: CameraChoice = None) -> mujoco.Mj
     names = camera_names(model)
     if isinstance(camera, str) and camera and camera in names:
         return _fixed_camera(names.index(camera))
-    if camera == FREE or (_is_index(camera) and camera == -1):
+    if camera == FREE:
         return _free_camera(model, FreeCamera())
     index = int(camera) if isinstance(camera, str) and camera.isdecimal() else camera
     if _is_index(index) and 0 <= int(index) < len(names):

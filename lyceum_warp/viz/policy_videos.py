@@ -10,11 +10,11 @@ import torch
 from lyceum_warp.algos.evaluation import evaluation_worlds
 from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.algos.networks import moved
-from lyceum_warp.algos.policy import Policy
+from lyceum_warp.algos.policy import Policy, acting
+from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.env import Env
 from lyceum_warp.viz.cameras import CameraChoice
-from lyceum_warp.viz.tensorboard import TensorBoard
-from lyceum_warp.viz.video import Progress, episode, write_video
+from lyceum_warp.viz.video import Progress, write_video
 
 log = logging.getLogger(__name__)
 
@@ -33,32 +33,31 @@ def policy_states(env: Env, policy: Policy, seed: int, *, progress: Progress | N
     """
     one = evaluation_worlds(env, 1, autoreset=False)
     policy = moved(policy, one) if isinstance(policy, torch.nn.Module) else policy
-    return one, episode(one, policy, seed=seed, progress=progress)
+    (episode,) = policy_episodes(one, acting(policy), 1, seed=seed, progress=progress)
+    return one, episode.states
 
 
 class Videos:
-    """Writes a video of the mean policy every few iterations, and shows it in TensorBoard.
+    """Writes a video of the mean policy every few iterations.
 
-    An error, as on a machine that cannot draw a video or convert it for TensorBoard, is reported once; there are no
-    further videos then, and training goes on.
+    An error, as on a machine that cannot draw, is reported once; no further videos are made then, and the
+    training goes on.
 
     Args:
         learner: The algorithm.
         folder: Folder of the videos, which have the numbers of their iterations.
         every: Iterations between two videos; 0 for none.
         seed: Seed of the initial state, the same for all videos.
-        board: TensorBoard's writer, if there is one.
         camera: The camera; see ``write_video``.
         note: Called with the line that reports an error.
         progress: Called now and then while a video is made.
     """
 
     def __init__(
-        self, learner: Learner, folder: Path, every: int, seed: int, board: TensorBoard | None, *,
-        camera: CameraChoice = None, note: Callable[[str], object] = log.warning,
-        progress: NamedProgress | None = None,
+        self, learner: Learner, folder: Path, every: int, seed: int, *, camera: CameraChoice = None,
+        note: Callable[[str], object] = log.warning, progress: NamedProgress | None = None,
     ) -> None:  # fmt: skip
-        self.learner, self.folder, self.every, self.seed, self.board = learner, folder, every, seed, board
+        self.learner, self.folder, self.every, self.seed = learner, folder, every, seed
         self.camera, self.note, self.progress = camera, note, progress
 
     def __call__(self, iteration: Iteration) -> None:
@@ -71,8 +70,6 @@ class Videos:
                 self.learner.env, self.learner.policy, self.seed, progress=self._progress("running an episode", "steps")
             )
             write_video(env, states, path, camera=self.camera, progress=self._progress("drawing the video", "frames"))
-            if self.board is not None:
-                self.board.video(path, iteration.samples)
         except Exception as error:  # of any kind: the training is worth more than its video
             self.note(f"no further videos ({one_line(error)})")
             self.every = 0

@@ -36,8 +36,6 @@ class Shot(TypedDict):
     """qpos, mocap_pos and mocap_quat."""
     model_fields: dict[str, np.ndarray]
     """Values of model fields by name. Other fields have the model's values."""
-    camera: tuple[float, ...] | None
-    """The camera from this frame on; None keeps the last one."""
     ghosts: list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[float, ...]]]
     """Further poses of the model, each with a colour."""
     lines: list[tuple[np.ndarray, tuple[float, ...], float]]
@@ -73,8 +71,6 @@ class Painter:
     def draw(self, shot: Shot) -> np.ndarray:
         """Draw one frame, (height, width, 3) uint8."""
         self._set_fields(shot["model_fields"])
-        if shot["camera"] is not None:
-            set_camera(self.view, shot["camera"])
         self._place(self.data, shot["pose"])
         self.renderer.update_scene(self.data, self.view, self.option)
         scene = self.renderer.scene

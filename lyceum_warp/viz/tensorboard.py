@@ -1,4 +1,4 @@
-"""Write curves, hyperparameters and videos of a run for TensorBoard, with the extra ``tensorboard``.
+"""Write curves and hyperparameters of a run for TensorBoard, with the extra ``tensorboard``.
 
 ``metrics.csv`` holds the same numbers; the files written here are a copy for another viewer.
 """
@@ -7,8 +7,6 @@ import importlib.util
 import json
 import math
 import os
-import struct
-import subprocess
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -36,8 +34,6 @@ _TAGS = {
 
 _COMPARED = ("return/mean", "mean_policy/return", "episode/eval", "episode/success")
 """The curves whose last values the tab of hyperparameters shows."""
-
-_VIDEO_WIDTH, _VIDEO_RATE = 320, 15
 
 
 class TensorBoard:
@@ -83,25 +79,6 @@ class TensorBoard:
             if number is not None and math.isfinite(number):
                 values.append(Summary.Value(tag=tag(column), simple_value=number))
         self._write(Summary(value=values), iteration.samples, replaced=iteration.samples)
-
-    def video(self, path: str | Path, samples: int) -> None:
-        """Add a video, reduced to a picture of 320 pixels and 15 frames per second that the tab IMAGES plays.
-
-        Args:
-            path: An mp4 file.
-            samples: Samples in all iterations so far.
-
-        Raises:
-            ImportError: The package imageio-ffmpeg is not installed.
-            ValueError: The file is not a video.
-        """
-        from tensorboard.compat.proto.summary_pb2 import Summary
-
-        picture = _animation(Path(path))
-        width, height = struct.unpack("<HH", picture[6:10])
-        image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=picture)
-        video = Summary(value=[Summary.Value(tag="video", image=image)])
-        self._write(video, samples, replaced=samples + 1)  # the curves of this iteration stay
 
     def close(self) -> None:
         """Close the file. A later iteration opens another one."""
@@ -175,19 +152,3 @@ def _flat(config: Mapping[str, Any]) -> Iterator[tuple[str, bool | float | str]]
             yield from _flat(value)
         elif value is not None:
             yield name, value if isinstance(value, (bool, int, float, str)) else str(value)
-
-
-def _animation(path: Path) -> bytes:
-    """A small GIF of a video."""
-    try:
-        from imageio_ffmpeg import get_ffmpeg_exe
-    except ImportError as error:
-        raise ImportError("videos for TensorBoard need imageio-ffmpeg: pip install 'lyceum-warp[viz]'") from error
-    colours = "split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
-    filters = f"fps={_VIDEO_RATE},scale={_VIDEO_WIDTH}:-2,{colours}"
-    command = [get_ffmpeg_exe(), "-v", "error", "-i", str(path), "-filter_complex", filters, "-f", "gif", "-"]
-    done = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL)
-    if done.returncode or not done.stdout.startswith(b"GIF8"):
-        lines = done.stderr.decode(errors="replace").strip().splitlines() or ["ffmpeg gave no picture"]
-        raise ValueError(f"{path} is not a video that ffmpeg reads ({lines[-1][:160]})")
-    return done.stdout

@@ -382,7 +382,7 @@ def test_ctrl_c_ends_the_command_and_closes_its_port(context: BrowserContext, tm
     # a shell makes its background jobs ignore Ctrl-C
     obey = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
     program = f"{obey}; import lyceum_warp.cli; sys.exit(lyceum_warp.cli.main())"
-    command = [sys.executable, "-c", program, "view", "point_mass", "--gfx", "web"]
+    command = [sys.executable, "-c", program, "view", "point_mass"]
     process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None

@@ -107,6 +107,7 @@ def test_a_broken_task_is_listed_with_its_mistake_and_ends_no_list(
 
 
 def test_a_list_that_is_read_in_part_ends_quietly() -> None:
-    command = f"{sys.executable} -m lyceum_warp.cli tasks | head -1"
+    """The reader of the pipe ends before the first line."""
+    command = f"{sys.executable} -m lyceum_warp.cli tasks hopper | true"
     done = subprocess.run(command, shell=True, capture_output=True, text=True)
-    assert done.stdout.startswith("task ") and done.stderr == ""
+    assert done.stderr == ""

@@ -6,7 +6,7 @@ import pytest
 import lyceum_warp as lw
 from lyceum_warp import cli
 
-COMMANDS = ("tasks", "new", "check", "train", "eval", "export", "plan", "view", "warmup", "bench")
+COMMANDS = ("tasks", "new", "check", "train", "eval", "export", "plan", "view", "bench")
 
 
 def test_help_lists_commands_with_examples(capsys: pytest.CaptureFixture[str]) -> None:
@@ -52,26 +52,6 @@ def test_wrong_options_are_refused(options: list[str], capsys: pytest.CaptureFix
         cli.main(["train", "hopper", *options])
     assert ended.value.code == 2
     assert options[0] in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("argv", "message"),
-    [
-        (["trian", "hopper"], "no command 'trian': did you mean train?"),
-        (["jump"], "there are tasks, new, check"),
-        ([], "which command"),
-    ],
-)
-def test_an_unknown_command_is_refused_with_the_closest_one(
-    argv: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(argv) == 2
-    assert message in capsys.readouterr().err
-
-
-def test_a_flag_of_rsl_rl_is_refused_with_the_algorithm_that_replaced_it(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["train", "hopper", "--config.learning-rate", "1e-3"]) == 2
-    assert "--config.learning-rate was a flag of rsl-rl, which ppo has replaced" in capsys.readouterr().err
 
 
 def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:

@@ -394,6 +394,7 @@ def assert_continues(out: Path, output: str, trained: Path) -> None:
     assert len(metrics(out)) == done + 1
 
 
+@pytest.mark.long  # the next test and those of plan cover it within this process and from outside
 def test_a_terminated_run_continues(trained: Path, tmp_path: Path) -> None:
     if os.name == "nt":
         pytest.skip("signals are POSIX's")

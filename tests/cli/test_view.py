@@ -22,9 +22,9 @@ class Opened:
         self.options: dict[str, Any] = {}
         self.number = 3
 
-    def __call__(self, scene: Scene, graphics: str, **options: Any) -> MemoryWindow:
+    def __call__(self, scene: Scene, **options: Any) -> MemoryWindow:
         self.scenes.append(scene)
-        self.options = {"gfx": graphics, **options}
+        self.options = options
 
         def after(frame: Frame, number: int) -> list[Any] | None:
             self.frames.append(frame)
@@ -37,8 +37,6 @@ class Opened:
 def opened(monkeypatch: pytest.MonkeyPatch) -> Opened:
     collected = Opened()
     monkeypatch.setattr(views, "opened", collected)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     return collected
 
 
@@ -57,12 +55,11 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def test_a_task_is_shown(opened: Opened) -> None:
-    options = ["--nworld", "3", "--world", "2", "--port", "8123", "--param", "success_distance=0.2"]
+    options = ["--nworld", "3", "--port", "8123", "--param", "success_distance=0.2"]
     assert cli.main(["view", "point_mass", *options]) == 0
     (scene,) = opened.scenes
     assert scene.title == "point_mass" and scene.nworld == 3 and scene.modes == ("passive",)
-    assert opened.options == {"gfx": "web", "host": "127.0.0.1", "port": 8123, "browser": False}
-    assert opened.frames[0].status.world == 2
+    assert opened.options == {"host": "127.0.0.1", "port": 8123}
 
 
 def test_a_task_is_shown_under_a_planner(opened: Opened) -> None:
@@ -96,14 +93,11 @@ def test_episodes_are_played_back(opened: Opened, files: list[Path]) -> None:
     ("words", "messages"),
     [
         (["hoper"], ["there is no task 'hoper'"]),
-        (["point_mass", "--world", "1"], ["there is no world 1: there is 1 world, number 0"]),
-        (["point_mass", "--gfx", "native"], ["there is no display for a native window"]),
         (["point_mass", "--follow"], ["--follow needs a run", "point_mass"]),
         (["point_mass", "--samples", "4"], ["--samples is a setting of the planner: add --mppi"]),
         (["point_mass", "hopper"], ["one task can be shown at a time, not 2"]),
         (["missing.npz"], ["there is no file missing.npz"]),
         (["point_mass", "--param", "nworld=3"], ["nworld is an option"]),
-        (["point_mass", "--mppi", "--trace", "nose"], ["no site and no body 'nose' to trace"]),
     ],
 )
 def test_a_mistake_is_one_line(

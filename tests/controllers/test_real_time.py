@@ -70,7 +70,7 @@ def planner_threads() -> list[threading.Thread]:
 
 def test_a_slow_planner_in_a_thread_plans_while_the_plant_steps(env: lw.Env) -> None:
     planner, interval = StepPlanner(env, seconds=0.12), sys.getswitchinterval()
-    episode = control_async(env, planner, period=0.04, seconds=0.4, seed=6)
+    episode = control_async(env, planner, period=0.04, steps=10, seed=6)
     assert episode.steps == 10 and episode.mode == "async" and episode.period == 0.04
     assert planner.resets == [6, 6]
     assert planner.shifts[:3] == [0, 0, 0]

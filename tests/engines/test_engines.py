@@ -204,12 +204,6 @@ def test_integrator_and_solver_options_reach_the_engine(engine: str) -> None:
     assert lw.make("point_mass", engine=engine).model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
 
 
-@pytest.mark.skipif(torch.backends.cuda.is_built(), reason="this torch can mark phases")
-def test_marks_for_a_profiler_are_refused_without_cuda() -> None:
-    with pytest.raises(ValueError, match="nvtx=True marks phases through torch"):
-        lw.make("point_mass", nvtx=True)
-
-
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_fields_that_the_task_does_not_read_are_kept_if_listed(engine: str) -> None:
     """A sensor is enabled only if a listed field needs it."""
@@ -245,47 +239,6 @@ def test_the_deterministic_option_changes_nothing_on_the_cpu() -> None:
         assert env.replicate().options.physics.deterministic
         assert type(env.engine) is type(lw.make("point_mass", engine=engine).engine)
         env.step()
-
-
-def test_an_unrolled_solver_gives_the_same_numbers() -> None:
-    """Iterations that a world does not need leave it unchanged."""
-    looped, unrolled = (
-        lw.make("half_cheetah", nworld=3, engine="warp", solver={"iterations": 6}, unroll=unroll)
-        for unroll in (False, True)
-    )
-    actions = 2 * torch.rand(12, *looped.action.shape, generator=torch.Generator().manual_seed(0)) - 1
-    for env in (looped, unrolled):
-        for action in actions:
-            env.step(action)
-    assert torch.equal(looped.get_state(), unrolled.get_state())
-    assert not unrolled.replicate().engine.m.opt.graph_conditional  # type: ignore[attr-defined]
-    with pytest.raises(ValueError, match=r"unroll=True repeats all of the solver's 100 iterations .*'iterations': 4"):
-        lw.make("half_cheetah", engine="warp", unroll=True)
-    lw.make("half_cheetah", engine="mujoco", unroll=True).step()
-
-
-PHASES = {
-    "warp": ["act", "physics", "judge", "restart", "refresh", "observe"],
-    "mujoco": ["act", "inputs", "physics", "fields", "judge", "restart", "refresh", "observe"],
-}
-
-
-@pytest.mark.parametrize("graphs", [True, False])
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_a_profiler_sees_each_phase(engine: str, graphs: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen, open_ranges = [], []
-    monkeypatch.setattr(torch.backends.cuda, "is_built", lambda: True)
-    monkeypatch.setattr(torch.cuda.nvtx, "range_push", lambda name: open_ranges.append(name))
-    monkeypatch.setattr(torch.cuda.nvtx, "range_pop", lambda: seen.append(open_ranges.pop()))
-    marked = lw.make("reach", engine=engine, nworld=2, nvtx=True, graphs=graphs)
-    plain = lw.make("reach", engine=engine, nworld=2)
-    for _ in range(4):
-        seen.clear()
-        marked.step()
-        plain.step()
-        assert seen == [phase for phase in PHASES[engine] if phase != "refresh" or marked.engine.reset_stage > 0]
-        assert not open_ranges
-    assert torch.equal(marked.get_state(), plain.get_state()) and torch.equal(marked.obs, plain.obs)
 
 
 def test_the_contact_pool_has_room_for_one_world_in_which_everything_touches() -> None:

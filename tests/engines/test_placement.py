@@ -59,7 +59,7 @@ def test_engine_name_resolves_auto_by_the_device() -> None:
 def test_open_engine_makes_the_named_engine(model: mujoco.MjModel) -> None:
     cpu = wp.get_device("cpu")
     for engine, wanted in (("auto", MujocoEngine), ("mujoco", MujocoEngine), ("warp", WarpEngine), (ToyEngine,) * 2):
-        made = open_engine(engine, model, 2, cpu, [], nthread=None, deterministic=False, unroll=False)
+        made = open_engine(engine, model, 2, cpu, [], nthread=None, deterministic=False)
         assert type(made) is wanted and made.nworld == 2
     for engine in ("bullet", None):
         with pytest.raises(ValueError, match=f"no engine {engine!r}: use one of 'auto', 'mujoco', 'warp'"):
@@ -83,15 +83,15 @@ def test_options_are_read_from_the_signature_of_an_engine(model: mujoco.MjModel)
         return open_engine(engine, model, 2, cpu, [], **options).given  # type: ignore[attr-defined]
 
     assert opened(Curious) == (3, False)
-    assert opened(Curious, patience=5, strict=True, deterministic=True, unroll=True) == (5, True)
-    assert opened(any_options, patience=None, njmax=8, unroll=False, strict=True) == {"njmax": 8, "strict": True}
+    assert opened(Curious, patience=5, strict=True, deterministic=True) == (5, True)
+    assert opened(any_options, patience=None, njmax=8, strict=True) == {"njmax": 8, "strict": True}
     with pytest.raises(ValueError, match="the toy engine takes no njmax, nthread; it takes patience, strict"):
         opened(Curious, nthread=2, njmax=8)
     with pytest.raises(ValueError, match="the toy engine takes no nthread; it takes no options"):
         opened(ToyEngine, nthread=2)
     with pytest.raises(ValueError, match="the mujoco engine takes no njmax; it takes nthread"):
         opened("mujoco", njmax=64)
-    with pytest.raises(ValueError, match="the warp engine takes no nthread; it takes nconmax, njmax, unroll"):
+    with pytest.raises(ValueError, match="the warp engine takes no nthread; it takes nconmax, njmax"):
         opened("warp", nthread=2)
 
 

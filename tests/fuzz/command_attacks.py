@@ -42,8 +42,7 @@ SMALL: dict[str, dict[str, tuple[str, ...]]] = {
         "--steps": ("2",), "--samples": ("2",), "--horizon": ("2",), "--out": ("out",), "--no-video": (),
         "--no-plot": (),
     },
-    "view": {"--gfx": ("native",)},
-    "warmup": {"--nworld": ("2",)},
+    "view": {},
     "bench": {},
 }  # fmt: skip
 """Commands, with flags that make them quick."""

@@ -14,9 +14,9 @@ from minimal_cases import COMMANDS, FILES, KEYWORDS
 
 FEW = {
     "file_attacks.py": {
-        "config.json": 10, "kept config.json": 5, "versions.json": 4, "metrics.csv": 6, "policy.pt": 14, "best.pt": 5,
-        "checkpoint.pt": 8, "previous.pt": 3, "episode.npz": 14, "kept model": 3, "kept table": 4, "model.xml": 16,
-        "table.npy": 10,
+        "config.json": 5, "kept config.json": 3, "versions.json": 2, "metrics.csv": 3, "policy.pt": 7, "best.pt": 3,
+        "checkpoint.pt": 4, "previous.pt": 2, "episode.npz": 7, "kept model": 2, "kept table": 2, "model.xml": 8,
+        "table.npy": 5,
     },
     "keyword_attacks.py": {
         "EnvOptions": 40, "PhysicsOptions": 40, "MPPIConfig": 40, "NPGConfig": 40, "make": 16, "MPPI": 16, "CEM": 4,
@@ -25,7 +25,7 @@ FEW = {
     },
     "command_attacks.py": {
         "tasks": 1, "new": 3, "check": 4, "train": 8, "train --resume good": 3, "train --from good": 3, "eval": 4,
-        "export": 2, "plan": 4, "view": 4, "warmup": 2, "bench": 1,
+        "export": 2, "plan": 4, "view": 4, "bench": 1,
     },
 }  # fmt: skip
 """Numbers of cases of each kind, by attack program."""

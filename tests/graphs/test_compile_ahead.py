@@ -1,4 +1,4 @@
-"""Kernels are compiled ahead of the first step, with progress, and by ``lyceum-warp warmup``."""
+"""Kernels are compiled ahead of the first step, with progress."""
 
 import os
 import runpy

@@ -52,7 +52,7 @@ def test_warp_starts_where_stderr_is_closed() -> None:
 
 @WITHOUT_GPU
 def test_a_cuda_device_without_a_driver_is_one_line_with_the_cause() -> None:
-    out, error = printed("import sys; from lyceum_warp.cli import main; main(['warmup', 'hopper', '--device', 'cuda'])")
+    out, error = printed("import sys; from lyceum_warp.cli import main; main(['check', 'hopper', '--device', 'cuda'])")
     assert out == "" and error.count("\n") == 1
     assert error.startswith("lyceum-warp: there is no device 'cuda' on this machine; it has 'cpu' (")
     assert "NVIDIA CUDA driver" in error

@@ -3,6 +3,9 @@
 import contextlib
 import importlib
 import re
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -33,7 +36,7 @@ def test_a_follower_takes_the_newest_policy(tmp_path: Path) -> None:
 
     lw.train(npg, folder, iterations=3, callback=callback)
     assert followers[0].iteration == 3
-    assert [message.partition(",")[0] for message in messages][-1] == "policy of iteration 3"
+    assert messages[-1] == "policy of iteration 3"
     obs = torch.randn(4, npg.policy.nobs)
     with torch.no_grad():
         assert torch.equal(followers[0](obs), npg.policy(obs))
@@ -67,7 +70,7 @@ def trained(folder: Path, callback: Callable[[lw.Iteration], object] | None = No
 def test_a_run_with_a_viewer_has_the_same_numbers_to_the_bit(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     alone = trained(tmp_path / "alone")
     begun, printed = time.monotonic(), ""
-    with lw.RunViewer(tmp_path / "shown", gfx="web", nworld=2) as viewer:
+    with lw.RunViewer(tmp_path / "shown", nworld=2) as viewer:
 
         def callback(iteration: lw.Iteration) -> None:
             nonlocal printed
@@ -85,6 +88,39 @@ def test_a_run_with_a_viewer_has_the_same_numbers_to_the_bit(tmp_path: Path, cap
         assert torch.equal(one, other)
 
 
+PROGRAM = """
+import sys, time
+import lyceum_warp as lw
+viewer = lw.RunViewer(sys.argv[1])
+print(viewer._process.pid, flush=True)
+time.sleep({seconds})
+viewer.close()
+"""
+
+
+def runs(process: int) -> bool:
+    """Whether a process runs; one that ended and is not waited for does not."""
+    with contextlib.suppress(FileNotFoundError):
+        return Path(f"/proc/{process}/cmdline").read_bytes() != b""
+    return False
+
+
+@pytest.mark.parametrize("kill", [pytest.param(True, marks=pytest.mark.long), False])
+def test_a_viewer_ends_with_its_program_also_while_it_waits_for_the_run(kill: bool, tmp_path: Path) -> None:
+    """A program that is killed, and one that closes the viewer at once."""
+    command = [sys.executable, "-c", PROGRAM.format(seconds=60 if kill else 0), str(tmp_path / "run")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
+        assert program.stdout is not None
+        viewer = int(program.stdout.readline())
+        if kill:
+            program.send_signal(signal.SIGKILL)
+    end = time.monotonic() + 60
+    while runs(viewer) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not runs(viewer)
+    assert kill or program.returncode == 0
+
+
 def test_train_shows_its_run_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folders: list[Path] = []
     training = importlib.import_module("lyceum_warp.cli.train")  # the package has a function of this name
@@ -99,7 +135,7 @@ def test_a_viewer_of_a_task_that_is_not_found_ends_with_one_line(
     assert train(tmp_path / "run", "--iterations", "1") == 0
     run = Run.open(tmp_path / "run")
     run.amend(task="missing_task")
-    with lw.RunViewer(tmp_path / "run", gfx="web") as viewer:
+    with lw.RunViewer(tmp_path / "run") as viewer:
         begun = time.monotonic()
         while viewer.is_open and time.monotonic() < begun + 60:
             time.sleep(0.1)

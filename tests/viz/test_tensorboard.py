@@ -1,11 +1,8 @@
 """Curves for TensorBoard, read back with TensorBoard's own reader."""
 
 import dataclasses
-import io
 import math
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -36,7 +33,7 @@ def numbered(first: lw.Iteration, i: int, **changes: object) -> lw.Iteration:
 def read(folder: Path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    return EventAccumulator(str(folder), size_guidance={"images": 0, "scalars": 0}).Reload()
+    return EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
 
 
 def curve(folder: Path, name: str) -> list[tuple[int, float]]:
@@ -104,25 +101,6 @@ def test_the_tab_of_hyperparameters_has_them_once_with_the_curves_to_compare(fir
     assert "config" in read(tmp_path).Tags()["tensors"]
 
 
-def test_a_video_becomes_an_animated_picture(first: lw.Iteration, tmp_path: Path) -> None:
-    ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
-    image = pytest.importorskip("PIL.Image")
-    mp4 = tmp_path / "video.mp4"
-    make = ["-v", "error", "-f", "lavfi", "-i", "testsrc=duration=2:size=640x480:rate=30", "-pix_fmt", "yuv420p"]
-    subprocess.run([ffmpeg, *make, str(mp4)], check=True)
-    with TensorBoard(tmp_path / "run", CONFIG) as board:
-        board(numbered(first, 1))
-        board.close()
-        board.video(mp4, 96)
-        with pytest.raises(ValueError, match=r"nothing.mp4 is not a video that ffmpeg reads \(.*\)$"):
-            board.video(tmp_path / "nothing.mp4", 96)
-    assert curve(tmp_path / "run", "policy/kl") == [(96, 0.01)]  # the later file of the video leaves it
-    (video,) = read(tmp_path / "run").Images("video")
-    assert (video.step, video.width, video.height) == (96, 320, 240)
-    animation = image.open(io.BytesIO(video.encoded_image_string))
-    assert animation.format == "GIF" and animation.n_frames == 30  # 2 seconds of 15 frames
-
-
 def test_a_full_disk_is_an_error_of_the_call(first: lw.Iteration, tmp_path: Path) -> None:
     resource = pytest.importorskip("resource")
     before, limits = signal.signal(signal.SIGXFSZ, signal.SIG_IGN), resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -144,12 +122,6 @@ def test_a_missing_package_is_one_line_with_the_command(tmp_path: Path, monkeypa
     with pytest.raises(ImportError, match=r"need the package tensorboard: pip install 'lyceum-warp\[tensorboard\]'$"):
         TensorBoard(tmp_path / "run", CONFIG)
     assert not (tmp_path / "run").exists()
-
-
-def test_a_missing_ffmpeg_is_one_line_with_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(ImportError, match=r"need imageio-ffmpeg: pip install 'lyceum-warp\[viz\]'$"):
-        TensorBoard(tmp_path, CONFIG).video(tmp_path / "video.mp4", 0)
 
 
 def test_train_writes_the_numbers_of_metrics_csv_also_after_it_resumes(tmp_path: Path) -> None:

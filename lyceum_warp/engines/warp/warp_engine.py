@@ -33,9 +33,6 @@ from lyceum_warp.support.validate import whole_number
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
-_MOST_UNROLLED = 20
-"""The most iterations of the solver that are unrolled; more would take minutes to capture and gain nothing."""
-
 
 class WarpEngine(Engine):
     """Worlds in ``mujoco_warp``'s own arrays, shown without a copy.
@@ -49,8 +46,6 @@ class WarpEngine(Engine):
         nconmax: Contacts that each world has room for, on average. None probes the model, and reserves additional room
             for one world in which everything touches.
         njmax: Constraints that each world has room for; None probes the model.
-        unroll: Whether graphs hold all iterations of the solver, instead of a loop that ends once every world has
-            converged. Iterations that a world does not need leave it unchanged.
 
     Raises:
         ValueError: MuJoCo Warp refuses the model, or an option is out of range.
@@ -73,12 +68,8 @@ class WarpEngine(Engine):
         *,
         nconmax: int | None = None,
         njmax: int | None = None,
-        unroll: bool = False,
     ) -> None:
         super().__init__(model, nworld, device, fields, dynamics, initial)
-        if unroll:
-            _check_unrolled(model)
-        self.unroll = unroll
         self.nconmax, self.njmax = _sizes(model, nconmax, njmax, self.dynamics)
         if None in (nconmax, njmax):
             warn_of_unknown_sizes(self.dynamics, self.nconmax, self.njmax)
@@ -131,7 +122,6 @@ class WarpEngine(Engine):
             model = put_varied_model(self.model, list(self.dynamics.values()), self.nworld)
         # overflows are reported per world; prints from a kernel would fill the disk
         model.opt.warn_overflow = 0
-        model.opt.graph_conditional = not self.unroll
         return model
 
     def _on_device(self) -> contextlib.AbstractContextManager[object]:
@@ -377,16 +367,6 @@ def _check_sdf_plugins(model: mujoco.MjModel) -> None:
     """Refuse SDF plugins unless a distance function was registered with MuJoCo Warp, which has none itself."""
     if (model.geom_plugin >= 0).any() and not has_sdf_functions():
         raise NotImplementedError("it has no functions of SDF plugins")
-
-
-def _check_unrolled(model: mujoco.MjModel) -> None:
-    if model.opt.iterations > _MOST_UNROLLED:
-        raise ValueError(
-            f"unroll=True repeats all of the solver's {model.opt.iterations} iterations in every substep: give it "
-            "fewer, as with solver={'iterations': 4, 'ls_iterations': 6}"
-        )
-    if model.nflex:
-        raise ValueError("unroll=True would unroll the collisions of the model's flexes, too: leave it out")
 
 
 def _contacts_of_one_world(model: mjw.Model) -> int:

@@ -5,15 +5,13 @@ import sys
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 
 from lyceum_warp.controllers.episode_collector import ControlProgress
-from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
-from lyceum_warp.support.validate import positive_number
 from lyceum_warp.viewer.protocol import Close, Command, Perturb, SetGhosts, SetMode, SetVideo
 from lyceum_warp.viewer.session.commands import obey
 from lyceum_warp.viewer.session.drivers import ControllerError, WorldControl
@@ -22,6 +20,7 @@ from lyceum_warp.viewer.session.stage import Stage
 from lyceum_warp.viewer.session.window_process import Window
 from lyceum_warp.viz import NoVideoError
 
+_FPS = 30.0  # maximum number of frames per second
 _LAG = 0.25  # maximum seconds that the worlds may be behind the clock; beyond it the clock is moved
 _IDLE = 0.5  # seconds between two frames while nothing changes
 _CHECK = 0.5  # seconds between two calls of a watcher
@@ -38,9 +37,8 @@ class Session:
 
     Args:
         env: The worlds.
-        fps: Maximum number of frames per second.
+        controllers: See ``lw.view``.
         watchers: Called about twice a second; they return messages.
-        on_trajectory: Called with the trajectory of each real-time run of a controller of one world.
         shown: Further arguments of ``Stage``.
 
     Raises:
@@ -50,15 +48,13 @@ class Session:
     def __init__(
         self,
         env: Env,
+        controllers: Mapping[str, Any] | None = None,
         *,
-        fps: float = 30.0,
         watchers: Sequence[Watcher] = (),
-        on_trajectory: Callable[[Trajectory], object] | None = None,
         **shown: Any,
     ) -> None:
-        self.fps = positive_number("fps", fps, "frames per second")
-        self.stage = Stage(env, **shown)
-        self._watchers, self._on_trajectory = watchers, on_trajectory
+        self.stage = Stage(env, controllers, **shown)
+        self._watchers = watchers
         self._window: Window | None = None
         self._closed = self._in_run = False
         self._waiting: deque[Command] = deque()
@@ -97,7 +93,7 @@ class Session:
         else:
             period = stage.env.timestep / stage.speed
             self._next_step = max(self._next_step, now - max(_LAG, period))
-            until = max(now + 0.5 / self.fps, self._next_frame)
+            until = max(now + 0.5 / _FPS, self._next_frame)
             while self._next_step <= now and not self._by_the_clock():
                 stage.advance()
                 self._next_step += period
@@ -132,7 +128,7 @@ class Session:
         stage, videos = self.stage, self.stage.videos
         if now < self._next_frame or not (videos.due or self._window.wants_frame):
             return
-        self._next_frame = max(self._next_frame + 1 / self.fps, now)
+        self._next_frame = max(self._next_frame + 1 / _FPS, now)
         changed = stage.changed or bool(stage.frames.messages) or videos.due
         if stage.paused and not changed and now - self._last_frame < _IDLE:
             return
@@ -159,10 +155,7 @@ class Session:
         stage.begin_due_episode()
         self._in_run = True
         try:
-            run_plant(
-                stage.live, control, speed=stage.speed, work=self._work, on_step=self._stepped,
-                on_trajectory=self._on_trajectory,
-            )  # fmt: skip
+            run_plant(stage.live, control, speed=stage.speed, work=self._work, on_step=self._stepped)
         finally:
             self._in_run = False
         self._next_step = time.perf_counter()
@@ -171,7 +164,7 @@ class Session:
         """Account for a step of the plant."""
         self.stage.live.stepped()
         self.stage.steps += 1
-        if time.perf_counter() - self._last_work > 1 / self.fps:  # a plant that is late or fast never waits
+        if time.perf_counter() - self._last_work > 1 / _FPS:  # a plant that is late or fast never waits
             self._work()
 
     def _work(self) -> None:

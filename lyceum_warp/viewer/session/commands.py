@@ -4,17 +4,14 @@ import numpy as np
 import torch
 
 from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.session.stage import Stage, check_world
-
-SLOWEST, FASTEST = 1 / 16, 16.0
-"""Limits of the speed, simulated seconds per second."""
+from lyceum_warp.viewer.session.stage import Stage
 
 
 def obey(stage: Stage, command: protocol.Command) -> None:
     """Carry out a command.
 
     Raises:
-        ValueError: The command is invalid; the message is for the user.
+        ValueError: There is no such world, or a playback cannot be perturbed; the message is for the user.
         NoVideoError: A video cannot be made.
         ControllerError: A controller raised an exception.
     """
@@ -24,12 +21,14 @@ def obey(stage: Stage, command: protocol.Command) -> None:
         case protocol.SetWorld(choice):
             if (world := stage.main.choose(choice)) is None:
                 raise ValueError("no episode has ended yet")
-            stage.show_world(check_world(world, stage.env.nworld))
+            if not 0 <= world < stage.env.nworld:
+                raise ValueError(f"there is no world {world}: there are {stage.env.nworld} worlds, from 0")
+            stage.show_world(world)
         case protocol.SetPaused(paused):
             stage.paused = paused
             stage.progress.clear()
         case protocol.SetSpeed(speed):
-            stage.speed = min(max(float(speed), SLOWEST), FASTEST)
+            stage.speed = speed
             stage.progress.clear()
         case protocol.StepBy(steps):
             stage.paused = True
@@ -55,7 +54,7 @@ def obey(stage: Stage, command: protocol.Command) -> None:
             else:
                 stage.reset(random=random)
         case protocol.SetGhosts():
-            _set_ghosts(stage, command)
+            stage.frames.ghosts = command
         case protocol.Perturb():
             _perturb(stage, command)
         case protocol.SetVideo(on, camera):
@@ -65,11 +64,6 @@ def obey(stage: Stage, command: protocol.Command) -> None:
 def _set_mode(stage: Stage, command: protocol.SetMode) -> None:
     """Change the mode, the controller or the episode; after a playback, the shown world continues from its state."""
     mode, controller = command.mode, command.controller
-    if mode not in stage.scene.modes:
-        raise ValueError(f"there is no mode {mode!r} here: there are {', '.join(stage.scene.modes)}")
-    if controller is not None and controller not in stage.controllers:
-        known = ", ".join(stage.controllers) or "none"
-        raise ValueError(f"there is no controller {controller!r}: there are {known}")
     if command.episode is not None:
         stage.playback.choose(command.episode)
     if mode == stage.mode and controller is None:
@@ -97,17 +91,3 @@ def _perturb(stage: Stage, command: protocol.Perturb) -> None:
         stage.live.push(command.forces)
     elif stage.live.pushed == stage.live.world:
         stage.live.end_push()
-
-
-def _set_ghosts(stage: Stage, ghosts: protocol.SetGhosts) -> None:
-    for kind, count, most in (
-        ("worlds", len(ghosts.worlds), protocol.MOST_GHOSTS), ("episodes", len(ghosts.episodes), protocol.MOST_GHOSTS),
-        ("states of the burst", ghosts.burst, protocol.MOST_BURST),
-    ):  # fmt: skip
-        if count > most:
-            raise ValueError(f"at most {most} {kind} are drawn as ghosts, not {count}: choose fewer")
-    for world in ghosts.worlds:
-        check_world(world, stage.env.nworld)
-    for episode in ghosts.episodes:
-        stage.playback.check(episode)
-    stage.frames.ghosts = ghosts

@@ -17,8 +17,8 @@ _COLOURS = (
     (0.20, 0.55, 0.95), (0.95, 0.60, 0.15), (0.35, 0.75, 0.35), (0.75, 0.40, 0.85), (0.90, 0.80, 0.20),
     (0.30, 0.80, 0.80),
 )  # fmt: skip
-_PAST, _FUTURE, _NEUTRAL, _PLAN = (0.90, 0.25, 0.20), (0.25, 0.40, 0.95), (0.70, 0.70, 0.75), (0.25, 0.90, 0.45)
-_OPACITY = 0.35
+_PAST, _FUTURE, _PLAN = (0.90, 0.25, 0.20), (0.25, 0.40, 0.95), (0.25, 0.90, 0.45)
+_OPACITY, _FADE = 0.35, 0.95  # fade: opacity of a state of the burst relative to the one before
 
 
 class FrameMaker:
@@ -32,8 +32,6 @@ class FrameMaker:
     def __init__(self, env: Env, curves: int) -> None:
         self.ghosts = SetGhosts()
         """The ghosts that are drawn."""
-        self.text: dict[str, str] = {}
-        """Further lines of the panel."""
         self.messages: list[str] = []
         """Messages of the next frame."""
         self._env, self._curves = env, curves
@@ -67,7 +65,8 @@ class FrameMaker:
             status: Completes the status.
             paused: Whether the frame must show the present state; otherwise it may lag by one frame.
         """
-        wanted = self.ghosts.worlds if live is main else (), self.ghosts.burst
+        shown = _following(main.world, main.env.nworld, self.ghosts.worlds)
+        wanted = shown if live is main else [], self.ghosts.burst
         rows, points = live.take(), []
         if rows is not None and rows.worlds[0] == live.world:
             points.append(rows.points)
@@ -83,20 +82,19 @@ class FrameMaker:
         state, parts = rows.states[0], live.env.state_space.parts
         self._report(rows, main.world if live is not main else None)
         others = rows.states[1:]
-        if live is not main and self.ghosts.worlds:  # other worlds wait
-            main.request(self.ghosts.worlds)
+        if live is not main and shown:  # other worlds wait
+            main.request(shown)
             waiting = main.take()
             others = others if waiting is None else waiting.states[1:]
         ghosts = [] if traces is None else [Ghost(traces.final, (*_PLAN, _OPACITY))]
         ghosts += [*self._coloured(others), *self._burst(rows.back, _PAST)]
         step, past = int(state[parts["step"]][0]), live.past
-        text = [("return", f"{rows.episode_return:.6g}"), ("past", past_text(live)), *self.text.items()]
-        shown = status(
+        complete = status(
             world=main.world, step=step, steps=live.env.horizon, time=float(state[parts["time"]][0]),
-            text=tuple(text), seekable=(max(0, step - past.behind), step + past.ahead),
+            text=(("return", f"{rows.episode_return:.6g}"),), seekable=(max(0, step - past.behind), step + past.ahead),
         )  # fmt: skip
         return Frame(
-            self._pose(state), self._physics(state), self._model_fields(state), shown, tuple(ghosts),
+            self._pose(state), self._physics(state), self._model_fields(state), complete, tuple(ghosts),
             None if traces is None else traces.paths, None if traces is None else traces.best,
             np.concatenate(points), self._take_messages(),
         )  # fmt: skip
@@ -104,7 +102,8 @@ class FrameMaker:
     def of_playback(self, playback: Playback, status: Callable[..., Status]) -> Frame:
         """Make a frame of a playback; ``status`` completes the status."""
         episode, state = playback.episode, playback.state
-        others = [playback.episodes[index].states for index in self.ghosts.episodes if index != playback.index]
+        shown = _following(playback.index, len(playback.episodes), self.ghosts.episodes)
+        others = [playback.episodes[index].states for index in shown]
         ghosts = self._coloured(states[min(playback.step, len(states) - 1)] for states in others)
         around = playback.around(self.ghosts.burst)
         ghosts += self._burst((episode.states[s] for s in reversed(around) if s < playback.step), _PAST)
@@ -114,13 +113,13 @@ class FrameMaker:
             text.append(("end", reasons(episode.done_reason)))
         if np.isfinite(episode.rewards).all() and episode.steps:
             text.append(("return", f"{episode.rewards[: playback.step].sum():.6g} of {episode.rewards.sum():.6g}"))
-        shown = status(
+        complete = status(
             world=0, step=playback.step, steps=episode.steps, time=playback.step * self._env.timestep,
             text=tuple(text), seekable=(0, episode.steps),
         )  # fmt: skip
         points, self._points = self._points, []
         return Frame(
-            self._pose(state), self._physics(state), self._model_fields(state), shown, tuple(ghosts),
+            self._pose(state), self._physics(state), self._model_fields(state), complete, tuple(ghosts),
             samples=np.array(points, dtype=float).reshape(-1, 1 + self._curves), messages=self._take_messages(),
         )  # fmt: skip
 
@@ -142,8 +141,7 @@ class FrameMaker:
 
     def _burst(self, states: Iterable[np.ndarray], colour: tuple[float, float, float]) -> list[Ghost]:
         """Ghosts along a trajectory, the nearest to the present first."""
-        colour, fade = colour if self.ghosts.doppler else _NEUTRAL, self.ghosts.fade
-        return [Ghost(self._pose(row), (*colour, _OPACITY * fade ** (i + 1))) for i, row in enumerate(states)]
+        return [Ghost(self._pose(row), (*colour, _OPACITY * _FADE ** (i + 1))) for i, row in enumerate(states)]
 
     def _pose(self, state: np.ndarray) -> Any:
         return pose(state, self._env.state_space.parts, self._env.task.model.nmocap)
@@ -167,13 +165,9 @@ class FrameMaker:
         return tuple(messages)
 
 
-def past_text(live: Live) -> str:
-    """Describe the length of the history."""
-    past = live.past
-    if not past.length:
-        return "none: the worlds' states are too large"
-    ahead = f", {past.ahead} ahead" if past.ahead else ""
-    return f"{past.behind} of at most {past.length - 1} steps{ahead}"
+def _following(index: int, number: int, count: int) -> list[int]:
+    """Indices of the other worlds or episodes that come after one, at most ``count``."""
+    return [(index + i) % number for i in range(1, min(count, number - 1) + 1)]
 
 
 def model_bytes(model: mujoco.MjModel) -> bytes:

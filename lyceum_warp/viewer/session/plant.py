@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 from lyceum_warp.controllers.episode_collector import ControlProgress
 from lyceum_warp.controllers.real_time import Clock, control_async
-from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.engines.placement import options_for_plant
 from lyceum_warp.viewer.session.drivers import ControllerError, WorldControl
 from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
@@ -43,7 +42,6 @@ def run_plant(
     speed: float,
     work: Callable[[], None],
     on_step: Callable[[ControlProgress], None],
-    on_trajectory: Callable[[Trajectory], object] | None,
 ) -> None:
     """Run the plant by the clock until its episode ends.
 
@@ -53,19 +51,16 @@ def run_plant(
         speed: Simulated seconds per second.
         work: Called while the plant waits for its next step; it may raise ``InterruptedByCommand`` to end the run.
         on_step: Called after each step.
-        on_trajectory: Called with the trajectory of the run, also after an interruption.
 
     Raises:
         ControllerError: The controller raised an exception, or its actions are invalid.
     """
     live.expect_steps()
     try:
-        trajectory = control_async(
+        control_async(
             live.env, control.new_run(), period=live.env.timestep / speed, steps=_PART, reset=False, on_step=on_step,
-            on_abort=on_trajectory, clock=_WorkingClock(work, warm=control.calls >= _WARM_UP),
+            clock=_WorkingClock(work, warm=control.calls >= _WARM_UP),
         )  # fmt: skip
-        if on_trajectory is not None:
-            on_trajectory(trajectory)
     except InterruptedByCommand:
         pass
     except ValueError as error:  # from invalid actions

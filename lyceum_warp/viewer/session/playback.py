@@ -104,18 +104,8 @@ class Playback:
         """The next step in the direction of the playback, which repeats the episode."""
         return (self.step + (-1 if self.backwards else 1)) % (self.episode.steps + 1)
 
-    def check(self, index: int) -> None:
-        """Raise ValueError if there is no such episode."""
-        if not 0 <= index < len(self.episodes):
-            raise ValueError(f"there is no episode {index}: there are {len(self.episodes)}, from 0")
-
     def choose(self, index: int) -> None:
-        """Show another episode, at the same step or its last one.
-
-        Raises:
-            ValueError: There is no such episode.
-        """
-        self.check(index)
+        """Show another episode, at the same step or its last one."""
         self.index = index
         self.seek(self.step)
 

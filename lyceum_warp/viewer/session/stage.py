@@ -13,11 +13,11 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.validate import check_kind, whole_number
 from lyceum_warp.viewer.protocol import Frame, Mode, Scene, Status
 from lyceum_warp.viewer.session.drivers import Control, ControllerError, PolicyControl, WorldControl, controls
-from lyceum_warp.viewer.session.frames import FrameMaker, model_bytes, past_text
+from lyceum_warp.viewer.session.frames import FrameMaker, model_bytes
 from lyceum_warp.viewer.session.live import Live
 from lyceum_warp.viewer.session.plant import make_plant
 from lyceum_warp.viewer.session.playback import Playback, episodes_of
-from lyceum_warp.viewer.session.traces import TraceRollouts, Traces, TraceThread, trace_point
+from lyceum_warp.viewer.session.traces import TraceRollouts, Traces, TraceThread
 from lyceum_warp.viewer.session.videos import VideoTaker
 
 _OLD = 1.0  # seconds after which traces are no longer shown
@@ -36,29 +36,21 @@ class Stage:
     def __init__(
         self,
         env: Env,
-        *,
         controllers: Mapping[str, Any] | None = None,
+        *,
         episodes: Any = None,
-        world: int = 0,
         seed: int | None = None,
         paused: bool = False,
-        trace: str | None = None,
-        title: str | None = None,
     ) -> None:
         check_kind("env", env, Env, "as lw.make('hopper') returns it")
-        check_world(world, env.nworld)
         self.env = env
         self.controllers = controls(controllers or {}, env)
         self.playback = Playback([] if episodes is None else episodes_of(episodes, env))
-        if trace is not None:
-            trace_point(env.task.model, trace)
         if seed is not None:
             env.rand_reset(whole_number("seed", seed, low=0))
         self.main = Live(env)
-        self.main.world = world
         planned = any(isinstance(each, WorldControl) for each in self.controllers.values())
         self._plant = make_plant(self.main) if planned else None
-        self._trace = trace
         self._threads: dict[str, TraceThread] = {}
         self.mode: Mode = "passive"
         self.controller: str | None = None
@@ -71,7 +63,7 @@ class Stage:
         modes += ["controller"] if self.controllers else []
         modes.append("passive")
         self.scene = Scene(
-            title=title or env.task.name, model=model_bytes(env.task.model), nworld=env.nworld,
+            title=env.task.name, model=model_bytes(env.task.model), nworld=env.nworld,
             modes=tuple(modes), controllers=tuple(self.controllers),
             episodes=tuple(episode.name for episode in self.playback.episodes),
             curves=("reward", "eval", *env.metrics),
@@ -157,7 +149,7 @@ class Stage:
         """Take steps back."""
         done = self.live.back(steps)
         if done < steps:
-            self.frames.say(f"the past ends here: {past_text(self.live)}")
+            self.frames.say(f"the past ends here: it keeps at most {max(self.live.past.length - 1, 0)} steps")
 
     def seek_episode(self, step: int) -> None:
         """Show a step of the playback."""
@@ -192,9 +184,7 @@ class Stage:
         self.frames.forget_seen(self.live)
         current = self.control
         if isinstance(current, WorldControl) and current.plans and current.name not in self._threads:
-            rollouts = TraceRollouts(current.controller, self.live.env, self._trace)
-            self.frames.text["trace"] = rollouts.point.name
-            self._threads[current.name] = TraceThread(rollouts)
+            self._threads[current.name] = TraceThread(TraceRollouts(current.controller, self.live.env))
 
     def show_world(self, world: int) -> None:
         """Show another world, and end a push."""
@@ -256,11 +246,3 @@ class Stage:
             measured_speed=measured, backwards=self.playback.backwards, video=self.videos.name,
             ghosts=self.frames.ghosts, plan_ms=1000 * self.control.seconds if self.control else math.nan, **rest,
         )  # fmt: skip
-
-
-def check_world(world: Any, nworld: int) -> int:
-    """Check the index of a world; raise ValueError if there is no such world."""
-    if not isinstance(world, int) or isinstance(world, bool) or not 0 <= world < nworld:
-        known = "is 1 world, number 0" if nworld == 1 else f"are {nworld} worlds, 0 to {nworld - 1}"
-        raise ValueError(f"there is no world {world!r}: there {known}")
-    return world

@@ -32,7 +32,6 @@ class TracePoint:
     field: str
     """Field with its position: "site_xpos", "xpos", "xipos" or "subtree_com"."""
     index: int
-    name: str
 
 
 def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
@@ -51,18 +50,18 @@ def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
     if name is not None:
         for kind, field in ((mujoco.mjtObj.mjOBJ_SITE, "site_xpos"), (mujoco.mjtObj.mjOBJ_BODY, "xpos")):
             if (index := mujoco.mj_name2id(model, kind, name)) >= 0:
-                return TracePoint(field, index, name)
+                return TracePoint(field, index)
         known = [model.site(i).name for i in range(model.nsite)] + [model.body(i).name for i in range(1, model.nbody)]
         raise ValueError(
             f"the model has no site and no body {name!r} to trace: it has {', '.join(filter(None, known)) or 'none'}"
         )
     driven = _driven_bodies(model)
     if not driven.any():
-        return TracePoint("subtree_com", 0, "centre of mass")
+        return TracePoint("subtree_com", 0)
     root = int(model.body_rootid[driven.argmax()])
     moving = model.body_jntnum > 0
     if not driven[(moving & (model.body_rootid == root)).argmax()]:
-        return TracePoint("subtree_com", root, f"centre of mass of {model.body(root).name or 'the robot'}")
+        return TracePoint("subtree_com", root)
     depth = np.zeros(model.nbody, dtype=int)  # number of moving bodies between the world and a body
     for body in range(1, model.nbody):
         parent = model.body_parentid[body]
@@ -70,9 +69,7 @@ def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
         depth[body] = depth[parent] + moving[body]
     end = int(np.where(driven, depth, -1).argmax())
     sites = np.flatnonzero(model.site_bodyid == end).tolist()
-    if sites:
-        return TracePoint("site_xpos", sites[0], model.site(sites[0]).name or f"site {sites[0]}")
-    return TracePoint("xipos", end, model.body(end).name or f"body {end}")
+    return TracePoint("site_xpos", sites[0]) if sites else TracePoint("xipos", end)
 
 
 def _driven_bodies(model: mujoco.MjModel) -> np.ndarray:
@@ -108,13 +105,12 @@ class TraceRollouts:
     Args:
         controller: The planner.
         plant: The plant.
-        name: Name of a site or a body; None for ``Task.trace``, or the default of ``trace_point``.
     """
 
-    def __init__(self, controller: Any, plant: Env, name: str | None) -> None:
+    def __init__(self, controller: Any, plant: Env) -> None:
         own = getattr(controller, "env", None)
         env = own if isinstance(own, Env) else plant
-        point = trace_point(env.task.model, name if name is not None else env.task.task.trace)
+        point = trace_point(env.task.model, env.task.task.trace)
         self.point = point
         self._nominal = bool(getattr(getattr(controller, "config", None), "nominal_model", False))
         fields = tuple(dict.fromkeys((*env.options.fields, point.field)))

@@ -9,16 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from lyceum_warp.support.interrupts import obeyed
-from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Frame
+from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Frame, Pose
 from lyceum_warp.viz import NoVideoError
+from lyceum_warp.viz.render import Shot
 from lyceum_warp.viz.video import Recorder
 
 FPS = 30
+_WIDTH = 2.0  # of lines, pixels
 _MOST_WAITING = 4 * FPS  # poses that wait for the drawing process, which starts slowly
-_PATIENCE = 120.0  # seconds to finish drawing when the viewer ends; a signal ends the wait
-_GRACE = 5.0  # further seconds to complete the files with the frames drawn so far
+_PATIENCE = 120.0  # seconds to finish drawing when the viewer ends; a signal discards the videos
 
 
 class VideoTaker:
@@ -70,19 +72,18 @@ class VideoTaker:
         Raises:
             NoVideoError: The drawing has failed.
         """
-        video, pose = self._running, frame.pose
-        if video is None:
+        video = self._running
+        if video is None or (count := int((time.perf_counter() - self._start) * FPS) + 1 - video.added) <= 0:
             return
-        lines: list[Any] = []
-        if frame.traces is not None:
-            lines = [(path, BEST_COLOUR if i == frame.best else TRACE_COLOUR) for i, path in enumerate(frame.traces)]
-        ghosts = [(g.pose.qpos, g.pose.mocap_pos, g.pose.mocap_quat, g.colour) for g in frame.ghosts]
-        count = int((time.perf_counter() - self._start) * FPS) + 1 - video.added
-        if count > 0:
-            video.add(
-                pose.qpos, pose.mocap_pos, pose.mocap_quat, model_fields=frame.model_fields, ghosts=ghosts,
-                lines=lines, frames=count,
-            )  # fmt: skip
+        paths = () if frame.traces is None else frame.traces
+        lines = [(path, BEST_COLOUR if i == frame.best else TRACE_COLOUR, _WIDTH) for i, path in enumerate(paths)]
+        ghosts = [(_numbers(ghost.pose), ghost.colour) for ghost in frame.ghosts]
+        video.add(
+            Shot(
+                pose=_numbers(frame.pose), model_fields=frame.model_fields, ghosts=list(ghosts), lines=list(lines),
+                frames=count,
+            )
+        )  # fmt: skip
 
     def end(self) -> None:
         """End the video. It is completed in the background."""
@@ -105,63 +106,37 @@ class VideoTaker:
 
     @contextlib.contextmanager
     def finishing(self, show: Callable[[str], object]) -> Iterator[None]:
-        """Finish all videos at the end of a ``with`` block; after an exception, such as Ctrl-C, with the frames drawn.
+        """Finish all videos at the end of a ``with`` block, also after an exception, such as Ctrl-C.
+
+        A video that is incomplete after two minutes, or at a second Ctrl-C, is discarded.
 
         Args:
             show: Called with a line about each.
         """
         try:
             yield
-        except BaseException:
-            self.finish(show, seconds=0.0)
-            raise
-        self.finish(show)
-
-    def finish(self, show: Callable[[str], object], *, seconds: float = _PATIENCE) -> None:
-        """Wait until all videos are complete.
-
-        After ``seconds``, a video ends with the frames drawn; if it is incomplete a few seconds later, it is discarded.
-        An exception during the wait, such as a second Ctrl-C, discards all of them.
-
-        Args:
-            show: Called with a line about each.
-            seconds: Time for all videos together.
-        """
-        self.end()
-        try:
-            with obeyed():
-                self._wait(seconds)
+        finally:
+            self.end()
+            end = time.monotonic() + _PATIENCE
+            try:
+                with obeyed():
+                    for video in self._drawing:
+                        video.wait(end - time.monotonic())
+            finally:
                 for video in self._drawing:
-                    video.end(drop=True)
-                self._wait(_GRACE)
-        except BaseException:
-            self.cancel()
-            raise
-        videos, self._drawing = self._drawing, []
-        for video in videos:
-            if not video.finished:
-                video.cancel()
-            show(_completed(video))
+                    video.cancel()  # no effect on a complete one
+                    show(_completed(video))
 
-    def cancel(self) -> None:
-        """Discard all videos that are not complete."""
-        self.end()
-        videos, self._drawing = self._drawing, []
-        for video in videos:
-            video.cancel()
 
-    def _wait(self, seconds: float) -> None:
-        """Wait until all videos are complete, for some seconds in all."""
-        end = time.monotonic() + seconds
-        for video in self._drawing:
-            video.wait(end - time.monotonic())
+def _numbers(pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return pose.qpos, pose.mocap_pos, pose.mocap_quat
 
 
 def _completed(video: Recorder) -> str:
     """Format a line about a video that has ended."""
     try:
-        line = f"video: {video.close(progress=False)}"
-    except (NoVideoError, ValueError, OSError) as error:
+        line = f"video: {video.close()}"
+    except (NoVideoError, OSError) as error:
         return f"no video: {error}"
     if not video.dropped:
         return line

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import Command, Failed, Frame, Graphics, Opened, Scene
+from lyceum_warp.viewer.protocol import Command, Failed, Frame, Opened, Scene
 
 FRAME_TIME = 1 / 60
 """Minimum seconds between two frames."""
@@ -44,22 +44,15 @@ class Window:
 
     Args:
         scene: The constant part of the display.
-        gfx: "web" or "native". This and the further arguments are explained in ``lw.view``.
+        host: Address to serve the page on; see ``lw.view``.
+        port: Port of the page; see ``lw.view``.
 
     Raises:
         ValueError: The port is out of range or in use, or the address is not an address of this machine.
         NoWindowError: The window cannot be opened.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        gfx: Graphics = "web",
-        *,
-        host: str = "127.0.0.1",
-        port: int | None = None,
-        browser: bool = False,
-    ) -> None:
+    def __init__(self, scene: Scene, *, host: str = "127.0.0.1", port: int | None = None) -> None:
         self._pending: Frame | None = None
         self._lock = threading.Lock()
         self._wake = threading.Event()
@@ -84,7 +77,7 @@ class Window:
         self.error: str | None = None
         """The error that ended the window, if there was one."""
         try:
-            self._connection.send(protocol.Opening(scene, gfx, host, port, browser))
+            self._connection.send(protocol.Opening(scene, host, port))
             reply = self._connection.recv() if self._connection.poll(OPENING_TIME) else None
         except (EOFError, OSError):
             self._process.wait()
@@ -99,7 +92,7 @@ class Window:
             reason = reply.reason if isinstance(reply, Failed) else f"its process did not start in {OPENING_TIME:.0f} s"
             raise NoWindowError(f"the viewer's window cannot be opened: {reason}")
         self.address = reply.address
-        """The page's address with its token; empty for a native window."""
+        """The page's address with its token."""
         self.instructions = reply.instructions
         """Lines to print: the page's address, and the ssh command for other machines."""
         for target in (self._send, self._receive):

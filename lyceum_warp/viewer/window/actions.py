@@ -5,7 +5,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from lyceum_warp.viewer import protocol
@@ -18,10 +17,7 @@ SPEEDS = tuple(2.0**power for power in range(-4, 5))
 MANY_STEPS = 50
 """Steps of the arrow keys with Shift."""
 
-KEY_NAMES = {
-    "Right": "RightArrow", "Left": "LeftArrow", "Up": "UpArrow", "Down": "DownArrow", "[": "LeftBracket",
-    "]": "RightBracket", "-": "Minus", "=": "Equal",
-}  # fmt: skip
+KEY_NAMES = {"Right": "RightArrow", "Left": "LeftArrow", "Up": "UpArrow", "Down": "DownArrow"}
 """Studio's names of keys that have others here."""
 
 
@@ -43,14 +39,9 @@ class Actions:
         """Set when the window starts."""
         self.windows = {"messages", *(["curves"] if scene.curves else [])}
         """Titles of the open windows."""
-        self.folded = False
-        """Whether the main window is folded."""
-        self.fold: bool | None = None
-        """Whether the main window is folded in the next drawing; None keeps it."""
         self.messages: deque[str] = deque(maxlen=200)
         self.scroll_down = False
         """Whether there is a message that has not been drawn yet."""
-        self._slow = SPEEDS[0] * 2
         self._keys = key_table()
 
     @property
@@ -104,14 +95,6 @@ class Actions:
         now = int(np.argmin(np.abs(np.log2(SPEEDS) - np.log2(max(self.status.speed, 1e-3)))))
         self.do(protocol.SetSpeed(SPEEDS[min(max(now + by, 0), len(SPEEDS) - 1)]))
 
-    def toggle_slow(self) -> None:
-        """Toggle between real time and the previous speed."""
-        if self.status.speed == 1:
-            self.do(protocol.SetSpeed(self._slow))
-        else:
-            self._slow = self.status.speed
-            self.do(protocol.SetSpeed(1.0))
-
     def set_ghosts(self, **changes: Any) -> None:
         """Change which ghosts are drawn."""
         self.do(dataclasses.replace(self.status.ghosts, **changes))
@@ -155,17 +138,10 @@ class Key:
 
 def key_table() -> list[Key]:
     """The keys of the panel. A browser passes all of them to the page."""
-    frames, labels = int(mujoco.mjtFrame.mjNFRAME), int(mujoco.mjtLabel.mjNLABEL)
-
-    def turn(panel: "Actions", option: str, by: int, number: int) -> None:
-        options = panel.viewer.vis_options
-        setattr(options, option, (getattr(options, option) + by) % number)
-
     return [
         Key("F1", "show or hide this table", lambda p: p.toggle_window("keys")),
         Key("F2", "messages", lambda p: p.toggle_window("messages")),
         Key("F3", "curves", lambda p: p.toggle_window("curves")),
-        Key("Tab", "fold or unfold the panel", lambda p: setattr(p, "fold", not p.folded)),
         Key("Space", "pause or continue", lambda p: p.do(protocol.SetPaused(not p.status.paused))),
         Key("Right", "a step", lambda p: p.do(protocol.StepBy(1)), repeat=True),
         Key("Left", "a step back", lambda p: p.do(protocol.StepBy(-1)), repeat=True),
@@ -179,23 +155,14 @@ def key_table() -> list[Key]:
         Key("Up", "previous world or episode", lambda p: p.change_shown(-1), repeat=True),
         Key("Shift+Up", "double the speed", lambda p: p.change_speed(1)),
         Key("Shift+Down", "halve the speed", lambda p: p.change_speed(-1)),
-        Key("Enter", "real time, or the previous speed", lambda p: p.toggle_slow()),
         Key("Backspace", "reset", lambda p: p.do(protocol.Reset(random=False))),
         Key("Shift+Backspace", "random reset", lambda p: p.do(protocol.Reset(random=True))),
         Key("Ctrl+R", "reverse the playback", lambda p: p.do(protocol.SetBackwards(not p.status.backwards))),
         Key("Ctrl+B", "burst: many states at once",
             lambda p: p.set_ghosts(burst=0 if p.status.ghosts.burst else MOST_BURST // 2)),
-        Key("Ctrl+D", "burst in colours: past red, future blue",
-            lambda p: p.set_ghosts(doppler=not p.status.ghosts.doppler)),
         Key("Ctrl+V", "start or end a video", lambda p: p.toggle_video()),
         Key("Ctrl+A", "look at everything", lambda p: p.cameras.reset()),
         Key("Escape", "free camera", lambda p: p.cameras.choose(ux.TUMBLE_CAMERA_IDX)),
-        Key("PageDown", "next camera", lambda p: p.cameras.change(1)),
-        Key("PageUp", "previous camera", lambda p: p.cameras.change(-1)),
-        Key("[", "frames of the next kind", lambda p: turn(p, "frame", 1, frames)),
-        Key("]", "frames of the previous kind", lambda p: turn(p, "frame", -1, frames)),
-        Key("-", "labels of the next kind", lambda p: turn(p, "label", 1, labels)),
-        Key("=", "labels of the previous kind", lambda p: turn(p, "label", -1, labels)),
     ]  # fmt: skip
 
 

@@ -16,6 +16,8 @@ import mujoco
 from lyceum_warp.viewer.protocol import Close, Failed, Frame, Opened, Opening, Reply, Taken, latest
 from lyceum_warp.viewer.window import studio
 from lyceum_warp.viewer.window.panel import Panel
+from lyceum_warp.viewer.window.proxy import Proxy
+from lyceum_warp.viewer.window.sockets import private_socket
 
 IDLE_TIME = 0.25
 """Seconds between two frames while no page is open."""
@@ -84,21 +86,15 @@ def main(descriptor: int) -> None:
 def run(opening: Opening, end: WindowEnd) -> None:
     """Run studio with the panel."""
     with contextlib.ExitStack() as ends:
-        proxy = sock = None
-        opened, limit = Opened(), studio.NATIVE_GEOMS
-        if opening.graphics == "web":
-            from lyceum_warp.viewer.window.proxy import Proxy  # loads aiohttp
-            from lyceum_warp.viewer.window.sockets import private_socket
-
-            try:
-                proxy = ends.enter_context(Proxy(host=opening.host, port=opening.port))
-            except ValueError as error:
-                return end.send(Failed(str(error), refused=True))
-            sock = private_socket()
-            opened, limit = Opened(proxy.address, tuple(proxy.instructions)), studio.MAX_GEOMS
+        try:
+            proxy = ends.enter_context(Proxy(host=opening.host, port=opening.port))
+        except ValueError as error:
+            return end.send(Failed(str(error), refused=True))
+        sock = private_socket()
         model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": opening.scene.model})
         screen = studio.Screen()
-        panel = Panel(opening.scene, model, end.send, end.take, screen, opened, limit)
+        opened = Opened(proxy.address, tuple(proxy.instructions))
+        panel = Panel(opening.scene, model, end.send, end.take, screen, opened)
 
         def follow() -> None:
             end.receive()
@@ -108,8 +104,5 @@ def run(opening: Opening, end: WindowEnd) -> None:
 
         threading.Thread(target=follow, daemon=True).start()
         screen.show_model(model)
-        if proxy and sock:
-            proxy.start(sock.getsockname(), on_quiet=panel.mouse.let_go)
-            if opening.browser:
-                proxy.open_in_browser()
+        proxy.start(sock.getsockname(), on_quiet=panel.mouse.let_go)
         screen.run(panel, title=opening.scene.title, sock=sock)

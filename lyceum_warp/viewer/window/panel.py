@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -45,7 +44,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         self.actions = Actions(scene, send)
         self.mouse = Mouse(send)
         self.values = ModelValues(model)
-        self.windows = Windows(self.actions, self.values, limit)
+        self.windows = Windows(self.actions, limit)
         self._send, self._newest, self._screen, self._opened, self._limit = send, newest, screen, opened, limit
         self._geoms = ExtraGeoms(model, limit)
         self._swapped = -SWAP_TIME
@@ -67,10 +66,6 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         frame = self._newest()
         if frame is not None:
             self.take(frame)
-        dropped = self.viewer.get_drop_file()  # on the page or the window
-        if dropped:
-            title = self.actions.scene.title
-            self.actions.say(f"{Path(dropped).name} was not loaded: this viewer shows {title} only")
         if self.actions.frame is None:
             return
         viewer = self.viewer

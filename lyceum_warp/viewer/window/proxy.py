@@ -19,18 +19,14 @@ import asyncio
 import contextlib
 import getpass
 import hmac
-import html
 import ipaddress
 import logging
 import os
 import re
 import secrets
 import socket
-import tempfile
 import threading
-import webbrowser
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import aiohttp
@@ -123,7 +119,6 @@ class Proxy:
         self._server: _Server
         self._client: aiohttp.ClientSession
         self._silence: asyncio.TimerHandle | None = None
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
 
     @property
     def address(self) -> str:
@@ -151,16 +146,6 @@ class Proxy:
     def _address(self, host: str) -> str:
         return f"http://{_bracketed(host)}:{self.port}/?token={self._token}"
 
-    def open_in_browser(self) -> None:
-        """Open the page in a browser on this machine, by a private file that redirects to it.
-
-        All users can read the command lines of processes, so the browser's command line must not contain the token.
-        """
-        self._folder = tempfile.TemporaryDirectory(prefix="lyceum-warp-", ignore_cleanup_errors=True)
-        file = Path(self._folder.name) / "viewer.html"  # the folder is readable by this user only
-        file.write_text(_page_leading_to(self.address))
-        threading.Thread(target=webbrowser.open, args=(file.as_uri(),), kwargs={"new": 2}, daemon=True).start()
-
     def start(self, upstream: tuple[str, int], on_quiet: Callable[[], object] = lambda: None) -> None:
         """Begin to answer, in a thread.
 
@@ -182,8 +167,6 @@ class Proxy:
             self._thread.join(timeout=5.0)
         for opened in self._sockets:
             opened.close()
-        if self._folder is not None:
-            self._folder.cleanup()
 
     def __enter__(self) -> "Proxy":
         return self
@@ -260,7 +243,8 @@ class Proxy:
             return web.Response(status=303, headers={**headers, "Location": target})
         # After a link on another site, browsers send the cookie (SameSite=Strict) neither at once nor after a redirect,
         # but when a page of this site leads on.
-        return web.Response(text=_page_leading_to(target), content_type="text/html", headers=headers)
+        page = f'<!doctype html><meta http-equiv="refresh" content="0; url={target}">'
+        return web.Response(text=page, content_type="text/html", headers=headers)
 
     def _checked_target(self, request: web.BaseRequest) -> str:
         """Check the path and the cookie; return the target without the secret path."""
@@ -385,8 +369,3 @@ def _is_cross_site(request: web.BaseRequest) -> bool:
 def _bracketed(host: str) -> str:
     """Put an IPv6 address in brackets."""
     return f"[{host}]" if ":" in host else host
-
-
-def _page_leading_to(address: str) -> str:
-    """A page that redirects."""
-    return f'<!doctype html><meta http-equiv="refresh" content="0; url={html.escape(address)}">'

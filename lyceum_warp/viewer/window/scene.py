@@ -196,12 +196,6 @@ class ViewCameras:
         """Choose studio's free, flying or tracking camera, or a camera of the model."""
         self.state.camera_index = ux.set_camera(self.values.model, self.viewer.camera, index)
 
-    def change(self, by: int) -> None:
-        """Choose the next or the previous camera."""
-        model = self.values.model
-        indices = [ux.TUMBLE_CAMERA_IDX, ux.FREE_CAMERA_IDX, ux.TRACKING_CAMERA_IDX, *range(model.ncam)]
-        self.choose(indices[(indices.index(self.state.camera_index) + by) % len(indices)])
-
     def reset(self) -> None:
         """Look at the whole model; track the body that a camera of the model tracks."""
         model = self.values.model

@@ -1,17 +1,15 @@
 """Wrap mujoco.studio, whose interface may still change: no other module imports it.
 
-Studio draws a scene and a panel, in a browser or in a window, and handles keys and the mouse. ``Screen.run`` opens it
+Studio draws a scene and a panel in a browser, and handles keys and the mouse. ``Screen.run`` opens it
 with a plugin: an object derived from ``Plugin`` with handlers of ``Started``, ``Update`` and ``Gui``. The simulation is
 in another process, so studio's own stepping, history and model loading are not used.
 """
 
-import collections.abc
 import socket
 from typing import Any
 
 import mujoco
-import numpy as np
-from mujoco.studio import launch_native, launch_thread, launch_web, messages, plugin, ux, viewer_protocol
+from mujoco.studio import launch_thread, launch_web, messages, plugin, ux, viewer_protocol
 from mujoco.studio.app import inputs
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
@@ -20,7 +18,7 @@ from mujoco.studio.web import state_payload, web_server
 from lyceum_warp.viewer.window.sockets import private_socket
 
 __all__ = [
-    "MAX_GEOMS", "NATIVE_GEOMS", "Gui", "Plugin", "Screen", "Started", "Update", "handler", "imgui", "implot",
+    "MAX_GEOMS", "Gui", "Plugin", "Screen", "Started", "Update", "handler", "imgui", "implot",
     "inputs", "ux",
 ]  # fmt: skip
 
@@ -32,12 +30,6 @@ Plugin: Any = plugin.ViewerPlugin
 
 handler: Any = messages.handler
 """Decorator for a plugin's method that handles the message in its annotation."""
-
-NATIVE_GRAPHICS = "opengl_software"
-"""Renderer of a native window. In mujoco 4.0.0 the others fail at the first frame ("Target not found")."""
-
-NATIVE_GEOMS = 0
-"""Maximum number of additional geoms in a native window. In mujoco 4.0.0 a single one causes a SIGSEGV."""
 
 Started: Any = plugin.ViewerInitEvent
 Update: Any = messages.UpdateEvent
@@ -58,24 +50,18 @@ class Screen:
         """End ``run``."""
         self._own_end.send_to_viewer(messages.ExitEvent())
 
-    def run(self, own: Any, *, title: str, sock: socket.socket | None) -> None:
-        """Draw until ``close`` is called or the user closes the window.
+    def run(self, own: Any, *, title: str, sock: socket.socket) -> None:
+        """Draw until ``close`` is called.
 
         Args:
             own: The plugin.
-            title: Title of the window.
-            sock: Bound socket that serves the page to a browser; None for a native window.
+            title: Title of the page.
+            sock: Bound socket that serves the page to a browser.
 
         Raises:
             RuntimeError: Studio did not take ``sock``, and would listen on another socket.
         """
-        gfx = "web" if sock else NATIVE_GRAPHICS
-        config = viewer_protocol.ViewerConfig(title=title, gfx=gfx, open_browser=False)
-        if sock is None:
-            if not hasattr(collections.abc, "Buffer"):  # studio's renderer names a class of Python 3.12
-                collections.abc.Buffer = np.ndarray  # type: ignore[attr-defined, unused-ignore]
-            launch_native.run_native_viewer(config, self._viewer_end, plugins=[own])
-            return
+        config = viewer_protocol.ViewerConfig(title=title, gfx="web", open_browser=False)
         taken: list[bool] = []
 
         def bound(host: str, port: int = 0) -> socket.socket:

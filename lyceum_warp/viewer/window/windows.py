@@ -1,17 +1,14 @@
 """Draw the windows of the panel with ImGui."""
 
-import functools
-import textwrap
 from collections.abc import Callable
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import MAX_POINTS, MOST_BURST
+from lyceum_warp.viewer.protocol import MAX_POINTS, MOST_BURST, MOST_GHOSTS
 from lyceum_warp.viewer.window.actions import MANY_STEPS, OTHER_KEYS, SPEEDS, Actions, key_table
-from lyceum_warp.viewer.window.scene import Drawn, ModelValues
+from lyceum_warp.viewer.window.scene import Drawn
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS = 200
@@ -24,17 +21,15 @@ class Windows:
 
     Args:
         actions: The user's choices.
-        values: The model of the shown world.
         limit: Maximum number of geoms of ghosts and traces.
     """
 
-    def __init__(self, actions: Actions, values: ModelValues, limit: int) -> None:
+    def __init__(self, actions: Actions, limit: int) -> None:
         self.curves = Curves(len(actions.scene.curves))
         self.drawn = Drawn([], 0, 0)
         """The drawn ghosts and traces."""
-        self._actions, self._values, self._limit = actions, values, limit
+        self._actions, self._limit = actions, limit
         self._scene = actions.scene
-        self._ghost_worlds = ""
         self._size = (0.0, 0.0)
 
     def draw(self) -> None:
@@ -68,16 +63,11 @@ class Windows:
             return
         imgui.SetNextWindowPos(imgui.Vec2(max(left, 0), max(top, 0)), cond)
         imgui.SetNextWindowSize(imgui.Vec2(max(width, 200), max(height, 80)), cond)
-        if first and self._actions.fold is not None:
-            imgui.SetNextWindowCollapsed(self._actions.fold)
-            self._actions.fold = None
         unfolded, still_open = imgui.Begin(title, None if first else True)
         if unfolded:
             content()
         imgui.End()
-        if first:
-            self._actions.folded = not unfolded
-        elif not still_open:
+        if not first and not still_open:
             self._actions.windows.discard(title)
 
     def _session(self) -> None:
@@ -90,7 +80,6 @@ class Windows:
         self._status()
         self._ghosts()
         self._camera()
-        self._body()
         self._buttons()
 
     def _modes(self) -> None:
@@ -193,7 +182,7 @@ class Windows:
             ("ghosts", len(frame.ghosts), self.drawn.ghosts),
             ("traces", 0 if frame.traces is None else len(frame.traces), self.drawn.traces),
         )
-        why = f"{self._limit:,} shapes at most" if self._limit else "only a browser draws them"
+        why = f"{self._limit:,} shapes at most"
         return [(name, f"{drawn} of {given} drawn: {why}") for name, given, drawn in counts if drawn < given]
 
     def _last_values(self) -> list[tuple[str, float]]:
@@ -206,30 +195,16 @@ class Windows:
             return
         ghosts = self._actions.status.ghosts
         imgui.PushItemWidth(150)
-        if self._scene.nworld > 1:
-            _, self._ghost_worlds = imgui.InputTextWithHint("worlds", "1 2 5-9", self._ghost_worlds)
-            if imgui.IsItemDeactivatedAfterEdit():
-                try:
-                    self._actions.set_ghosts(worlds=numbers(self._ghost_worlds, self._scene.nworld))
-                except ValueError as error:
-                    self._actions.say(str(error))
-        if len(self._scene.episodes) > 1 and imgui.BeginCombo("episodes", f"{len(ghosts.episodes)} chosen"):
-            for i, name in enumerate(self._scene.episodes):
-                changed, on = imgui.Checkbox(f"{name}##{i}", i in ghosts.episodes)
-                if changed:
-                    others = set(ghosts.episodes) - {i}
-                    self._actions.set_ghosts(episodes=tuple(sorted(others | {i} if on else others)))
-            imgui.EndCombo()
-        changed, burst = imgui.SliderInt("burst", ghosts.burst, 0, MOST_BURST)
-        if changed:
-            self._actions.set_ghosts(burst=burst)
-        imgui.SetItemTooltip("number of states along the trajectory (Ctrl+B)")
-        changed, fade = imgui.SliderFloat("fade", ghosts.fade, 0.5, 1.0)
-        if changed:
-            self._actions.set_ghosts(fade=fade)
-        changed, doppler = imgui.Checkbox("past red, future blue", ghosts.doppler)
-        if changed:
-            self._actions.set_ghosts(doppler=doppler)
+        for name, most, what in (
+            ("worlds", min(self._scene.nworld - 1, MOST_GHOSTS), "number of other worlds"),
+            ("episodes", min(len(self._scene.episodes) - 1, MOST_GHOSTS), "number of other episodes"),
+            ("burst", MOST_BURST, "number of states along the trajectory (Ctrl+B)"),
+        ):
+            if most > 0:
+                changed, count = imgui.SliderInt(name, getattr(ghosts, name), 0, most)
+                if changed:  # a typed number may be beyond the ends of the slider
+                    self._actions.set_ghosts(**{name: min(max(count, 0), most)})
+                imgui.SetItemTooltip(what)
         changed, plan = imgui.Checkbox("plan", ghosts.plan)
         if changed:
             self._actions.set_ghosts(plan=plan)
@@ -239,32 +214,11 @@ class Windows:
         if not imgui.CollapsingHeader("camera"):
             return
         imgui.PushItemWidth(190)
-        cameras, viewer = self._actions.cameras, self._actions.viewer
-        ux.camera_selection_gui(viewer.model, viewer.data, viewer.camera, cameras.state)
-        model, camera = self._values.model, viewer.camera
-        names = [model.body(i).name or f"body {i}" for i in range(1, model.nbody)]
-        tracking = camera.type == mujoco.mjtCamera.mjCAMERA_TRACKING
-        body = combo("follows", ["-", *names], int(camera.trackbodyid) if tracking else 0)
-        if body == 0:
-            cameras.choose(ux.TUMBLE_CAMERA_IDX)
-        elif body is not None:
-            cameras.track(body)
+        viewer = self._actions.viewer
+        ux.camera_selection_gui(viewer.model, viewer.data, viewer.camera, self._actions.cameras.state)
         imgui.PopItemWidth()
         if imgui.Button("look at everything"):
-            cameras.reset()
-
-    def _body(self) -> None:
-        if not imgui.CollapsingHeader("push a body"):
-            return
-        model, perturb = self._values.model, self._actions.viewer.perturb
-        names = [model.body(i).name or f"body {i}" for i in range(1, model.nbody)]
-        imgui.PushItemWidth(190)
-        body = combo("body", ["-", *names], max(int(perturb.select), 0))
-        imgui.PopItemWidth()
-        if body is not None:
-            perturb.select, perturb.flexselect, perturb.skinselect = body, -1, -1
-            perturb.localpos = model.body_ipos[body]
-        imgui.TextDisabled("Ctrl + drag right: push, left: twist")
+            self._actions.cameras.reset()
 
     def _buttons(self) -> None:
         imgui.Separator()
@@ -283,9 +237,8 @@ class Windows:
             imgui.TextWrapped(self._actions.status.video)
 
     def _messages(self) -> None:
-        columns = int(imgui.GetContentRegionAvail().x / imgui.CalcTextSize("n" * 10).x * 10)
         for message in self._actions.messages:
-            imgui.TextUnformatted(wrapped(message, max(columns, 10)))
+            imgui.TextWrapped(message)
         if self._actions.scroll_down:
             imgui.SetScrollHereY(1.0)
             self._actions.scroll_down = False
@@ -340,30 +293,9 @@ def combo(label: str, names: Any, now: int) -> int | None:
     return int(chosen) if changed and chosen != now else None
 
 
-@functools.lru_cache(maxsize=1000)
-def wrapped(text: str, columns: int) -> str:
-    """Wrap a text at spaces, which ImGui does not."""
-    return textwrap.fill(text, columns)
-
-
 def speed_name(speed: float) -> str:
     """Format a speed, such as 1/4."""
     return f"1/{1 / speed:g}" if 0 < speed < 1 else f"{speed:g}"
-
-
-def numbers(text: str, below: int) -> tuple[int, ...]:
-    """Parse numbers and ranges, such as "1 2 5-9". Ranges end at ``below``, so that none is huge.
-
-    Raises:
-        ValueError: A word is neither a number nor a range.
-    """
-    chosen: dict[int, None] = {}
-    for word in text.replace(",", " ").split():
-        first, _, last = word.partition("-")
-        if not first.isdecimal() or not (last or first).isdecimal() or word.endswith("-"):
-            raise ValueError(f"{word!r} is not a number or a range: write for example 1 2 5-9")
-        chosen |= dict.fromkeys(range(int(first), min(int(last or first), max(int(first), below)) + 1))
-    return tuple(chosen)
 
 
 class Curves:

@@ -41,14 +41,15 @@ def test_a_planner_keeps_its_rate_and_shows_its_plan() -> None:
 def test_a_planner_controls_a_copy_of_the_shown_world(shared_env: SharedEnv) -> None:
     env = shared_env("point_mass", nworld=3)
     mppi = lw.MPPI("point_mass", **PLANNER)
-    session = Session(env, controllers={"mppi": mppi, "own": towards}, world=1, paused=True, seed=0)
+    session = Session(env, controllers={"mppi": mppi, "own": towards}, paused=True, seed=0)
+    session.obey(protocol.SetWorld(1))
     before, qpos = env.get_state(), env.state_space.parts["qpos"]
     session.stage.advance(3)
     assert torch.equal(env.get_state(), before)
     moved = session.stage.live.env.get_state()[0]
     assert not torch.equal(moved, before[1])
-    session.obey(protocol.SetGhosts(worlds=(0,)))
-    np.testing.assert_array_equal(session.stage.frame().ghosts[0].pose.qpos, before[0, qpos].numpy())
+    session.obey(protocol.SetGhosts(worlds=1))
+    np.testing.assert_array_equal(session.stage.frame().ghosts[0].pose.qpos, before[2, qpos].numpy())
     session.obey(protocol.SetWorld(2))  # world 1 takes over the state of the copy
     assert torch.equal(env.get_state()[1, qpos], moved[qpos])
     assert torch.equal(session.stage.live.env.get_state()[0, qpos], before[2, qpos])
@@ -62,12 +63,11 @@ def test_a_planner_controls_a_copy_of_the_shown_world(shared_env: SharedEnv) -> 
 
 def test_an_episode_of_a_plant_that_ends_is_followed_by_another() -> None:
     env = lw.make("point_mass", autoreset=False, horizon=12)
-    done: list[lw.Trajectory] = []
-    session = Session(env, controllers={"own": towards}, seed=0, on_trajectory=done.append)
+    session = Session(env, controllers={"own": towards}, seed=0)
     session.obey(protocol.SetSpeed(8.0))
     window = run(session, lambda frame: session.stage.live.made > 30)
-    assert [episode.steps for episode in done[:2]] == [12, 12] and done[0].truncated
-    assert any("the episode ended after 12 steps (truncated)" in message for message in window.messages)
+    ends = [message for message in window.messages if "the episode ended after 12 steps (truncated)" in message]
+    assert len(ends) >= 2
 
 
 class Slow:
@@ -149,6 +149,6 @@ def test_a_controller_that_fails_is_reported_and_loses_control(
 @pytest.mark.parametrize("speed", [4.0, 16.0])
 def test_frames_come_from_a_plant_that_never_waits(shared_env: SharedEnv, speed: float) -> None:
     env = shared_env("point_mass", autoreset=False, horizon=0)
-    session = Session(env, controllers={"none": lambda state, obs: torch.zeros(2)}, seed=0, fps=20.0)
+    session = Session(env, controllers={"none": lambda state, obs: torch.zeros(2)}, seed=0)
     session.obey(protocol.SetSpeed(speed))
     run(session, lambda frame: session.stage.live.made > 0, *[[]] * 20)

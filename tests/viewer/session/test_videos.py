@@ -78,32 +78,27 @@ def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> No
         pytest.skip(str(error))
 
 
-def test_an_interrupted_viewer_ends_its_video_with_what_is_drawn(
+def test_an_interrupted_viewer_completes_its_video(
     taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     lines: list[str] = []
     with pytest.raises(Interrupted), taker.finishing(lines.append):
         take(taker, frame, monkeypatch)
-        begin = time.monotonic()
+        monkeypatch.undo()
         raise Interrupted(signal.SIGINT)
-    assert time.monotonic() - begin < 6
     (video,) = tmp_path.iterdir()
     assert video.name.startswith("runs-one-two-")
-    assert len(lines) == 1 and lines[0].startswith(f"video: {video} (")
-    assert "frames dropped, which came faster than they were drawn" in lines[0]
+    assert lines == [f"video: {video}"]
 
 
 def test_a_second_signal_discards_the_videos(
     taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     begin = 0.0
-    with signals(), pytest.raises(Interrupted):
-        try:
-            take(taker, frame, monkeypatch)
-            signal.raise_signal(signal.SIGTERM)
-        except Interrupted:
-            begin = time.monotonic()
-            threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGTERM)).start()
-            taker.finish(print, seconds=60.0)
+    with signals(), pytest.raises(Interrupted), taker.finishing(print):
+        take(taker, frame, monkeypatch)
+        begin = time.monotonic()
+        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        signal.raise_signal(signal.SIGTERM)
     assert 0 < time.monotonic() - begin < 6
     assert not list(tmp_path.iterdir())

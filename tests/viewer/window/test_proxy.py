@@ -6,15 +6,12 @@ import http.cookiejar
 import os
 import re
 import socket
-import stat
 import subprocess
 import sys
 import threading
 import time
 import urllib.request
-import webbrowser
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 from websockets.exceptions import ConnectionClosed
@@ -463,18 +460,6 @@ def test_the_ssh_line_forwards_the_port(monkeypatch: pytest.MonkeyPatch) -> None
         with Proxy() as proxy:
             assert proxy.ssh_line == f"ssh -C -N -L {proxy.port}:127.0.0.1:{proxy.port} {target}"
             assert proxy.instructions == [f"viewer: {proxy.address}", f"from another machine: {proxy.ssh_line}"]
-
-
-def test_the_browsers_command_line_does_not_contain_the_token(proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
-    opened: list[str] = []
-    monkeypatch.setattr(webbrowser, "open", lambda address, new: opened.append(address))
-    proxy.open_in_browser()
-    wait_until(lambda: bool(opened))
-    file = Path(opened[0].removeprefix("file://"))
-    assert token(proxy) not in opened[0] and proxy.address in file.read_text()
-    assert stat.S_IMODE(file.parent.stat().st_mode) == 0o700
-    proxy.close()
-    assert not file.parent.exists()
 
 
 # the private socket

@@ -1,7 +1,6 @@
 import numpy as np
-import pytest
 
-from lyceum_warp.viewer.window.windows import Curves, numbers
+from lyceum_warp.viewer.window.windows import Curves
 
 
 def ramp(begin: int, end: int) -> np.ndarray:
@@ -37,16 +36,3 @@ def test_thinned_curve_keeps_its_extremes() -> None:
     assert len(thin) == 50
     assert (thin[:, 1].min(), thin[:, 1].max()) == (-7, 5)
     assert (np.diff(thin[:, 0]) >= 0).all()
-
-
-def test_numbers_and_ranges_are_read_once_each() -> None:
-    assert numbers("1 2, 5-7 6", 8) == (1, 2, 5, 6, 7)
-    assert numbers("", 8) == ()
-    assert numbers("7-9 12", 8) == (7, 8, 12)  # the session refuses these
-    assert len(numbers("0-99999999999", 8)) == 9
-
-
-@pytest.mark.parametrize("text", ["1 x", "1-", "-1", "1-2-3"])
-def test_numbers_of_another_form_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match=f"'{text.split()[-1]}' is not a number or a range"):
-        numbers(text, 8)
