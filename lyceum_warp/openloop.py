@@ -110,6 +110,9 @@ class OpenLoop:
             # the states before each step, after it, and at the end are views of one buffer per field
             self._fields: dict[str, wp.array] = {}
             self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
+            if task.shared:
+                for batch in (self._before, self._after, self._last):
+                    batch.shared = self.worlds.shared
             constant = {f.name: shared_rows(f.value(task.model), f.dtype, rows + n, env.device) for f in task.constants}
             for name in task.types:
                 live = getattr(self.worlds.after, name)

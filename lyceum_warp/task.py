@@ -42,7 +42,7 @@ class TaskFunction:
     about: str
     """Its purpose and its default, for the documentation."""
     default: str | None = None
-    """The body of the default function; None if the task must have the function."""
+    """The body of the default function; None for no default."""
     optional: str = ""
     """Optional arguments at the end, as in a task's file."""
     writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -121,12 +121,18 @@ FUNCTIONS = {
         TaskFunction("advance", f"{_TRANSITION}, {_RNG}", None,
                      "Writes task memory of ``s1`` after each step and before ``reward``. Default: keeps it.", "pass",
                      writes={"s1": "memory"}),
+        TaskFunction("tally", f"{_TRANSITION}, ended: bool, sums: Sums", None,
+                     "Writes a transition's share of sums over all worlds; ``ended`` says whether the episode ended. "
+                     "Only in environments with automatic resets. Default: none."),
+        TaskFunction("share", "shared: Shared, sums: Sums, p: Params", None,
+                     "Updates the memory that all worlds share from the sums since the last update, in "
+                     "``env.update_shared``. Default: keeps it."),
     )
 }  # fmt: skip
 """The functions of a task, by name. Checks, kernels, error messages and ``help(lw.Task)`` are made from this table."""
 
 
-RESULTS = ("obs", "ctrl", "metrics", "rng")
+RESULTS = ("obs", "ctrl", "metrics", "rng", "sums", "shared")
 """Arguments that are rows for results, which a function may write."""
 
 MEMORIES = ("memory", "lasting_memory")
@@ -185,7 +191,7 @@ def lasting_memory(size: int | str = 1) -> Any:
 
 
 def part(size: int | str = 1) -> Any:
-    """As a default in the struct of a group of observations: a part of the observation.
+    """As a default in the struct of a group of observations, in Shared or in Sums: a part of it.
 
     Args:
         size: Number of elements, or the name of a table in Params: one element for each of its rows.

@@ -89,6 +89,7 @@ class WorldArrays:
             if live.size and name not in constant and name not in varied:  # no step changes the model
                 self._copies[name] = wp.zeros_like(live)
             setattr(self.before, name, self._copies.get(name, live))
+        self._allocate_shared()
         self.fields = {**self.engine.arrays, **constant}
         """The arrays of all fields of the engine and the model, (nworld, ...), by name."""
         drawn = [f.name for f in self.task.dynamics if f.name in self.task.writes.get("event", ())]
@@ -97,6 +98,17 @@ class WorldArrays:
         self.action_space = action_space(model, task.action_range, task.actions)
         self.obs_spaces = {group: Space.of(layout) for group, layout in self.task.obs_layouts.items()}
         self.state_space = state_space(model, self.engine.snapshots, self.task.dynamics, own_parts(self.task))
+
+    def _allocate_shared(self) -> None:
+        """The memory that all worlds share, and the sums over worlds from which it is updated."""
+        layouts = self.task.shared
+        shared, sums = (sum(sizes(layouts.get(name, {})).values()) for name in ("Shared", "Sums"))
+        self.shared, self.sums = wp.zeros((1, shared), dtype=float), wp.zeros(sums, dtype=wp.int64)
+        """The memory, (1, size), and the sums in units of 1 / ``steps.UNIT``, (size of Sums,)."""
+        self._shares = wp.zeros((self.nworld, sums), dtype=float)
+        if layouts:
+            for batch in (self.after, self.before):
+                batch.shared = self.shared
 
     def _allocate_outcome(self) -> None:
         """Rewards, ends, metrics and observations."""

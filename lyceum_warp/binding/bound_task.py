@@ -177,10 +177,11 @@ class BoundTask:
         self.functions = self.source.functions
         self._check_class()
         memory = self.source.memory
-        named = [name for name in dict.fromkeys([*self.source.world.vars, *fields]) if name not in memory]
+        own_names = [*memory, *(["shared"] if self.source.shared is not None else [])]
+        named = [name for name in dict.fromkeys([*self.source.world.vars, *fields]) if name not in own_names]
         for name in named:
             check_field_name(name)
-        self.types = {name: v.type for name, v in self.source.world.vars.items() if name not in memory}
+        self.types = {name: v.type for name, v in self.source.world.vars.items() if name not in own_names}
         """The types of a world's fields and of its rows of memory, as a batch of worlds has them."""
         self.types |= {name: Row[float] for name in MEMORIES if any(part.kind == name for part in memory.values())}
         self.writes = self._checked_writes()
@@ -214,7 +215,10 @@ class BoundTask:
         """The functions that write the groups of observations, by the groups' names."""
         observers = {observer_name(group): function for group, function in self.observers.items()}
         check_writes(self.name, observers, dict.fromkeys(observers, self._rights(FUNCTIONS["observe"])))
-        self.kernels = kernels_of(self.source, self.observers, self.memory, obs_slices(self.source, self.params))
+        self.shared = self._shared_layouts()
+        """The layouts of Shared and Sums; empty for a task without memory that worlds share."""
+        structs = obs_slices(self.source, self.params) | self.shared
+        self.kernels = kernels_of(self.source, self.observers, self.memory, structs)
 
     @property
     def params(self) -> dict[str, Any]:
@@ -237,6 +241,14 @@ class BoundTask:
 
     def _memory_layouts(self) -> dict[str, parts.Layout]:
         return {name: parts.layout(self.source.world, name, self.params, "World") for name in MEMORIES}
+
+    def _shared_layouts(self) -> dict[str, parts.Layout]:
+        structs = {"Shared": self.source.shared, "Sums": self.source.sums}
+        return {
+            name: parts.layout(struct, "obs", self.params, name)
+            for name, struct in structs.items()
+            if struct is not None
+        }
 
     def _rights(self, function: TaskFunction) -> Rights:
         """The fields that a function may write, by the names of its arguments."""
@@ -285,7 +297,8 @@ class BoundTask:
             changed = "the observation's" if obs_layouts(self.source, self.params) != self.obs_layouts else ""
         except ValueError:  # one value per world for a parameter that sets a size
             changed = "the observation's"
-        changed = changed or ("the memory's" if self._memory_layouts() != self.memory else "")
+        layouts = (self._memory_layouts(), self._shared_layouts())
+        changed = changed or ("the memory's" if layouts != (self.memory, self.shared) else "")
         if changed:
             self.parameters.values = previous
             raise ValueError(f"{', '.join(params)} would change {changed} parts: make a new environment")

@@ -14,7 +14,7 @@ import warp as wp
 
 from lyceum_warp.binding.functions import TaskSource, draws_noise
 from lyceum_warp.binding.parts import Layout, view_lines
-from lyceum_warp.binding.sources import free_module_name, run_source
+from lyceum_warp.binding.sources import free_module_name, is_struct, run_source
 from lyceum_warp.binding.writes import written_fields
 from lyceum_warp.fields import is_data_field
 from lyceum_warp.kernels import random, steps
@@ -76,12 +76,12 @@ def valid_model(s: World, lane: int, lanes: int) -> bool:
     return valid
 """
 
-_GROUP_VIEW = """
+_ROW_VIEW = """
 @wp.func
-def view_{number}(row: Row[float]) -> Group{number}:
-    group_{number} = Group{number}()
+def view_{name}(row: Row[float]) -> Struct_{name}:
+    struct_{name} = Struct_{name}()
 {lines}
-    return group_{number}
+    return struct_{name}
 
 """
 
@@ -101,7 +101,7 @@ def kernels_of(
     source: TaskSource,
     groups: Mapping[str, wp.Function],
     memory: Mapping[str, Layout],
-    observations: Mapping[str, Layout],
+    structs: Mapping[str, Layout],
 ) -> steps.Kernels:
     """The kernels of a task, made once for the same functions, structs and sizes; see ``kernels.steps.make_kernels``.
 
@@ -109,14 +109,14 @@ def kernels_of(
         source: The task.
         groups: The functions that write its groups of observations.
         memory: The layouts of its rows of memory.
-        observations: The layouts of the groups of observations that are structs.
+        structs: The layouts of rows that functions see as structs: groups of observations, Shared and Sums.
     """
-    layouts = tuple((name, *layout.items()) for name, layout in (*memory.items(), *observations.items()))
+    layouts = tuple((name, *layout.items()) for name, layout in (*memory.items(), *structs.items()))
     key = (source.world, source.params, tuple(source.functions.values()), tuple(groups.items()), layouts)
     with _MAKING:
         if key not in _kernels:
-            scope = _generated(source, groups, memory, observations)
-            functions = {name: function or scope[f"no_{name}"] for name, function in source.functions.items()}
+            scope = _generated(source, groups, memory, structs)
+            functions = {name: function or scope.get(f"no_{name}") for name, function in source.functions.items()}
             written = [name for name, function in source.functions.items() if function is not None]
             module = free_module_name(f"lyceum_warp.generated.{source.path}")
             given: dict[str, Any] = {"module": module, "functions": functions, "written": written}
@@ -129,12 +129,26 @@ def _generated(
     source: TaskSource,
     groups: Mapping[str, wp.Function],
     memory: Mapping[str, Layout],
-    observations: Mapping[str, Layout],
+    structs: Mapping[str, Layout],
 ) -> dict[str, Any]:
     """The names that the generated source defines: structs, functions that call the task's, and defaults."""
     scope: dict[str, Any] = {"wp": wp, "Row": Row, "World": source.world, "Params": source.params}
-    batch, rows, state = [], [], []
-    fields = {name: variable.type for name, variable in source.world.vars.items() if name not in source.memory}
+    scope |= {"Shared": source.shared, "Sums": source.sums}
+    batch, rows, state, views = [], [], [], []
+
+    def view_row(name: str, struct: Any) -> None:
+        scope[f"Struct_{name}"] = struct
+        lines = view_lines(structs[name], f"struct_{name}", "row", scope)
+        views.append(_ROW_VIEW.format(name=name, lines="\n".join(f"    {line}" for line in lines)))
+
+    if source.shared is not None:
+        view_row("Shared", source.shared)
+        view_row("Sums", source.sums)
+        scope["type_shared"] = wp.array2d(dtype=float)
+        batch.append("    shared: type_shared")
+        rows.append("s.shared = view_Shared(batch.shared[0])")
+    fields = {name: variable.type for name, variable in source.world.vars.items()
+              if name not in source.memory and not is_struct(variable.type)}  # fmt: skip
     fields |= {name: Row[float] for name, layout in memory.items() if layout}
     for name, kind in fields.items():
         ndim, dtype = (kind.ndim + 1, kind.dtype) if hasattr(kind, "ndim") else (1, kind)
@@ -148,7 +162,7 @@ def _generated(
             state += _copy(name, ndim)
     scope |= {"substream": random.substream, "finite_row": kernel_rows.finite_row, "copy_row": kernel_rows.copy_row}
     scope["restored_row"] = kernel_rows.restored_row
-    observe, views = [], []
+    observe = []
     for number, (group, function) in enumerate(groups.items()):
         scope[f"observe_{number}"] = function
         noisy = draws_noise(function)
@@ -156,11 +170,9 @@ def _generated(
         if noisy:  # a stream for each group, so that no group's draws depend on another's
             observe.append(f"    rng[0] = substream(base, {number})")
         row = f"out.{group}[w]"
-        if group in observations:
-            scope[f"Group{number}"] = list(function.input_types.values())[2]
-            lines = view_lines(observations[group], f"group_{number}", "row", scope)
-            views.append(_GROUP_VIEW.format(number=number, lines="\n".join(f"    {line}" for line in lines)))
-            row = f"view_{number}({row})"
+        if group in structs:
+            view_row(group, list(function.input_types.values())[2])
+            row = f"view_{group}({row})"
         observe.append(f"    observe_{number}(s, p, {row}{', rng' if noisy else ''})")
     blocks = {
         "batch": batch,
@@ -183,8 +195,7 @@ def _generated(
     text = "\n".join([*views, *parts])
     scope["__name__"] = f"lyceum_warp.generated.{source.name}"
     run_source(text, f"<lyceum_warp {source.path}>", scope)
-    scope["views"] = {source.world: scope["view"]}
-    scope["views"] |= {scope[f"Group{i}"]: scope[f"view_{i}"] for i in range(len(groups)) if f"Group{i}" in scope}
+    scope["views"] = {source.world: scope["view"]} | {scope[f"Struct_{x}"]: scope[f"view_{x}"] for x in structs}
     return scope
 
 

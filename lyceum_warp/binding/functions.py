@@ -34,6 +34,8 @@ class TaskSource:
         self.params: Any = self._struct("Params")
         self.memory: dict[str, Part] = self._memory()
         """The fields of World that are the task's memory, by name."""
+        self.shared, self.sums = self._shared_structs()
+        """The structs of the memory that worlds share and of the sums over worlds; None for a task without them."""
         self.functions: dict[str, wp.Function | None] = {
             name: self._function(wanted) for name, wanted in FUNCTIONS.items()
         }
@@ -122,6 +124,25 @@ class TaskSource:
             raise ValueError(f"World.{wrong[0]} of the task {self.name!r} is lw.part(...): write lw.memory(...)")
         return parts
 
+    def _shared_structs(self) -> tuple[Any, Any]:
+        """The structs of the memory that worlds share and of their sums.
+
+        Raises:
+            ValueError: One of ``World.shared``, ``tally`` and ``share`` is missing, or is of another form.
+        """
+        field, tally, share = self.world.vars.get("shared"), self._written("tally"), self._written("share")
+        if field is None and tally is None and share is None:
+            return None, None
+        structs = [list(function.input_types.values())[i] for function, i in ((tally, -1), (share, 1))
+                   if isinstance(function, wp.Function) and len(function.input_types) > 1]  # fmt: skip
+        if field is None or not is_struct(field.type) or len(structs) < 2 or structs[0] is not structs[1]:
+            raise ValueError(
+                f"memory that the worlds of the task {self.name!r} share needs a struct Shared, listed in World as "
+                f"shared: Shared, a struct Sums, and two functions: {FUNCTIONS['tally'].signature}; and "
+                f"{FUNCTIONS['share'].signature}"
+            )
+        return field.type, structs[0]
+
     def _function(self, wanted: TaskFunction) -> wp.Function | None:
         name = wanted.name
         function = self._written(name)
@@ -174,10 +195,13 @@ class TaskSource:
             return "World"
         if argument is self.params:
             return "Params"
+        if argument is not None and argument in (self.shared, self.sums):
+            return "Shared" if argument is self.shared else "Sums"
         if self._has_structs and is_struct(argument):
             return "Row[float]"
         element: Any = getattr(argument, "dtype", None) if getattr(argument, "ndim", 0) == 1 else None
-        return {wp.float32: "Row[float]", wp.uint32: "Row[wp.uint32]"}.get(element, "?")
+        kinds = {wp.float32: "Row[float]", wp.uint32: "Row[wp.uint32]"}
+        return "bool" if argument in (bool, wp.bool) else kinds.get(element, "?")
 
     def _check_names(self) -> None:
         """Refuse names that resemble one of the table: nothing would ever call such a function."""
