@@ -2,7 +2,7 @@
 
 import functools
 import inspect
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 import mujoco
@@ -105,6 +105,8 @@ class Env:
     """The sums of the metrics over the episode of the last step, each (nworld,), float32."""
     episode_metric_sums: torch.Tensor
     """``episode_metrics`` as one tensor, (nworld, number of metrics), in the order of ``metrics``."""
+    shared: dict[str, torch.Tensor]
+    """The memory that all worlds share, by name; only the task's ``share`` changes it, in ``update_shared``."""
     success: torch.Tensor
     """Whether the task's goal has been met for ``success_steps`` steps in a row, (nworld,), bool."""
     done: torch.Tensor
@@ -176,6 +178,9 @@ class Env:
                 for array in (worlds.metrics, worlds.episode_metrics)
             )
             self.episode_metric_sums = torch_view(worlds.episode_metrics)
+            memory = torch_view(worlds.shared)[0]
+            self.shared = {name: memory[part.start : part.start + part.size]
+                           for name, part in self.task.shared.get("Shared", {}).items()}  # fmt: skip
             self.reward_space = self.eval_space = Space()
             self._fields = {name: torch_view(array) for name, array in worlds.fields.items()}
             self.time, self.episode_step = self._fields["time"], torch_view(worlds.counters.step)
@@ -466,6 +471,48 @@ class Env:
             if field.name in names and (problem := field.problem(self.task.model, columns[field.name].cpu().numpy())):
                 raise ValueError(f"{self.task.name!r}: {problem}")
 
+    # memory that all worlds share
+
+    def update_shared(self, total: Callable[[torch.Tensor], object] | None = None) -> None:
+        """Update ``shared`` from the sums over the transitions since the last update, by the task's ``share``.
+
+        Observations that depend on it follow. Learners call it after each rollout. Nothing waits for the device.
+
+        Args:
+            total: Adds the sums of several processes, int64, in place, such as ``Team.sum``. All processes must call
+                this method.
+        """
+        if self.shared and total is not None:
+            total(torch_view(self.worlds.sums))
+        self.worlds.update_shared()
+
+    def get_shared(self) -> torch.Tensor:
+        """A copy of the memory that all worlds share and of the sums for its next update, for ``set_shared``.
+
+        Returns:
+            The memory, followed by the sums; float64, empty if the task has none.
+        """
+        parts = (torch_view(self.worlds.shared)[0], torch_view(self.worlds.sums) / steps.UNIT)
+        return torch.cat([part.double() for part in parts])
+
+    def set_shared(self, state: torch.Tensor) -> None:
+        """Set the memory that all worlds share, and the sums for its next update.
+
+        Args:
+            state: From ``get_shared`` of an environment of the same task.
+
+        Raises:
+            ValueError: The state has another size or type.
+        """
+        check_tensor(state, "the state of shared memory", self.get_shared())
+        size = self.worlds.shared.shape[1]
+        torch_view(self.worlds.shared)[0].copy_(state[:size])
+        torch_view(self.worlds.sums).copy_((state[size:] * steps.UNIT).round())
+
+    def _copy_shared(self, other: "Env") -> None:
+        for name, memory in other.shared.items():
+            self.shared[name].copy_(memory)
+
     # parameters and other environments of the same task
 
     @property
@@ -486,13 +533,14 @@ class Env:
             self._scratch.follow(self)
 
     def follow(self, other: "Env") -> None:
-        """Copy the parameters of another environment of the same task.
+        """Copy the parameters, and the memory that worlds share, of another environment of the same task.
 
         Raises:
             ValueError: ``other`` is not an environment, or belongs to a task with other parameters.
         """
         check_kind("other", other, Env, "an environment of the same task")
         self.set_params(**other._params_for(self.nworld, {**self._given_params, **other._given_params}))
+        self._copy_shared(other)
 
     def replicate(self, *, nworld: int | None = None, **changes: Any) -> "Env":
         """Make another environment of the same task with the same options and parameters, except for the given changes.
@@ -505,7 +553,9 @@ class Env:
         own = {"horizon": self.horizon, "autoreset": self.autoreset, "model": self.task.spec}
         known, params = EnvOptions.split(changes, self.options.changed(own | {"seed": 0, "first_world": 0}))
         given = self._params_for(nworld, self._given_params)
-        return Env(self.task.task, known.changed({"nworld": nworld}), _replica=True, **(given | params))
+        made = Env(self.task.task, known.changed({"nworld": nworld}), _replica=True, **(given | params))
+        made._copy_shared(self)
+        return made
 
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
         """``replicate`` for a few worlds, such as an evaluation's: with engine="auto" they run on the C engine.
@@ -526,6 +576,7 @@ class Env:
         """Worlds of the same task in given states; made when first needed."""
         if self._scratch is None:
             self._scratch = self.replicate()
+        self._scratch._copy_shared(self)
         self._scratch.set_state(given)
         return self._scratch
 

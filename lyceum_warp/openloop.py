@@ -23,7 +23,7 @@ from lyceum_warp.support.arrays import (
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_kind, whole_number
 from lyceum_warp.task import MEMORIES
-from lyceum_warp.world_arrays import own_parts
+from lyceum_warp.world_arrays import memory_columns, own_parts
 
 
 @document_attributes
@@ -110,6 +110,9 @@ class OpenLoop:
             # the states before each step, after it, and at the end are views of one buffer per field
             self._fields: dict[str, wp.array] = {}
             self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
+            if task.shared:
+                for batch in (self._before, self._after, self._last):
+                    batch.shared = self.worlds.shared
             constant = {f.name: shared_rows(f.value(task.model), f.dtype, rows + n, env.device) for f in task.constants}
             for name in task.types:
                 live = getattr(self.worlds.after, name)
@@ -194,7 +197,7 @@ class OpenLoop:
         if self._keys is not None:
             wp.copy(worlds.counters.key, self._keys)
         for name, buffer in self._memories.items():
-            columns = worlds.state[:, self.env.state_space.parts[name]]
+            columns = worlds.state[:, memory_columns(self.env.task, self.env.state_space)[name]]
             launch_rows(state.narrow, worlds.everyone, columns, getattr(worlds, name))
             wp.copy(buffer[0], getattr(worlds, name))
         for name, buffer in self._dynamics.items():

@@ -8,10 +8,11 @@ import torch
 import warp as wp
 
 from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.parts import sizes
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.kernels import state, steps
-from lyceum_warp.spaces import Space, action_space, control_ranges, control_scale, state_space
+from lyceum_warp.spaces import OWN_PARTS, Space, action_space, control_ranges, control_scale, state_space
 from lyceum_warp.support.arrays import flat, launch_rows, shared_rows, torch_view, with_memory
 from lyceum_warp.support.validate import check_tensor
 from lyceum_warp.task import MEMORIES
@@ -28,10 +29,17 @@ def own_bytes_per_world(task: BoundTask) -> int:
 
 def own_parts(task: BoundTask) -> dict[str, int]:
     """The sizes of the parts that ``Worlds`` adds to a state beside the counters."""
-    form = task.task
-    sizes = {name: getattr(form, name) for name in MEMORIES}
-    sizes |= {"metrics": len(form.metrics), "success_steps": int(form.success_steps > 1)}
-    return {name: size for name, size in sizes.items() if size}
+    form, found = task.task, dict[str, int]()
+    for layout in task.memory.values():
+        found |= sizes(layout)
+    own = {"metrics": len(form.metrics), "success_steps": int(form.success_steps > 1)}
+    return found | {name: size for name, size in own.items() if size}
+
+
+def memory_columns(task: BoundTask, space: Space) -> dict[str, slice]:
+    """The columns of the rows ``memory`` and ``lasting_memory`` in a state, without those that the task lacks."""
+    ends = {name: [space.parts[part] for part in layout] for name, layout in task.memory.items() if layout}
+    return {name: slice(parts[0].start, parts[-1].stop) for name, parts in ends.items()}
 
 
 class WorldArrays:
@@ -56,9 +64,10 @@ class WorldArrays:
     def _allocate_fields(self) -> None:
         """The fields of the states after and before a step, and the task's memory."""
         n, model, task, kernels = self.nworld, self.task.model, self.task.task, self.task.kernels
-        self.memory = wp.zeros((n, task.memory), dtype=float)
-        self.lasting_memory = wp.zeros((n, task.lasting_memory), dtype=float)
-        self._lasting_before = wp.zeros((n, task.lasting_memory), dtype=float)
+        self.memory, self.lasting_memory, self._lasting_before = (
+            wp.zeros((n, sum(sizes(self.task.memory[name]).values())), dtype=float)
+            for name in ("memory", "lasting_memory", "lasting_memory")
+        )
         self.metric_sums = wp.zeros((n, len(task.metrics)), dtype=float)
         """Sums of the metrics over the episode so far."""
         self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
@@ -80,6 +89,7 @@ class WorldArrays:
             if live.size and name not in constant and name not in varied:  # no step changes the model
                 self._copies[name] = wp.zeros_like(live)
             setattr(self.before, name, self._copies.get(name, live))
+        self._allocate_shared()
         self.fields = {**self.engine.arrays, **constant}
         """The arrays of all fields of the engine and the model, (nworld, ...), by name."""
         drawn = [f.name for f in self.task.dynamics if f.name in self.task.writes.get("event", ())]
@@ -88,6 +98,17 @@ class WorldArrays:
         self.action_space = action_space(model, task.action_range, task.actions)
         self.obs_spaces = {group: Space.of(layout) for group, layout in self.task.obs_layouts.items()}
         self.state_space = state_space(model, self.engine.snapshots, self.task.dynamics, own_parts(self.task))
+
+    def _allocate_shared(self) -> None:
+        """The memory that all worlds share, and the sums over worlds from which it is updated."""
+        layouts = self.task.shared
+        shared, sums = (sum(sizes(layouts.get(name, {})).values()) for name in ("Shared", "Sums"))
+        self.shared, self.sums = wp.zeros((1, shared), dtype=float), wp.zeros(sums, dtype=wp.int64)
+        """The memory, (1, size), and the sums in units of 1 / ``steps.UNIT``, (size of Sums,)."""
+        self._shares = wp.zeros((self.nworld, sums), dtype=float)
+        if layouts:
+            for batch in (self.after, self.before):
+                batch.shared = self.shared
 
     def _allocate_outcome(self) -> None:
         """Rewards, ends, metrics and observations."""
@@ -189,10 +210,11 @@ class WorldArrays:
 
     def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
         """The arrays of ``own_parts``, with their columns of the state."""
-        arrays = {name: getattr(self, name) for name in MEMORIES}
-        arrays |= {"metrics": self.metric_sums, "success_steps": self.success_counts}
-        for name in own_parts(self.task):
-            yield arrays[name], self.state[:, self.state_space.parts[name]]
+        columns = memory_columns(self.task, self.state_space)
+        columns |= {name: self.state_space.parts[name] for name in own_parts(self.task) if name in OWN_PARTS}
+        arrays = {"metrics": self.metric_sums, "success_steps": self.success_counts}
+        for name, place in columns.items():
+            yield arrays[name] if name in arrays else getattr(self, name), self.state[:, place]
 
     def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
         """Set the masked worlds' counters from columns of states."""

@@ -137,7 +137,13 @@ class Worlds(WorldArrays):
             Phase("act", self.act, by_world=True),
             *self.physics_phases(),
             Phase("judge", self._judge_step, by_world=True),
+            *self._tally_phases(),
         ]
+
+    def _tally_phases(self) -> list[Phase]:
+        """Add up the task's sums over all worlds, in one thread, because atomic additions on a CPU need that."""
+        kernel = self.task.kernels.tally_worlds if self.autoreset else None
+        return [] if kernel is None else [Phase("tally", partial(self._tally, kernel))]
 
     def physics_phases(self) -> list[Phase]:
         """The substeps of a step."""
@@ -244,6 +250,11 @@ class Worlds(WorldArrays):
         if (advance := self.task.kernels.advance_memory) is not None:
             args = [self.before, self.after, self.params, self.safe_action, self.counters]
             launch_worlds(advance, self.nworld, args, self.device)
+
+    def _tally(self, kernel: wp.Kernel) -> None:
+        reason = self.outcome.done_reason
+        args = [self.before, self.after, self.params, self.safe_action, reason, self._shares, self.sums]
+        launch_worlds(kernel, self.nworld, args, self.device)
 
     def _judge(
         self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool, keep_reason: bool = False
@@ -368,6 +379,12 @@ class Worlds(WorldArrays):
             launch_worlds(self.task.kernels.start_worlds, self.nworld, args, self.device)
         if self.task.dynamics:
             self.engine.apply_model(self.mask)
+
+    def update_shared(self) -> None:
+        """Update the memory that all worlds share from the sums, clear these, and observe the worlds again."""
+        if (kernel := self.task.kernels.share_memory) is not None:
+            launch_worlds(kernel, 1, [self.sums, self._shares, self.params, self.shared], self.device)
+            self._observe(self.everyone)
 
     def update_params(self) -> None:
         """Copy the task's parameters into the array that kernels read."""

@@ -167,6 +167,7 @@ class Learner(abc.ABC):
         state = {
             "policy": self.policy.state_dict(),
             "env": self.team.gather(self.env.get_state()),
+            "shared": self.env.get_shared(),
             "iteration": self.iteration,
             "samples": self.samples,
         }
@@ -190,6 +191,8 @@ class Learner(abc.ABC):
             self.value.load_state_dict(state["value"])
         if self.generator is not None:
             self.generator.set_state(state["generator"].cpu())
+        if "shared" in state:  # earlier releases had none
+            self.env.set_shared(state["shared"].to(self.env.obs.device))
         self.env.set_state(state["env"][self._own].to(self.env.obs.device))
         self.iteration = whole_number("iteration", state["iteration"], low=0)
         self.samples = whole_number("samples", state["samples"], low=0, high=2**63 - 1)

@@ -214,6 +214,7 @@ class NPG(OnPolicyLearner):
             self.noise.normal_(generator=self.generator)
             self._dense = DensePolicy.of(self.policy)
             self.rollout.collect(self._dense or self.policy, self.noise[:, self._own])
+            self.env.update_shared(self.team.sum)
 
     @torch.no_grad()
     def advantages(self) -> tuple[torch.Tensor, torch.Tensor, ValueSums, torch.Tensor]:

@@ -155,6 +155,7 @@ class PPO(OnPolicyLearner):
         with precision(tf32=config.tf32 and self._cuda):
             # 1. Sample with the current policy.
             self.sample()
+            self.env.update_shared(team.sum)
 
             # 2. Values and advantages, from the value function before its fit to these samples.
             samples = self.evaluated_samples()

@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from lyceum_warp.done import Done
+from lyceum_warp.done import FAULTS, Done
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.random import stream, substream
 from lyceum_warp.kernels.rows import copy_row
@@ -17,6 +17,7 @@ ACTION = wp.constant(int(Done.ACTION))
 REWARD = wp.constant(int(Done.REWARD))
 OBSERVATION = wp.constant(int(Done.OBSERVATION))
 MODEL = wp.constant(int(Done.MODEL))
+ALL_FAULTS = wp.constant(int(FAULTS))
 NAN = wp.constant(int(Done.NAN))
 
 # substreams of a step's stream; ``advance`` draws from the stream itself
@@ -121,7 +122,10 @@ class TaskCode:
     Params: Any
     Batch: Any  # struct of the task's fields in all worlds
     Observations: Any  # struct of the observation groups
+    Shared: Any  # struct of the memory that worlds share, or None
+    Sums: Any  # struct of the sums over worlds, or None
     view: wp.Function  # (batch, world) -> World
+    views: Mapping[Any, wp.Function]  # ``Kernels.views``
     copy_state: wp.Function  # copies the fields that steps change
     observe_group: wp.Function
     finite_group: wp.Function
@@ -281,7 +285,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         """Find faults in the task's memory, in the masked worlds; launched over (nworld, lanes)."""
         k, lane = wp.tid()
         w = first + k
-        if mask_in[w] and not finite_memory(view(before, w), view(after, w), lane, lanes):
+        if mask_in[w] and not finite_memory(before, after, w, lane, lanes):
             fault_inout[w] = fault_inout[w] | NAN
 
     @task.kernel()
@@ -631,16 +635,76 @@ def rollout_kernels(task: TaskCode) -> RolloutKernels:
     return RolloutKernels(judge_rows, advance_rows)
 
 
+UNIT = wp.constant(2.0**20)
+"""Sums over worlds are whole multiples of 1 / UNIT, so that they do not depend on the order of the worlds."""
+
+
 @dataclasses.dataclass(frozen=True)
-class Kernels(ActKernels, JudgeKernels, BeginKernels, RolloutKernels):
+class SharedKernels:
+    """Kernels for the memory that all worlds share."""
+
+    tally_worlds: wp.Kernel | None
+    share_memory: wp.Kernel | None
+
+
+def shared_kernels(task: TaskCode) -> SharedKernels:
+    """Make the kernels of ``SharedKernels`` around a task's functions."""
+    Batch, Params, view = task.Batch, task.Params, task.view  # noqa: N806
+    tally, share = task.functions["tally"], task.functions["share"]
+    view_sums, view_shared = task.views.get(task.Sums), task.views.get(task.Shared)
+
+    @task.kernel_for("tally")
+    def tally_worlds(
+        before: Batch,
+        after: Batch,
+        params: wp.array[Params],
+        action_in: wp.array2d[float],
+        reason_in: wp.array[int],
+        share_out: wp.array2d[float],
+        sum_inout: wp.array[wp.int64],
+        first: int,
+    ):
+        """Add each world's share of a transition without a fault to the sums; launched over (nworld,)."""
+        w = first + wp.tid()
+        for i in range(share_out.shape[1]):
+            share_out[w, i] = 0.0
+        if (reason_in[w] & ALL_FAULTS) == 0:
+            p = params[w % params.shape[0]]
+            tally(view(before, w), action_in[w], view(after, w), p, reason_in[w] != 0, view_sums(share_out[w]))
+        for i in range(share_out.shape[1]):
+            if share_out[w, i] != 0.0 and wp.isfinite(share_out[w, i]):
+                wp.atomic_add(sum_inout, i, wp.int64(wp.round(wp.float64(share_out[w, i]) * wp.float64(UNIT))))
+
+    @task.kernel_for("share")
+    def share_memory(
+        sum_inout: wp.array[wp.int64],
+        sum_row_out: wp.array2d[float],
+        params: wp.array[Params],
+        shared_inout: wp.array2d[float],
+        first: int,
+    ):
+        """Update the shared memory from the sums, and clear these; launched over (1,)."""
+        for i in range(sum_inout.shape[0]):
+            sum_row_out[0, i] = float(wp.float64(sum_inout[i]) / wp.float64(UNIT))
+            sum_inout[i] = wp.int64(0)
+        share(view_shared(shared_inout[0]), view_sums(sum_row_out[0]), params[0])
+
+    return SharedKernels(tally_worlds, share_memory)
+
+
+@dataclasses.dataclass(frozen=True)
+class Kernels(ActKernels, JudgeKernels, BeginKernels, RolloutKernels, SharedKernels):
     """The kernels of a step, and the structs of their arrays. Kernels that the task does not need are None."""
 
+    views: Mapping[Any, wp.Function]
+    """By the task's structs, the functions that make them: World of a batch and a world's index, and the structs of
+    observations of a row."""
     Batch: Any
     Observations: Any
 
 
 def make_kernels(task: TaskCode) -> Kernels:
     """Make all kernels of a task."""
-    parts = (make(task) for make in (act_kernels, judge_kernels, begin_kernels, rollout_kernels))
+    parts = (make(task) for make in (act_kernels, judge_kernels, begin_kernels, rollout_kernels, shared_kernels))
     kernels = {name: kernel for part in parts for name, kernel in vars(part).items()}
-    return Kernels(**kernels, Batch=task.Batch, Observations=task.Observations)
+    return Kernels(**kernels, views=task.views, Batch=task.Batch, Observations=task.Observations)

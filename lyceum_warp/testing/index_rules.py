@@ -48,7 +48,7 @@ class _Run:
         self.functions |= {observer_name(group): function for group, function in task.observers.items()}
         try:
             self.checked: CheckedFunctions = checked_functions(
-                task.source.path, self.functions, task.source.world, task.kernels.Batch, self.env.device
+                task.source.path, self.functions, task.kernels.views, self.env.device
             )
         except Unchecked as error:
             ctx.fail(f"the functions could not be checked: {error}")
@@ -64,6 +64,9 @@ class _Run:
             for group, space in self.worlds.obs_spaces.items()
         }
         self.rows["rng"] = self._array((n, 1), wp.uint32)
+        self.rows["sums"] = self._array((n, self.worlds.sums.size), wp.float32)
+        self.rows["shared"] = self._array((n, self.worlds.shared.shape[1]), wp.float32)
+        self.rows["ended"] = wp.full(1, True, dtype=bool, device=self.env.device)
 
     def steps(self) -> None:
         """Run the functions on the states of random steps and of resets between them."""
@@ -153,6 +156,8 @@ class _Run:
         for name in self.env.task.types:
             live = getattr(self.worlds.after, name)
             setattr(batch, name, self._array(live.shape, live.dtype))
+        if self.env.task.shared:
+            batch.shared = self.worlds.shared
         return batch
 
     def _array(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
