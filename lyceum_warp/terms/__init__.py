@@ -5,16 +5,14 @@ task. A name of an argument means the same in all functions; ``ARGUMENTS`` expla
 """
 
 from lyceum_warp.support.docstrings import document_arguments
+
 # fmt: off
 # isort: off
-from lyceum_warp.terms.actions import action_acceleration_l2, action_rate_l2
+from lyceum_warp.terms.action_changes import action_acceleration_l2, action_rate_l2
 from lyceum_warp.terms.base_motion import (
     alive, angular_velocity, base_height, base_height_l2, fell_over, gravity, heading, linear_velocity, orientation,
     roll_pitch_rate_l2, tilt_l2, too_low, track_angular_velocity, track_linear_velocity, track_planar_velocity,
     track_yaw_rate, upright, velocity_error, vertical_velocity_l2, yaw_rate_error)
-from lyceum_warp.terms.commands import (
-    active, command_size, draw_flag, draw_forward_only, draw_heading, draw_timer, draw_velocity, heading_yaw_rate,
-    is_due, run_timer, velocity_command)
 from lyceum_warp.terms.draws import (
     chosen, draw_delay, draw_friction, draw_row, log_uniform, scale_elements, scale_gains, scale_mass,
     shift_center_of_mass, uniform_int)
@@ -29,6 +27,9 @@ from lyceum_warp.terms.joints import (
 from lyceum_warp.terms.motors import dc_motor_torque, servo_torque
 from lyceum_warp.terms.observations import add_normal_noise, add_uniform_noise, gather, gather_positions
 from lyceum_warp.terms.pushes import push
+from lyceum_warp.terms.velocity_commands import (
+    active, command_size, draw_flag, draw_forward_only, draw_heading, draw_timer, draw_velocity, heading_yaw_rate,
+    is_due, run_timer, velocity_command)
 
 __all__ = [
     "absolute_power", "action_acceleration_l2", "action_rate_l2", "active", "add_normal_noise", "add_uniform_noise",
