@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from lyceum_warp.done import Done
     from lyceum_warp.env import Env, make
     from lyceum_warp.fields import quat, vec10
+    from lyceum_warp.kernels.ground import ground_height, ground_normal, height_scan, next_level, on_ground
     from lyceum_warp.kernels.random import normal, uniform
     from lyceum_warp.kernels.rotations import (
         quat_angle, quat_difference, quat_from_axis_angle, quat_from_euler, quat_from_mat, quat_from_rotvec,
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
     from lyceum_warp.task import (
         Planning, Row, Task, act, actuator, body, camera, ctrl, dof, equality, geom, joint, mocap, qpos, sensor, site,
         tendon)
+    from lyceum_warp.terrain import Terrain, height_field, scan_grid
     from lyceum_warp.training import train
     from lyceum_warp.viewer.follow import RunViewer
     from lyceum_warp.viewer.show import view
@@ -57,14 +59,15 @@ __all__ = [
     "CEM", "MPPI", "NPG", "PPO", "ControlProgress", "ControlReport", "Controller", "Done", "Env", "EnvOptions",
     "Episodes", "GaussianPolicy", "Iteration", "Learner", "MPPIConfig", "ModelFile", "NPGConfig", "OpenLoop",
     "PPOConfig", "PhysicsOptions", "PlanSamples", "PlanUpdate", "Planner", "Planning", "PlanningController",
-    "PredictiveSampling", "Rollout", "Row", "RunViewer", "Sigmoid", "Task", "Trajectory", "ValueFunction", "act",
-    "actuator", "all_inside", "angle_between", "body", "body_velocity", "camera", "control", "control_async",
+    "PredictiveSampling", "Rollout", "Row", "RunViewer", "Sigmoid", "Task", "Terrain", "Trajectory", "ValueFunction",
+    "act", "actuator", "all_inside", "angle_between", "body", "body_velocity", "camera", "control", "control_async",
     "control_report", "ctrl", "dof", "equality", "evaluate", "export_policy", "follow_velocity", "geom", "grasp_terms",
-    "gymnasium_model", "gymnasium_robotics_model", "inside", "joint", "load", "load_value", "local_velocity", "make",
-    "menagerie_model", "mocap", "normal", "package_model", "put", "put_upright", "qpos", "quat", "quat_angle",
-    "quat_difference", "quat_from_axis_angle", "quat_from_euler", "quat_from_mat", "quat_from_rotvec", "quat_inverse",
-    "quat_mul", "quat_random", "quat_rotate", "quat_rotate_inverse", "quat_to_euler", "quat_to_mat", "quat_to_rotvec",
-    "register", "sensor", "site", "sum_squares", "task_names", "tendon", "tolerance", "train", "uniform", "vec10",
+    "ground_height", "ground_normal", "gymnasium_model", "gymnasium_robotics_model", "height_field", "height_scan",
+    "inside", "joint", "load", "load_value", "local_velocity", "make", "menagerie_model", "mocap", "next_level",
+    "normal", "on_ground", "package_model", "put", "put_upright", "qpos", "quat", "quat_angle", "quat_difference",
+    "quat_from_axis_angle", "quat_from_euler", "quat_from_mat", "quat_from_rotvec", "quat_inverse", "quat_mul",
+    "quat_random", "quat_rotate", "quat_rotate_inverse", "quat_to_euler", "quat_to_mat", "quat_to_rotvec", "register",
+    "scan_grid", "sensor", "site", "sum_squares", "task_names", "tendon", "tolerance", "train", "uniform", "vec10",
     "view"]
 
 _NAMES = {
@@ -92,6 +95,7 @@ _NAMES = {
     "done": "Done",
     "env": "Env make",
     "fields": "quat vec10",
+    "kernels.ground": "ground_height ground_normal height_scan next_level on_ground",
     "kernels.random": "normal uniform",
     "kernels.rotations":
         "quat_angle quat_difference quat_from_axis_angle quat_from_euler quat_from_mat quat_from_rotvec quat_inverse "
@@ -104,6 +108,7 @@ _NAMES = {
     "options": "EnvOptions PhysicsOptions",
     "runs.folder": "load load_value",
     "task": "Planning Row Task act actuator body camera ctrl dof equality geom joint mocap qpos sensor site tendon",
+    "terrain": "Terrain height_field scan_grid",
     "training": "train",
     "viewer.follow": "RunViewer",
     "viewer.show": "view",

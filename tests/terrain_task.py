@@ -1,0 +1,109 @@
+"""A task on rough ground: a ball with velocity servos along x and y, a height scan, and levels by distance."""
+
+import mujoco
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+KINDS = ("flat", "slope_up", "slope_down", "stairs_up", "stairs_down", "steps", "rough", "waves", "stones")
+TERRAIN = lw.Terrain(dict.fromkeys(KINDS, 1), levels=3, patch=4.0, border=2.0)
+
+_MODEL = """
+<mujoco>
+  <option timestep="0.004" integrator="implicitfast"/>
+  <worldbody>
+    <light pos="0 0 20"/>
+    <geom name="floor" type="plane" size="1 1 1" condim="1"/>
+    <body name="ball">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <joint name="y" type="slide" axis="0 1 0"/>
+      <joint name="z" type="slide" axis="0 0 1" damping="5"/>
+      <geom name="ball" size="0.05" mass="1" condim="1" solref="0.01 1"/>
+      <site name="ball" zaxis="0 0 -1"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <velocity name="x" joint="x" kv="1000"/>
+    <velocity name="y" joint="y" kv="1000"/>
+  </actuator>
+  <sensor><rangefinder name="down" site="ball"/></sensor>
+</mujoco>
+"""
+
+LEVEL, COLUMN, WALKED = 0, 1, 2
+
+
+@wp.struct
+class World:
+    qpos: Row[float]
+    sensordata: Row[float]
+    lasting_memory: Row[float]
+
+
+@wp.struct
+class Params:
+    ground: wp.array2d[float] = lw.height_field("terrain")
+    origins: wp.array2d[wp.vec3] = TERRAIN.origins
+    scan: wp.array[wp.vec2] = lw.scan_grid(0.08, 0.08, spacing=0.005)
+    patch: float = TERRAIN.patch
+    commanded: float = 4.0  # m in an episode
+    radius: float = 0.05
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    base = wp.vec3(s.qpos[0], s.qpos[1], s.qpos[2])
+    k = lw.put(obs, 0, base)
+    k = lw.put(obs, k, s.sensordata)
+    lw.height_scan(obs, k, p.ground, p.scan, base, lw.quat(1.0, 0.0, 0.0, 0.0))
+
+
+@wp.func
+def start(s: World, p: Params) -> wp.vec3:
+    return p.origins[int(s.lasting_memory[LEVEL]), int(s.lasting_memory[COLUMN])]
+
+
+@wp.func
+def evaluate(s: World, p: Params) -> float:
+    return s.lasting_memory[LEVEL]
+
+
+@wp.func
+def terminated(s: World, p: Params) -> bool:
+    return not lw.on_ground(p.ground, s.qpos[0], s.qpos[1])
+
+
+@wp.func
+def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
+    x = start(s0, p)
+    s1.lasting_memory[WALKED] = wp.length(wp.vec2(s1.qpos[0] - x[0], s1.qpos[1] - x[1]))
+
+
+@wp.func
+def startup(s: World, p: Params, rng: Row[wp.uint32]):
+    s.lasting_memory[COLUMN] = wp.floor(lw.uniform(rng, 0.0, float(p.origins.shape[1])))
+    s.lasting_memory[WALKED] = p.commanded  # before the first episode
+
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    level = int(s.lasting_memory[LEVEL])
+    level = lw.next_level(level, s.lasting_memory[WALKED], p.commanded, p.patch, p.origins.shape[0], rng)
+    s.lasting_memory[LEVEL] = float(level)
+    x = start(s, p) + lw.uniform(rng, wp.vec3(-0.5, -0.5, 0.0), wp.vec3(0.5, 0.5, 0.0))
+    s.qpos[0] = x[0]
+    s.qpos[1] = x[1]
+    s.qpos[2] = lw.ground_height(p.ground, x[0], x[1]) + 0.2
+
+
+def ball() -> mujoco.MjSpec:
+    spec = mujoco.MjSpec.from_string(_MODEL)
+    TERRAIN.add_to(spec)
+    return spec
+
+
+class OnTerrain(lw.Task):
+    model, frame_skip, horizon = staticmethod(ball), 5, 250
+    obs = {"position": 3, "range": 1, "heights": 17 * 17}
+    lasting_memory = 3
