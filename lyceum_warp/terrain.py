@@ -68,9 +68,9 @@ def _waves(x: np.ndarray, y: np.ndarray, amount: float, rng: np.random.Generator
 
 
 def _stones(x: np.ndarray, y: np.ndarray, amount: float, rng: np.random.Generator) -> np.ndarray:
-    pitch, depth = 0.8, 0.5
-    from_middle = [abs((side + pitch / 2) % pitch - pitch / 2) for side in (x, y)]
-    gap = np.maximum(*from_middle) > (pitch - amount) / 2 + 1e-6
+    pitch, depth, tiny = 0.8, 0.5, 1e-6
+    into = [(side + tiny) % pitch for side in (x, y)]  # from the near edge of a gap
+    gap = np.logical_or(*[(phase > 2 * tiny) & (phase < amount) for phase in into])
     return np.where(gap & _around_platform(x, y), -depth, 0.0)
 
 
@@ -78,7 +78,7 @@ _KINDS: dict[str, tuple[Shape, float]] = {
     "flat": (_flat, 0.0),
     "slope_up": (_slope, -0.4), "slope_down": (_slope, 0.4),
     "stairs_up": (_stairs, -0.2), "stairs_down": (_stairs, 0.2),
-    "steps": (_steps, 0.2), "rough": (_rough, 0.08), "waves": (_waves, 0.2), "stones": (_stones, 0.3),
+    "steps": (_steps, 0.2), "rough": (_rough, 0.08), "waves": (_waves, 0.2), "stones": (_stones, 0.4),
 }  # fmt: skip
 """The shapes of patches, and their amounts at difficulty 1."""
 
@@ -99,7 +99,7 @@ class Terrain:
     steps               rectangles, 0.5 to 2 m long, higher or lower             0.2 m
     rough               random heights every 0.2 m, with planes between          0.08 m up and down
     waves               two waves along each side                                0.2 m up and down
-    stones              stones every 0.8 m, gaps 0.5 m deep                      gaps of 0.3 m
+    stones              stones every 0.8 m, gaps 0.5 m deep                      gaps of 0.4 m
     =================== ======================================================== ===================
     """
 

@@ -24,14 +24,14 @@ _MODEL = """
     </body>
   </worldbody>
   <actuator>
-    <velocity name="x" joint="x" kv="1000"/>
-    <velocity name="y" joint="y" kv="1000"/>
+    <velocity name="x" joint="x" kv="100"/>
+    <velocity name="y" joint="y" kv="100"/>
   </actuator>
   <sensor><rangefinder name="down" site="ball"/></sensor>
 </mujoco>
 """
 
-LEVEL, COLUMN, WALKED = 0, 1, 2
+LEVEL, COLUMN, WALKED, COMMANDED = 0, 1, 2, 3
 
 
 @wp.struct
@@ -45,10 +45,11 @@ class World:
 class Params:
     ground: wp.array2d[float] = lw.height_field("terrain")
     origins: wp.array2d[wp.vec3] = TERRAIN.origins
-    scan: wp.array[wp.vec2] = lw.scan_grid(0.08, 0.08, spacing=0.005)
+    scan: wp.array[wp.vec2] = lw.scan_grid(0.1, 0.1, spacing=0.005)
     patch: float = TERRAIN.patch
-    commanded: float = 4.0  # m in an episode
-    radius: float = 0.05
+    command: float = 1.0  # m/s
+    seconds: float = 5.0  # in an episode
+    spread: float = 0.5  # m, of starts around the middle of a patch
 
 
 @wp.func
@@ -65,7 +66,7 @@ def start(s: World, p: Params) -> wp.vec3:
 
 
 @wp.func
-def evaluate(s: World, p: Params) -> float:
+def evaluate(s: World, p: Params) -> float:  # the level
     return s.lasting_memory[LEVEL]
 
 
@@ -78,20 +79,21 @@ def terminated(s: World, p: Params) -> bool:
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
     x = start(s0, p)
     s1.lasting_memory[WALKED] = wp.length(wp.vec2(s1.qpos[0] - x[0], s1.qpos[1] - x[1]))
+    s1.lasting_memory[COMMANDED] = p.command * p.seconds
 
 
 @wp.func
 def startup(s: World, p: Params, rng: Row[wp.uint32]):
     s.lasting_memory[COLUMN] = wp.floor(lw.uniform(rng, 0.0, float(p.origins.shape[1])))
-    s.lasting_memory[WALKED] = p.commanded  # before the first episode
 
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    level = int(s.lasting_memory[LEVEL])
-    level = lw.next_level(level, s.lasting_memory[WALKED], p.commanded, p.patch, p.origins.shape[0], rng)
-    s.lasting_memory[LEVEL] = float(level)
-    x = start(s, p) + lw.uniform(rng, wp.vec3(-0.5, -0.5, 0.0), wp.vec3(0.5, 0.5, 0.0))
+    level, levels = int(s.lasting_memory[LEVEL]), p.origins.shape[0]
+    walked, commanded = s.lasting_memory[WALKED], s.lasting_memory[COMMANDED]
+    s.lasting_memory[LEVEL] = float(lw.next_level(level, walked, commanded, p.patch, levels, rng))
+    reach = wp.vec3(p.spread, p.spread, 0.0)
+    x = start(s, p) + lw.uniform(rng, -reach, reach)
     s.qpos[0] = x[0]
     s.qpos[1] = x[1]
     s.qpos[2] = lw.ground_height(p.ground, x[0], x[1]) + 0.2
@@ -105,5 +107,5 @@ def ball() -> mujoco.MjSpec:
 
 class OnTerrain(lw.Task):
     model, frame_skip, horizon = staticmethod(ball), 5, 250
-    obs = {"position": 3, "range": 1, "heights": 17 * 17}
-    lasting_memory = 3
+    obs = {"position": 3, "range": 1, "heights": 21 * 21}
+    lasting_memory = 4
