@@ -124,7 +124,7 @@ class Terrain:
         """Check the description.
 
         Raises:
-            ValueError: A kind is unknown, a number is not positive, or a length is no multiple of the resolution.
+            ValueError: A kind is unknown, a number is not positive, or a length is not a multiple of the resolution.
         """
         for name in [*self.kinds, *self.scale]:
             if isinstance(name, str) and name not in _KINDS:

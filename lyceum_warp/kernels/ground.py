@@ -86,9 +86,7 @@ def height_scan(
 
 
 @wp.func
-def next_level(
-    level: int, walked: float, commanded: float, patch: float, levels: int, rng: wp.array[wp.uint32]
-) -> int:
+def next_level(level: int, walked: float, commanded: float, patch: float, levels: int, rng: wp.array[wp.uint32]) -> int:
     """The level of the next episode on a terrain: one more, the same or one less; as in Rudin et al., 2021.
 
     One more if the robot walked more than half a patch; otherwise one less if it walked less than half the commanded

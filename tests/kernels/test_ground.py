@@ -131,9 +131,7 @@ def test_scan_has_the_distances_of_rays_on_a_grid_that_turns_with_the_yaw(
 
 
 @wp.kernel
-def levels(
-    level: int, walked: float, commanded: float, rng: wp.array2d[wp.uint32], out: wp.array[int]
-):
+def levels(level: int, walked: float, commanded: float, rng: wp.array2d[wp.uint32], out: wp.array[int]):
     i = wp.tid()
     out[i] = lw.next_level(level, walked, commanded, 8.0, 5, rng[i])
 
