@@ -162,7 +162,7 @@ class Terrain:
 
     @functools.cached_property
     def origins(self) -> np.ndarray:
-        """Middles of the patches in the model's frame, m, (levels, columns, 3).
+        """Middles of the patches relative to the plane that the field replaces, m, (levels, columns, 3).
 
         z is the greatest height within 0.5 m.
         """
