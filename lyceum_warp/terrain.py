@@ -180,7 +180,7 @@ class Terrain:
 
         The plane becomes the height field and keeps its name, friction and material; without a plane the model gets a
         geom ``name``. A corner of patches in the middle of the field is at the plane's position, so that a robot that
-        stood on the plane stands on the field.
+        stood on the plane stands on the field. The extent of the model stays, on which cameras depend.
 
         Args:
             spec: The model, changed in place; for instance in a task's ``edit_model``.
@@ -193,6 +193,9 @@ class Terrain:
         if len(planes) > 1:
             named = ", ".join(repr(geom.name) for geom in planes)
             raise ValueError(f"the model has the planes {named}: delete all but one, which becomes the terrain")
+        if np.isnan(spec.stat.extent):
+            without = spec.copy().compile().stat
+            spec.stat.extent, spec.stat.center = without.extent, without.center
         heights, (nrow, ncol) = self.heights, self.heights.shape
         size = self.resolution / 2.0 * np.array([ncol - 1, nrow - 1])
         low, depth = heights.min(), max(float(np.ptp(heights)), 1e-3)

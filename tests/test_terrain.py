@@ -142,6 +142,13 @@ def test_the_plane_becomes_the_terrain_and_keeps_its_name_and_friction() -> None
         lw.Terrain({"flat": 1}).add_to(spec)
 
 
+def test_cameras_stay_near_the_robot() -> None:
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_body().add_geom(size=[0.2, 0, 0])
+    extent = spec.copy().compile().stat.extent
+    assert model_of(lw.Terrain({"rough": 4}), spec).stat.extent == extent
+
+
 def test_level_ground_everywhere_is_a_valid_field() -> None:
     table = HeightField("terrain").table(model_of(lw.Terrain({"flat": 1}, levels=1)))
     assert not table[1:, 1:].any()
