@@ -31,14 +31,15 @@ _MODEL = """
 </mujoco>
 """
 
-LEVEL, COLUMN, WALKED, COMMANDED = 0, 1, 2, 3
-
 
 @wp.struct
 class World:
     qpos: Row[float]
     sensordata: Row[float]
-    lasting_memory: Row[float]
+    level: Row[float] = lw.lasting_memory()
+    column: Row[float] = lw.lasting_memory()
+    walked: Row[float] = lw.lasting_memory()  # m, in the episode so far
+    commanded: Row[float] = lw.lasting_memory()
 
 
 @wp.struct
@@ -52,22 +53,29 @@ class Params:
     spread: float = 0.5  # m, of starts around the middle of a patch
 
 
+@wp.struct
+class Policy:
+    position: Row[wp.vec3] = lw.part()
+    range: Row[float] = lw.part()
+    heights: Row[float] = lw.part("scan")
+
+
 @wp.func
-def observe(s: World, p: Params, obs: Row[float]):
+def observe(s: World, p: Params, obs: Policy):
     base = wp.vec3(s.qpos[0], s.qpos[1], s.qpos[2])
-    k = lw.put(obs, 0, base)
-    k = lw.put(obs, k, s.sensordata)
-    lw.height_scan(obs, k, p.ground, p.scan, base, lw.quat(1.0, 0.0, 0.0, 0.0))
+    obs.position[0] = base
+    obs.range[0] = s.sensordata[0]
+    lw.height_scan(obs.heights, p.ground, p.scan, base, lw.quat(1.0, 0.0, 0.0, 0.0))
 
 
 @wp.func
 def start(s: World, p: Params) -> wp.vec3:
-    return p.origins[int(s.lasting_memory[LEVEL]), int(s.lasting_memory[COLUMN])]
+    return p.origins[int(s.level[0]), int(s.column[0])]
 
 
 @wp.func
 def evaluate(s: World, p: Params) -> float:  # the level
-    return s.lasting_memory[LEVEL]
+    return s.level[0]
 
 
 @wp.func
@@ -78,20 +86,20 @@ def terminated(s: World, p: Params) -> bool:
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
     x = start(s0, p)
-    s1.lasting_memory[WALKED] = wp.length(wp.vec2(s1.qpos[0] - x[0], s1.qpos[1] - x[1]))
-    s1.lasting_memory[COMMANDED] = p.command * p.seconds
+    s1.walked[0] = wp.length(wp.vec2(s1.qpos[0] - x[0], s1.qpos[1] - x[1]))
+    s1.commanded[0] = p.command * p.seconds
 
 
 @wp.func
 def startup(s: World, p: Params, rng: Row[wp.uint32]):
-    s.lasting_memory[COLUMN] = wp.floor(lw.uniform(rng, 0.0, float(p.origins.shape[1])))
+    s.column[0] = wp.floor(lw.uniform(rng, 0.0, float(p.origins.shape[1])))
 
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    level, levels = int(s.lasting_memory[LEVEL]), p.origins.shape[0]
-    walked, commanded = s.lasting_memory[WALKED], s.lasting_memory[COMMANDED]
-    s.lasting_memory[LEVEL] = float(lw.next_level(level, walked, commanded, p.patch, levels, rng))
+    level, levels = int(s.level[0]), p.origins.shape[0]
+    walked, commanded = s.walked[0], s.commanded[0]
+    s.level[0] = float(lw.next_level(level, walked, commanded, p.patch, levels, rng))
     reach = wp.vec3(p.spread, p.spread, 0.0)
     x = start(s, p) + lw.uniform(rng, -reach, reach)
     s.qpos[0] = x[0]
@@ -107,5 +115,3 @@ def ball() -> mujoco.MjSpec:
 
 class OnTerrain(lw.Task):
     model, frame_skip, horizon = staticmethod(ball), 5, 250
-    obs = {"position": 3, "range": 1, "heights": 21 * 21}
-    lasting_memory = 4

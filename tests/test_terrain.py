@@ -3,7 +3,6 @@
 import mujoco
 import numpy as np
 import pytest
-import terrain_task
 import torch
 from conftest import SharedEnv
 from terrain_task import KINDS, TERRAIN, OnTerrain
@@ -178,8 +177,8 @@ def test_a_ball_rests_on_every_kind_of_patch_at_the_height_that_is_looked_up(
     for _ in range(75):
         env.step()
     assert not env.done.any()
-    columns = env.state_space.split(env.get_state())["lasting_memory"][:, terrain_task.COLUMN]
-    assert set(columns.int().tolist()) == set(range(len(KINDS)))
+    columns = env.state_space.split(env.get_state())["column"]
+    assert set(columns.flatten().int().tolist()) == set(range(len(KINDS)))
     obs = env.obs.cpu().numpy().astype(float)
     away = (lw.scan_grid(0.1, 0.1, spacing=0.005) ** 2).sum(axis=1)
     nearest = np.sqrt(away + obs[:, 4:] ** 2).min(axis=1)
@@ -204,14 +203,14 @@ def test_worlds_that_walk_far_rise_a_level_and_fall_when_they_stop(shared_env: S
         for _ in range(OnTerrain.horizon):
             env.action[:] = torch.tensor(speed)
             env.step()
-        return lasting(terrain_task.LEVEL)
+        return memory("level")
 
-    def lasting(number: int) -> torch.Tensor:
-        return env.state_space.split(env.get_state())["lasting_memory"][:, number]
+    def memory(name: str) -> torch.Tensor:
+        return env.state_space.split(env.get_state())[name][:, 0]
 
-    column = lasting(terrain_task.COLUMN).int()
+    column = memory("column").int()
     easy = (column == KINDS.index("flat")) | (column == KINDS.index("slope_up"))
-    assert easy.any() and not lasting(terrain_task.LEVEL).any()
+    assert easy.any() and not memory("level").any()
     assert (episode(0.7, 0.0)[easy] == 1.0).all()
     middle = torch.as_tensor(TERRAIN.origins)[1, column.long()]
     assert ((env.obs[easy, :2].cpu() - middle[easy, :2]).abs() <= 0.5 + 1e-6).all()  # the middle of the next patch

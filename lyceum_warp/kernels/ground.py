@@ -60,17 +60,15 @@ def on_ground(ground: wp.array2d[float], x: float, y: float) -> bool:
 @wp.func
 def height_scan(
     row: wp.array[float],
-    at: int,
     ground: wp.array2d[float],
     points: wp.array[wp.vec2],
     base: wp.vec3,
     orientation: wp.vec4,
-) -> int:
-    """Write the heights of a robot's base above the ground at points around it; returns the next index.
+):
+    """Write the heights of a robot's base above the ground at points around it.
 
     Args:
-        row: A row, such as an observation.
-        at: Index of the first height; ``points.shape[0]`` heights follow.
+        row: A row, such as a part of an observation, with an element for each point.
         ground: The table of ``lw.height_field``.
         points: Points relative to the base, m, which turn with its yaw only: x forwards, y to the left.
         base: Position of the base, m.
@@ -81,8 +79,7 @@ def height_scan(
     for i in range(points.shape[0]):
         x = base[0] + heading[0] * points[i][0] - heading[1] * points[i][1]
         y = base[1] + heading[1] * points[i][0] + heading[0] * points[i][1]
-        row[at + i] = base[2] - ground_height(ground, x, y)
-    return at + points.shape[0]
+        row[i] = base[2] - ground_height(ground, x, y)
 
 
 @wp.func

@@ -18,21 +18,6 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row
 
-# indices in memory
-VELOCITY = wp.constant(0)  # commanded forward and lateral velocity and yaw rate, as drawn
-HEADING = wp.constant(3)  # commanded heading, rad
-HEADING_CONTROLLED = wp.constant(4)  # 1 if the heading determines the yaw rate
-STANDING = wp.constant(5)  # 1 if the command is to stand
-COMMAND_TIMER = wp.constant(6)  # seconds until a new command
-PUSH_TIMER = wp.constant(7)  # seconds until a push
-LAST_ACTION = wp.constant(8)
-CONTACT_TIME = wp.constant(20)  # seconds since each foot came into contact; 0 in the air
-AIR_TIME = wp.constant(24)  # seconds since each foot left the floor; 0 in contact
-# indices in lasting memory
-ENCODER_BIAS = wp.constant(0)  # of the joints, rad
-PEAK_HEIGHT = wp.constant(12)  # of each foot since its last landing, m
-ENV_STEPS = wp.constant(16)
-
 
 @wp.struct
 class World:
@@ -48,8 +33,18 @@ class World:
     geom_friction: Row[wp.vec3]
     actuator_gainprm: Row[lw.vec10]
     actuator_forcerange: Row[wp.vec2]
-    memory: Row[float]
-    lasting_memory: Row[float]
+    drawn_velocity: Row[float] = lw.memory(3)  # commanded forward and lateral velocity and yaw rate, as drawn
+    heading_target: Row[float] = lw.memory()  # rad
+    heading_controlled: Row[float] = lw.memory()  # 1 if the heading determines the yaw rate
+    standing: Row[float] = lw.memory()  # 1 if the command is to stand
+    command_timer: Row[float] = lw.memory()  # seconds until a new command
+    push_timer: Row[float] = lw.memory()  # seconds until a push
+    last_action: Row[float] = lw.memory(12)
+    contact_time: Row[float] = lw.memory(4)  # seconds since each foot came into contact; 0 in the air
+    air_time: Row[float] = lw.memory(4)  # seconds since each foot left the floor; 0 in contact
+    encoder_bias: Row[float] = lw.lasting_memory(12)  # of the joints, rad
+    peak_height: Row[float] = lw.lasting_memory(4)  # of each foot since its last landing, m
+    env_steps: Row[float] = lw.lasting_memory()
 
 
 @wp.struct
@@ -117,10 +112,7 @@ class Params:
     imu: int = lw.site("imu")
     feet: int = lw.site("FR_foot")
     forces: int = lw.sensor("FR_force")
-    fr_foot: int = lw.geom("FR_foot")
-    fl_foot: int = lw.geom("FL_foot")
-    rr_foot: int = lw.geom("RR_foot")
-    rl_foot: int = lw.geom("RL_foot")
+    foot_geoms: wp.array[int] = lw.geoms("FR_foot", "FL_foot", "RR_foot", "RL_foot")
 
 
 # the trunk
@@ -184,7 +176,7 @@ def speed(v: wp.vec3) -> float:  # of a foot along the floor
 
 @wp.func
 def touches(x: wp.vec3, s: World, p: Params) -> bool:
-    return x[2] <= s.geom_size[p.fr_foot][0]
+    return x[2] <= s.geom_size[p.foot_geoms[0]][0]
 
 
 @wp.func
@@ -204,8 +196,8 @@ def substep(s: World, p: Params):
     for leg in range(int(4)):
         x, _ = foot(s, p, leg)
         touching = touches(x, s, p)
-        s.memory[CONTACT_TIME + leg] = wp.where(touching, s.memory[CONTACT_TIME + leg] + p.substep_dt, 0.0)
-        s.memory[AIR_TIME + leg] = wp.where(touching, 0.0, s.memory[AIR_TIME + leg] + p.substep_dt)
+        s.contact_time[leg] = wp.where(touching, s.contact_time[leg] + p.substep_dt, 0.0)
+        s.air_time[leg] = wp.where(touching, 0.0, s.air_time[leg] + p.substep_dt)
 
 
 # the command
@@ -215,7 +207,7 @@ def substep(s: World, p: Params):
 def stage(s: World, p: Params) -> int:  # of the curriculum
     k = int(0)
     for i in range(1, p.stages.shape[0]):
-        if s.lasting_memory[ENV_STEPS] >= p.stages[i, 0]:
+        if s.env_steps[0] >= p.stages[i, 0]:
             k = i
     return k
 
@@ -223,14 +215,14 @@ def stage(s: World, p: Params) -> int:  # of the curriculum
 @wp.func
 def command(s: World, p: Params) -> wp.vec3:
     """Commanded forward and lateral velocity, m/s, and yaw rate, rad/s, in the trunk's axes."""
-    if s.memory[STANDING] > 0.0:
+    if s.standing[0] > 0.0:
         return wp.vec3(0.0)
-    yaw_rate = s.memory[VELOCITY + 2]
-    if s.memory[HEADING_CONTROLLED] > 0.0:
-        error = s.memory[HEADING] - heading(s)
+    yaw_rate = s.drawn_velocity[2]
+    if s.heading_controlled[0] > 0.0:
+        error = s.heading_target[0] - heading(s)
         fastest = p.stages[stage(s, p), 3]
         yaw_rate = wp.clamp(p.heading_gain * wp.atan2(wp.sin(error), wp.cos(error)), -fastest, fastest)
-    return wp.vec3(s.memory[VELOCITY], s.memory[VELOCITY + 1], yaw_rate)
+    return wp.vec3(s.drawn_velocity[0], s.drawn_velocity[1], yaw_rate)
 
 
 @wp.func
@@ -251,17 +243,17 @@ def chosen(rng: Row[wp.uint32], share: float) -> bool:
 @wp.func
 def draw_command(s: World, p: Params, rng: Row[wp.uint32]):
     k = stage(s, p)
-    s.memory[COMMAND_TIMER] = lw.uniform(rng, p.command_seconds[0], p.command_seconds[1])
-    s.memory[VELOCITY] = lw.uniform(rng, p.stages[k, 1], p.stages[k, 2])
-    s.memory[VELOCITY + 1] = lw.uniform(rng, -p.lateral_velocity, p.lateral_velocity)
-    s.memory[VELOCITY + 2] = lw.uniform(rng, -p.stages[k, 3], p.stages[k, 3])
-    s.memory[HEADING] = lw.uniform(rng, -wp.pi, wp.pi)
-    s.memory[HEADING_CONTROLLED] = wp.where(chosen(rng, p.heading_share), 1.0, 0.0)
-    s.memory[STANDING] = wp.where(chosen(rng, p.standing_share), 1.0, 0.0)
+    s.command_timer[0] = lw.uniform(rng, p.command_seconds[0], p.command_seconds[1])
+    s.drawn_velocity[0] = lw.uniform(rng, p.stages[k, 1], p.stages[k, 2])
+    s.drawn_velocity[1] = lw.uniform(rng, -p.lateral_velocity, p.lateral_velocity)
+    s.drawn_velocity[2] = lw.uniform(rng, -p.stages[k, 3], p.stages[k, 3])
+    s.heading_target[0] = lw.uniform(rng, -wp.pi, wp.pi)
+    s.heading_controlled[0] = wp.where(chosen(rng, p.heading_share), 1.0, 0.0)
+    s.standing[0] = wp.where(chosen(rng, p.standing_share), 1.0, 0.0)
     if chosen(rng, p.forward_share):
-        s.memory[VELOCITY] = wp.max(wp.abs(s.memory[VELOCITY]), p.least_forward_velocity)
-        s.memory[VELOCITY + 1] = 0.0
-        s.memory[VELOCITY + 2] = 0.0
+        s.drawn_velocity[0] = wp.max(wp.abs(s.drawn_velocity[0]), p.least_forward_velocity)
+        s.drawn_velocity[1] = 0.0
+        s.drawn_velocity[2] = 0.0
 
 
 # actions and observations
@@ -271,7 +263,7 @@ def draw_command(s: World, p: Params, rng: Row[wp.uint32]):
 def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
     for j in range(12):
         scale = p.action_scale * s.actuator_forcerange[j][1] / s.actuator_gainprm[j][0]
-        ctrl[j] = p.default_pose[j] + scale * action[j] - s.lasting_memory[ENCODER_BIAS + j]
+        ctrl[j] = p.default_pose[j] + scale * action[j] - s.encoder_bias[j]
 
 
 @wp.func
@@ -282,9 +274,9 @@ def put_robot(s: World, p: Params, obs: Row[float], bias: float) -> int:
     k = lw.put(obs, k, angular_velocity(s))
     k = lw.put(obs, k, gravity(s))
     for j in range(12):
-        k = lw.put(obs, k, s.qpos[7 + j] + bias * s.lasting_memory[ENCODER_BIAS + j] - p.default_pose[j])
+        k = lw.put(obs, k, s.qpos[7 + j] + bias * s.encoder_bias[j] - p.default_pose[j])
     k = lw.put(obs, k, s.qvel, 6, 18)
-    k = lw.put(obs, k, s.memory, LAST_ACTION, LAST_ACTION + 12)
+    k = lw.put(obs, k, s.last_action)
     return lw.put(obs, k, command(s, p))
 
 
@@ -310,7 +302,7 @@ def observe_critic(s: World, p: Params, obs: Row[float]):
     for leg in range(int(4)):
         x, _ = foot(s, p, leg)
         obs[k + leg] = height(x)
-        obs[k + 4 + leg] = s.memory[AIR_TIME + leg]
+        obs[k + 4 + leg] = s.air_time[leg]
         obs[k + 8 + leg] = wp.where(touches(x, s, p), 1.0, 0.0)
         f = force(s, p, leg)
         for i in range(3):
@@ -362,7 +354,7 @@ def dof_pos_limits(s1: World, p: Params) -> float:
 def action_rate_l2(s0: World, action: Row[float]) -> float:
     total = float(0.0)
     for j in range(12):
-        change = action[j] - s0.memory[LAST_ACTION + j]
+        change = action[j] - s0.last_action[j]
         total += change * change
     return total
 
@@ -383,8 +375,8 @@ def foot_clearance_and_slip(c: wp.vec3, s1: World, p: Params) -> wp.vec2:
 def foot_swing_height(c: wp.vec3, s0: World, s1: World, p: Params) -> float:
     total = float(0.0)
     for leg in range(int(4)):
-        if landed(s1.memory[CONTACT_TIME + leg], p):
-            error = s0.lasting_memory[PEAK_HEIGHT + leg] / p.foot_height - 1.0
+        if landed(s1.contact_time[leg], p):
+            error = s0.peak_height[leg] / p.foot_height - 1.0
             total += error * error
     return total * active(c, p)
 
@@ -394,7 +386,7 @@ def soft_landing(c: wp.vec3, s1: World, p: Params) -> float:
     total = float(0.0)
     for leg in range(int(4)):
         # the force is from the beginning of the last substep, when the contact was one substep younger
-        if landed(s1.memory[CONTACT_TIME + leg] - p.substep_dt, p):
+        if landed(s1.contact_time[leg] - p.substep_dt, p):
             total += wp.length(force(s1, p, leg))
     return total * active(c, p)
 
@@ -451,23 +443,23 @@ def terminated(s: World, p: Params) -> bool:
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
     for j in range(12):
-        s1.memory[LAST_ACTION + j] = action[j]
-    s1.memory[COMMAND_TIMER] = s0.memory[COMMAND_TIMER] - p.dt
-    s1.memory[PUSH_TIMER] = s0.memory[PUSH_TIMER] - p.dt
-    s1.lasting_memory[ENV_STEPS] = s0.lasting_memory[ENV_STEPS] + 1.0
+        s1.last_action[j] = action[j]
+    s1.command_timer[0] = s0.command_timer[0] - p.dt
+    s1.push_timer[0] = s0.push_timer[0] - p.dt
+    s1.env_steps[0] = s0.env_steps[0] + 1.0
     for leg in range(int(4)):
-        peak = s0.lasting_memory[PEAK_HEIGHT + leg]
+        peak = s0.peak_height[leg]
         x, _ = foot(s1, p, leg)
-        if landed(s1.memory[CONTACT_TIME + leg], p):
+        if landed(s1.contact_time[leg], p):
             peak = 0.0
         elif not touches(x, s1, p):
             peak = wp.max(peak, height(x))
-        s1.lasting_memory[PEAK_HEIGHT + leg] = peak
+        s1.peak_height[leg] = peak
 
 
 @wp.func
 def push(s: World, p: Params, rng: Row[wp.uint32]):
-    s.memory[PUSH_TIMER] = lw.uniform(rng, p.push_seconds[0], p.push_seconds[1])
+    s.push_timer[0] = lw.uniform(rng, p.push_seconds[0], p.push_seconds[1])
     velocity = lw.uniform(rng, -p.push_velocity, p.push_velocity)
     spin = lw.quat_rotate_inverse(orientation(s), lw.uniform(rng, -p.push_spin, p.push_spin))
     for i in range(3):
@@ -477,9 +469,9 @@ def push(s: World, p: Params, rng: Row[wp.uint32]):
 
 @wp.func
 def event(s: World, p: Params, rng: Row[wp.uint32]):
-    if s.memory[COMMAND_TIMER] <= 0.0:
+    if s.command_timer[0] <= 0.0:
         draw_command(s, p, rng)
-    if s.memory[PUSH_TIMER] < 1e-6:
+    if s.push_timer[0] < 1e-6:
         push(s, p, rng)
 
 
@@ -495,13 +487,11 @@ def log_uniform(rng: Row[wp.uint32], bounds: wp.vec2) -> float:
 def startup(s: World, p: Params, rng: Row[wp.uint32]):
     sliding = lw.uniform(rng, p.sliding_friction[0], p.sliding_friction[1])
     friction = wp.vec3(sliding, log_uniform(rng, p.spinning_friction), log_uniform(rng, p.rolling_friction))
-    s.geom_friction[p.fr_foot] = friction
-    s.geom_friction[p.fl_foot] = friction
-    s.geom_friction[p.rr_foot] = friction
-    s.geom_friction[p.rl_foot] = friction
+    for leg in range(p.foot_geoms.shape[0]):
+        s.geom_friction[p.foot_geoms[leg]] = friction
     s.body_ipos[p.trunk] = s.body_ipos[p.trunk] + lw.uniform(rng, -p.trunk_offset, p.trunk_offset)
     for j in range(12):
-        s.lasting_memory[ENCODER_BIAS + j] = lw.uniform(rng, -p.encoder_bias, p.encoder_bias)
+        s.encoder_bias[j] = lw.uniform(rng, -p.encoder_bias, p.encoder_bias)
 
 
 @wp.func
@@ -515,7 +505,7 @@ def initialize(s: World, p: Params):
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     start = wp.vec3(s.qpos[0], s.qpos[1], s.qpos[2]) + lw.uniform(rng, p.start_low, p.start_high)
     lw.put_upright(s.qpos, 0, start, lw.uniform(rng, -p.start_yaw, p.start_yaw))
-    s.memory[PUSH_TIMER] = lw.uniform(rng, p.push_seconds[0], p.push_seconds[1])
+    s.push_timer[0] = lw.uniform(rng, p.push_seconds[0], p.push_seconds[1])
     draw_command(s, p, rng)
 
 
@@ -551,4 +541,3 @@ class Go1Velocity(lw.Task):
         "yaw_rate_error",
     )
     cleared = ("sensordata",)  # zero before the first substep; mjlab computes it for the first state
-    memory, lasting_memory = 28, 17
