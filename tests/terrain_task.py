@@ -69,11 +69,6 @@ def observe(s: World, p: Params, obs: Policy):
 
 
 @wp.func
-def start(s: World, p: Params) -> wp.vec3:
-    return p.origins[int(s.level[0]), int(s.column[0])]
-
-
-@wp.func
 def evaluate(s: World, p: Params) -> float:  # the level
     return s.level[0]
 
@@ -85,23 +80,15 @@ def terminated(s: World, p: Params) -> bool:
 
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
-    x = start(s0, p)
-    s1.walked[0] = wp.length(wp.vec2(s1.qpos[0] - x[0], s1.qpos[1] - x[1]))
-    s1.commanded[0] = p.command * p.seconds
-
-
-@wp.func
-def startup(s: World, p: Params, rng: Row[wp.uint32]):
-    s.column[0] = wp.floor(lw.uniform(rng, 0.0, float(p.origins.shape[1])))
+    position, distance = wp.vec3(s1.qpos[0], s1.qpos[1], s1.qpos[2]), p.command * p.seconds
+    lw.follow_walk(s1.level, s1.column, s1.walked, s1.commanded, p.origins, position, distance)
 
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    level, levels = int(s.level[0]), p.origins.shape[0]
-    walked, commanded = s.walked[0], s.commanded[0]
-    s.level[0] = float(lw.next_level(level, walked, commanded, p.patch, levels, rng))
     reach = wp.vec3(p.spread, p.spread, 0.0)
-    x = start(s, p) + lw.uniform(rng, -reach, reach)
+    start = lw.start_on_terrain(s.level, s.column, s.walked, s.commanded, p.origins, p.patch, rng)
+    x = start + lw.uniform(rng, -reach, reach)
     s.qpos[0] = x[0]
     s.qpos[1] = x[1]
     s.qpos[2] = lw.ground_height(p.ground, x[0], x[1]) + 0.2

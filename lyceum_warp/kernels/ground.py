@@ -83,6 +83,12 @@ def height_scan(
 
 
 @wp.func
+def _draw(count: int, rng: wp.array[wp.uint32]) -> int:
+    """A random whole number from 0 to ``count`` - 1."""
+    return wp.min(int(uniform(rng, 0.0, float(count))), count - 1)
+
+
+@wp.func
 def next_level(level: int, walked: float, commanded: float, patch: float, levels: int, rng: wp.array[wp.uint32]) -> int:
     """The level of the next episode on a terrain: one more, the same or one less; as in Rudin et al., 2021.
 
@@ -100,7 +106,63 @@ def next_level(level: int, walked: float, commanded: float, patch: float, levels
     if walked > 0.5 * patch:
         if level + 1 < levels:
             return level + 1
-        return wp.min(int(uniform(rng, 0.0, float(levels))), levels - 1)
+        return _draw(levels, rng)
     if walked < 0.5 * commanded:
         return wp.max(level - 1, 0)
     return level
+
+
+@wp.func
+def start_on_terrain(
+    level: wp.array[float],
+    column: wp.array[float],
+    walked: wp.array[float],
+    commanded: wp.array[float],
+    origins: wp.array2d[wp.vec3],
+    patch: float,
+    rng: wp.array[wp.uint32],
+) -> wp.vec3:
+    """Choose the patch of a new episode, and return its middle, m; for ``randomize``.
+
+    The first episode of a world is at level 0, in a random column, which stays. Later levels follow ``next_level``.
+
+    Args:
+        level: Lasting memory of one number: the level, from 0.
+        column: Lasting memory of one number: the column, from 0.
+        walked: Lasting memory of one number, written by ``follow_walk``.
+        commanded: Lasting memory of one number, written by ``follow_walk``.
+        origins: ``lw.Terrain.origins``, (levels, columns).
+        patch: Side of a patch, m: ``lw.Terrain.patch``.
+        rng: The world's random numbers.
+    """
+    if walked[0] == 0.0 and commanded[0] == 0.0:
+        column[0] = float(_draw(origins.shape[1], rng))
+    number = next_level(int(level[0]), walked[0], commanded[0], patch, origins.shape[0], rng)
+    level[0] = float(number)
+    return origins[number, int(column[0])]
+
+
+@wp.func
+def follow_walk(
+    level: wp.array[float],
+    column: wp.array[float],
+    walked: wp.array[float],
+    commanded: wp.array[float],
+    origins: wp.array2d[wp.vec3],
+    position: wp.vec3,
+    distance: float,
+):
+    """Write the distances by which ``start_on_terrain`` chooses the next level; for ``advance``.
+
+    Args:
+        level: See ``start_on_terrain``, as for the other rows.
+        column: The column.
+        walked: Gets the horizontal distance from the middle of the patch, m.
+        commanded: Gets the commanded distance, m.
+        origins: ``lw.Terrain.origins``.
+        position: Position of the robot.
+        distance: Speed of the command times the duration of a whole episode, m; 0 keeps the level.
+    """
+    way = position - origins[int(level[0]), int(column[0])]
+    walked[0] = wp.length(wp.vec2(way[0], way[1]))
+    commanded[0] = distance
