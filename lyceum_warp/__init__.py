@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from lyceum_warp.done import Done
     from lyceum_warp.env import Env, make
     from lyceum_warp.fields import quat, vec10
+    from lyceum_warp.kernels.ground import (
+        follow_walk, ground_height, ground_normal, height_scan, next_level, on_ground, start_on_terrain)
     from lyceum_warp.kernels.random import normal, uniform
     from lyceum_warp.kernels.rotations import (
         quat_angle, quat_difference, quat_from_axis_angle, quat_from_euler, quat_from_mat, quat_from_rotvec,
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
     from lyceum_warp.task import (
         Planning, Row, Task, act, actuator, actuators, bodies, body, camera, ctrl, dof, dofs, equality, geom, geoms,
         joint, joints, lasting_memory, memory, mocap, part, qpos, qposes, sensor, sensors, site, sites, tendon)
+    from lyceum_warp.terrain import Terrain, height_field, scan_grid
     from lyceum_warp.training import train
     from lyceum_warp.viewer.follow import RunViewer
     from lyceum_warp.viewer.show import view
@@ -58,16 +61,17 @@ __all__ = [
     "CEM", "MPPI", "NPG", "PPO", "ControlProgress", "ControlReport", "Controller", "Done", "Env", "EnvOptions",
     "Episodes", "GaussianPolicy", "Iteration", "Learner", "MPPIConfig", "ModelFile", "NPGConfig", "OpenLoop",
     "PPOConfig", "PhysicsOptions", "PlanSamples", "PlanUpdate", "Planner", "Planning", "PlanningController",
-    "PredictiveSampling", "Rollout", "Row", "RunViewer", "Sigmoid", "Task", "Trajectory", "ValueFunction", "act",
-    "actuator", "actuators", "all_inside", "angle_between", "bodies", "body", "body_velocity", "camera", "control",
-    "control_async", "control_report", "ctrl", "dof", "dofs", "equality", "evaluate", "export_policy",
-    "follow_velocity", "geom", "geoms", "grasp_terms", "gymnasium_model", "gymnasium_robotics_model", "inside", "joint",
-    "joints", "lasting_memory", "load", "load_value", "local_velocity", "make", "memory", "menagerie_model", "mocap",
-    "normal", "package_model", "part", "put", "put_upright", "qpos", "qposes", "quat", "quat_angle", "quat_difference",
-    "quat_from_axis_angle", "quat_from_euler", "quat_from_mat", "quat_from_rotvec", "quat_inverse", "quat_mul",
-    "quat_random", "quat_rotate", "quat_rotate_inverse", "quat_to_euler", "quat_to_mat", "quat_to_rotvec", "register",
-    "sensor", "sensors", "site", "sites", "sum_squares", "task_names", "tendon", "tolerance", "train", "uniform",
-    "vec10", "view"]
+    "PredictiveSampling", "Rollout", "Row", "RunViewer", "Sigmoid", "Task", "Terrain", "Trajectory", "ValueFunction",
+    "act", "actuator", "actuators", "all_inside", "angle_between", "bodies", "body", "body_velocity", "camera",
+    "control", "control_async", "control_report", "ctrl", "dof", "dofs", "equality", "evaluate", "export_policy",
+    "follow_velocity", "follow_walk", "geom", "geoms", "grasp_terms", "ground_height", "ground_normal",
+    "gymnasium_model", "gymnasium_robotics_model", "height_field", "height_scan", "inside", "joint", "joints",
+    "lasting_memory", "load", "load_value", "local_velocity", "make", "memory", "menagerie_model", "mocap",
+    "next_level", "normal", "on_ground", "package_model", "part", "put", "put_upright", "qpos", "qposes", "quat",
+    "quat_angle", "quat_difference", "quat_from_axis_angle", "quat_from_euler", "quat_from_mat", "quat_from_rotvec",
+    "quat_inverse", "quat_mul", "quat_random", "quat_rotate", "quat_rotate_inverse", "quat_to_euler", "quat_to_mat",
+    "quat_to_rotvec", "register", "scan_grid", "sensor", "sensors", "site", "sites", "start_on_terrain", "sum_squares",
+    "task_names", "tendon", "tolerance", "train", "uniform", "vec10", "view"]
 
 _NAMES = {
     "model_actuators": "follow_velocity",
@@ -94,6 +98,7 @@ _NAMES = {
     "done": "Done",
     "env": "Env make",
     "fields": "quat vec10",
+    "kernels.ground": "follow_walk ground_height ground_normal height_scan next_level on_ground start_on_terrain",
     "kernels.random": "normal uniform",
     "kernels.rotations":
         "quat_angle quat_difference quat_from_axis_angle quat_from_euler quat_from_mat quat_from_rotvec quat_inverse "
@@ -108,6 +113,7 @@ _NAMES = {
     "task":
         "Planning Row Task act actuator actuators bodies body camera ctrl dof dofs equality geom geoms joint joints "
         "lasting_memory memory mocap part qpos qposes sensor sensors site sites tendon",
+    "terrain": "Terrain height_field scan_grid",
     "training": "train",
     "viewer.follow": "RunViewer",
     "viewer.show": "view",

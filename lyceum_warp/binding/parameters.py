@@ -11,6 +11,7 @@ import warp as wp
 from lyceum_warp.fields import elements, rows
 from lyceum_warp.options import OPTIONS, suggestion
 from lyceum_warp.task import Element
+from lyceum_warp.terrain import HeightField
 
 _FILLED_IN = ("dt", "substep_dt")
 """Fields of ``Params`` that are filled in: seconds in a step and in a substep."""
@@ -171,6 +172,8 @@ class Parameters:
         if isinstance(value, (str, Path)):
             what += f" from {str(value)!r}"
             value = _loaded(what, value)
+        if isinstance(value, HeightField):
+            value = value.table(self._model)
         try:
             given = value.detach().cpu() if hasattr(value, "detach") else value
             given = np.asarray(given.numpy() if isinstance(given, wp.array) else given, dtype=np.float64)

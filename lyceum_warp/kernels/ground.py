@@ -1,0 +1,168 @@
+"""Look up the height of the ground in a table, in Warp functions for tasks, and choose levels of difficulty.
+
+A table of heights is ``lw.height_field(name)``: heights z with their coordinates, x in the first row, y in the first
+column, at constant distances. Points between have the heights of MuJoCo's triangles: the diagonal of a cell leads from
+its point with the least x and y to its point with the greatest.
+"""
+
+import warp as wp
+
+from lyceum_warp.kernels.random import uniform
+from lyceum_warp.kernels.rotations import quat_rotate
+
+
+@wp.func
+def _triangle(ground: wp.array2d[float], x: float, y: float) -> wp.vec3:
+    """The triangle under a point: its height at the point, and its slopes along x and y."""
+    ny, nx = ground.shape[0] - 1, ground.shape[1] - 1
+    x0, y0, x1, y1 = ground[0, 1], ground[1, 0], ground[0, nx], ground[ny, 0]
+    px, py = wp.clamp(x, x0, x1), wp.clamp(y, y0, y1)
+    # clamped once more, for the last point and for not-a-number
+    c = 1 + wp.clamp(int((px - x0) / (x1 - x0) * float(nx - 1)), 0, nx - 2)
+    r = 1 + wp.clamp(int((py - y0) / (y1 - y0) * float(ny - 1)), 0, ny - 2)
+    dx, dy = ground[0, c + 1] - ground[0, c], ground[r + 1, 0] - ground[r, 0]
+    u, v = (px - ground[0, c]) / dx, (py - ground[r, 0]) / dy
+    low, high = ground[r, c], ground[r + 1, c + 1]
+    along_x, along_y = ground[r, c + 1] - low, high - ground[r, c + 1]
+    if v > u:
+        along_x, along_y = high - ground[r + 1, c], ground[r + 1, c] - low
+    return wp.vec3(low + u * along_x + v * along_y, along_x / dx, along_y / dy)
+
+
+@wp.func
+def ground_height(ground: wp.array2d[float], x: float, y: float) -> float:
+    """The height of the ground at a point, m, on the triangles with which MuJoCo collides.
+
+    Outside the field it is the height of the nearest point of the edge, although MuJoCo has no ground there.
+
+    Args:
+        ground: The table of ``lw.height_field``.
+        x: World coordinate, m.
+        y: World coordinate, m.
+    """
+    return _triangle(ground, x, y)[0]
+
+
+@wp.func
+def ground_normal(ground: wp.array2d[float], x: float, y: float) -> wp.vec3:
+    """The normal of the triangle of the ground at a point, of length 1, upwards; see ``ground_height``."""
+    t = _triangle(ground, x, y)
+    return wp.normalize(wp.vec3(-t[1], -t[2], 1.0))
+
+
+@wp.func
+def on_ground(ground: wp.array2d[float], x: float, y: float) -> bool:
+    """Whether the field covers a point. A robot that leaves the field falls."""
+    ny, nx = ground.shape[0] - 1, ground.shape[1] - 1
+    return x >= ground[0, 1] and x <= ground[0, nx] and y >= ground[1, 0] and y <= ground[ny, 0]
+
+
+@wp.func
+def height_scan(
+    row: wp.array[float],
+    ground: wp.array2d[float],
+    points: wp.array[wp.vec2],
+    base: wp.vec3,
+    orientation: wp.vec4,
+):
+    """Write the heights of a robot's base above the ground at points around it.
+
+    Args:
+        row: A row, such as a part of an observation, with an element for each point.
+        ground: The table of ``lw.height_field``.
+        points: Points relative to the base, m, which turn with its yaw only: x forwards, y to the left.
+        base: Position of the base, m.
+        orientation: Orientation of the base (w, x, y, z).
+    """
+    forward = quat_rotate(orientation, wp.vec3(1.0, 0.0, 0.0))
+    heading = wp.normalize(wp.vec2(forward[0], forward[1]))
+    for i in range(points.shape[0]):
+        x = base[0] + heading[0] * points[i][0] - heading[1] * points[i][1]
+        y = base[1] + heading[1] * points[i][0] + heading[0] * points[i][1]
+        row[i] = base[2] - ground_height(ground, x, y)
+
+
+@wp.func
+def _draw(count: int, rng: wp.array[wp.uint32]) -> int:
+    """A random whole number from 0 to ``count`` - 1."""
+    return wp.min(int(uniform(rng, 0.0, float(count))), count - 1)
+
+
+@wp.func
+def next_level(level: int, walked: float, commanded: float, patch: float, levels: int, rng: wp.array[wp.uint32]) -> int:
+    """The level of the next episode on a terrain: one more, the same or one less; as in Rudin et al., 2021.
+
+    One more if the robot walked more than half a patch; otherwise one less if it walked less than half the commanded
+    distance, but at least 0. After the last level follows a random one. (arXiv 2109.11978, section 3.2.)
+
+    Args:
+        level: The level of the episode that ended, from 0.
+        walked: Distance from its start to its end, m.
+        commanded: Speed of the command times the duration of a whole episode, m; 0 keeps the level.
+        patch: Side of a patch, m: ``lw.Terrain.patch``.
+        levels: Number of levels: ``lw.Terrain.levels``.
+        rng: The world's random numbers.
+    """
+    if walked > 0.5 * patch:
+        if level + 1 < levels:
+            return level + 1
+        return _draw(levels, rng)
+    if walked < 0.5 * commanded:
+        return wp.max(level - 1, 0)
+    return level
+
+
+@wp.func
+def start_on_terrain(
+    level: wp.array[float],
+    column: wp.array[float],
+    walked: wp.array[float],
+    commanded: wp.array[float],
+    origins: wp.array2d[wp.vec3],
+    patch: float,
+    rng: wp.array[wp.uint32],
+) -> wp.vec3:
+    """Choose the patch of a new episode, and return its middle, m; for ``randomize``.
+
+    The first episode of a world is at level 0, in a random column, which stays. Later levels follow ``next_level``.
+
+    Args:
+        level: Lasting memory of one number: the level, from 0.
+        column: Lasting memory of one number: the column, from 0.
+        walked: Lasting memory of one number, written by ``follow_walk``.
+        commanded: Lasting memory of one number, written by ``follow_walk``.
+        origins: ``lw.Terrain.origins``, (levels, columns).
+        patch: Side of a patch, m: ``lw.Terrain.patch``.
+        rng: The world's random numbers.
+    """
+    if walked[0] == 0.0 and commanded[0] == 0.0:
+        column[0] = float(_draw(origins.shape[1], rng))
+    number = next_level(int(level[0]), walked[0], commanded[0], patch, origins.shape[0], rng)
+    level[0] = float(number)
+    return origins[number, int(column[0])]
+
+
+@wp.func
+def follow_walk(
+    level: wp.array[float],
+    column: wp.array[float],
+    walked: wp.array[float],
+    commanded: wp.array[float],
+    origins: wp.array2d[wp.vec3],
+    position: wp.vec3,
+    distance: float,
+):
+    """Write the distances by which ``start_on_terrain`` chooses the next level; for ``advance``.
+
+    Args:
+        level: See ``start_on_terrain``, as for the other rows.
+        column: The column.
+        walked: Gets the horizontal distance from the middle of the patch, m.
+        commanded: Gets the commanded distance, m.
+        origins: ``lw.Terrain.origins``.
+        position: Position of the robot.
+        distance: Speed of the command times the duration of a whole episode, m; 0 keeps the level.
+    """
+    way = position - origins[int(level[0]), int(column[0])]
+    walked[0] = wp.length(wp.vec2(way[0], way[1]))
+    commanded[0] = distance

@@ -1,0 +1,297 @@
+"""Make rough ground: a height field of patches by difficulty, as an asset of a model and as a table for kernels."""
+
+import dataclasses
+import difflib
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+Shape = Callable[[np.ndarray, np.ndarray, float, np.random.Generator], np.ndarray]
+"""``shape(x, y, amount, rng)``: the heights of a square patch, m, (n, n), from the coordinates of its points relative
+to its middle, m, (n, n) each. The outline of a patch is then set to 0, so that patches meet without a step."""
+
+_PLATFORM = 1.0
+"""Half the side of the flat square in the middle of a patch, m."""
+
+_BASE = 1.0
+"""Thickness of the ground below its lowest point, m."""
+
+
+def _inwards(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Distance from the outline of a patch towards its middle, m, up to the edge of the platform."""
+    half = float(x.max())
+    return np.clip(half - np.maximum(abs(x), abs(y)), 0.0, max(half - _PLATFORM, 0.0))
+
+
+def _around_platform(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.maximum(abs(x), abs(y)) > _PLATFORM
+
+
+def _flat(x: np.ndarray, y: np.ndarray, amount: float, rng: np.random.Generator) -> np.ndarray:
+    return np.zeros_like(x)
+
+
+def _slope(x: np.ndarray, y: np.ndarray, amount: float, rng: np.random.Generator) -> np.ndarray:
+    return amount * _inwards(x, y)
+
+
+def _stairs(x: np.ndarray, y: np.ndarray, amount: float, rng: np.random.Generator) -> np.ndarray:
+    tread = 0.3
+    return amount * np.floor(_inwards(x, y) / tread + 1e-6)
+
+
+def _steps(x: np.ndarray, y: np.ndarray, amount: float, rng: np.random.Generator) -> np.ndarray:
+    half, heights = float(x.max()), np.zeros_like(x)
+    for _ in range(int(half * half) + 4):
+        cx, cy = rng.uniform(-half, half, 2)
+        wide, long = rng.uniform(0.25, 1.0, 2)
+        heights[(abs(x - cx) <= wide) & (abs(y - cy) <= long)] = amount * rng.choice((-1.0, -0.5, 0.5, 1.0))
+    return heights * _around_platform(x, y)
+
+
+def _rough(x: np.ndarray, y: np.ndarray, amount: float, rng: np.random.Generator) -> np.ndarray:
+    side = x[0]
+    knots = np.arange(side[0], side[-1] + 0.2, 0.2)
+    values = rng.uniform(-amount, amount, (len(knots), len(knots)))
+    for _ in range(2):  # bilinear: along x, then along y
+        values = np.array([np.interp(side, knots, row) for row in values]).T
+    return values
+
+
+def _waves(x: np.ndarray, y: np.ndarray, amount: float, rng: np.random.Generator) -> np.ndarray:
+    number = 2.0 * np.pi / x.max()  # two waves in a patch
+    heights: np.ndarray = amount * np.sin(number * x) * np.sin(number * y)
+    return heights
+
+
+def _stones(x: np.ndarray, y: np.ndarray, amount: float, rng: np.random.Generator) -> np.ndarray:
+    pitch, depth, tiny = 0.8, 0.5, 1e-6
+    into = [(side + tiny) % pitch for side in (x, y)]  # from the near edge of a gap
+    gap = np.logical_or(*[(phase > 2 * tiny) & (phase < amount) for phase in into])
+    return np.where(gap & _around_platform(x, y), -depth, 0.0)
+
+
+_KINDS: dict[str, tuple[Shape, float]] = {
+    "flat": (_flat, 0.0),
+    "slope_up": (_slope, -0.4), "slope_down": (_slope, 0.4),
+    "stairs_up": (_stairs, -0.2), "stairs_down": (_stairs, 0.2),
+    "steps": (_steps, 0.2), "rough": (_rough, 0.08), "waves": (_waves, 0.2), "stones": (_stones, 0.4),
+}  # fmt: skip
+"""The shapes of patches, and their amounts at difficulty 1."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Terrain:
+    """Rough ground: a field of square patches, in rows of increasing difficulty along y and in columns by kind along x.
+
+    The difficulty of level i is (i + 1) / ``levels``. A patch depends only on the seed, its level and its column. All
+    patches have height 0 along their outline, and a flat border surrounds them.
+
+    =================== ======================================================== ===================
+    kind                ground around the middle of a patch                      at difficulty 1
+    =================== ======================================================== ===================
+    flat                flat
+    slope_up, _down     a pyramid: the ground rises, or falls, from the middle   slope 0.4
+    stairs_up, _down    the same in steps of 0.3 m                               0.2 m a step
+    steps               rectangles, 0.5 to 2 m long, higher or lower             0.2 m
+    rough               random heights every 0.2 m, with planes between          0.08 m up and down
+    waves               two waves along each side                                0.2 m up and down
+    stones              stones every 0.8 m, gaps 0.5 m deep                      gaps of 0.4 m
+    =================== ======================================================== ===================
+    """
+
+    kinds: Mapping[str | Shape, int]
+    """Kinds of patches, in order, each with its number of columns. A kind is a name from the table, or a function
+    ``shape(x, y, difficulty, rng)`` that returns the heights of a patch, m, (n, n); x and y are the coordinates of its
+    points relative to its middle, (n, n)."""
+    levels: int = 10
+    """Number of rows."""
+    patch: float = 8.0
+    """Side of a patch, m; a multiple of ``resolution``."""
+    resolution: float = 0.1
+    """Distance between neighbouring points of the field, m. A wall takes one such distance."""
+    border: float = 4.0
+    """Width of the border, m; a multiple of ``resolution``."""
+    seed: int = 0
+    """Seed of all random heights."""
+    scale: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Amounts at difficulty 1 that replace those of the table, by kind."""
+
+    def __post_init__(self) -> None:
+        """Check the description.
+
+        Raises:
+            ValueError: A kind is unknown, a number is not positive, or a length is not a multiple of the resolution.
+        """
+        for name in [*self.kinds, *self.scale]:
+            if isinstance(name, str) and name not in _KINDS:
+                close = difflib.get_close_matches(name, _KINDS, 3) or _KINDS
+                raise ValueError(f"there is no kind of terrain {name!r}: use {', '.join(close)}, or a function")
+        for name, count in [("levels", self.levels), *((f"columns of {kind}", n) for kind, n in self.kinds.items())]:
+            if not (isinstance(count, int) and count > 0):
+                raise ValueError(f"{name} must be a whole number above 0, not {count!r}")
+        if not self.kinds:
+            raise ValueError('kinds must name at least one kind of patch, such as {"rough": 4}')
+        if not self.resolution > 0.0:
+            raise ValueError(f"resolution must be positive, not {self.resolution!r}")
+        for name, length, least in (("patch", self.patch, 2), ("border", self.border, 0)):
+            cells = length / self.resolution
+            if not (cells >= least and abs(cells - round(cells)) < 1e-6):
+                raise ValueError(f"{name}={length!r} must be a multiple of resolution={self.resolution!r}")
+
+    @functools.cached_property
+    def columns(self) -> tuple[str | Shape, ...]:
+        """The kind of each column."""
+        return tuple(kind for kind, count in self.kinds.items() for _ in range(count))
+
+    @functools.cached_property
+    def heights(self) -> np.ndarray:
+        """Heights of all points, m, (points along y, points along x)."""
+        cells, edge = self._cells, round(self.border / self.resolution)
+        found = np.zeros([count * cells + 1 + 2 * edge for count in (self.levels, len(self.columns))])
+        for level in range(self.levels):
+            for column in range(len(self.columns)):
+                row, start = edge + level * cells, edge + column * cells
+                # the outline stays 0
+                inner = found[row + 1 : row + cells, start + 1 : start + cells]
+                inner[:] = self._patch(level, column)[1:-1, 1:-1]
+        return found
+
+    @functools.cached_property
+    def origins(self) -> np.ndarray:
+        """Middles of the patches relative to the plane that the field replaces, m, (levels, columns, 3).
+
+        z is the greatest height within 0.5 m.
+        """
+        cells, edge, around = self._cells, round(self.border / self.resolution), round(0.5 / self.resolution)
+        around = min(around, cells // 2)
+        found = np.zeros((self.levels, len(self.columns), 3))
+        for level, column in np.ndindex(found.shape[:2]):
+            row, start = (edge + i * cells + cells // 2 for i in (level, column))
+            near = self.heights[row - around : row + around + 1, start - around : start + around + 1]
+            found[level, column] = (*self._corner + self.patch * (np.array([column, level]) + 0.5), near.max())
+        return found
+
+    def add_to(self, spec: mujoco.MjSpec, *, name: str = "terrain") -> None:
+        """Add the ground to a model, in place of the world's plane.
+
+        The plane becomes the height field and keeps its name, friction and material; without a plane the model gets a
+        geom ``name``. A corner of patches in the middle of the field is at the plane's position, so that a robot that
+        stood on the plane stands on the field. The extent of the model stays, on which cameras depend.
+
+        Args:
+            spec: The model, changed in place; for instance in a task's ``edit_model``.
+            name: Name of the height field.
+
+        Raises:
+            ValueError: The world has several planes, or a kind's function returns no heights.
+        """
+        planes = [geom for geom in spec.worldbody.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
+        if len(planes) > 1:
+            named = ", ".join(repr(geom.name) for geom in planes)
+            raise ValueError(f"the model has the planes {named}: delete all but one, which becomes the terrain")
+        if np.isnan(spec.stat.extent):
+            without = spec.copy().compile().stat
+            spec.stat.extent, spec.stat.center = without.extent, without.center
+        heights, (nrow, ncol) = self.heights, self.heights.shape
+        size = self.resolution / 2.0 * np.array([ncol - 1, nrow - 1])
+        low, depth = heights.min(), max(float(np.ptp(heights)), 1e-3)
+        spec.add_hfield(name=name, size=[*size, depth, _BASE], nrow=nrow, ncol=ncol, userdata=heights.ravel())
+        geom = planes[0] if planes else spec.worldbody.add_geom(name=name)
+        geom.type, geom.hfieldname, geom.quat = mujoco.mjtGeom.mjGEOM_HFIELD, name, [1.0, 0.0, 0.0, 0.0]
+        geom.pos = geom.pos + np.array([*self._corner - self.border + size, low])
+
+    @property
+    def _cells(self) -> int:
+        """Distances between points along the side of a patch."""
+        return round(self.patch / self.resolution)
+
+    @property
+    def _corner(self) -> np.ndarray:
+        """The corner of the first patch, m, (2,)."""
+        return -self.patch * np.array([len(self.columns) // 2, self.levels // 2])
+
+    def _patch(self, level: int, column: int) -> np.ndarray:
+        """Heights of one patch, m, (n, n)."""
+        kind, difficulty = self.columns[column], (level + 1) / self.levels
+        side = self.resolution * (np.arange(self._cells + 1) - self._cells / 2)
+        x, y = np.meshgrid(side, side)
+        rng = np.random.default_rng((self.seed, level, column))
+        if isinstance(kind, str):
+            shape, scale = _KINDS[kind]
+            return shape(x, y, difficulty * self._scale(kind, scale), rng)
+        heights = np.asarray(kind(x, y, difficulty, rng), dtype=float)
+        if heights.shape != x.shape or not np.isfinite(heights).all():
+            raise ValueError(f"{kind!r} must return finite heights of shape {x.shape}, not {heights!r}")
+        return heights
+
+    def _scale(self, kind: str, default: float) -> float:
+        given = self.scale.get(kind)
+        return default if given is None else float(np.copysign(given, default))
+
+
+@dataclasses.dataclass(frozen=True)
+class HeightField:
+    """A table of a model's height field, which is filled in from the compiled model. ``height_field`` makes it."""
+
+    name: str
+
+    def table(self, model: mujoco.MjModel) -> np.ndarray:
+        """Heights with their coordinates, m, (1 + points along y, 1 + points along x).
+
+        Raises:
+            ValueError: The model has no such height field, or not exactly one geom of the world has it, upright.
+        """
+        number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_HFIELD, self.name)
+        if number < 0:
+            names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_HFIELD, i) for i in range(model.nhfield)]
+            raise ValueError(f"the model has no height field {self.name!r}; it has: {', '.join(names) or 'none'}")
+        (geoms,) = np.nonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD) & (model.geom_dataid == number))
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        fixed = [g for g in geoms if model.body_weldid[model.geom_bodyid[g]] == 0]
+        if len(geoms) != 1 or not fixed or not np.allclose(data.geom_xmat[geoms[0]], np.eye(3).ravel(), atol=1e-9):
+            raise ValueError(
+                f"the height field {self.name!r} must be the shape of one geom, which is fixed and not turned: "
+                f"{len(geoms)} geoms have it"
+            )
+        position, (along_x, along_y, height, _) = data.geom_xpos[geoms[0]], model.hfield_size[number]
+        nrow, ncol = int(model.hfield_nrow[number]), int(model.hfield_ncol[number])
+        start = model.hfield_adr[number]
+        found = np.zeros((1 + nrow, 1 + ncol))
+        found[0, 1:] = position[0] + np.linspace(-along_x, along_x, ncol)
+        found[1:, 0] = position[1] + np.linspace(-along_y, along_y, nrow)
+        heights = model.hfield_data[start : start + nrow * ncol].reshape(nrow, ncol)
+        found[1:, 1:] = position[2] + height * heights.astype(float)
+        return found
+
+
+def height_field(name: str) -> Any:
+    """As a default in Params: the table of a height field of the model, for ``lw.ground_height`` and ``height_scan``.
+
+    The table is filled in from the compiled model. Its first row has the coordinates x of the points, its first column
+    their y, the rest their heights z in the world's frame, m, (1 + points along y, 1 + points along x). All worlds
+    share it. Declare it as ``ground: wp.array2d[float] = lw.height_field("terrain")``.
+
+    Args:
+        name: The name of the height field, as in the model; ``lw.Terrain.add_to`` names it "terrain".
+    """
+    return HeightField(name)
+
+
+def scan_grid(length: float, width: float, *, spacing: float = 0.1) -> np.ndarray:
+    """As a default in Params: points of a rectangle around a robot for ``lw.height_scan``, (n, 2), m.
+
+    The first point is behind on the right; y, to the left, increases first. ``lw.scan_grid(1.6, 1.0)`` has 17 x 11
+    points. Declare it as ``scan: wp.array[wp.vec2] = lw.scan_grid(1.6, 1.0)``.
+
+    Args:
+        length: Extent along x, forwards, m.
+        width: Extent along y, m.
+        spacing: Distance between neighbouring points, m.
+    """
+    x, y = (np.linspace(-side / 2, side / 2, round(side / spacing) + 1) for side in (length, width))
+    return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
