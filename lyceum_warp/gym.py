@@ -1,7 +1,7 @@
 """Register all tasks with Gymnasium: ``gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=64)``.
 
 Importing this module registers each task under the name of its class, as ``lyceum/HalfCheetah-v0``. A task's file is
-read when an environment is made. ``register`` adds a task of your own.
+loaded when an environment is made. ``register`` adds a task of your own.
 """
 
 from pathlib import Path

@@ -120,7 +120,7 @@ def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
         kind = pydoc.locate(own) if own.startswith("lyceum_warp.algos.") and shape is not None else None
         if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
             fix = f": give one, as in lw.load(run, policy={own.rpartition('.')[2]}(...))" if name == "policy" else ""
-            raise ValueError(f"the {name} is of a class of its own, {own}{fix}")
+            raise ValueError(f"the {name} has a custom class, {own}{fix}")
     module: nn.Module = kind.like(shape) if hasattr(kind, "like") else kind(**shape)
     return module
 

@@ -204,7 +204,7 @@ def test_integrator_and_solver_options_reach_the_engine(engine: str) -> None:
 
 @pytest.mark.skipif(torch.backends.cuda.is_built(), reason="this torch can mark phases")
 def test_marks_for_a_profiler_are_refused_without_cuda() -> None:
-    with pytest.raises(ValueError, match="nvtx=True marks phases through torch"):
+    with pytest.raises(ValueError, match="nvtx=True needs a CUDA build of torch"):
         lw.make("point_mass", nvtx=True)
 
 
