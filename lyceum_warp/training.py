@@ -258,5 +258,5 @@ def _check_equal(run: Run, learner: Learner) -> None:
             if value != after.get(name):
                 raise ValueError(
                     f"the run in {run.folder} has {name} {value}, not {after.get(name)}, and a run keeps its settings: "
-                    "leave that out, or begin a new run in another folder"
+                    "omit it, or start a new run in another folder"
                 )

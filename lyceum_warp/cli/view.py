@@ -1,4 +1,4 @@
-"""Show a task, a policy, a planner or episodes: lyceum-warp view."""
+"""Show a task, a policy, a planner or saved episodes: lyceum-warp view."""
 
 import dataclasses
 from pathlib import Path
@@ -33,24 +33,24 @@ _LONG = 1e9
 
 @optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)")
 class Place:
-    """Where the worlds run, with --mppi the planner's worlds."""
+    """Where the worlds run; with --mppi, where the planner's worlds run."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu, or a CUDA device such as cuda:0. Without this flag a run with the engine auto is shown on the CPU."""
+    """cpu, or a CUDA device such as cuda:0. By default a run with engine auto is shown on the CPU."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View:
-    """Show a task, a policy, a planner or episodes, in a browser or in a window.
+    """Show a task, a policy, a planner or saved episodes in a browser or a window.
 
-    With a task the viewer shows its worlds, lets you push bodies with the mouse, and with --mppi runs a planner in real
-    time. With a run it shows the run's policy, and with --follow the newest policy while the run trains. Files of
-    episodes, or a folder of lyceum-warp plan, are played back.
+    For a task, the viewer shows its worlds, lets you push bodies with the mouse, and with --mppi runs a planner in real
+    time. For a run, it shows the run's policy, and with --follow the newest policy while the run trains. Episode files,
+    or a folder of lyceum-warp plan, are played back.
 
     The viewer is a web page. The command prints its address, which contains a secret, and over ssh the command that
-    forwards the port. With --gfx native it is a window, on a machine with a display.
+    forwards the port. With --gfx native the viewer is a window, on a machine with a display.
 
     $ lyceum-warp view hopper
     $ lyceum-warp view runs/hopper-20260101-120000 --which best
@@ -60,49 +60,49 @@ class View:
     """
 
     what: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TASK|RUN|FILE...")]
-    """A task's name or a file with one, a run's folder, or files of episodes."""
+    """A task's name or file, a run's folder, or episode files."""
     mppi: bool = False
-    """Control the shown world with a planner: MPPI, or another one with --update."""
+    """Control the shown world with a planner: MPPI, or with --update a different one."""
     follow: bool = False
     """Show the newest policy of a run while it trains."""
     which: str = "last"
-    """Which policy of a run: last, best, or the number of an iteration that was kept."""
+    """Which policy of a run: last, best, or the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """The task of a run or of episodes, a name or a file, if it is not found."""
+    """The task of a run or of episodes, as a name or a file, if it cannot be found."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of worlds: by default 16 for a run, 1 otherwise."""
     world: int = 0
-    """Number of the first shown world."""
+    """Index of the first shown world."""
     seed: int = 0
     """Seed of the initial states."""
     paused: bool = False
     """Whether to start paused."""
     trace: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """The site or body whose path is drawn for each of the planner's samples; by default the task's choice."""
+    """The site or body whose path is drawn for each planner sample; by default the task's choice."""
     gfx: Annotated[str, tyro.conf.arg(metavar="web|native")] = "web"
-    """web for a page in a browser, native for a window on this machine's screen."""
+    """web for a browser page, native for a window on this machine's screen."""
     host: str = "127.0.0.1"
-    """Address on which the page is served. Other machines can reach the page only with another address than this."""
+    """Address on which to serve the page. The default is reachable only from this machine."""
     port: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Port of the page; by default the first free port from 8080 on."""
+    """Port of the page; by default the first free port from 8080."""
     browser: bool = False
     """Whether to open the page in this machine's browser."""
     param: ParamWords = ()
     trust: Trust = False
     fps: float = 30.0
-    """Maximal number of frames per second."""
+    """Maximum number of frames per second."""
     place: tyro.conf.OmitArgPrefixes[Place] = dataclasses.field(default_factory=Place)
     planner: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
 
     def run(self) -> int:
-        """Run the command; returns the exit code."""
+        """Run the command, and return the exit code."""
         return self.show()
 
     def show(self, parent: Parent | None = None) -> int:
-        """Show it until the viewer is closed; returns the exit code.
+        """Show the viewer until it is closed; return the exit code.
 
         Args:
-            parent: The program that started this one. The viewer ends with it.
+            parent: The program that started this one; the viewer ends with it.
         """
         chosen_graphics(self.gfx)
         _check(self)
@@ -110,7 +110,7 @@ class View:
         kind = _kind(self.what)
         for flag, fits in (("follow", ("run",)), ("mppi", ("task", "run")), ("trust", ("run",))):
             if getattr(self, flag) and kind not in fits:
-                raise ValueError(f"--{flag} needs a {' or a '.join(fits)}, and {self.what[0]} is not one: leave it out")
+                raise ValueError(f"--{flag} needs a {' or a '.join(fits)}, and {self.what[0]} is not one: omit it")
         shown: dict[str, Any] = {
             name: getattr(self, name) for name in ("world", "paused", "trace", "gfx", "host", "port", "browser", "fps")
         }
@@ -144,7 +144,7 @@ class View:
 
 
 def _check(options: View) -> None:
-    """Refuse numbers out of range, and flags without an effect, before worlds are made."""
+    """Refuse numbers out of range and flags without effect, before worlds are made."""
     whole_number("seed", options.seed, low=0)
     if options.nworld is not None:
         whole_number("nworld", options.nworld, low=1)
@@ -156,7 +156,7 @@ def _check(options: View) -> None:
 
 
 def _kind(what: tuple[str, ...]) -> str:
-    """The kind of the arguments: "task", "run" or "episodes"."""
+    """What to show: "task", "run" or "episodes"."""
     first = Path(what[0])
     if first.suffix == ".npz":
         return "episodes"
@@ -175,7 +175,7 @@ def _kind(what: tuple[str, ...]) -> str:
 def _episodes_env(options: View, episodes: dict[Path, Trajectory]) -> Env:
     """A world for the playback of episodes."""
     if options.nworld is not None and options.nworld > 1:
-        raise ValueError(f"--nworld {options.nworld} has no effect for episodes: leave it out")
+        raise ValueError(f"--nworld {options.nworld} has no effect for episodes: omit it")
     check_world(options.world, 1)
     return episode_env(episodes, task=options.task, **parameters(options.param, options))
 
@@ -184,13 +184,13 @@ def _task_worlds(options: View) -> Env:
     params = parameters(options.param, options)
     nworld = options.nworld or 1
     check_world(options.world, nworld)
-    if options.mppi and nworld == 1:  # the plant itself
+    if options.mppi and nworld == 1:  # this world is the plant
         return Env(options.what[0], autoreset=False, nthread=1, **params)
     return Env(options.what[0], nworld=nworld, **given(options.place), **params)
 
 
 def _planner(options: View, env: Env) -> MPPI:
-    """The planner, on the engine and device of the flags."""
+    """The planner, on the engine and device given by the flags."""
     config = options.planner.on_top_of(task_config(env.task.task, None))
     words = given(options.place) | ({} if env.options.model is None else {"model": env.options.model})
     return MPPI(env.task.task, config, seed=options.seed, params=env.given_params, **words)
@@ -201,7 +201,7 @@ def _run(options: View, parent: Parent | None) -> Run:
     if not options.follow:
         return Run.open(folder)
     if options.which != "last":
-        raise ValueError(f"--follow shows the newest policy, not {options.which!r}: leave out one of them")
+        raise ValueError(f"--follow shows the newest policy, not {options.which!r}: omit one of them")
     if parent is None:
         return wait_for_run(folder, seconds=_WAIT)
     return wait_for_run(folder, seconds=_LONG, going_on=lambda: not parent.ended.is_set())
@@ -215,7 +215,7 @@ def _run_worlds(options: View, run: Run) -> Env:
 
 
 class _Ends:
-    """Ends the viewer with the program that started it."""
+    """Ends the viewer when the program that started it ends."""
 
     def __init__(self, parent: Parent) -> None:
         self._parent = parent

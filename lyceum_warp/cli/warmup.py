@@ -17,10 +17,11 @@ from lyceum_warp.graphs.compile_ahead import cached
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Warmup:
-    """Compile a task's kernels ahead of time, so that later runs start at once, and print the memory of a world.
+    """Compile a task's kernels ahead of time, so that later runs start immediately, and print the memory per world.
 
-    Warp caches compiled kernels for each kind of device. Kernels depend on the model and on the options of physics
-    (--integrator, --solver, ...), so give the options of the later run. They do not depend on the number of worlds.
+    Warp caches compiled kernels for each type of device. Kernels depend on the model and on physics options
+    (--integrator, --solver, ...), so give the same options as in the later run. They do not depend on the number of
+    worlds.
 
     $ lyceum-warp warmup hopper --device cuda:0 --nworld 4096 --npg
     $ lyceum-warp warmup reach --device cuda:0 --plan
@@ -39,17 +40,17 @@ class Warmup:
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
     def run(self) -> int:
-        """Run the command; returns the exit code."""
+        """Run the command, and return the exit code."""
         more = self.physics.options().given() | parameters(self.param, self)
         start, before = time.perf_counter(), cached()
         env = Env(self.task, nworld=self.nworld, **vars(self.env), **more)
-        for _ in range(3):  # run directly, captured as graphs, replayed
+        for _ in range(3):  # run directly, capture, replay
             env.step()
         if self.npg:
             next(NPG(env, config=NPGConfig(samples=2 * env.nworld, mean_every=0)))
-            env.replicate_few(1).step()  # evaluations of the mean policy
+            env.replicate_few(1).step()  # as evaluations of the mean policy do
         if self.plan:
-            # auto depends on the number of samples, which is unknown here
+            # for a planner, auto depends on the number of samples, which is unknown here
             placement = vars(self.env) | {"engine": env.engine.name}
             plan = MPPI(self.task, **placement, **more)
             for _ in range(3):

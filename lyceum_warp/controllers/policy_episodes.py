@@ -70,9 +70,7 @@ class _Batch:
         self._states, self._obs = [env.get_state().cpu()], [env.obs.cpu().clone()]
         self._actions: list[torch.Tensor] = []
         self._outcomes: list[torch.Tensor] = []
-        self._times: list[
-            tuple[float, float, float]
-        ] = []  # time of the action, duration of the policy's call, end of the step
+        self._times: list[tuple[float, float, float]] = []  # action applied at, policy's duration, step ended at
         self._lengths = torch.zeros(env.nworld, dtype=torch.long)
         self._reasons = torch.zeros(env.nworld, dtype=torch.long)
         self._start = time.perf_counter()
