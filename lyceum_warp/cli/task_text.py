@@ -230,9 +230,17 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 #
 # @wp.func
 # def evaluate(s: World, p: Params) -> float:
-# return s.qpos[0]  # a metric in physical units, separate from the reward   @wp.func def terminated(s: World, p:
-# Params) -> bool: return s.qpos[0] < -10.0  # a state that ends the episode, such as a fall   @wp.func def success(s:
-# World, p: Params) -> bool: return s.qpos[0] > 10.0  # the goal
+#     return s.qpos[0]  # a metric in physical units, separate from the reward
+#
+#
+# @wp.func
+# def terminated(s: World, p: Params) -> bool:
+#     return s.qpos[0] < -10.0  # a state that ends the episode, such as a fall
+#
+#
+# @wp.func
+# def success(s: World, p: Params) -> bool:
+#     return s.qpos[0] > 10.0  # the goal
 
 
 @lw.register

@@ -128,7 +128,7 @@ def _named(owner: dict[str, Any]) -> str:
 
 
 def _started(pid: int) -> str:
-    """The start time of a process, which tells reused pids apart; "" if there is no such process."""
+    """The start time of a process, to distinguish it from later ones with its pid; "" if it does not exist."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         return "" if state[0] == "Z" else state[19]  # a zombie has ended

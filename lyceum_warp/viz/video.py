@@ -1,4 +1,4 @@
-"""Write videos of states, drawn off-screen by a subprocess."""
+"""Write videos of states, rendered off-screen in a subprocess."""
 
 import contextlib
 import math
@@ -87,7 +87,7 @@ def write_video(
     speed: float = 1.0,
     progress: Progress | bool = True,
 ) -> Path:
-    """Draw states into an mp4 file, each with its own model fields.
+    """Render states into an mp4 file, each with its own model fields.
 
     The video has at most 60 frames per second; with a shorter time step, states are left out. A subprocess draws it,
     without a display.
@@ -110,7 +110,7 @@ def write_video(
     Raises:
         ValueError: The states do not have the environment's shape, the model has no such camera, the size is odd, or
             the file's name does not end in ``.mp4``.
-        NoVideoError: The machine cannot draw, or lacks a package for videos.
+        NoVideoError: This machine cannot render, or a package for videos is missing.
     """
     if states.ndim != 2 or states.shape[1] != env.state_space.size or not len(states):
         raise ValueError(f"states must have the shape (steps, {env.state_space.size}), not {tuple(states.shape)}")
@@ -172,7 +172,7 @@ class Recorder:
         camera: The camera, as in ``write_video``.
         size: Width and height in pixels, even numbers.
         fps: Frames per second of the video.
-        most_waiting: Maximal number of poses in the queue; unlimited by default.
+        most_waiting: Maximum number of poses in the queue; unlimited by default.
 
     Raises:
         ValueError: The model has no such camera, or an argument is out of range.
@@ -195,7 +195,7 @@ class Recorder:
         self._drawing = Drawing(model, out, camera=camera, size=size, fps=fps, background=True)
         self._most = math.inf if most_waiting is None else whole_number("most_waiting", most_waiting, low=1)
         self._poses: deque[Shot] = deque()
-        self._changed = threading.Condition()  # also guards the poses and the numbers
+        self._changed = threading.Condition()  # also guards the poses and the counts
         self._added = self._drawn = self._dropped = 0
         self._ended = self._cancelled = False
         self._error: NoVideoError | OSError | None = None
@@ -218,7 +218,7 @@ class Recorder:
 
     @property
     def drawn(self) -> int:
-        """Number of drawn frames."""
+        """Number of rendered frames."""
         return self._drawn
 
     @property
@@ -228,7 +228,7 @@ class Recorder:
 
     @property
     def finished(self) -> bool:
-        """Whether the drawing has ended, with the file or with an error that ``close`` raises."""
+        """Whether rendering has ended, with a complete file or with an error that ``close`` raises."""
         return not self._thread.is_alive()
 
     def add(
@@ -251,8 +251,8 @@ class Recorder:
             mocap_quat: Orientations of the mocap bodies, (nmocap, 4), w, x, y, z; by default the model's.
             model_fields: Model fields by MuJoCo's names, if they differ from the model's in this pose.
             camera: The camera from this pose on.
-            ghosts: Further poses to draw: (qpos, mocap_pos, mocap_quat, colour). mocap_pos and mocap_quat may be None;
-                the colour is red, green, blue and opacity, from 0 to 1.
+            ghosts: Additional poses to draw: (qpos, mocap_pos, mocap_quat, colour). mocap_pos and mocap_quat may be
+                None; the colour is red, green, blue and opacity, from 0 to 1.
             lines: Lines through points: (points, colour), points (n, 3) in metres.
             frames: Number of frames that show the pose.
 
@@ -281,7 +281,7 @@ class Recorder:
             self._changed.notify_all()
 
     def end(self, *, drop: bool = False) -> None:
-        """Accept no further poses, and finish the video in the background.
+        """Accept no more poses, and finish the video in the background.
 
         Args:
             drop: Whether to drop the poses in the queue.
@@ -294,7 +294,7 @@ class Recorder:
             self._changed.notify_all()
 
     def wait(self, seconds: float = math.inf, *, progress: Progress | bool = True) -> bool:
-        """Wait until the drawing has ended; returns whether it has.
+        """Wait until rendering has ended; return whether it has.
 
         Args:
             seconds: Timeout.
@@ -312,7 +312,7 @@ class Recorder:
         return self.finished
 
     def close(self, *, progress: Progress | bool = True) -> Path:
-        """Accept no further poses, and wait until the file is complete.
+        """Accept no more poses, and wait until the file is complete.
 
         An exception meanwhile, such as Ctrl-C, cancels the video.
 
@@ -365,7 +365,7 @@ class Recorder:
                     drawing.finish()
         except (NoVideoError, OSError) as error:
             self._error = None if self._cancelled else error
-        except Exception as error:  # the thread has no caller
+        except Exception as error:  # close raises it: the thread has no caller
             self._error = NoVideoError(f"the video could not be written ({' '.join(str(error).split())})")
 
     def _next(self) -> Shot | None:
