@@ -245,7 +245,7 @@ class Env:
             action: Copied into ``env.action`` first, if given; (nworld, nact).
 
         Raises:
-            ValueError: The action has another shape or type.
+            ValueError: The action has the wrong shape or type.
         """
         if action is not None:
             check_tensor(action, "action", self.action)
@@ -259,7 +259,7 @@ class Env:
         """Reset worlds to the task's fixed initial state, and zero their actions.
 
         Args:
-            mask: Which worlds, (nworld,) bool; all by default.
+            mask: Worlds to change, (nworld,) bool; by default all.
         """
         worlds = self.worlds
         worlds.set_mask(mask)
@@ -272,7 +272,7 @@ class Env:
 
         Args:
             seed: Restarts the worlds' random streams; by default each world continues its own.
-            mask: Which worlds, (nworld,) bool; all by default.
+            mask: Worlds to change, (nworld,) bool; by default all.
         """
         worlds = self.worlds
         worlds.set_mask(mask)
@@ -285,7 +285,7 @@ class Env:
     # the state
 
     def get_state(self, out: torch.Tensor | None = None, mask: torch.Tensor | None = None) -> torch.Tensor:
-        """The full state of every world, which determines its future, (nworld, state_space.size), float64.
+        """The complete state of every world, (nworld, state_space.size), float64; it determines the world's future.
 
         It holds the engine's integration state, fields left by the last substep, model fields that differ between
         worlds, the step and episode counters, the random stream, the task's memory, the metric sums, and the count for
@@ -293,10 +293,10 @@ class Env:
 
         Args:
             out: Where to write the states.
-            mask: Which worlds' rows of ``out`` to write, (nworld,) bool; all by default.
+            mask: Worlds whose rows of ``out`` to write, (nworld,) bool; by default all.
 
         Raises:
-            ValueError: An argument has another shape or type, or a mask comes without ``out``.
+            ValueError: An argument has the wrong shape or type, or a mask comes without ``out``.
         """
         worlds = self.worlds
         for call in worlds.programs.read_state:
@@ -316,11 +316,11 @@ class Env:
 
         Args:
             state: (nworld, state_space.size), float64.
-            mask: Which worlds, (nworld,) bool; all by default.
+            mask: Worlds to change, (nworld,) bool; by default all.
             check: Whether to refuse states that are not finite. On a GPU the check waits for the device.
 
         Raises:
-            ValueError: The state has another shape or type, or is not finite.
+            ValueError: The state has the wrong shape or type, or is not finite.
         """
         worlds = self.worlds
         check_tensor(state, "state", worlds.state_view)
@@ -343,10 +343,10 @@ class Env:
         Args:
             state: States to observe, (nworld, state_space.size).
             out: Where to write the observations.
-            group: Which group of observations.
+            group: Name of the observation group.
 
         Raises:
-            ValueError: There is no such group, or an argument has another shape or type.
+            ValueError: There is no such group, or an argument has the wrong shape or type.
         """
         check_group(group, self.obs_groups, self.task.name)
         return _copied((self if state is None else self._scratch_at(state)).obs_groups[group], out)
@@ -396,7 +396,7 @@ class Env:
         """Check and set the actions of the next step. ``env.action.copy_(...)`` skips the checks.
 
         Raises:
-            ValueError: The action has another shape or type, or is not finite.
+            ValueError: The action has the wrong shape or type, or is not finite.
         """
         self._check_action(action)
         self.action.copy_(action.detach())
@@ -445,7 +445,7 @@ class Env:
         ``event`` writes. Other fields keep the new values until ``rand_reset(seed=...)``.
 
         Args:
-            mask: Which worlds, (nworld,) bool; all by default.
+            mask: Worlds to change, (nworld,) bool; by default all.
             fields: Values by model field, as in ``body_mass=masses``: one row per world, or one row for all worlds.
 
         Raises:

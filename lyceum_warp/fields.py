@@ -169,7 +169,7 @@ class Field:
 
     @property
     def size(self) -> int:
-        """Numbers in one world's value."""
+        """Number of scalars in one world's value."""
         return int(np.prod(self.shape, dtype=int)) * max(1, wp.types.type_size_in_bytes(self.dtype) // 4)
 
 

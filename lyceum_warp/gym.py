@@ -30,7 +30,7 @@ def register(task: str | Path | type[Task]) -> str:
     known = isinstance(task, str) and task in task_names()
     name = str(task) if known else task_name(find_task(task))
     id = f"lyceum/{''.join(map(str.capitalize, name.split('_')))}-v0"
-    gymnasium.registry.pop(id, None)  # Gymnasium warns of an id that is registered twice
+    gymnasium.registry.pop(id, None)  # Gymnasium warns if an id is registered twice
     gymnasium.register(
         id,
         entry_point="lyceum_warp.gym:GymnasiumEnv",

@@ -118,7 +118,7 @@ class ModelField:
 
     @property
     def size(self) -> int:
-        """Floats in one world's value."""
+        """Number of floats in one world's value."""
         return int(np.prod(self.shape, dtype=int)) * wp.types.type_size_in_bytes(self.dtype) // 4
 
     @property
@@ -173,7 +173,7 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
         columns: Columns of all model fields that differ between worlds, by name, (nworld, size) each.
 
     Raises:
-        ValueError: A field is unknown or the same in every world, or a value has another size.
+        ValueError: A field is unknown or the same in every world, or a value has the wrong size.
     """
     for name, value in values.items():
         field = describe_model_field(model, name)  # raises for a misspelt name

@@ -47,7 +47,7 @@ class OpenLoop:
         states: Number of states to start from. Each has nworld / states consecutive worlds.
 
     Raises:
-        ValueError: The environment resets its worlds automatically, ``keys`` has another shape, type or device, the
+        ValueError: The environment resets its worlds automatically, ``keys`` has the wrong shape, type or device, the
             worlds cannot be divided among the states, or the buffers do not fit into memory.
     """
 
@@ -69,7 +69,7 @@ class OpenLoop:
     fault: torch.Tensor
     """Bits of ``Done`` for the faults of a world, (nworld,) int32; if a bit is set, ignore that world's rewards."""
     phases: tuple[Phase, ...]
-    """The phases of ``run``, for callers that capture additional phases in the same graph."""
+    """The phases of ``run``, for callers that add phases to the same graph."""
 
     def __init__(
         self, env: Env, horizon: int, *, keys: wp.array | None = None, nominal_model: bool = False,

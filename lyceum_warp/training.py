@@ -37,7 +37,7 @@ class Display:
 
     @contextlib.contextmanager
     def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
-        """Context that surrounds the training, up to a total number of iterations."""
+        """Context that surrounds training, up to a total number of iterations."""
         yield
 
     def __call__(self, iteration: Iteration) -> None:
@@ -110,7 +110,7 @@ def train(
         ImportError: ``tensorboard`` is True, but the extra ``tensorboard`` is not installed.
         NoVideoError: ``video_every`` is given, but the extra ``viz`` is not installed.
         OSError: The folder cannot be written; ``resume=True`` later continues from the last save.
-        FloatingPointError: The learner's updates are no longer finite.
+        FloatingPointError: An update of the learner is not finite.
         Interrupted: One of several ranks received a signal.
     """
     check_kind("learner", learner, Learner, "as lw.NPG(env)")
@@ -231,7 +231,7 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
         text = " ".join(str(error).split())
         raise ValueError(f"{run.checkpoint} does not fit the configuration beside it: {text}") from error
     if learner.team.leads:
-        cut_rows(run.metrics, done)  # a killed run may have rows of unsaved iterations
+        cut_rows(run.metrics, done)  # a killed run may have rows for unsaved iterations
         if changed := run.changed(versions(run.config["device"])):
             text = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
             note(f"versions have changed, so numbers may differ from an uninterrupted run's: {text}")

@@ -45,7 +45,7 @@ class Worlds(WorldArrays):
 
     Args:
         task: The task, bound to its model and parameters.
-        engine: Its physics, which keeps the task's fields.
+        engine: The physics engine, with the task's fields.
         options: Options of the environment.
     """
 

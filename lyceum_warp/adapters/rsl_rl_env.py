@@ -112,7 +112,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
 
             ============= =========================================================================================
             ``time_outs`` whether the time limit or a fault truncated the episode, (nworld,) bool. A transition with
-                          a fault has reward 0 and the last good observation as its final one
+                          a fault has reward 0 and the last valid observation as its final one
             ``final_obs`` a dict of observation groups after the step, before any reset
             ``log``       means of the task's metrics over about the last 100 episodes that ended (all of this step's),
                           ``metrics/NAME``, which are 0 before the first end; and ``faults/worlds``, worlds with a

@@ -132,7 +132,7 @@ class StepResults:
 
     Args:
         env: The environment.
-        observations: Its observations.
+        observations: The observations to return.
         given: Converts all buffers for the caller in one call.
     """
 

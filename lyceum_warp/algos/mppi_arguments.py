@@ -115,7 +115,7 @@ def explained_worlds(config: MPPIConfig, plants: int) -> Iterator[None]:
     """If the worlds made in this block do not fit into memory, name the settings that determine their number.
 
     Raises:
-        NotEnoughMemoryError: They do not fit.
+        NotEnoughMemoryError: The worlds do not fit.
     """
     try:
         yield

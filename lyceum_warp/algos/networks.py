@@ -34,7 +34,7 @@ def check_memory(sizes: Sequence[int], **arguments: Any) -> None:
         arguments: The arguments that determine the sizes, for the message.
 
     Raises:
-        ValueError: They do not fit.
+        ValueError: The weights do not fit.
     """
     needed, free = 4 * sum(n * m + m for n, m in itertools.pairwise(sizes)), free_memory(wp.get_device("cpu"))
     if free is not None and needed > free:

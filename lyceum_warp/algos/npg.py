@@ -282,7 +282,7 @@ class NPG(OnPolicyLearner):
                 square = (old_mean - mean(obs)).square()
                 kl = 0.5 * (square * torch.exp(-2 * self.policy.log_std)).sum(-1).mean()
                 kl = self.team.sum(kl) / self.team.size
-                if self._reads_numbers and kl <= limit:  # further rounds would not change it
+                if self._reads_numbers and kl <= limit:  # more rounds would change nothing
                     break
                 part = torch.where(kl <= limit, part, part * (limit / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5))
             normalizer.interpolate(before, after, part)
@@ -349,7 +349,7 @@ class NPG(OnPolicyLearner):
         fraction = finite.float()
         for _ in range(_SHORTER):
             kl = measured(fraction)
-            if self._reads_numbers and kl <= limit:  # further rounds would not change it
+            if self._reads_numbers and kl <= limit:  # more rounds would change nothing
                 break
             factor = (wanted / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5)
             fraction = torch.where(kl <= limit, fraction, fraction * factor)

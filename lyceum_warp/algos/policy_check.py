@@ -112,7 +112,7 @@ def check_value(value: ValueFunction, env: Env) -> None:
     """Check that a value function fits an environment's observations.
 
     Raises:
-        ValueError: Its group or its number of observations does not fit, or a parameter is not finite.
+        ValueError: The value function's group or input size does not fit, or a parameter is not finite.
     """
     name = env.task.name
     check_group(value.group, env.obs_groups, name)

@@ -45,7 +45,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path) -> Path:
 
     Raises:
         ImportError: The extra ``export`` is not installed, which ``.onnx`` requires.
-        ValueError: The file has another suffix, or the policy's network cannot be exported.
+        ValueError: The file has an unsupported suffix, or the policy's network cannot be exported.
     """
     if not (isinstance(policy, torch.nn.Module) and hasattr(policy, "act") and hasattr(policy, "nobs")):
         raise ValueError(f"policy must be a policy as lw.load(run) returns it, not {described(policy)}")

@@ -48,7 +48,7 @@ class CheckedController:
 
         Args:
             state: State of the plant, (state_size,) float64.
-            obs: Its observation, (nobs,).
+            obs: The plant's observation, (nobs,).
             shift: Number of controller steps since the state of its last plan.
             step: Step of the plant, for error messages.
 

@@ -20,7 +20,7 @@ class Controller(Protocol):
 
         Args:
             state: State of the plant as in ``env.get_state()[0]``, (state_size,) float64, on the plant's device.
-            obs: Its observation, (nobs,) float32, on the same device.
+            obs: The plant's observation, (nobs,) float32, on the same device.
 
         Returns:
             The action, (nu,), finite, on any device.

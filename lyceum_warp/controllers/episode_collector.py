@@ -96,7 +96,7 @@ class EpisodeCollector:
 
     Args:
         env: The plant, in its initial state.
-        controller: Its controller.
+        controller: The checked controller.
         mode: "sync" or "async"; see ``Trajectory.mode``.
         period: Wall time between two steps, seconds.
         seed: Seed of the run.

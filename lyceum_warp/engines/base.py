@@ -38,7 +38,7 @@ class Engine(abc.ABC):
         initial: The state that ``reset`` puts worlds into, (integration_size,); None for the model's own.
 
     Raises:
-        ValueError: A field is listed twice, once lagged and once current, the initial state has another shape, or a
+        ValueError: A field is listed twice, once lagged and once current, the initial state has the wrong shape, or a
             model field cannot differ between worlds of this model.
     """
 

@@ -53,7 +53,7 @@ def write_content(path: Path, content: Mapping[str, Any], **options: Any) -> Non
 
     Args:
         path: The file.
-        content: Its content.
+        content: The content to write.
         options: Additional arguments for ``replaced``.
     """
     buffer = io.BytesIO()  # Python's write raises OSError on a full disk; torch raises other errors
@@ -231,7 +231,7 @@ def check_format(path: Path, number: Any) -> None:
 
     Args:
         path: The file.
-        number: Its format.
+        number: The format number in the file.
 
     Raises:
         ValueError: The format is unknown.

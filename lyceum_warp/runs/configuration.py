@@ -141,7 +141,7 @@ class Configuration:
         """Make the learner.
 
         Args:
-            team: The processes of the training.
+            team: The processes that train together.
             run: The run whose task to use. Its copies replace files that have moved or changed.
             networks: The initial policy and value function; None for new ones.
             note: Called with messages about the task's files.

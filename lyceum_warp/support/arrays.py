@@ -126,7 +126,7 @@ def launch_several_rows(kernel: wp.Kernel, mask: wp.array, pairs: Sequence[tuple
 
     Args:
         kernel: The kernel.
-        mask: Which rows, (n,).
+        mask: Rows to copy, (n,) bool.
         pairs: Sources and targets, (n, columns) each.
     """
     pairs = [pair for pair in pairs if pair[1].size]

@@ -55,7 +55,7 @@ def newer_format(path: Path, number: int, known: int) -> ValueError:
 
     Args:
         path: The file.
-        number: Its format.
+        number: The format number in the file.
         known: The newest format that this release can read.
     """
     return ValueError(

@@ -22,7 +22,7 @@ def _ignore(number: int, frame: Any) -> None:
 
 
 def _interrupt(number: int, frame: Any) -> None:
-    """Raise Interrupted, and ignore further signals."""
+    """Raise Interrupted, and ignore all later signals."""
     for other in _NUMBERS:
         if signal.getsignal(other) is _interrupt:
             signal.signal(other, _ignore)

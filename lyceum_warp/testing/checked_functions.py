@@ -58,8 +58,8 @@ class CheckedFunctions:
     """The checked copies of some functions, with a kernel for each.
 
     A kernel gets the report, (places, 3) int32, and for each argument of its function the values of all worlds: a
-    ``Batch`` for the task's World, (nworld,) or (1,) for Params, (nworld, size) for a row. The report has, for each
-    place, the number of times that its index was out of range, the first such index and the size.
+    ``Batch`` for the task's World, (nworld,) or (1,) for Params, (nworld, size) for a row. The report has one row per
+    place: how often its index was out of range, the first such index, and the size.
 
     Raises:
         Unchecked: A function can't be copied.

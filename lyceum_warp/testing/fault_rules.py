@@ -72,7 +72,7 @@ def check_bad_action(ctx: Context) -> None:
 
 
 def check_bad_warmstart(ctx: Context) -> None:
-    """A NaN warm start changes no other world, and a reset of its world clears it."""
+    """A NaN warm start changes no other world, and a reset clears it."""
     a, b, bad = ctx.a, ctx.b, 0
     if "qacc_warmstart" not in a.state_space.parts:
         return

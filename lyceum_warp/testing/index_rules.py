@@ -88,7 +88,7 @@ class _Run:
             self._run_step(self.worlds)
 
     def _run_before_restart(self, state: torch.Tensor, action: torch.Tensor) -> None:
-        """Run the functions of a step on the state in which a fault ended the episode; ``env`` has restarted since.
+        """Run the functions of a step on the state in which a fault ended the episode, before ``env`` restarted.
 
         A read out of range may return NaN and so cause the fault.
         """

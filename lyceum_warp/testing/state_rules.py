@@ -138,7 +138,7 @@ def _physics(env: Env, state: torch.Tensor) -> torch.Tensor:
 
 
 def _lasting_columns(env: Env) -> list[slice]:
-    """The columns of a state that resets keep: lasting memory, and model fields that no reset draws."""
+    """The state columns that resets preserve: lasting memory, and model fields that no reset randomizes."""
     names = [field.name for field in env.task.dynamics if field.name not in env.task.reset_dynamics]
     parts = env.state_space.parts
     return [parts[name] for name in ("lasting_memory", *names) if name in parts]
@@ -147,7 +147,7 @@ def _lasting_columns(env: Env) -> list[slice]:
 def check_reset(ctx: Context) -> None:
     """``reset`` leads to the same state regardless of the past, with zero actions.
 
-    It may depend on columns that resets keep, which are therefore the same before both resets and in all worlds.
+    It may depend on columns that resets keep, so these are made equal before both resets and in all worlds.
     """
     env = ctx.a
     lasting = _lasting_columns(env)

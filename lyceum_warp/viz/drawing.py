@@ -72,7 +72,7 @@ class DrawingProcess:
         self._ends = contextlib.ExitStack()
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: Any = None
-        self._lock = threading.Lock()  # for abandon, which another thread calls
+        self._lock = threading.Lock()  # other threads may call abandon
         self._abandoned = False
 
     def __enter__(self) -> Self:

@@ -1,4 +1,4 @@
-"""Make videos of a policy, during and after its training."""
+"""Make videos of a policy, during and after training."""
 
 import logging
 from collections.abc import Callable
@@ -73,7 +73,7 @@ class Videos:
             write_video(env, states, path, camera=self.camera, progress=self._progress("drawing the video", "frames"))
             if self.board is not None:
                 self.board.video(path, iteration.samples)
-        except Exception as error:  # of any kind: a video must not end the training
+        except Exception as error:  # of any kind: a video must not end training
             self.note(f"no further videos ({one_line(error)})")
             self.every = 0
 

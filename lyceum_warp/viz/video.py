@@ -89,7 +89,7 @@ def write_video(
 ) -> Path:
     """Render states into an mp4 file, each with its own model fields.
 
-    The video has at most 60 frames per second; with a shorter time step, states are left out. A subprocess draws it,
+    The video has at most 60 frames per second; with a shorter time step, states are skipped. A subprocess draws it,
     without a display.
 
     Args:
@@ -156,7 +156,7 @@ class Recorder:
     """A video of poses that are added one by one, for example by a viewer.
 
     A subprocess draws them at a low priority, and ``add`` never waits for it. Poses wait in a queue, and ``close``
-    waits until the last one is drawn. ``most_waiting`` limits the queue: if it is full, further poses are dropped, and
+    waits until the last one is drawn. ``most_waiting`` limits the queue: if it is full, new poses are dropped, and
     the last pose in the queue is shown longer, so that the video keeps its duration. The file is written when the video
     is complete. After ``cancel``, after an error within a ``with`` block, or if the program is killed, an older file of
     this name is unchanged.
@@ -258,7 +258,7 @@ class Recorder:
 
         Raises:
             ValueError: A shape is wrong, the model has no such camera or field, or the video is closed.
-            NoVideoError: The drawing has failed.
+            NoVideoError: Rendering has failed.
         """
         self._check()
         if self._ended:
@@ -324,7 +324,7 @@ class Recorder:
             The file's path.
 
         Raises:
-            NoVideoError: The drawing has failed, or there is no pose.
+            NoVideoError: Rendering has failed, or there is no pose.
             ValueError: The video was cancelled.
             OSError: The file cannot be written.
         """

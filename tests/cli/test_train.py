@@ -113,7 +113,7 @@ def test_resume_refuses_other_settings(trained: Path, tmp_path: Path, capsys: py
     before = {path: path.read_bytes() for path in trained.iterdir()}
     for options, words in [
         (["--iterations", "4"], ["already has 4 iterations", "--iterations 8"]),
-        (["--iterations", "9", "--gamma", "0.9"], ["has gamma 0.995, not 0.9", "begin a new run in another folder"]),
+        (["--iterations", "9", "--gamma", "0.9"], ["has gamma 0.995, not 0.9", "start a new run in another folder"]),
         (["--iterations", "9", "--nworld", "4"], ["has nworld 2, not 4"]),
         (["--iterations", "9", "--param", "success_distance=1"], ["has success_distance None, not 1"]),
         (["--iterations", "9", "--num-steps", "4"], ["--num-steps is a setting of ppo, not of npg"]),

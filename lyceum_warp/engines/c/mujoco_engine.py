@@ -222,8 +222,8 @@ class MujocoEngine(Engine):
         """Copy fields of the masked worlds from the engine's float64 arrays into their float32 arrays.
 
         Args:
-            fields: Which fields.
-            mask: Which worlds; None for all.
+            fields: The fields to copy.
+            mask: Mask of the worlds; None for all.
             early: Whether to skip sensors of the acceleration stage.
         """
         with np.errstate(over="ignore"):  # a world with a fault may hold numbers beyond float32

@@ -44,7 +44,7 @@ class WorldModels:
 
         Args:
             values: By name, (nworld, size) float32.
-            mask: Which worlds; None for all.
+            mask: Mask of the worlds; None for all.
         """
         if mask is not None and 1 not in mask.tobytes():  # the usual case; faster than mask.any()
             return

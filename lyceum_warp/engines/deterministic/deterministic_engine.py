@@ -50,9 +50,9 @@ class DeterministicEngine(WarpEngine):
         return _TIMES_THE_MEMORY * super().bytes_per_world(model, fields, dynamics, **options)
 
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
-        """Another model and data with the same options and sizes, for measurements of bare MuJoCo Warp.
+        """Make another Model and Data with the same options and sizes, to benchmark MuJoCo Warp alone.
 
-        Graphs of their steps take about a hundred times the memory, because they share no scratch.
+        Graphs of their steps take about a hundred times the memory, because they do not share scratch memory.
         """
         model, data = super().bare()
         with wp.ScopedDevice(self.device):

@@ -30,7 +30,7 @@ def step(model: mjw.Model, data: mjw.Data, done: Collection[Part] = ()) -> None:
 
     Args:
         model: MuJoCo Warp's model.
-        data: Its data.
+        data: MuJoCo Warp's data.
         done: Parts of ``POSITION`` that are already computed for the current state.
     """
     _without(frozenset(done))["step"](model, data)
@@ -236,7 +236,7 @@ class PartialForward:
         """Compute the masked worlds' fields; consists of launches.
 
         Args:
-            mask: Which worlds, (nworld,) bool.
+            mask: The worlds, (nworld,) bool.
             forward: Computes the fields of a Data.
             targets: Destinations of the fields, (nworld, ...), by their names in MuJoCo Warp's Data.
         """

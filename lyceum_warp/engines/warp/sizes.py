@@ -82,7 +82,7 @@ def warn_of_little_room(
         model: The compiled model.
         states: Integration states of worlds, (n, integration size); the first 32 are checked.
         fields: The model fields that differ between worlds.
-        values: Their values, (n, ...).
+        values: Values of these fields, by name, (n, ...).
         nconmax: Contact capacity per world, on average.
         njmax: Constraint capacity of each world.
     """
