@@ -21,7 +21,7 @@ _GROUPS = {
     "mean_": "mean_policy", "return_": "return", "value_": "value", "time_": "time", "metrics/": "metrics",
     "step_metrics/": "step_metrics",
 }  # fmt: skip
-"""Groups of curves by the beginnings of their columns in metrics.csv."""
+"""Groups of curves, by the prefix of their columns in metrics.csv."""
 
 _TAGS = {
     "iteration": "time/iteration", "samples": "time/samples", "samples_per_second": "time/samples_per_second",
@@ -30,17 +30,17 @@ _TAGS = {
     "skipped_updates": "policy/skipped_updates", "reward_mean": "return/reward",
     "explained_variance": "value/explained_variance",
 }  # fmt: skip
-"""Names of curves that do not follow from the columns."""
+"""Names of curves that cannot be derived from the columns."""
 
 _COMPARED = ("return/mean", "mean_policy/return", "episode/eval", "episode/success")
-"""The curves whose last values the tab of hyperparameters shows."""
+"""The curves whose last values are shown in the tab HPARAMS."""
 
 
 class TensorBoard:
     """Writes a run's iterations where TensorBoard reads them; the horizontal axis counts samples.
 
-    Every number of an iteration is a curve, named by its group: return/, episode/, mean_policy/, policy/, value/, time/
-    metrics/ and step_metrics/. The hyperparameters appear in the tabs HPARAMS and TEXT.
+    Every number of an iteration becomes a curve, whose name starts with its group: return/, episode/, mean_policy/,
+    policy/, value/, time/ metrics/ and step_metrics/. The hyperparameters appear in the tabs HPARAMS and TEXT.
 
     In a folder that already holds curves, the curves continue: what they hold from the samples of the first new
     iteration on is replaced.
@@ -51,7 +51,8 @@ class TensorBoard:
         ...         board(it)
 
     Args:
-        folder: The folder; it is made if it does not exist. ``tensorboard --logdir`` takes it, or one above it.
+        folder: The folder; it is created if it does not exist. Pass it, or a parent folder, to ``tensorboard
+            --logdir``.
         config: The hyperparameters, which may be nested.
 
     Raises:
@@ -71,7 +72,7 @@ class TensorBoard:
         self.close()
 
     def __call__(self, iteration: Iteration) -> None:
-        """Add an iteration. Numbers that are not finite, such as returns where no episode ended, are left out."""
+        """Add an iteration. Non-finite numbers, such as returns if no episode ended, are omitted."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
         values = []
@@ -81,7 +82,7 @@ class TensorBoard:
         self._write(Summary(value=values), iteration.samples, replaced=iteration.samples)
 
     def close(self) -> None:
-        """Close the file. A later iteration opens another one."""
+        """Close the file. A later iteration opens a new one."""
         if self._file is not None:
             file, self._file = self._file, None
             file.close()
@@ -95,15 +96,15 @@ class TensorBoard:
         self._file.flush()
 
     def _open(self, replaced: int) -> None:
-        """Open a file. torch's and TensorBoard's own writers would write it in a thread, which hides a full disk."""
+        """Open a file. Writers of torch and TensorBoard use a thread, which would hide a full disk."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
         from torch.utils.tensorboard import RecordWriter
 
-        number = len(list(self._folder.glob("events.out.tfevents.*")))  # files are read in the order of their names
+        number = len(list(self._folder.glob("events.out.tfevents.*")))  # TensorBoard reads files in alphabetical order
         name = f"events.out.tfevents.{int(time.time()):010d}.{number:04d}.{os.getpid()}"
         self._file = RecordWriter((self._folder / name).open("xb"))
         self._add(Event(file_version="brain.Event:2"))
-        if number:  # TensorBoard leaves out points of earlier files from this step on
+        if number:  # TensorBoard discards points of earlier files from this step on
             self._add(Event(step=replaced, session_log=SessionLog(status=SessionLog.START)))
         else:
             for summary in _hyperparameters(self._config):
@@ -118,14 +119,14 @@ def check_tensorboard() -> None:
     """Check that the package for TensorBoard is installed.
 
     Raises:
-        ImportError: It is not installed.
+        ImportError: The package tensorboard is not installed.
     """
     if importlib.util.find_spec("tensorboard") is None:
         raise ImportError(f"curves for TensorBoard need the package tensorboard: {EXTRA}")
 
 
 def tag(column: str) -> str:
-    """The name of a curve, by the column of ``metrics.csv`` that has its numbers."""
+    """The name of the curve for a column of ``metrics.csv``."""
     if column in _TAGS:
         return _TAGS[column]
     for beginning, group in _GROUPS.items():
@@ -135,7 +136,7 @@ def tag(column: str) -> str:
 
 
 def _hyperparameters(config: Mapping[str, Any]) -> list[Any]:
-    """What the tabs HPARAMS and TEXT show."""
+    """The summaries for the tabs HPARAMS and TEXT."""
     from tensorboard.plugins.hparams.summary_v2 import HParam, Metric, hparams_config_pb, hparams_pb
     from tensorboard.plugins.text.summary_v2 import text_pb
 
@@ -146,7 +147,7 @@ def _hyperparameters(config: Mapping[str, Any]) -> list[Any]:
 
 
 def _flat(config: Mapping[str, Any]) -> Iterator[tuple[str, bool | float | str]]:
-    """The hyperparameters without nesting, as TensorBoard takes them; None is left out."""
+    """The hyperparameters as a flat dict, as TensorBoard expects; entries whose value is None are omitted."""
     for name, value in config.items():
         if isinstance(value, Mapping):
             yield from _flat(value)

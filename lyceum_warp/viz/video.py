@@ -1,4 +1,4 @@
-"""Write videos of states, drawn off-screen by a subprocess."""
+"""Write videos of states, rendered off-screen in a subprocess."""
 
 import contextlib
 import math
@@ -39,9 +39,9 @@ def write_video(
     speed: float = 1.0,
     progress: Progress | bool = True,
 ) -> Path:
-    """Draw states into an mp4 file, each with its own model fields.
+    """Render states into an mp4 file, each with its own model fields.
 
-    The video has at most 60 frames per second; with a shorter time step, states are left out. A subprocess draws it,
+    The video has at most 60 frames per second; with a shorter time step, states are skipped. A subprocess draws it,
     without a display.
 
     Args:
@@ -62,7 +62,7 @@ def write_video(
     Raises:
         ValueError: The states do not have the environment's shape, the model has no such camera, the size is odd, or
             the file's name does not end in ``.mp4``.
-        NoVideoError: The machine cannot draw, or lacks a package for videos.
+        NoVideoError: This machine cannot render, or a package for videos is missing.
     """
     if states.ndim != 2 or states.shape[1] != env.state_space.size or not len(states):
         raise ValueError(f"states must have the shape (steps, {env.state_space.size}), not {tuple(states.shape)}")
@@ -146,7 +146,7 @@ class Recorder:
 
     @property
     def finished(self) -> bool:
-        """Whether the drawing has ended, with the file or with an error that ``close`` raises."""
+        """Whether rendering has ended, with a complete file or with an error that ``close`` raises."""
         return not self._thread.is_alive()
 
     def add(self, shot: Shot) -> None:

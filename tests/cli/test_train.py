@@ -111,11 +111,11 @@ def test_resume_refuses_other_settings(trained: Path, tmp_path: Path, capsys: py
     before = {path: path.read_bytes() for path in trained.iterdir()}
     for options, words in [
         (["--iterations", "4"], ["already has 4 iterations", "--iterations 8"]),
-        (["--iterations", "9", "--gamma", "0.9"], ["has gamma 0.995, not 0.9", "begin a new run in another folder"]),
+        (["--iterations", "9", "--gamma", "0.9"], ["has gamma 0.995, not 0.9", "start a new run in another folder"]),
         (["--iterations", "9", "--nworld", "4"], ["has nworld 2, not 4"]),
         (["--iterations", "9", "--param", "success_distance=1"], ["has success_distance None, not 1"]),
         (["--iterations", "9", "--num-steps", "4"], ["--num-steps is a setting of ppo, not of npg"]),
-        (["--iterations", "9", "--seed", "0"], ["--seed has no effect with --resume", "leave it out"]),
+        (["--iterations", "9", "--seed", "0"], ["--seed has no effect with --resume", "omit it"]),
         (["--iterations", "9", "--algorithm", "npg"], ["--algorithm has no effect with --resume"]),
         (["--iterations", "9", "--out", str(tmp_path)], ["--out has no effect with --resume"]),
         (["--iterations", "9", "point_mass"], ["TASK has no effect with --resume"]),
@@ -242,7 +242,7 @@ def test_a_flag_of_the_other_algorithm_is_refused(capsys: pytest.CaptureFixture[
     for words, message in (
         (
             ["--learning-rate", "3"],
-            "--learning-rate is a setting of ppo, not of npg: leave it out, or give --algorithm",
+            "--learning-rate is a setting of ppo, not of npg: omit it, or give --algorithm",
         ),
         (["--no-stagger"], "--stagger is a setting of ppo, not of npg"),
         (["--algorithm", "ppo", "--samples", "9"], "--samples is a setting of npg, not of ppo"),
