@@ -4,12 +4,12 @@
     lyceum-warp bench compare v0.1.0 HEAD --parts env plans --tasks hopper reach --out differences.json
     lyceum-warp bench compare ../before ../after --short --ignore '*/metrics.csv/new_column'
 
-OLD and NEW are revisions of git, or folders with a checkout; NEW is this working tree by default. Both compute the same
-units of work side by side, each in a process of its own, with the same Python and the same packages. A unit is a part
-on a task and an engine.
+OLD and NEW are git revisions or folders with a checkout; NEW is this working tree by default. Each checkout runs in a
+subprocess, with the same Python and packages, and both compute the same units of work side by side. A unit is one part
+of the comparison for one task on one engine.
 
-The numbers depend on the processor: a file of them cannot replace OLD. The program uses the public
-names of the package only (probes/checkout.py). Exit code: 0 without a difference, 1 with differences, 2 for bad input.
+The numbers depend on the processor, so stored numbers cannot replace OLD. The program uses only public names of the
+package (probes/checkout.py). Exit code: 0 without differences, 1 with differences, 2 for bad input.
 """
 
 import contextlib
@@ -38,9 +38,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PROBE = ROOT / "bench" / "probes" / "checkout.py"
 PACKAGE = "lyceum_warp"
 PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "numpy")
-"""Packages that both checkouts use, whose versions are written into the file of --out."""
+"""Packages that both checkouts use; --out stores their versions."""
 LINES = 12
-"""Differences of a unit that are printed; a file of --out has all."""
+"""Number of differences of a unit that are printed; the file of --out holds all."""
 
 Part = Literal["env", "plans", "learners", "commands"]
 PARTS: tuple[Part, ...] = ("env", "plans", "learners", "commands")
@@ -48,12 +48,12 @@ ENGINES = ("mujoco", "warp")
 
 EVERY_VARIANT = ("MPPI", "CEM", "PredictiveSampling", "knots", "plants", "control")
 MANY_PLANNERS = ("point_mass", "reach", "hopper")
-"""Tasks on which every planner is compared; on the others only MPPI is."""
+"""Tasks on which all planners are compared; on other tasks only MPPI is."""
 LEARNING = {"mujoco": ("point_mass", "hopper", "go1_velocity"), "warp": ("hopper",)}
 """Tasks on which learners are compared, by engine."""
 COMMANDS = {"mujoco": ("hopper",), "warp": ("point_mass",)}
 SHORT = ("point_mass", "reach", "hopper", "go1_velocity")
-"""Tasks of --short: without contacts, with a mocap body, with episodes that end early, with everything else."""
+"""Tasks of --short: without contacts, with a mocap body, with early ends of episodes, and with all other features."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,44 +61,43 @@ class Options:
     """Report every difference, to the bit, between the numbers of two checkouts."""
 
     old: tyro.conf.Positional[str]
-    """A revision of git, or a folder with a checkout."""
+    """A git revision, or a folder with a checkout."""
     new: tyro.conf.Positional[str] = str(ROOT)
-    """The revision or folder to compare it with; this working tree by default."""
+    """The revision or folder to compare with; by default this working tree."""
     tasks: tuple[str, ...] = ()
-    """Tasks; by default all. Learners and commands by default run on few; of given tasks on those among them, or on
-    all if none is."""
+    """Tasks; by default all. Of these, learners and commands use a few, or all if none of the few is given."""
     engines: tuple[Literal["mujoco", "warp"], ...] = ENGINES
     """Engines."""
     device: str = "cpu"
-    """Device of the Warp engine, for example cuda, with its deterministic mode."""
+    """Device of the Warp engine, for example cuda. On a GPU the engine is deterministic."""
     parts: tuple[Part, ...] = PARTS
-    """What is compared. env: the compiled model, resets, steps with actions beyond their bounds and short episodes,
-    observations, rewards and evaluations of given states, resets of some worlds, a fault, a rollout of given actions.
-    plans: MPPI, CEM, predictive sampling, plans of knots and of several plants, episodes under lw.control. learners:
-    NPG, and PPO if both checkouts have lw.PPO; the networks afterwards. commands: lyceum-warp train, at once and with
-    a break; metrics.csv and the saved policies."""
+    """Parts. env: the compiled model, resets, steps with actions beyond their bounds and short episodes, observations,
+    rewards and evaluations of given states, resets of some worlds, a fault, a rollout of given actions. plans: MPPI,
+    CEM, predictive sampling, plans with knots and for several plants, episodes under lw.control. learners: NPG, and PPO
+    if both checkouts have lw.PPO, with their final networks. commands: lyceum-warp train, with and without an
+    interruption: metrics.csv and the saved policies."""
     steps: int = 20
-    """Steps of an environment."""
+    """Number of steps of an environment."""
     iterations: int = 10
-    """Iterations of a learner."""
+    """Number of iterations of a learner."""
     out: Path | None = None
-    """File (JSON) for every digest and every difference."""
+    """JSON file for all digests and differences."""
     ignore: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="PATTERN")] = ()
-    """Names to leave out, as '*/metrics.csv/*' or 'plans/hopper/*'; may be given several times."""
+    """Names to ignore, such as '*/metrics.csv/*' or 'plans/hopper/*'; may be repeated."""
     short: bool = False
-    """Compare four tasks, and plans and commands only on the C engine: about three minutes on two busy cores with a
-    warm cache of kernels, where everything takes sixteen."""
+    """Compare four tasks, and plans and commands only on the C engine. With a warm kernel cache on two busy cores this
+    takes about three minutes instead of sixteen."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Unit:
-    """A unit of work: a part on a task and an engine."""
+    """A unit of work: one part for one task on one engine."""
 
     part: Part
     task: str
     engine: str
     more: Mapping[str, Any]
-    """Further arguments of the part."""
+    """Additional arguments of the part."""
     variant: str = ""
 
     @property
@@ -108,50 +107,50 @@ class Unit:
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """A difference between two arrays of one name, or between two checkouts."""
+    """A difference between two arrays of one name, or between the checkouts themselves."""
 
     name: str
     kind: Literal["numbers", "form", "added", "removed", "failure"]
     text: str
-    """What differs, in a line."""
+    """A description in one line."""
     first: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """The first place that differs, by the names of the axes."""
+    """Index of the first different element, by axis name."""
     old: str = ""
-    """The old number at this place."""
+    """The old value at this index."""
     new: str = ""
     largest: float | None = None
     """The largest absolute difference; None if it is not finite."""
     count: int = 0
-    """How many elements differ."""
+    """Number of different elements."""
     size: int = 0
-    """How many elements there are."""
+    """Number of elements."""
 
 
 # arrays
 
 
 def digest(array: np.ndarray) -> str:
-    """A hash of an array's type, shape and bits."""
+    """Hash an array's type, shape and bits."""
     head = f"{array.dtype.str} {array.shape} ".encode()
     return hashlib.sha256(head + np.ascontiguousarray(array).tobytes()).hexdigest()
 
 
 def unequal(old: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Which elements of two arrays of one type and shape differ in a bit, flat."""
+    """Return which elements of two arrays of equal type and shape differ in any bit, flattened."""
     rows = [np.ascontiguousarray(a).reshape(-1).view(np.uint8).reshape(a.size, a.itemsize) for a in (old, new)]
     return (rows[0] != rows[1]).any(axis=1)
 
 
 def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] = ()) -> Difference | None:
-    """The difference between two arrays, None if they are equal to the bit.
+    """Return the difference between two arrays, or None if they are equal to the bit.
 
     Args:
         name: Their name.
-        old: An array of numbers or of text.
-        new: The other.
-        axes: Names of their leading axes.
+        old: An array of numbers or strings.
+        new: The array to compare with it.
+        axes: Names of the leading axes.
     """
-    if old.dtype.kind == new.dtype.kind == "U" and old.shape == new.shape:  # types of texts have a length
+    if old.dtype.kind == new.dtype.kind == "U" and old.shape == new.shape:  # string types include a length
         longer = max(old.dtype, new.dtype)
         old, new = old.astype(longer), new.astype(longer)
     if (old.dtype, old.shape) != (new.dtype, new.shape):
@@ -177,7 +176,7 @@ def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] 
 def differences(
     unit: str, old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray], axes: Mapping[str, Sequence[str]]
 ) -> Iterator[Difference]:
-    """The differences between the arrays of a unit, in the order in which they were computed."""
+    """Yield the differences between the arrays of a unit, in the order of their computation."""
     names = [*old, *(name for name in new if name not in old)]
     for name in names:
         whole = f"{unit}/{name}"
@@ -190,7 +189,7 @@ def differences(
 
 
 def below(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """The arrays whose names begin with a prefix, by the rest of their names."""
+    """Return the arrays whose names begin with a prefix, without the prefix."""
     return {name.removeprefix(f"{prefix}/"): array for name, array in arrays.items() if name.startswith(f"{prefix}/")}
 
 
@@ -199,14 +198,14 @@ def below(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray
 
 @contextlib.contextmanager
 def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
-    """A folder with a checkout, and its description.
+    """Provide a folder with a checkout, and its description.
 
     Args:
-        given: A folder, or a revision of git, whose package is unpacked.
+        given: A folder, or a git revision whose package is unpacked.
         folder: An empty folder for it.
 
     Raises:
-        ValueError: There is neither.
+        ValueError: ``given`` is neither.
     """
     if Path(given, PACKAGE, "__init__.py").is_file():
         yield Path(given).resolve(), str(Path(given).resolve())
@@ -225,7 +224,7 @@ def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
 
 
 class Side:
-    """A checkout's process. It starts when it is first asked, and again if it has died.
+    """The subprocess of a checkout. It starts with the first request, and restarts if it has died.
 
     Args:
         name: "old" or "new".
@@ -240,17 +239,18 @@ class Side:
 
     def start(self) -> None:
         path = os.pathsep.join([str(self.root), *filter(None, [os.environ.get("PYTHONPATH")])])
-        # a process that is killed leaves temporary files of Warp's compiler behind
+        # a killed process leaves temporary files of Warp's compiler behind
         own = {"PYTHONPATH": path, "TMPDIR": str(self.folder), "CUBLAS_WORKSPACE_CONFIG": ":4096:8"}
         with self._log.open("w") as log:
-            # -P leaves out bench/, whose programs have names of their own; a session of its own is ended as a whole
+            # -P omits bench/ from the path, because its modules could shadow others; a new session can be killed as a
+            # whole
             self._process = subprocess.Popen(
                 [sys.executable, "-P", str(PROBE), str(self._file)], cwd=self.folder, env=os.environ | own, text=True,
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, start_new_session=True,
             )  # fmt: skip
 
     def contents(self) -> dict[str, Any]:
-        """What the checkout has, once its process is there; or a failure."""
+        """Return the tasks and learners of the checkout once its process has started, or a failure."""
         found = self.answer()
         if "file" in found and not Path(found["file"]).is_relative_to(self.root):
             text = f"imports {found['file']} instead of {self.root}"
@@ -263,11 +263,11 @@ class Side:
             self.start()
             self.answer()
         assert self._process is not None and self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # the answer says why
+        with contextlib.suppress(BrokenPipeError):  # the answer gives the reason
             print(json.dumps(unit), file=self._process.stdin, flush=True)
 
     def answer(self) -> dict[str, Any]:
-        """The process's answer, or how it ended."""
+        """Return the process's answer, or how it ended."""
         assert self._process is not None and self._process.stdout is not None
         if line := self._process.stdout.readline():
             return json.loads(line)
@@ -277,14 +277,14 @@ class Side:
         return {"failure": {"text": f"the process ended with {code}", "trace": trace, "missing": False}}
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays of the last unit."""
+        """Return the arrays of the last unit."""
         if not self._file.exists():
             return {}
         with np.load(self._file) as file:
             return dict(file)
 
     def close(self) -> None:
-        """End the process with those that it started."""
+        """Kill the process and its children."""
         if self._process is not None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGKILL)
@@ -296,12 +296,12 @@ class Side:
 
 
 def units(options: Options, tasks: Sequence[str], learners: Sequence[str]) -> Iterator[Unit]:
-    """The units of work, in the order in which they are compared.
+    """Yield the units of work in the order of the comparison.
 
     Args:
         options: The options.
         tasks: The tasks that both checkouts have.
-        learners: The learners that both have.
+        learners: The learners that both checkouts have.
     """
     given = set(options.tasks)
 
@@ -334,20 +334,20 @@ def units(options: Options, tasks: Sequence[str], learners: Sequence[str]) -> It
 
 @dataclasses.dataclass
 class Report:
-    """What was compared."""
+    """The results of a comparison."""
 
     ignore: Sequence[str]
     units: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     found: list[Difference] = dataclasses.field(default_factory=list)
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Skipped units, and the missing extra of each."""
+    """Skipped units, with the missing extra of each."""
     arrays: int = 0
-    """Arrays that were compared."""
+    """Number of compared arrays."""
     ignored: int = 0
-    """Names that a pattern left out."""
+    """Number of names that a pattern excluded."""
 
     def kept(self, name: str) -> bool:
-        """Whether no pattern leaves out a name."""
+        """Return whether a name is compared, and count it as ignored otherwise."""
         if any(fnmatch.fnmatchcase(name, pattern) for pattern in self.ignore):
             self.ignored += 1
             return False
@@ -356,7 +356,7 @@ class Report:
     def add(
         self, name: str, found: Sequence[Difference], seconds: float = 0.0, digests: Mapping[str, Any] | None = None
     ) -> None:
-        """Take the differences of a unit with the old and the new digest of each array, and print them."""
+        """Add and print the differences of a unit; ``digests`` holds the old and the new digest of each array."""
         digests = digests or {}
         self.found += found
         self.arrays += len(digests)
@@ -373,7 +373,8 @@ class Report:
 
 
 def failures(name: str, answers: Mapping[str, Mapping[str, Any]]) -> list[Difference]:
-    """The failures of a unit, whose text names the checkout. Those of both are listed, too: nothing was compared."""
+    """Return a unit's failures, with the checkout in their text. A failure in both is listed, because nothing was
+    compared."""
     failed = {side: answer["failure"] for side, answer in answers.items() if "failure" in answer}
     for failure in failed.values():
         print(failure["trace"], file=sys.stderr)
@@ -381,7 +382,7 @@ def failures(name: str, answers: Mapping[str, Mapping[str, Any]]) -> list[Differ
 
 
 def compare_unit(unit: Unit, sides: Sequence[Side], device: str, report: Report) -> None:
-    """Let both checkouts compute a unit, and take the differences into the report."""
+    """Let both checkouts compute a unit, and add the differences to the report."""
     began = time.perf_counter()
     request = {"part": unit.part, "task": unit.task, "engine": unit.engine, "device": device, **unit.more}
     for side in sides:
@@ -396,7 +397,7 @@ def compare_unit(unit: Unit, sides: Sequence[Side], device: str, report: Report)
     )
     axes = {**answers["new"].get("axes", {}), **answers["old"].get("axes", {})}
     found = [each for each in failures(unit.name, answers) if report.kept(each.name)]
-    if found:  # arrays that a failure left out are not further differences
+    if found:  # arrays that are missing after a failure are not counted as additional differences
         old, new = ({name: array for name, array in side.items() if name in old and name in new} for side in (old, new))
     found += differences(unit.name, old, new, axes)
     for side, arrays in (("old", old), ("new", new)):
@@ -412,7 +413,7 @@ def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
     """Compare two checkouts.
 
     Raises:
-        ValueError: Neither has one of the tasks.
+        ValueError: Neither checkout has one of the tasks.
     """
     for side in sides:
         side.start()
@@ -442,7 +443,7 @@ def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
 
 
 def written(report: Report, options: Options, checkouts: Mapping[str, str], seconds: float) -> dict[str, Any]:
-    """The content of the file."""
+    """Return the content of the file of --out."""
     return {
         "checkouts": checkouts,
         "options": dataclasses.asdict(options) | {"out": str(options.out)},
@@ -457,10 +458,10 @@ def written(report: Report, options: Options, checkouts: Mapping[str, str], seco
 
 
 def run(options: Options) -> int:
-    """Compare, and report; returns the exit code.
+    """Compare, print a report, and return the exit code.
 
     Raises:
-        ValueError: An option is wrong.
+        ValueError: An option is invalid.
     """
     if options.steps < 1 or options.iterations < 2:
         raise ValueError("--steps must be at least 1 and --iterations at least 2, so that a run can have a break")
@@ -493,7 +494,7 @@ def run(options: Options) -> int:
 
 
 def main(options: Options) -> int:
-    """The program; returns the exit code: 0, 1 with differences, 2 for bad input, 130 or 143 after a signal."""
+    """Run the program; return 0, 1 with differences, 2 for bad input, 130 or 143 after a signal."""
     for number in (signal.SIGTERM, signal.SIGHUP):  # so that temporary folders are removed
         signal.signal(number, lambda number, frame: sys.exit(128 + number))
     try:

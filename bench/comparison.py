@@ -1,4 +1,4 @@
-"""Compute statistics of learning curves: means with intervals, and whether two sets of curves differ."""
+"""Compute statistics of learning curves: means with intervals, and a test that compares two sets of curves."""
 
 import itertools
 import math
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 MOST_SPLITS = 20_000
-"""Most splits of the seeds in the permutation test; from more, it draws so many."""
+"""Maximum number of splits of the seeds in the permutation test; if there are more, a random subset is used."""
 
 
 def student_quantile(probability: float, freedom: float) -> float:
@@ -34,7 +34,7 @@ def student_quantile(probability: float, freedom: float) -> float:
 
 
 def mean_interval(values: Sequence[float], confidence: float = 0.95) -> tuple[float, float]:
-    """Return the mean, and half the width of its confidence interval (Student's t); nan for a single value."""
+    """Return the mean and the half-width of its confidence interval (Student's t); nan for a single value."""
     array = np.asarray(values, float)
     if len(array) < 2:
         return float(array.mean()), math.nan
@@ -45,16 +45,17 @@ def mean_interval(values: Sequence[float], confidence: float = 0.95) -> tuple[fl
 def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Test at every point whether the curves a and b have the same distribution, adjusted for all points.
 
-    The test permutes whole curves, and compares each point's Welch statistic with the largest one of all points
-    (Westfall and Young 1993, single step), so that the probability of an error at any point is at most the level, with
-    any dependence between the points. With few curves the p values cannot be small: five against five have 252 splits.
+    The test permutes whole curves, and compares each point's Welch statistic with the largest statistic over all points
+    (Westfall and Young 1993, single step). The probability of a false positive at any point is therefore at most the
+    level, whatever the dependence between points. With few curves the p-values cannot be small: five against five have
+    252 splits.
 
     Args:
         a: Curves, (curves, points).
         b: Curves, (curves, points).
 
     Returns:
-        Adjusted two-sided p values, (points,); nan with fewer than two curves in a or b.
+        Adjusted two-sided p-values, (points,); nan with fewer than two curves in a or b.
     """
     both, n = np.concatenate([a, b]), len(a)
     if min(n, len(b)) < 2:
@@ -70,7 +71,7 @@ def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     statistics = np.stack([_welch(both[first], both[~first]) for first in chosen])
     observed = _welch(a, b)
     largest = statistics.max(axis=1)
-    # the observed split is among them; rounding must not count it as smaller than itself
+    # the observed split is included; rounding must not make it smaller than itself
     return (largest[:, None] >= observed * (1.0 - 1e-9)).mean(axis=0)
 
 

@@ -1,9 +1,8 @@
-"""Step the worlds of lyceum_warp, of ``mujoco.rollout`` and of other libraries for the experiment throughput.
+"""Step worlds with lyceum_warp, ``mujoco.rollout`` and other libraries for the experiment throughput.
 
 A sample is one environment step whose observation and reward the caller has received. All contestants use the same
-model, substeps and bounds of uniformly random actions. Worlds start from random initial states, take some steps before
-the clock starts, and restart at the end of an episode. Each contestant gets the number of worlds for each thread that
-suits it.
+model, substeps and bounds of uniformly random actions. Worlds start from random initial states, step a few times before
+the clock starts, and restart when an episode ends. Each contestant runs with its best number of worlds per thread.
 """
 
 import importlib.util
@@ -37,20 +36,20 @@ LABELS = {
 }
 
 WORLDS = {"c": 64, "warp": 64, "native": 64, "envpool": 64, "gym-async": 2, "gym-sync": 16, "dm_control": 8}
-"""Worlds for each thread; SyncVectorEnv has one thread."""
+"""Worlds per thread; SyncVectorEnv has one thread."""
 
 GPU_WORLDS = 16_384
 
 
 def worlds(contestant: str, threads: int, device: str) -> int:
-    """Return the default number of worlds of a contestant."""
+    """Return a contestant's default number of worlds."""
     if contestant == "warp" and device.startswith("cuda"):
         return GPU_WORLDS
     return WORLDS[contestant] * (1 if contestant == "gym-sync" else threads)
 
 
 def takes_part(contestant: str, task: str) -> bool:
-    """Return whether a contestant has a task."""
+    """Return whether a contestant supports a task."""
     return contestant != "envpool" or task in sampling.ENVPOOL
 
 
@@ -60,14 +59,14 @@ def measure(
     """Measure environment steps per second.
 
     Args:
-        contestant: A name of ``LABELS``.
+        contestant: A name in ``LABELS``.
         task: A task of this package.
         worlds: Number of worlds.
         threads: Number of threads and cores.
         device: Device of the Warp engine.
         seed: Seed of actions and initial states.
         seconds: Duration of the measurement.
-        warm: Steps before it.
+        warm: Number of steps before it.
 
     Raises:
         experiment.Skipped: The contestant is not installed, or there are too few cores.
@@ -86,7 +85,7 @@ def measure(
 
 
 def python_of(contestant: str) -> Path:
-    """Return the Python that runs another library."""
+    """Return the Python that runs a library."""
     if contestant.startswith("gym") or (contestant == "envpool" and importlib.util.find_spec("envpool")):
         return Path(sys.executable)
     return venvs.python_of(contestant)
@@ -110,17 +109,17 @@ class LyceumWarp:
 
 
 def actions(env: lw.Env, seed: int) -> list[torch.Tensor]:
-    """Return actions of several steps, (nworld, nact) each; a list, because indexing a tensor would be timed, too."""
+    """Return a list of actions for several steps, (nworld, nact) each; indexing a tensor would cost time."""
     low, high = (np.nan_to_num(x, posinf=1.0, neginf=-1.0) for x in (env.action_space.low, env.action_space.high))
     drawn = sampling.draw(np.asarray(low), np.asarray(high), env.nworld, seed)
     return list(torch.as_tensor(drawn, dtype=torch.float32, device=env.obs.device))
 
 
 class Native:
-    """``mujoco.rollout`` without a task, one call for each environment step.
+    """``mujoco.rollout`` without a task, with one call for each environment step.
 
-    It steps the states from which lyceum_warp's environment steps, with the same controls: the same substeps and
-    restarts, without observations and rewards.
+    It starts each step in the same state as lyceum_warp's environment, with the same controls, substeps and restarts,
+    but computes no observations or rewards.
     """
 
     def __init__(self, task: str, nworld: int, threads: int, seed: int, warm: int) -> None:
@@ -160,4 +159,4 @@ class Native:
         )
 
     def wait(self) -> None:
-        """Do nothing: a step ends before its call returns."""
+        """Do nothing, because steps are synchronous."""

@@ -1,9 +1,9 @@
 """Run experiments: cases, stored results, tables and figures.
 
-An experiment is a file with an ``EXPERIMENT``: a list of cases, a function that measures one case, and functions that
-make tables and a figure from stored results. ``main`` prints the time that the cases take and skips cases whose results
-from the same hardware and software are stored. Each result is written as soon as it is measured: an interrupted run
-loses at most one case per job, and the same command continues.
+An experiment is a module with an ``EXPERIMENT``: a function that lists cases, a function that measures a case, and
+functions that make tables and a figure from stored results. ``main`` prints the expected duration, and skips cases
+with stored results from the same hardware and software. Each result is written immediately: an interrupted run loses
+at most one case per job, and the same command continues it.
 """
 
 import concurrent.futures
@@ -34,10 +34,10 @@ import tyro
 FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
 NAMES = ("throughput", "npg", "learning", "mppi", "fidelity", "soak")
-"""The experiments."""
+"""Names of the experiments."""
 
 SOFTWARE = ("python", "mujoco", "mujoco_warp", "warp_lang", "torch", "numpy", "gymnasium")
-"""Versions that must be equal for results to be compared, together with the hardware."""
+"""Versions that must be equal, together with the hardware, before results are compared."""
 
 STYLES = (
     ("#D55E00", "o", "-"), ("#0072B2", "s", "--"), ("#009E73", "^", "-."), ("#CC79A7", "D", ":"),
@@ -47,21 +47,21 @@ STYLES = (
 
 
 class Skipped(Exception):  # noqa: N818
-    """A case cannot be measured on this machine; the message is one line with the reason."""
+    """A case cannot be measured on this machine; the message gives the reason in one line."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Options of every experiment. An experiment may derive a class with more options."""
+    """Options of every experiment; an experiment may derive a class with additional options."""
 
     short: bool = False
-    """Measure little, in two minutes on two cores; the results go to results/short/."""
+    """Run a small measurement, which takes two minutes on two cores; the results go to results/short/."""
     out: Path | None = None
     """File of the results (JSON lines); by default results/NAME.jsonl."""
     tasks: tuple[str, ...] = ()
-    """Tasks; by default the experiment's."""
+    """Tasks; by default all tasks of the experiment."""
     contestants: tuple[str, ...] = ()
-    """Contestants; by default the experiment's."""
+    """Contestants; by default all contestants of the experiment."""
     device: str = "cpu"
     """Device of the Warp engine, for example cuda."""
     threads: int | None = None
@@ -69,29 +69,29 @@ class Options:
     repeats: int | None = None
     """Number of repeats of each comparison."""
     seeds: tuple[int, ...] = ()
-    """Seeds, if the experiment has any."""
+    """Seeds, if the experiment uses any."""
     jobs: int = 1
-    """Number of cases that run at the same time, each on cores of its own, if the experiment allows it."""
+    """Number of cases that run at the same time, each on separate cores, if the experiment allows it."""
     dry_run: bool = False
-    """Print the cases and their durations, and measure nothing."""
+    """Print the cases and their durations without measuring."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One result, a line of the file."""
+    """One result, which is a line of the file."""
 
     case: dict[str, Any]
-    """What was measured."""
+    """The measured case."""
     result: dict[str, Any]
     provenance: dict[str, Any]
     """Machine, versions, commit and date."""
     seconds: float
-    """Wall-clock time of the measurement, including its preparation."""
+    """Wall-clock time of the measurement, including setup."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """A table of text."""
+    """A text table."""
 
     title: str
     header: Sequence[str]
@@ -106,41 +106,41 @@ class Table:
 class Experiment:
     """An experiment.
 
-    A case is a frozen dataclass with everything that the result depends on, except for the machine and the versions.
-    Contestants that are compared take turns: list the cases with the repeats outside and the contestants inside.
+    A case is a frozen dataclass with everything that affects the result, except for the machine and the versions.
+    Compared contestants take turns: list the cases with repeats as the outer loop and contestants as the inner loop.
     """
 
     name: str
-    """Name of the program and of the file of results."""
+    """Name of the program and of its results file."""
     summary: str
-    """One line."""
+    """Description in one line."""
     cases: Callable[[Any], Sequence[Any]]
-    """Return the cases for the options, in the order of the measurements."""
+    """Return the cases for the options, in the order of measurement."""
     estimate: Callable[[Any], float]
     """Return the seconds that a case takes on two cores."""
     measure: Callable[[Any, Any], dict[str, Any]]
-    """Measure a case with the options; raise Skipped if that is impossible on this machine."""
+    """Measure a case with the options; raise Skipped if this machine cannot."""
     tables: Callable[[Sequence[Row]], Sequence[Table]]
     """Make tables from the stored results of one machine."""
     figure: Callable[[Sequence[Row]], Any] | None = None
     """Draw the stored results of one machine with matplotlib; return None if there is nothing to draw."""
     options: type[Options] = Options
     packages: tuple[str, ...] = ()
-    """Peers whose versions belong to the provenance."""
+    """Peers whose versions are stored with the results."""
     apart: bool = False
-    """Whether each case runs in a process of its own."""
+    """Whether each case runs in a subprocess."""
     parallel: bool = False
-    """Whether cases run in processes of their own if there are several jobs."""
+    """Whether cases run in subprocesses if there are several jobs."""
 
 
 def load(name: str) -> Experiment:
-    """Import an experiment by its name; raise ValueError if there is none of that name."""
+    """Import an experiment by name; raise ValueError if the name is unknown."""
     choose((name,), NAMES, what="experiment")
     return importlib.import_module(name).EXPERIMENT
 
 
 def choose(given: Sequence[str], known: Iterable[str], default: Sequence[str] = (), *, what: str) -> tuple[str, ...]:
-    """Return the given names; without any, the default ones, and all without a default.
+    """Return the given names, or else the default names, or else all known names.
 
     Raises:
         ValueError: A name is unknown.
@@ -155,10 +155,10 @@ def choose(given: Sequence[str], known: Iterable[str], default: Sequence[str] = 
 
 
 def installed(module: str, requirement: str) -> Any:
-    """Import a package of a peer.
+    """Import a peer's package.
 
     Raises:
-        Skipped: It is not installed.
+        Skipped: The package is not installed.
     """
     try:
         return importlib.import_module(module)
@@ -172,7 +172,7 @@ def installed(module: str, requirement: str) -> Any:
 
 
 def stored(names: Sequence[str], results: Path) -> dict[str, Path]:
-    """Return the files of results in a folder by experiment: of the given experiments, or of all with results.
+    """Return a folder's results files by experiment, for the given experiments or for all that have results.
 
     Raises:
         ValueError: A name is unknown.
@@ -190,7 +190,7 @@ def stored(names: Sequence[str], results: Path) -> dict[str, Path]:
 
 
 def read(path: Path) -> list[Row]:
-    """Read a file of results; an incomplete last line is dropped with a warning.
+    """Read a results file; drop an incomplete last line with a warning.
 
     Raises:
         ValueError: A line is not a result.
@@ -200,7 +200,7 @@ def read(path: Path) -> list[Row]:
 
 
 def _read(path: Path) -> tuple[list[Row], int]:
-    """Return the rows, and the offset at which the last one ends."""
+    """Return the rows, and the offset at which the last row ends."""
     rows, size = [], 0
     for number, line in enumerate(path.read_bytes().splitlines(keepends=True), start=1):
         try:
@@ -215,7 +215,7 @@ def _read(path: Path) -> tuple[list[Row], int]:
 
 
 def append(path: Path, row: Row) -> None:
-    """Append a row to a file of results, and flush it to the disk."""
+    """Append a row to a results file, and flush it to the disk."""
     with path.open("ab") as file:
         file.write(json.dumps(dataclasses.asdict(row)).encode() + b"\n")
         file.flush()
@@ -223,17 +223,17 @@ def append(path: Path, row: Row) -> None:
 
 
 def machine(row: Row) -> tuple[Any, ...]:
-    """Return the hardware that must be equal for numbers to be compared."""
+    """Return the hardware that must be equal before numbers are compared."""
     return tuple(row.provenance.get(name) for name in measurements.HARDWARE)
 
 
 def software(row: Row) -> tuple[Any, ...]:
-    """Return the versions that must be equal for numbers to be compared."""
+    """Return the versions that must be equal before numbers are compared."""
     return tuple(row.provenance.get(name) for name in SOFTWARE)
 
 
 def by_machine(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Group rows by hardware and software, under names such as "64-cores-h200"; keep the last row of each case."""
+    """Group rows by hardware and software under names such as "64-cores-h200"; keep the last row of each case."""
     groups: dict[tuple[Any, ...], dict[str, Row]] = {}
     for row in rows:
         groups.setdefault((machine(row), software(row)), {})[key(row.case)] = row
@@ -247,14 +247,14 @@ def by_machine(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 def slug(row: Row) -> str:
-    """Return a short name of a machine."""
+    """Return a short name for a row's machine."""
     cores, gpu = row.provenance["cores"], row.provenance.get("gpu")
     model = [] if gpu is None else [word.lower() for word in gpu.split() if any(map(str.isdigit, word))][:1] or ["gpu"]
     return "-".join([f"{cores}-cores", *model])
 
 
 def described(rows: Sequence[Row]) -> str:
-    """Describe machine, versions and commits of rows from one machine in one line."""
+    """Describe machine, versions and commits of one machine's rows in one line."""
     found = rows[-1].provenance
     parts = [f"{found['cores']} cores ({found['cpu']})"]
     if found.get("gpu"):
@@ -271,7 +271,7 @@ def described(rows: Sequence[Row]) -> str:
 
 
 def key(case: Mapping[str, Any]) -> str:
-    """Return text that is equal for equal cases."""
+    """Return a string that is equal for equal cases."""
     return json.dumps(case, sort_keys=True)
 
 
@@ -279,12 +279,12 @@ def key(case: Mapping[str, Any]) -> str:
 
 
 def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[float]]:
-    """Return, by contestant, ratios of a quantity to the quantity of the reference in the same repeat.
+    """Return the ratios of a quantity to the reference contestant's in the same repeat, by contestant.
 
     Args:
-        rows: Rows of otherwise equal cases, which have a ``repeat``.
+        rows: Rows whose cases differ only in contestant and ``repeat``.
         quantity: Entry of the results.
-        unit: The contestant that counts as 1.
+        unit: The reference contestant.
     """
     values: dict[str, dict[int, float]] = {}
     for row in rows:
@@ -294,7 +294,7 @@ def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[floa
 
 
 def median_and_range(values: Sequence[float], form: str = ".2f") -> str:
-    """Format the median, and the smallest and largest value in parentheses; empty text without values."""
+    """Format the median, with the smallest and largest value in parentheses; empty if there are no values."""
     if not values:
         return ""
     middle = format(statistics.median(values), form)
@@ -303,10 +303,10 @@ def median_and_range(values: Sequence[float], form: str = ".2f") -> str:
 
 @contextlib.contextmanager
 def cores(number: int | None) -> Iterator[None]:
-    """Limit this thread, and the threads and processes that it starts, to the first cores.
+    """Limit this thread, and all threads and processes that it starts, to the first cores.
 
     Raises:
-        Skipped: There are fewer.
+        Skipped: There are too few cores.
     """
     before = sorted(os.sched_getaffinity(0))
     if number is not None and number > len(before):
@@ -341,7 +341,7 @@ def run(experiment: Experiment, options: Options) -> int:
     """Measure the cases without a stored result; return the exit code.
 
     Raises:
-        ValueError: An option is wrong.
+        ValueError: An option is invalid.
     """
     kind, _, number = options.device.partition(":")
     if kind not in ("cpu", "cuda") or (number and not number.isdigit()):
@@ -374,7 +374,7 @@ def run(experiment: Experiment, options: Options) -> int:
                 print(f"skipped: {result}", flush=True)
             skipped.add(str(result))
             continue
-        if isinstance(result, Exception):  # the other cases are worth measuring
+        if isinstance(result, Exception):  # a failure must not stop the remaining cases
             failed += 1
             traceback.print_exception(result)
             print(f"failed: {_text(case)}", file=sys.stderr, flush=True)
@@ -393,7 +393,7 @@ def run(experiment: Experiment, options: Options) -> int:
 def outcomes(
     experiment: Experiment, cases: Sequence[Any], options: Options
 ) -> Iterator[tuple[Any, dict[str, Any] | Exception, float]]:
-    """Yield each case with its result, or with the exception that it raised, and its seconds."""
+    """Yield each case with its duration, and its result or the exception that it raised."""
     if not experiment.apart and options.jobs == 1:
         for case in cases:
             began = time.perf_counter()
@@ -410,11 +410,11 @@ def outcomes(
 
     def alone(case: Any) -> tuple[Any, dict[str, Any] | Exception, float]:
         began, place = time.perf_counter(), places.get()
-        os.sched_setaffinity(0, place)  # of this thread; the process inherits it
+        os.sched_setaffinity(0, place)  # the affinity of this thread, which the subprocess inherits
         try:
             with concurrent.futures.ProcessPoolExecutor(1, context) as process:
                 result = process.submit(_measure_apart, experiment.measure, case, options).result()
-        except Exception as error:  # the case's own, or that its process died
+        except Exception as error:  # raised by the case, or because its process died
             result = error
         places.put(place)
         return case, result, time.perf_counter() - began
@@ -431,8 +431,8 @@ def outcomes(
 
 
 def _measure_apart(measure: Callable[[Any, Any], Any], case: Any, options: Options) -> Any:
-    """Measure a case in this process, which ends with its parent and on SIGTERM."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that it ends its own processes, too
+    """Measure a case in this subprocess, and end on SIGTERM or with the parent process."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that it ends its own subprocesses, too
     threading.Thread(target=_interrupt_after_parent, daemon=True).start()
     return measure(case, options)
 
@@ -445,7 +445,7 @@ def _interrupt_after_parent() -> None:
 
 
 def core_sets(jobs: int, threads: int | None) -> list[set[int]]:
-    """Return disjoint sets of cores, one for each job.
+    """Return disjoint sets of cores, one per job.
 
     Raises:
         ValueError: There are too few cores.
@@ -468,13 +468,13 @@ def _values(result: Mapping[str, Any]) -> str:
 
 
 def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
-    """Run an experiment; return the exit code: 0, 1 if a case failed, 2 for bad input, 130 after Ctrl-C."""
+    """Run an experiment; return 0, 1 if a case failed, 2 for bad input, 130 after Ctrl-C."""
     options = tyro.cli(experiment.options, prog=f"lyceum-warp bench {experiment.name}", args=argv)
     return guarded(lambda: run(experiment, options), experiment.name)
 
 
 def guarded(program: Callable[[], int], name: str) -> int:
-    """Run a program with a one-line message for bad input and for Ctrl-C; return the exit code."""
+    """Run a program with one-line messages for bad input and Ctrl-C; return the exit code."""
     try:
         return program()
     except (ValueError, FileNotFoundError) as error:

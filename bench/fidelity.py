@@ -2,13 +2,13 @@
 
     lyceum-warp bench fidelity --device cuda --jobs 4
 
-Worlds of both engines begin in the same float32 states and get the same random actions. The C engine (float64) is
-compared with the Warp engine (float32), with itself if its state is rounded to float32 after every step, and with
-itself from a start that was moved by the rounding of float32. The last two are the scale: chaos separates any two
-trajectories, and an engine is as faithful as its precision allows if it stays with the C engine as long as they do.
-Differences are the largest of a world's observations, relative to the larger of 1 and the number; contact forces,
-which a solver finds to its tolerance only, are left out. Worlds go on after the end of their episode, and are dropped
-at a fault.
+Worlds of both engines start in the same float32 states and get the same random actions. The C engine (float64) is
+compared with the Warp engine (float32), with itself when its state is rounded to float32 after every step, and with
+itself from an initial state perturbed by float32 rounding. The last two give the scale: chaos separates any two
+trajectories, so an engine is as faithful as its precision allows if it stays with the C engine for as long as these do.
+A difference is the largest difference of a world's observations, relative to the larger of 1 and the value. Contact
+forces are excluded, because a solver is accurate only to its tolerance. Worlds continue after the end of an episode,
+and are dropped at a fault.
 """
 
 import dataclasses
@@ -29,16 +29,16 @@ from lyceum_warp.spaces import COUNTERS
 from lyceum_warp.support.validate import whole_number
 
 SHOWN = (1, 10, 100)
-"""Steps at which differences are kept, with the last one."""
+"""Steps whose differences are stored, together with the last step."""
 
 SETTLING = 20
 """Steps before the trajectories start, so that there are contacts."""
 
 ROUNDING = 2.0**-24
-"""Largest relative error of a number that is rounded to float32."""
+"""Largest relative error of rounding to float32."""
 
 APART = 0.01
-"""Difference of observations beyond which two trajectories are apart."""
+"""Difference of observations above which two trajectories count as apart."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Options(experiment.Options):
     """Agreement of the engines."""
 
     steps: int = 1000
-    """Steps over which trajectories are compared, at most an episode's."""
+    """Number of compared steps, at most an episode's."""
     nworld: int = 128
     """Number of worlds."""
 
@@ -84,7 +84,7 @@ def rounded(env: lw.Env, state: torch.Tensor) -> torch.Tensor:
 
 
 def moved(env: lw.Env, state: torch.Tensor, seed: int) -> torch.Tensor:
-    """Move positions and velocities by at most the float32 rounding of the larger of 1 and the number."""
+    """Perturb positions and velocities by at most the float32 rounding of the larger of 1 and the value."""
     generator, near = torch.Generator().manual_seed(seed), state.clone()
     for name in ("qpos", "qvel"):
         values = near[:, env.state_space.parts[name]]
@@ -145,14 +145,14 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def quantiles(error: torch.Tensor, shown: Sequence[int]) -> dict[str, list[float | None]]:
-    """Return median and 99 % quantile over worlds, after some numbers of steps."""
+    """Return the median and the 99 % quantile over worlds after given numbers of steps."""
     rows = error[[t - 1 for t in shown]].double()
     found = {name: rows.nanquantile(q, dim=1).tolist() for name, q in (("median", 0.5), ("p99", 0.99))}
     return {name: [value if math.isfinite(value) else None for value in values] for name, values in found.items()}
 
 
 def half_apart(error: torch.Tensor) -> int | None:
-    """Return the number of steps after which half of the worlds are apart; None if fewer are at the end."""
+    """Return the number of steps after which half of the worlds are apart, or None if fewer are at the end."""
     ever = (error > APART).cummax(0).values.double().mean(1) >= 0.5
     return int(ever.int().argmax()) + 1 if ever.any() else None
 

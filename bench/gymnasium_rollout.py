@@ -1,4 +1,4 @@
-"""Fill NPG's buffer of samples from Gymnasium's vector environments."""
+"""Fill NPG's rollout buffer from Gymnasium's vector environments."""
 
 import contextlib
 import functools
@@ -15,14 +15,14 @@ from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.rollout_buffer import Rollout
 
 TASKS = {"swimmer": "Swimmer-v5", "hopper": "Hopper-v5", "walker2d": "Walker2d-v5"}
-"""Our tasks, with Gymnasium's names."""
+"""Gymnasium's names of our tasks."""
 
 
 class GymnasiumRollout(Rollout):
-    """Fill NPG's buffer from a vector environment of Gymnasium, as ``Rollout`` does from an ``Env``.
+    """Fill NPG's rollout buffer from a Gymnasium vector environment, as ``Rollout`` does from an ``Env``.
 
-    A world that ends begins its next episode within the same step. The first episodes begin at the
-    episode steps of ``env``.
+    When an episode ends, the next one begins within the same step. The first episodes start at the step counts of
+    ``env``.
     """
 
     def __init__(self, env: lw.Env, steps: int, envs: VectorEnv, seed: int, *, segments: bool) -> None:
@@ -32,7 +32,7 @@ class GymnasiumRollout(Rollout):
         self.elapsed = torch.zeros(env.nworld)
         if segments:
             self.elapsed.copy_(env.episode_step)
-            # the time limit is the outermost wrapper, in AsyncVectorEnv, too
+            # the time limit is the outermost wrapper in AsyncVectorEnv, too
             envs.set_attr("_elapsed_steps", env.episode_step.tolist())
             self.running_return.masked_fill_(self.elapsed > 0, torch.nan)
 
@@ -70,16 +70,16 @@ class GymnasiumRollout(Rollout):
 
 
 def vector(task: str, nworld: int, mode: str) -> VectorEnv:
-    """Make Gymnasium's vector environment, without the checks for writers of environments."""
+    """Make Gymnasium's vector environment without its environment checker."""
     made = [functools.partial(gymnasium.make, TASKS[task], disable_env_checker=True)] * nworld
     if mode == "sync":
         return SyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP)
-    # Gymnasium's default on Linux; a new interpreter for each world would import all of this program
+    # Gymnasium's default on Linux; a new interpreter per world would import this whole program
     return AsyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP, context="fork")
 
 
 def rates(task: str, nworld: int, steps: int) -> dict[str, float]:
-    """Measure environment steps per second of both vector modes on these cores, with random actions."""
+    """Measure steps per second of both vector modes on these cores, with random actions."""
     found = {}
     for mode in ("sync", "async"):
         with contextlib.closing(vector(task, nworld, mode)) as envs:

@@ -1,9 +1,9 @@
-"""Measure the cost of an environment's step beside the bare engine on the same states.
+"""Compare the cost of an environment's step with the bare engine's, on the same states.
 
-Environment and bare engine alternate every ten steps. The states from which the environment steps are copied to the
-bare engine, outside the clock, so that both step the same states, resets included, under the same load of the machine.
-The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the same model, controls and
-substeps. ``kept`` is bare time divided by environment time; ``added`` is the difference.
+Environment and bare engine alternate every ten steps. The states before the environment's steps are copied to the bare
+engine, outside the clock, so that both step the same states, resets included, under the same machine load. The bare
+engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the same model, controls and substeps.
+``kept`` is bare time divided by environment time; ``added`` is the difference.
 """
 
 import statistics
@@ -25,7 +25,7 @@ from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.support.arrays import launch_worlds
 
 BLOCK = 10
-"""Steps after which environment and bare engine change places."""
+"""Steps after which environment and bare engine alternate."""
 
 
 def next_controls(env: lw.Env) -> torch.Tensor:
@@ -108,18 +108,29 @@ def seconds(env: lw.Env, function: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def measure(task: str, nworld: int, blocks: int, **place: Any) -> dict[str, Any]:
-    """Time an environment under random actions and its bare engine on the same states; return medians over the blocks.
+def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **place: Any) -> dict[str, Any]:
+    """Time an environment and its bare engine on the same states; return medians over the blocks.
 
     Args:
         task: Name of a task.
         nworld: Number of worlds.
         blocks: Number of blocks.
+        policy: Folder of the run whose policy acts; by default actions are random.
         **place: Engine, device and threads, as in lw.make.
     """
     env = lw.make(task, nworld=nworld, **place)
     actions = contestants.actions(env, seed=0)
+    acting = None if policy is None else lw.load(policy, device=env.obs.device)
     bare = bare_engine(env)
+
+    def choose_actions() -> None:
+        """Write the policy's next actions into ``actions``, off the clock."""
+        if acting is not None:
+            start = env.get_state()
+            for t in range(BLOCK):
+                actions[t].copy_(acting.act(env.obs))
+                env.step(actions[t])
+            env.set_state(start)
 
     def block() -> None:
         for t in range(BLOCK):
@@ -127,8 +138,10 @@ def measure(task: str, nworld: int, blocks: int, **place: Any) -> dict[str, Any]
             env.step()
 
     whole, alone = [], []
-    warm = max(2, env.horizon // 500)  # captures graphs and leaves the initial states
+    # captures graphs and leaves the initial states; a walking robot needs two seconds until it walks
+    warm = max(2 if policy is None else 20, env.horizon // 500)
     for repetition in range(warm + blocks):
+        choose_actions()
         start = env.get_state()
         time_env = seconds(env, block)
         env.set_state(start)

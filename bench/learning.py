@@ -1,13 +1,14 @@
-"""Measure the seconds of learning until NPG or PPO reaches a return.
+"""Measure the time until NPG or PPO reaches a target return.
 
     lyceum-warp bench learning --device cuda
     lyceum-warp bench learning --tasks go1_velocity --algorithm npg --device cuda
 
-The clock includes captures of graphs, sampling and updates; it excludes the compilation of kernels and evaluations. The
-mean return covers the last 100 episodes, without each world's first episode, which begins at a random step. If
-iterations have too few steps for whole episodes, it covers 16 separate episodes of the stochastic policy every few
-iterations. On go1_velocity a robot that stands still also reaches high returns: the mean policy therefore walks for
-10 s in new worlds, with noise and pushes, and its tracking errors and falls are measured.
+The time includes graph captures, sampling and updates, and excludes kernel compilation and evaluations. The mean
+return is taken over the last 100 episodes, without each world's first episode, which starts at a random step. If
+iterations are too short for whole episodes, it is taken over 16 separate episodes of the stochastic policy every few
+iterations. On go1_velocity a robot that stands still reaches high returns, too. For that
+task the mean policy therefore also walks for 10 s in new worlds, with noise and pushes, and its tracking errors and
+falls are measured.
 """
 
 import collections
@@ -34,25 +35,25 @@ TARGETS: dict[str, tuple[str, float, int, int | None, int]] = {
     "half_cheetah": ("npg", 5000.0, 4096, 65_536, 5),
     "humanoid": ("npg", 4500.0, 8192, 131_072, 5),
 }
-"""Algorithm, target, worlds, samples of an iteration, and iterations between evaluations (0: the last 100 episodes)."""
+"""Algorithm, target, worlds, samples per iteration, iterations between evaluations (0: use the last 100 episodes)."""
 
 SETTINGS: dict[str, dict[str, Any]] = {"default": {}, "desired_kl 0.01": {"desired_kl": 0.01}}
 """Hyperparameters that differ from the algorithm's defaults."""
 
 JUDGED, RECENT, WALKED = 16, 100, (256, 500)
-"""Episodes of an evaluation, episodes in the mean return of a training run, and worlds and steps of the walk."""
+"""Episodes per evaluation, episodes in a run's mean return, and worlds and steps of the walk."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Seconds until NPG or PPO reaches a return."""
+    """Time until NPG or PPO reaches a target return."""
 
     algorithm: Literal["npg", "ppo"] | None = None
     """Algorithm; by default the task's."""
     settings: tuple[str, ...] = ("default",)
-    """Settings: default, desired_kl 0.01 (PPO)."""
+    """Names of settings: default, desired_kl 0.01 (PPO only)."""
     seconds: float = 300.0
-    """Longest duration of a run."""
+    """Maximum duration of a run in seconds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +81,7 @@ def cases(options: Options) -> list[Case]:
 
 
 def learner(case: Case, nworld: int, **changes: Any) -> Any:
-    """Make the case's learner."""
+    """Make the learner of a case."""
     env = lw.make(case.task, nworld=nworld, seed=case.seed, device=case.device)
     words = {**changes, **SETTINGS[case.setting]}
     if case.algorithm == "ppo":
@@ -102,7 +103,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     seconds, curve, mean = 0.0, [], -math.inf
     while seconds < case.seconds and mean < case.target:
         began = time.perf_counter()
-        it = next(made)  # it ends with a copy to the host: the device has finished its work
+        it = next(made)  # an iteration ends with a copy to the host: the device has finished
         seconds += time.perf_counter() - began
         if judge is None:
             returns = made.rollout.episode_return[made.rollout.done]
@@ -120,7 +121,8 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 @torch.no_grad()
 def walk(case: Case, policy: lw.GaussianPolicy) -> dict[str, float]:
-    """Return mean tracking errors and falls of a mean policy in new worlds; a fall is an early end of an episode."""
+    """Return the mean tracking errors and falls of a mean policy in new worlds; a fall is an early end of an
+    episode."""
     nworld, steps = WALKED
     env = lw.make(case.task, nworld=min(nworld, case.nworld), seed=1000, device=case.device)
     sums = torch.zeros(3, dtype=torch.float64, device=env.obs.device)
@@ -133,7 +135,7 @@ def walk(case: Case, policy: lw.GaussianPolicy) -> dict[str, float]:
 
 
 class Judge:
-    """Evaluate a stochastic policy in 16 worlds, with the same initial states and the same noise each time."""
+    """Evaluate a stochastic policy in 16 worlds, always with the same initial states and noise."""
 
     def __init__(self, env: lw.Env) -> None:
         self.env = env.replicate_few(JUDGED)
@@ -172,7 +174,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    """Draw the returns of go1_velocity by seconds, beside mjlab's."""
+    """Plot the returns of go1_velocity over seconds, together with mjlab's."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         if (row.case["task"], row.case["algorithm"]) == ("go1_velocity", "ppo"):
@@ -200,7 +202,7 @@ def figure(rows: Sequence[Row]) -> Any:
 
 
 EXPERIMENT = Experiment(
-    name="learning", summary="Seconds of learning until NPG or PPO reaches a return.",
+    name="learning", summary="Seconds of learning until NPG or PPO reaches a target return.",
     cases=cases, estimate=lambda case: 0.3 * case.seconds, measure=measure, tables=tables, figure=figure,
     options=Options,
 )  # fmt: skip

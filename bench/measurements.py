@@ -11,7 +11,7 @@ from typing import Any
 from lyceum_warp.support.versions import versions
 
 HARDWARE = ("cpu", "cores", "gpu", "driver", "power_limit")
-"""Entries that must be equal for numbers to be compared."""
+"""Entries that must be equal before numbers are compared."""
 
 _QUERY = {
     "driver": "driver_version",
@@ -38,7 +38,8 @@ def context(device: str = "cpu") -> dict[str, Any]:
 
 
 def write(path: Path, rows: Sequence[Any], device: str = "cpu", **more: Any) -> None:
-    """Write rows (dataclasses) and their context as JSON, directly after the measurement: the clocks are current."""
+    """Write rows (dataclasses) and their context as JSON; call it right after the measurement, while the clocks are
+    current."""
     content = {"versions": context(device), "rows": [dataclasses.asdict(row) for row in rows], **more}
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=2) + "\n")

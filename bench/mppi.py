@@ -1,4 +1,4 @@
-"""Measure MPPI in episodes and in planning time, beside Python (the paper's table).
+"""Compare MPPI with a Python planner: episode results and planning time (the paper's table).
 
     lyceum-warp bench mppi --threads 16
     lyceum-warp bench mppi --parts episodes --threads 1 --jobs 16
@@ -6,9 +6,9 @@
 ``episodes``: the paper's planning tasks with its settings and its 75 steps; success and time. ``plans``: the time of a
 plan from given states.
 
-The Python planner (python_mppi.py) sends one message a plan to each process. All planners control the same plant, and
-take turns in blocks of episodes. The contestants "a set at a time" follow: one planner controls the plants of all
-episodes of a set. With --jobs, blocks run at the same time, each in a process with cores of its own.
+The Python planner (python_mppi.py) sends one message per plan to each process. All planners control the same plant, and
+take turns in blocks of episodes. The contestants "a set at a time" run last: one planner controls the plants of all
+episodes of a set. With --jobs, blocks run at the same time, each in a subprocess on separate cores.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ from lyceum_warp.controllers.control_report import wilson
 
 EPISODES = {"reach": 75, "adroit_pen": 75, "herb_reach": 150, "panda_lift": 150, "aloha_lift": 150,
             "arm_hand_pickup": 300}  # fmt: skip
-"""Steps of an episode; by default the paper's two tasks take part."""
+"""Steps of an episode; the paper's two tasks are the default."""
 PAPER = ("reach", "adroit_pen")
 PLANS = ("reach", "half_cheetah", "adroit_pen")
 TASKS = ("reach", "half_cheetah", "adroit_pen", "herb_reach", "panda_lift", "aloha_lift", "arm_hand_pickup")
@@ -49,42 +49,42 @@ ON_WARP = ("mppi_warp", "mppi_warp_together")
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Episodes under MPPI and the time of its plans."""
+    """Episodes under MPPI, and the time of its plans."""
 
     parts: tuple[str, ...] = ()
     """Parts: plans, episodes; by default both."""
     episodes: int = 100
-    """Episodes of each set of seeds."""
+    """Number of episodes per set of seeds."""
     sets: tuple[int, ...] = (1, 2, 3)
-    """Numbers of the sets of seeds. Set i begins at seed 1000 i."""
+    """Sets of seeds to run; set i begins at seed 1000 i."""
     block: int = 10
-    """Episodes that a contestant runs in each turn."""
+    """Number of episodes that a contestant runs per turn."""
     seconds: float = 20.0
-    """Time for the plans of a case, at least ten plans."""
+    """Seconds for the plans of a case; at least ten plans are made."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A block of episodes, or some plans, of one contestant."""
+    """A block of episodes or a series of plans of one contestant."""
 
     part: str
     task: str
     contestant: str
     repeat: int
-    """Number of the repeat, or of the set of seeds."""
+    """Number of the repeat or of the set of seeds."""
     first: int
     """The first seed."""
     count: int
-    """Episodes."""
+    """Number of episodes."""
     steps: int
-    """Steps of an episode."""
+    """Number of steps of an episode."""
     seconds: float
-    """Time for plans outside of episodes."""
+    """Seconds for plans outside episodes."""
     threads: int
 
 
 def cases(options: Options) -> list[Case]:
-    """List plans, then episodes; contestants that are compared follow one another."""
+    """List plans, then episodes; contestants to compare are adjacent."""
     short, cuda = options.short, options.device.startswith("cuda")
     threads = options.threads or len(os.sched_getaffinity(0)) // max(options.jobs, 1)
     parts = choose(options.parts, ("plans", "episodes"), what="part")
@@ -120,7 +120,7 @@ def estimate(case: Case) -> float:
     return case.count * case.steps * plan * max(2 / case.threads, 0.1)
 
 
-# planners and plants; they stay for the next cases
+# planners and plants, which later cases reuse
 
 
 @functools.cache
@@ -133,7 +133,7 @@ def planner(task: str, contestant: str, threads: int, device: str, plants: int =
 
 @functools.cache
 def python_planner(task: str, threads: int) -> Any:
-    """Make the Python planner with as many processes as threads; they wait for messages while others plan."""
+    """Make the Python planner with one process per thread; idle processes wait for messages."""
     return python_mppi.PythonMPPI(task, planner(task, "mppi", threads, "cpu"), threads)
 
 
@@ -180,7 +180,7 @@ def episodes_together(
     for seed in seeds:
         one.rand_reset(seed)
         starts.append(one.get_state()[0])
-    for steps in (min(3, case.steps), case.steps):  # the first ones capture graphs and wake threads
+    for steps in (min(3, case.steps), case.steps):  # the first steps capture graphs and wake threads
         env.set_state(torch.stack(starts))
         made.reset(seeds)
         returns = torch.zeros(case.count, dtype=torch.float64)
@@ -207,7 +207,7 @@ def states(task: str, seed: int, steps: int, threads: int) -> torch.Tensor:
 
 
 def run_plans(case: Case, options: Options) -> dict[str, Any]:
-    """Plan from the states of an episode until the time is over; the first four plans do not count."""
+    """Plan from the states of an episode until the time is up; the first four plans do not count."""
     made, given = controller(case, options), states(case.task, case.first, case.steps, case.threads)
     made.reset(case.first)
     times: list[float] = []
@@ -230,7 +230,7 @@ RUN = {"plans": run_plans, "episodes": run_episodes}
 def measure(case: Case, options: Options) -> dict[str, Any]:
     if case.task.startswith("adroit"):
         installed("gymnasium_robotics", "gymnasium-robotics")
-    # threads and processes that start now use only these cores
+    # new threads and processes use only these cores
     with experiment.cores(case.threads):
         return RUN[case.part](case, options)
 
@@ -265,7 +265,7 @@ def flat(rows: Sequence[Row]) -> list[list[Any]]:
 
 
 def mean_seconds(each: Sequence[Sequence[Any]]) -> float | None:
-    """Return the mean time of the episodes that were timed."""
+    """Return the mean time of the timed episodes."""
     timed = [episode[3] for episode in each if episode[3] is not None]
     return statistics.fmean(timed) if timed else None
 
@@ -314,7 +314,7 @@ def plan_table(found: dict[str, dict[str, list[Row]]]) -> Table:
 
 
 EXPERIMENT = experiment.Experiment(
-    name="mppi", summary="MPPI in episodes and in planning time, beside Python.",
+    name="mppi", summary="MPPI and a Python planner: episode results and planning time.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
     packages=("gymnasium-robotics",), parallel=True,
 )  # fmt: skip

@@ -1,15 +1,15 @@
-"""Measure NPG's learning on lyceum_warp's and Gymnasium's environments, beside PPO and TRPO (the paper's figure 2).
+"""Compare NPG's learning on lyceum_warp's and Gymnasium's environments, and with PPO and TRPO (the paper's figure 2).
 
     lyceum-warp bench npg --threads 2 --jobs 16
 
-Both NPGs are the same class with the same settings, number of worlds and seeds; only the buffer of samples is filled by
-other environments, in the faster of Gymnasium's two vector modes. Beside them learn PPO of stable-baselines3 and TRPO
-of sb3-contrib with the settings that RL Baselines3 Zoo tuned for these tasks, for twelve minutes each, and, with
---device cuda, lw.NPG and lw.PPO on the same worlds of a GPU.
+Both NPGs are the same class with the same settings, number of worlds and seeds. They differ in the environments that
+fill the rollout buffer; Gymnasium uses the faster of its two vector modes. For twelve minutes each, stable-baselines3's
+PPO and sb3-contrib's TRPO learn with the settings that RL Baselines3 Zoo tuned for these tasks. With --device cuda,
+lw.NPG and lw.PPO learn on the same worlds on a GPU.
 
-All policies are evaluated alike: the mean action, in single environments of Gymnasium, from the same initial states.
-The clock stops meanwhile, and starts once kernels are compiled and environments exist. Every case is a process of its
-own on cores of its own; runs on a GPU need --jobs 1.
+All policies are evaluated in the same way: the mean action, in single Gymnasium environments, from the same initial
+states. The clock stops during evaluations, and starts after kernels are compiled and environments are made. Each case
+runs in a subprocess on separate cores; runs on a GPU need --jobs 1.
 """
 
 import contextlib
@@ -39,10 +39,10 @@ CONFIGS = {
     "hopper": lw.NPGConfig(mean_every=0),
     "walker2d": lw.NPGConfig(mean_every=0),
 }
-"""Settings of NPG: the default ones, except for Swimmer's discount."""
+"""Settings of NPG: the defaults, except for Swimmer's discount."""
 
 SHORT: dict[str, Any] = {"samples": 500, "value_epochs": 1}
-"""Other settings of NPG in the short mode."""
+"""Settings of NPG that differ in the short mode."""
 
 CONTESTANTS = {
     "npg": "NPG, lyceum_warp",
@@ -58,13 +58,13 @@ ON_CPU, ON_GPU, YARDSTICKS = tuple(CONTESTANTS)[:4], tuple(CONTESTANTS)[4:6], ("
 GPU_WORLDS = {"npg_gpu": 2048, "ppo_gpu": 4096}
 
 EVERY_100K = tuple(range(100_000, 1_000_001, 100_000))
-"""Samples at which the curves are compared."""
+"""Numbers of samples at which the curves are compared."""
 
 LIMITS = dict.fromkeys(YARDSTICKS, 720.0) | dict.fromkeys(ON_GPU, 30.0)
-"""Seconds of learning after which a run ends, if it has not ended before."""
+"""Seconds of learning after which a run ends at the latest."""
 
 EVALUATIONS, EPISODES = 20, 16
-"""Evaluations of a run after the first, and episodes of an evaluation."""
+"""Evaluations of a run after the first, and episodes per evaluation."""
 
 _TUNED_NETWORK = {"log_std_init": -2.0, "ortho_init": False, "activation_fn": torch.nn.ReLU,
                   "net_arch": {"pi": [256, 256], "vf": [256, 256]}}  # fmt: skip
@@ -82,7 +82,7 @@ PPO: dict[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 """Settings of stable-baselines3's PPO, with one environment and normalised observations and rewards, from
-https://github.com/DLR-RM/rl-baselines3-zoo (hyperparams/ppo.yml; TRPO's from hyperparams/trpo.yml)."""
+https://github.com/DLR-RM/rl-baselines3-zoo (hyperparams/ppo.yml; for TRPO hyperparams/trpo.yml)."""
 
 _TRPO = {"batch_size": 128, "n_steps": 1024, "gamma": 0.99, "gae_lambda": 0.95, "sub_sampling_factor": 1,
          "cg_max_steps": 25, "cg_damping": 0.1, "n_critic_updates": 20, "learning_rate": 1e-3}  # fmt: skip
@@ -93,14 +93,14 @@ TRPO = {"swimmer": _TRPO | {"gamma": 0.9999}, "hopper": _TRPO, "walker2d": _TRPO
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Learning curves of NPG and of its peers."""
+    """Learning curves of NPG and its peers."""
 
     threads: int | None = 2
-    """Cores of each case, of which stable-baselines3's learners and those on a GPU use one."""
+    """Cores per case; stable-baselines3's learners and learners on a GPU use only one."""
     samples: int = 1_000_000
-    """Samples of a run on the CPU."""
+    """Number of samples of a run on the CPU."""
     nworld: int = 64
-    """Worlds of both NPGs on the CPU."""
+    """Number of worlds of both NPGs on the CPU."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,19 +112,19 @@ class Case:
     seed: int
     threads: int
     nworld: int | None
-    """Worlds, if they do not follow from the contestant's settings."""
+    """Number of worlds; None if the contestant's settings determine it."""
     samples: int | None
-    """Samples after which it ends."""
+    """Number of samples after which the run ends."""
     short: bool
 
     @property
     def limit(self) -> float:
-        """Seconds of learning after which it ends."""
+        """Return the seconds of learning after which the run ends."""
         return LIMITS.get(self.contestant, math.inf) / (10.0 if self.short else 1.0)
 
 
 def cases(options: Options) -> list[Case]:
-    """List the runs: contestants that are compared follow one another, and runs on a GPU come last."""
+    """List the runs: contestants to compare are adjacent, and runs on a GPU come last."""
     short, cuda = options.short, options.device.startswith("cuda")
     contestants = choose(options.contestants, ON_CPU + ON_GPU, ON_CPU + (ON_GPU if cuda else ()), what="contestant")
     for name in contestants:
@@ -152,11 +152,11 @@ def estimate(case: Case) -> float:
 # evaluations
 
 Act = Callable[[np.ndarray], np.ndarray]
-"""Maps observations (n, nobs) to actions (n, nact)."""
+"""A function that maps observations (n, nobs) to actions (n, nact)."""
 
 
 class Judge:
-    """Evaluate policies in single environments of Gymnasium, from the same initial states each time."""
+    """Evaluate policies in single Gymnasium environments, always from the same initial states."""
 
     def __init__(self, task: str, episodes: int) -> None:
         self.envs = [gymnasium.make(TASKS[task], disable_env_checker=True) for _ in range(episodes)]
@@ -177,12 +177,12 @@ class Judge:
 
 
 class Curve:
-    """Keep a run's curve, on a clock that stops while a policy is evaluated."""
+    """Collect a run's curve on a clock that stops during evaluations."""
 
     def __init__(self, case: Case) -> None:
         self.case, self.judge = case, Judge(case.task, 2 if case.short else EPISODES)
         self.points: list[tuple[int, float, float]] = []
-        """Samples, seconds of learning, and return of the mean policy."""
+        """(samples, seconds of learning, return of the mean policy) per point."""
         self._stopped, self._next = 0.0, 0
 
     def start(self, act: Act) -> None:
@@ -194,15 +194,15 @@ class Curve:
         return time.perf_counter() - self._stopped
 
     def ended(self, samples: int) -> bool:
-        """Return whether the run has reached its end."""
+        """Return whether the run has ended."""
         return samples >= (self.case.samples or math.inf) or self.seconds() >= self.case.limit
 
     def due(self, samples: int) -> bool:
-        """Return whether an evaluation is due: at even distances, and at the end."""
+        """Return whether an evaluation is due; evaluations are evenly spaced, with one at the end."""
         return self.ended(samples) or self._evaluations(samples) >= self._next
 
     def _evaluations(self, samples: int) -> float:
-        """Return the progress of the run, in distances between evaluations."""
+        """Return the progress of the run as a number of evaluations."""
         progress = max(samples / (self.case.samples or math.inf), self.seconds() / self.case.limit)
         return (2 if self.case.short else EVALUATIONS) * progress
 
@@ -220,7 +220,7 @@ class Curve:
 
 
 def mean_action(policy: torch.nn.Module) -> Act:
-    """Copy a policy for the evaluation."""
+    """Return the mean action of a copy of a policy."""
     now = copy.deepcopy(policy).cpu()
 
     @torch.no_grad()
@@ -233,7 +233,7 @@ def mean_action(policy: torch.nn.Module) -> Act:
 def config_of(case: Case) -> lw.NPGConfig:
     changes = dict(SHORT) if case.short else {}
     if case.contestant not in ON_GPU:
-        changes["min_restarts"] = 0.0  # Gymnasium's vector environments cannot restart some of their worlds
+        changes["min_restarts"] = 0.0  # Gymnasium's vector environments cannot restart individual worlds
     return dataclasses.replace(CONFIGS[case.task], **changes)
 
 
@@ -244,7 +244,7 @@ def environment(case: Case, options: Options, nworld: int) -> lw.Env:
 
 
 def npg(case: Case, options: Options, curve: Curve) -> dict[str, Any]:
-    """Run NPG. Gymnasium's environments are made first, because their processes are forks."""
+    """Run NPG. Gymnasium's environments are made first, because their processes are forked."""
     assert case.nworld is not None
     more: dict[str, Any] = {}
     with contextlib.ExitStack() as stack:
@@ -277,7 +277,7 @@ def iterate(learner: Any, curve: Curve) -> dict[str, Any]:
     sampling = 0.0
     curve.start(mean_action(learner.policy))
     while not curve.ended(learner.samples):
-        sampling += next(learner).time_sample  # it ends with a copy to the host: a GPU has finished its work
+        sampling += next(learner).time_sample  # an iteration ends with a copy to the host, so a GPU has finished
         if curve.due(learner.samples):
             curve.add(learner.samples, mean_action(learner.policy))
     curve.add(learner.samples, mean_action(learner.policy))
@@ -288,7 +288,7 @@ def iterate(learner: Any, curve: Curve) -> dict[str, Any]:
 
 
 def stable_baselines3(case: Case, options: Options, curve: Curve) -> dict[str, Any]:
-    """Run PPO or TRPO with the published settings of the task, on environments of Gymnasium."""
+    """Run PPO or TRPO with the published settings of the task, on Gymnasium's environments."""
     installed("stable_baselines3", "stable-baselines3")
     import stable_baselines3 as sb3
     from stable_baselines3.common.callbacks import BaseCallback
@@ -306,7 +306,7 @@ def stable_baselines3(case: Case, options: Options, curve: Curve) -> dict[str, A
         return algorithm("MlpPolicy", envs, seed=case.seed, device="cpu", **words), envs
 
     class Watch(BaseCallback):
-        """Evaluates the policy between two updates."""
+        """A callback that evaluates the policy between two updates."""
 
         def _on_step(self) -> bool:
             return curve.seconds() < case.limit
@@ -355,7 +355,7 @@ def runs(rows: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
 
 
 def values_at(row: Row, samples: Sequence[float]) -> np.ndarray:
-    """Interpolate the returns of a curve at numbers of samples; nan beyond the curve's end."""
+    """Interpolate a curve's returns at given numbers of samples; nan beyond its end."""
     x, _, y = zip(*row.result["curve"], strict=True)
     return np.interp(samples, x, y, left=np.nan, right=np.nan)
 
@@ -375,7 +375,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def ends(found: dict[str, dict[str, list[Row]]]) -> Table:
-    """Tabulate the ends of the runs, and when they reached 90 % of the final return of NPG on Gymnasium."""
+    """Tabulate how the runs ended, and when they reached 90 % of the final return of NPG on Gymnasium."""
     lines = []
     for task, same in found.items():
         ours = {row.case["seed"]: row for row in same.get("npg", ())}
@@ -419,7 +419,7 @@ def interval(found: tuple[float, float], form: str = ",.0f") -> str:
 
 
 def agreement(task: str, same: dict[str, list[Row]]) -> Table | None:
-    """Compare the returns of both NPGs every 100,000 samples; return None with one seed or with shorter runs."""
+    """Compare the returns of both NPGs every 100,000 samples; return None with one seed or shorter runs."""
     ours, fed = (np.array([values_at(row, EVERY_100K) for row in same[name]]) for name in ("npg", "npg_gymnasium"))
     there = ~np.isnan(np.concatenate([ours, fed])).any(axis=0)
     if not there.any() or min(len(ours), len(fed)) < 2:
@@ -432,14 +432,15 @@ def agreement(task: str, same: dict[str, list[Row]]) -> Table | None:
     ]
     title = (
         f"{task}: the curves on lyceum_warp's and on Gymnasium's environments differ at {int((p < 0.05).sum())} of "
-        f"{len(lines)} points (permutation of whole curves, adjusted for all points, level 5 %; least p {p.min():.3f})."
+        f"{len(lines)} points (permutation of whole curves, adjusted for all points, level 5 %; "
+        f"smallest p {p.min():.3f})."
     )
     header = ["samples", "lyceum_warp", "Gymnasium", "adjusted p"]
     return Table(title, header, lines)
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    """Draw returns against samples and against seconds: mean over the seeds with its 95 % interval."""
+    """Draw returns over samples and over seconds: mean over the seeds with its 95 % interval."""
     found = runs(rows)
     drawn = new_figure("npg", max(4.0 * len(found), 7.0), 6.6)
     axes = drawn.subplots(2, len(found), squeeze=False)
@@ -467,17 +468,17 @@ def figure(rows: Sequence[Row]) -> Any:
 
 
 def draw(axes: Any, group: Sequence[Row], name: str, x: int) -> None:
-    """Draw the curves of a contestant against samples (x = 0) or seconds (x = 1)."""
+    """Draw a contestant's curves over samples (x = 0) or seconds (x = 1)."""
     color, marker, line = STYLES[list(CONTESTANTS).index(name)]
     last = min(row.result["curve"][-1][x] for row in group)
-    # the first policy is at 0 seconds, which a logarithmic axis does not have
+    # the first policy is at 0 seconds, which a logarithmic axis cannot show
     first = min(max(row.result["curve"][x][x] for row in group), last)
     grid = np.linspace(first, last, 101) if x == 0 else np.geomspace(first, last, 101)
     curves = [
         np.interp(grid, [p[x] for p in row.result["curve"]], [p[2] for p in row.result["curve"]]) for row in group
     ]
     mean, half = np.array([comparison.mean_interval(values) for values in np.array(curves).T]).T
-    # markers of contestants whose curves coincide must not cover each other
+    # markers of coinciding curves must not cover each other
     every = (3 * list(CONTESTANTS).index(name), 16)
     axes.plot(grid, mean, color=color, linestyle=line, marker=marker, markevery=every, markersize=5, linewidth=1.5,
               label=CONTESTANTS[name])  # fmt: skip
@@ -486,7 +487,7 @@ def draw(axes: Any, group: Sequence[Row], name: str, x: int) -> None:
 
 
 EXPERIMENT = experiment.Experiment(
-    name="npg", summary="NPG's learning curves on lyceum_warp's and on Gymnasium's environments, beside PPO and TRPO.",
+    name="npg", summary="NPG's learning curves on lyceum_warp's and Gymnasium's environments, with PPO and TRPO.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, figure=figure, options=Options,
     packages=("stable-baselines3", "sb3-contrib"), apart=True,
 )  # fmt: skip

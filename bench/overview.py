@@ -1,4 +1,4 @@
-"""List the experiments, with their durations on two cores."""
+"""List the experiments with their durations on two cores."""
 
 import experiment
 from rich.console import Console

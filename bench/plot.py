@@ -10,12 +10,12 @@ import tyro
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Draw the figure of each experiment and machine with stored results."""
+    """Draw a figure for each experiment and machine with stored results."""
 
     names: tyro.conf.Positional[tuple[str, ...]] = ()
     """Experiments; by default all with results."""
     results: Path = experiment.RESULTS
-    """Folder of the results and of the figures."""
+    """Folder with the results, to which the figures are written."""
 
 
 def main(options: Options) -> int:

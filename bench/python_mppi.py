@@ -1,7 +1,7 @@
-"""Plan with MPPI in Python, over single environments with Gymnasium's step in processes.
+"""Plan with MPPI in Python, with single Gymnasium environments in subprocesses.
 
-``PythonMPPI`` does not use this package's worlds: each process keeps an environment and gets one message a plan; noise
-and weights are NumPy's. It takes the settings of an ``lw.MPPI`` and controls the same plant.
+``PythonMPPI`` does not use this package's worlds: each subprocess has an environment and gets one message per plan;
+NumPy computes noise and weights. It has the settings of an ``lw.MPPI`` and controls the same plant.
 """
 
 import multiprocessing
@@ -41,12 +41,12 @@ class ReachEnv:
 
 
 class GymnasiumEnv:
-    """Set an environment of Gymnasium or Gymnasium-Robotics to a state of our task.
+    """Adapt an environment of Gymnasium or Gymnasium-Robotics, so that it can be set to a state of our task.
 
     Args:
         name: Gymnasium's name.
-        model: Our model, which describes the states.
-        target: A body whose orientation is a constant of Gymnasium's model, and a mocap body of ours.
+        model: Our model, which defines the states.
+        target: A body with a constant orientation in Gymnasium's model, and a mocap body in ours.
     """
 
     def __init__(self, name: str, model: mujoco.MjModel, target: str | None = None) -> None:
@@ -79,7 +79,7 @@ ENVS: dict[str, Callable[[mujoco.MjModel], Any]] = {
     "half_cheetah": lambda model: GymnasiumEnv("HalfCheetah-v5", model),
     "adroit_pen": lambda model: GymnasiumEnv("AdroitHandPen-v1", model, "target"),
 }
-"""Environments by the names of our tasks; their actions are bounded by -1 and 1."""
+"""Environments by our tasks' names; their actions are bounded by -1 and 1."""
 
 
 def smoothed(noise: np.ndarray, smoothing: tuple[float, float, float]) -> np.ndarray:
@@ -90,12 +90,12 @@ def smoothed(noise: np.ndarray, smoothing: tuple[float, float, float]) -> np.nda
 
 
 class PythonMPPI:
-    """MPPI over single environments in processes, with one message for each plan and process.
+    """MPPI over single environments in subprocesses, with one message per plan and process.
 
     Args:
-        task: A name of ``ENVS``.
-        plan: Planner whose settings it takes.
-        count: Number of processes.
+        task: A name in ``ENVS``.
+        plan: Planner whose settings are used.
+        count: Number of subprocesses.
     """
 
     def __init__(self, task: str, plan: lw.MPPI, count: int) -> None:
@@ -108,19 +108,19 @@ class PythonMPPI:
             pipe, other = context.Pipe()
             settings = (task, int(share), config.horizon, config.noise, config.smoothing, i)
             context.Process(target=_roll_out, args=(other, *settings), daemon=True).start()
-            other.close()  # so that recv raises EOFError if the process has ended
+            other.close()  # makes recv raise EOFError if the subprocess has ended
             self.pipes.append(pipe)
         for pipe in self.pipes:
             pipe.recv()
 
     def reset(self, seed: int | None) -> None:
-        """Forget the plan, and seed the noise."""
+        """Clear the plan, and seed the noise."""
         self.plan[:] = 0.0
         for pipe in self.pipes:
             pipe.send(seed)
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor | None = None) -> torch.Tensor:
-        """Improve the plan from a state; return its first action, and move the plan forward by a step."""
+        """Improve the plan from a state, return its first action, and shift the plan by one step."""
         for pipe in self.pipes:
             pipe.send((state.numpy(), self.plan))
         answers = [pipe.recv() for pipe in self.pipes]
@@ -134,7 +134,7 @@ class PythonMPPI:
 def _roll_out(
     pipe: Connection, task: str, samples: int, horizon: int, scale: Any, smoothing: tuple[float, float, float], own: int
 ) -> None:
-    """Roll out a process's share of the samples for each plan that it receives."""
+    """Roll out a subprocess's share of the samples for each plan that it receives."""
     env = ENVS[task](lw.make(task, nthread=1).model)
     random = np.random.default_rng((own, 0))
     pipe.send("ready")
@@ -146,7 +146,7 @@ def _roll_out(
         state, plan = message
         noise = smoothed(scale * random.standard_normal((samples, horizon, plan.shape[1])), smoothing)
         if own == 0:
-            noise[0] = 0.0  # the plan itself is a sample
+            noise[0] = 0.0  # the plan itself is one of the samples
         actions = np.clip(plan + noise, -1.0, 1.0)
         returns = np.zeros(samples)
         for k in range(samples):

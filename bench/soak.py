@@ -3,18 +3,18 @@
     lyceum-warp bench soak --threads 2
     lyceum-warp bench soak --parts faults --device cuda --work runs/soak
 
-Part faults: worlds step under random actions, and every thousandth step of a world gets a fault. States that are
-not-a-number or too fast, and actions that are not finite, come from outside. For the others the soak writes a variant
-of the task beside a copy of its source (``VARIANT``): a further number of the action asks for a reward or an
-observation that is not-a-number, or for a negative mass. Every fault must be found in its world and in its step,
-nothing else may be found, and ``env.fault_counts`` must agree. A second environment without faults must have equal
-numbers, to the bit, in each world up to its first fault, and in every fourth world, which gets none, always.
+Part faults: worlds step under random actions, and every thousandth step of a world gets a fault. Invalid or too fast
+states, and actions that are not finite, are written from outside. For the other faults the program writes a variant of
+the task beside a copy of its source (``VARIANT``), in which an additional action number requests a NaN reward, a NaN
+observation or a negative mass. Every fault must be reported in its world and step, nothing else may be reported, and
+``env.fault_counts`` must agree. A second environment without faults must give equal numbers, to the bit, for each world
+up to its first fault, and throughout for every fourth world, which gets no faults.
 
 A run is divided into chunks. A chunk is one result, and ends with a file of the worlds' states in the folder
-``--work``, from which the next chunk continues, also on another machine that gets this folder.
+``--work``. The next chunk continues from this file, also on another machine with a copy of the folder.
 
-Part memory: environments are made and deleted. Part kills: trainings are killed and resumed, and must end like a
-training that nothing interrupted.
+Part memory: environments are made and deleted. Part kills: trainings are killed and resumed, and must end like an
+uninterrupted training.
 """
 
 import collections
@@ -49,24 +49,24 @@ from lyceum_warp.support.validate import whole_number
 PARTS = ("faults", "memory", "kills")
 KINDS = {"state": Done.NAN, "speed": Done.NAN, "action": Done.ACTION, "reward": Done.REWARD,
          "observation": Done.OBSERVATION, "model": Done.MODEL}  # fmt: skip
-"""The faults by the place where they are injected, numbered from 1, and how they must be found."""
+"""Kinds of faults by the place of injection, numbered from 1, with the reasons that must be reported."""
 NBIT = len(Done)
 EVERY = 16
-"""Steps between two in which states are changed; as many times more worlds then get such a fault."""
+"""Number of steps between changes of states; each change affects this many times more worlds."""
 SAMPLES = 5
-"""Samples of the memory in a chunk."""
+"""Memory samples per chunk."""
 TASKS = {
     "point_mass": (1024, 10**7, 10, 4.0), "hopper": (512, 10**6, 10, 100.0), "soft_ball": (256, 10**6, 10, 100.0),
     "panda_lift": (256, 10**6, 10, 250.0), "adroit_relocate": (256, 10**6, 10, 250.0),
     "humanoid": (256, 10**6, 10, 300.0), "go1_velocity": (256, 10**6, 10, 300.0),
 }  # fmt: skip
-"""Worlds, steps of a chunk, chunks, and seconds for a million steps on two cores."""
+"""Worlds, steps per chunk, chunks, and seconds for a million steps on two cores."""
 OTHERS = (256, 10**6, 1, 300.0)
-"""The same for all other tasks."""
+"""The same numbers for all other tasks."""
 SHORT = (64, 20_000, 2, 0.0)
 GPU_TASKS = {"half_cheetah": (16_384, 10**8, 10, 0.5)}
 SAME_BITS = {"half_cheetah": (4096, 10**6, 10, 20.0)}
-"""The same in the deterministic mode, without which a GPU's numbers differ in the last bits from run to run."""
+"""The same numbers in the deterministic mode, without which a GPU's results are not reproducible to the last bit."""
 TRAININGS = {
     "hopper": "--iterations 400 --nthread 2",
     "point_mass": "--algorithm ppo --iterations 300 --nworld 256 --nthread 2",
@@ -122,20 +122,20 @@ class Soak({parent}):
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Very long runs with injected faults, memory, and kills."""
+    """Very long runs with injected faults, memory checks, and kills."""
 
     parts: tuple[str, ...] = ()
-    """faults, memory, kills; by default all."""
+    """Parts: faults, memory, kills; by default all."""
     engine: str = "auto"
     """Engine of the parts faults and memory."""
     nworld: int | None = None
-    """Worlds; by default the task's."""
+    """Number of worlds; by default the task's."""
     steps: int | None = None
-    """Steps of a chunk, of all worlds together; by default the task's."""
+    """Number of steps per chunk, summed over worlds; by default the task's."""
     kill_every: float = 40.0
-    """Seconds of training between two kills, on average."""
+    """Mean seconds of training between two kills."""
     work: Path = Path("runs/soak")
-    """Folder of variants, of states between two chunks, and of trainings."""
+    """Folder of task variants, of states between chunks, and of trainings."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,7 +154,7 @@ class Faults:
     part: str = "faults"
 
     def state(self, work: Path, chunk: int) -> Path:
-        """Return the file of the state before a chunk."""
+        """Return the path of the state before a chunk."""
         run = f"{self.task}-{self.engine}-{self.device.partition(':')[0]}-{self.nworld}-{self.steps}-{self.seed}"
         return work / f"{run}{'-same-bits' if self.compared else ''}-{chunk}.pt"
 
@@ -198,7 +198,7 @@ def cases(options: Options) -> list[Any]:
             steps = whole_number("--steps", options.steps or sizes[1], low=nworld * SAMPLES)
             chunks = [Faults(task, chunk, steps, nworld, options.engine, options.device, compared,
                              1e-2 if short else 1e-3, seed) for chunk in range(sizes[2])]  # fmt: skip
-            # a machine that gets another one's folder goes on from there
+            # a machine that gets another machine's folder continues from its last state
             done = max((i for i in range(1, len(chunks) + 1) if chunks[0].state(options.work, i).exists()), default=1)
             found += chunks[done - 1 :]
         if "kills" in parts and not cuda:
@@ -226,13 +226,14 @@ def measure(case: Any, options: Options) -> dict[str, Any]:
 
 
 def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
-    """Write a task's variant, whose last action number asks for a fault; return it with the range of the others."""
+    """Write a task's variant, whose last action number requests a fault; return it with the range of the other
+    actions."""
     parent, plain = find_task(task), lw.make(task, nworld=1, engine="mujoco")
     own = TaskSource(parent, task)
     functions, nact = own.functions, plain.action.shape[1]
     file = Path(sys.modules[parent.__module__].__file__ or "")
     source = file.read_text().replace("@lw.register\n", "")
-    own_model = r'"(\w+\.xml)"'  # beside the task's file
+    own_model = r'"(\w+\.xml)"'  # relative to the task's file
     source = re.sub(own_model, lambda m: repr(str(path)) if (path := file.parent / m[1]).exists() else m[0], source)
     fields = [f"    {name}: Row[float]\n" for name in ("userdata", "body_mass") if name not in own.world.vars]
     source = source.replace("class World:\n", "".join(["class World:\n", *fields]), 1)
@@ -262,9 +263,9 @@ def draw(
     pending: wp.array[bool], row: wp.array[int], kind_out: wp.array[int], action_out: wp.array2d[float],
     twin_action_out: wp.array2d[float],
 ):  # fmt: skip
-    """Draw actions, and faults that begin with this step: a function of seed, step and world; launched over (nworld,).
+    """Draw actions, and faults that start in this step, as a function of seed, step and world; launched over (nworld,).
 
-    Every fourth world gets no fault, nor does a world in which a fault waits to be found.
+    Every fourth world gets no fault, nor does a world with a fault that is not reported yet.
     """
     w = wp.tid()
     rng = wp.rand_init(int(wp.rand_init(seed, step)), w)
@@ -293,7 +294,7 @@ def tally(
     clean_inout: wp.array[bool], injected_inout: wp.array2d[int], reasons_inout: wp.array2d[int],
     outcome_inout: wp.array2d[int],
 ):  # fmt: skip
-    """Count faults after a step, and compare clean worlds with those of the twin; launched over (nworld,)."""
+    """Count faults after a step, and compare clean worlds with the twin's; launched over (nworld,)."""
     w = wp.tid()
     due = wp.where(pending_inout[w], 6, wp.where(kind_in[w] < 6, kind_in[w], 0))
     pending_inout[w] = kind_in[w] == 6 and not done_in[w]  # no event happens in a world that restarts
@@ -301,7 +302,7 @@ def tally(
     for bit in range(wp.static(NBIT)):
         reasons_inout[w, due * wp.static(NBIT) + bit] += reason_in[w] >> bit & 1
     clean_inout[w] = clean_inout[w] and due == 0 and not pending_inout[w]
-    compared = row[w] >= 0 and clean_inout[w] and kind_in[w] == 0  # the reward may see the whole action
+    compared = row[w] >= 0 and clean_inout[w] and kind_in[w] == 0  # the reward may depend on the whole action
     twin = wp.max(row[w], 0)
     same = reward_in[w] == twin_reward_in[twin] and reason_in[w] == twin_reason_in[twin]
     finite = wp.isfinite(reward_in[w])
@@ -314,9 +315,9 @@ def tally(
 
 
 def inject(case: Faults, options: Options) -> dict[str, Any]:
-    """Step a task for a chunk with injected faults, beside a twin without any."""
+    """Step a task for a chunk with injected faults, together with a twin without faults."""
     torch.set_num_threads(1)
-    gc.collect()  # environments of the chunk before
+    gc.collect()  # environments of the previous chunk
     before = case.state(options.work, case.chunk)
     if case.chunk and not before.exists():
         raise Skipped(f"there is no {before}: give the folder in which chunk {case.chunk - 1} ran as --work")
@@ -406,7 +407,7 @@ def memory(device: torch.device) -> tuple[int, int]:
 
 
 def slope(samples: Sequence[Sequence[int]], column: int) -> float:
-    """Return the growth of the memory per step, or per environment, without the first sample."""
+    """Return the memory's growth per step, or per environment, without the first sample."""
     points = np.array(samples[1:], dtype=float)
     return float(np.polyfit(points[:, 0], points[:, column], 1)[0])
 
@@ -429,7 +430,7 @@ def make_and_delete(case: Memory, options: Options) -> dict[str, Any]:
 
 
 def kill(case: Kills, options: Options) -> dict[str, Any]:
-    """Train without interruption, and with kills that each come after some progress; compare."""
+    """Train without interruption and with kills, each after some progress, and compare the results."""
     straight, killed = (options.work / f"{case.task}-{case.seed}-{name}" for name in ("straight", "killed"))
     for folder in (straight, killed):
         shutil.rmtree(folder, ignore_errors=True)
@@ -510,24 +511,24 @@ def tables(rows: Sequence[Row]) -> list[Table]:
                               experiment.median_and_range(slopes, ",.0f")])  # fmt: skip
     return [
         Table(
-            "Faults found where they were injected (one number if all were), other bits beside them, and faults where "
-            "none was injected; whether fault_counts agrees; steps whose numbers are not finite; steps of worlds "
-            "without faults that were compared to the bit with those of an environment without faults, and how many "
-            "differ.",
+            "Faults reported where they were injected (one number if all were), other bits reported with them, and "
+            "faults reported elsewhere; whether fault_counts agrees; steps with numbers that are not finite; steps of "
+            "worlds without faults that were compared to the bit with an environment without faults, and the number "
+            "of differences.",
             ["task", "worlds", "steps", *KINDS, "beside", "others", "counts agree", "not finite", "compared", "differ"],
             faults,
         ),
         Table("Memory, MiB, and its growth, bytes per million steps: median over chunks and range.",
               ["task", "memory", "first", "most", "last", "growth"], grown),
-        Table("Bytes that stay for each environment that is made and deleted.",
+        Table("Bytes that remain allocated per environment that was made and deleted.",
               ["task", "device", "worlds", "made", "resident", "GPU"], made),
-        Table("Trainings that were killed and resumed, beside one that was not interrupted.",
+        Table("Trainings that were killed and resumed, compared with an uninterrupted one.",
               ["training", "kills", "iterations", "equal metrics", "equal policy"], kills),
     ]  # fmt: skip
 
 
 EXPERIMENT = Experiment(
-    name="soak", summary="Very long runs with injected faults, memory, and trainings that are killed and resumed.",
+    name="soak", summary="Very long runs with injected faults, memory growth, and killed and resumed trainings.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
 )  # fmt: skip
 

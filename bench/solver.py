@@ -1,11 +1,11 @@
-"""Measure speed and accuracy of options of the physics, on states that the model's own options lead to.
+"""Measure the speed and accuracy of physics options, on states that the model's own options produce.
 
     lyceum-warp bench solver --tasks hopper half_cheetah humanoid --nworld 4096 --engine warp --device cuda
 
-Every setting makes the same steps: one step with the saved action from each saved state, including states at the start
+Every setting takes the same steps: one step with the saved action from each saved state, including states at the start
 of episodes. The error of a step is a world's largest difference of velocities, relative to the larger of 1 and the
-largest velocity; its scale is the difference between two passes with the model's own options ("own, again": a GPU adds
-in any order). Settings take turns, under the same load.
+largest velocity. Its scale is the difference between two passes with the model's own options ("own, again"), because a
+GPU adds in any order. Settings take turns, under the same load.
 """
 
 import dataclasses
@@ -48,7 +48,7 @@ ON_A_GPU = ("deterministic",)
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Gain and loss of options of the physics, as a table and as JSON."""
+    """Speed and accuracy of physics options, as a table and as JSON."""
 
     tasks: tuple[str, ...] = ("hopper", "half_cheetah", "humanoid")
     """Tasks."""
@@ -61,31 +61,31 @@ class Options:
     settings: tuple[str, ...] = tuple(SETTINGS)
     """Settings to compare with the model's own options."""
     states: int = 20
-    """Steps that each setting makes, five steps of the environment apart."""
+    """Number of steps of each setting; the saved states are five environment steps apart."""
     out: Path | None = None
     """JSON file for the results."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One setting; errors are quantiles over worlds and steps."""
+    """Results of one setting; errors are quantiles over worlds and steps."""
 
     task: str
     nworld: int
     setting: str
     step_ms: float
     gain: float
-    """Time with the model's own options by time with these, median over the steps."""
+    """Time with the model's own options divided by the time with these, median over the steps."""
     error_median: float
     error_99: float
     error_max: float
     faults: int
-    """Worlds whose step ended in a fault; the errors exclude them."""
+    """Number of worlds whose step ended in a fault; the errors exclude them."""
     bytes_per_world: float
 
 
 def saved_steps(task: str, nworld: int, options: Options) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """Return states and their actions, under uniformly random actions."""
+    """Return states and their actions, from steps with uniformly random actions."""
     env = lw.make(task, nworld=nworld, engine=options.engine, device=options.device)
     generator = torch.Generator(env.obs.device).manual_seed(0)
     low, high = (torch.as_tensor(x, device=env.obs.device) for x in (env.action_space.low, env.action_space.high))
@@ -113,7 +113,7 @@ def measure(task: str, nworld: int, options: Options) -> list[Row]:
     velocity = envs["own"].state_space.parts["qvel"]
     times: dict[str, list[float]] = {name: [] for name in envs}
     errors: dict[str, list[torch.Tensor]] = {name: [] for name in envs}
-    for state, action in [*steps[:3], *steps]:  # three to warm up, captures included
+    for state, action in [*steps[:3], *steps]:  # three steps to warm up, captures included
         wanted = None
         for name, env in envs.items():
             env.set_state(state)

@@ -1,4 +1,4 @@
-"""Write the tables of experiments from stored results, as results/NAME.md."""
+"""Write the tables of experiments from stored results as results/NAME.md."""
 
 import dataclasses
 import sys
@@ -17,7 +17,7 @@ class Options:
     names: tyro.conf.Positional[tuple[str, ...]] = ()
     """Experiments; by default all with results."""
     results: Path = experiment.RESULTS
-    """Folder of the results and of the pages."""
+    """Folder with the results, to which the pages are written."""
 
 
 def main(options: Options) -> int:

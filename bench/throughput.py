@@ -1,12 +1,12 @@
-"""Measure environment steps per second, beside native C and other libraries (the paper's figure 1).
+"""Compare environment steps per second with native C and other libraries (the paper's figure 1).
 
     lyceum-warp bench throughput --short
     lyceum-warp bench throughput --parts worlds kept --device cuda
 
 Five parts. ``sampling``: many worlds on all threads, relative to native C, which is ``mujoco.rollout`` with the same
 substeps on all threads. ``single``: one world on one thread, relative to Gymnasium. ``cores``: as ``sampling``, on 1,
-2, 4, ... cores. ``worlds``: lyceum_warp with 1 to 131,072 worlds. ``kept``: an environment beside its bare engine
-(kept.py). contestants.py defines a sample, and how each contestant makes it.
+2, 4, ... cores. ``worlds``: lyceum_warp with 1 to 131,072 worlds. ``kept``: an environment compared with its bare
+engine (kept.py). contestants.py defines a sample, and how each contestant takes it.
 """
 
 import dataclasses
@@ -39,12 +39,12 @@ PARTS = {
     "worlds": ("warp", "c"),
     "kept": ("c", "warp"),
 }
-"""Contestants of each part. The Warp engine takes part on a GPU, or if it is named."""
+"""Contestants of each part. The Warp engine takes part on a GPU, or if it is requested by name."""
 UNITS = {"sampling": "native", "single": "gymnasium", "cores": "native"}
-"""Contestant that counts as 1."""
+"""The reference contestant of each part."""
 WORLDS = {"warp": (1, 8, 64, 512, 2_048, 8_192, 16_384, 32_768, 65_536, 131_072), "c": (1, 8, 64, 512, 4_096)}
 CPU_WORLDS = 512
-"""Most worlds of the Warp engine on the CPU."""
+"""Maximum number of worlds of the Warp engine on the CPU."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,9 +54,11 @@ class Options(experiment.Options):
     parts: tuple[str, ...] = ()
     """Parts: sampling, single, cores, worlds, kept; by default all."""
     seconds: float = 1.0
-    """Duration of each measurement."""
+    """Duration of each measurement in seconds."""
     worlds: int | None = None
-    """Number of worlds of lyceum_warp and of native C; by default 64 for each thread, and 16,384 on a GPU."""
+    """Number of worlds of lyceum_warp and of native C; by default 64 per thread, and 16,384 on a GPU."""
+    policy: str | None = None
+    """Folder of a run whose policy acts in the part kept; by default actions are random."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,14 +66,16 @@ class Case:
     part: str
     task: str
     repeat: int
-    """Also the seed of actions and initial states."""
+    """Number of the repeat, which is also the seed of actions and initial states."""
     contestant: str
     worlds: int
     threads: int
     device: str
     seconds: float
     warm: int
-    """Steps before the clock starts."""
+    """Number of steps before the clock starts."""
+    policy: str | None = None
+    """Folder of the run whose policy acts; None for random actions."""
 
 
 def cases(options: Options) -> list[Case]:
@@ -88,7 +92,7 @@ def cases(options: Options) -> list[Case]:
         return 1 if part == "single" else own or contestants.worlds(name, cores, options.device)
 
     def sizes(part: str, name: str) -> list[tuple[int, int]]:
-        """Numbers of worlds and threads."""
+        """Return the numbers of worlds and threads."""
         if part == "cores":
             doubled = [1 << k for k in range(threads.bit_length()) if 1 << k < threads]
             return [(size(part, name, cores), cores) for cores in (*doubled, threads)]
@@ -99,7 +103,8 @@ def cases(options: Options) -> list[Case]:
 
     return [
         Case(part, task, repeat, name, worlds, cores, options.device if name == "warp" else "cpu", seconds,
-             0 if part == "kept" else warm if worlds <= contestants.GPU_WORLDS else 20)
+             0 if part == "kept" else warm if worlds <= contestants.GPU_WORLDS else 20,
+             options.policy if part == "kept" else None)
         for part in choose(options.parts, PARTS, what="part")
         for task in (SCALED if part in ("cores", "worlds") and not options.tasks else given)
         for repeat in range(1 if part == "kept" else repeats)
@@ -121,7 +126,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
         place = {"engine": "warp", "device": case.device} if case.contestant == "warp" else {
             "engine": "mujoco", "nthread": case.threads}  # fmt: skip
         with experiment.cores(case.threads):
-            return kept.measure(case.task, case.worlds, max(5, int(30 * case.seconds)), **place)
+            return kept.measure(case.task, case.worlds, max(5, int(30 * case.seconds)), case.policy, **place)
     return contestants.measure(
         case.contestant, case.task, worlds=case.worlds, threads=case.threads, device=case.device, seed=case.repeat,
         seconds=case.seconds, warm=case.warm,
@@ -139,7 +144,7 @@ def grouped(rows: Sequence[Row], part: str, *by: str) -> dict[tuple[Any, ...], l
     mine.sort(key=lambda row: (order.get(row.case["task"], len(order)), row.case["task"], row.case["threads"],
                                row.case["worlds"]))  # fmt: skip
     for row in mine:
-        found.setdefault(tuple(row.case[name] for name in by), []).append(row)
+        found.setdefault(tuple(row.case.get(name) for name in by), []).append(row)
     return found
 
 
@@ -167,7 +172,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         explained = "Medians over the repeats; ratios of the same repeat: median (smallest to largest)."
         if lines:
             made.append(Table(f"{title} {explained}", [*by, *(LABELS[name] for name in names)], lines))
-    if lines := [kept_line(row) for (row,) in grouped(rows, "kept", "task", "contestant", "worlds").values()]:
+    if lines := [kept_line(row) for (row,) in grouped(rows, "kept", "task", "contestant", "worlds", "policy").values()]:
         header = ["task", "engine", "worlds", "env steps/s", "of the bare engine's", "added to a step", "kB a world"]
         made.append(
             Table("Environment and bare engine on the same states, alternating every ten steps.", header, lines)
@@ -179,8 +184,9 @@ def kept_line(row: Row) -> list[str]:
     case, found = row.case, row.result
     step = case["worlds"] / found["env_steps_per_second"]
     memory = found["bytes_per_world"]
+    task = case["task"] + (", trained policy" if case.get("policy") else "")
     return [
-        case["task"], "Warp" if case["contestant"] == "warp" else "C", f"{case['worlds']:,}",
+        task, "Warp" if case["contestant"] == "warp" else "C", f"{case['worlds']:,}",
         f"{found['env_steps_per_second']:,.0f}", f"{found['kept']:.1%}",
         f"{found['added_microseconds']:,.0f} µs of {step * 1e3:.2f} ms",
         "" if memory is None else f"{memory / 1e3:,.1f}",
@@ -188,7 +194,7 @@ def kept_line(row: Row) -> list[str]:
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    """Draw the ratios of the part sampling to native C, as points on a logarithmic axis."""
+    """Draw the part sampling's ratios to native C as points on a logarithmic axis."""
     groups = grouped(rows, "sampling", "task")
     ratios = {task: experiment.paired(same, "env_steps_per_second", "native") for (task,), same in groups.items()}
     names = [name for name in PARTS["sampling"][1:] if any(found.get(name) for found in ratios.values())]
@@ -223,7 +229,7 @@ def figure(rows: Sequence[Row]) -> Any:
 
 
 EXPERIMENT = Experiment(
-    name="throughput", summary="Environment steps per second, beside native C and other libraries.",
+    name="throughput", summary="Environment steps per second, compared with native C and other libraries.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, figure=figure, options=Options,
     packages=("envpool",),
 )  # fmt: skip

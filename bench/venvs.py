@@ -1,7 +1,7 @@
-"""Run programs of peers, in virtual environments of their own if they need other versions of our packages.
+"""Run peers' programs, in separate virtual environments if they need other versions of our packages.
 
-``peers/NAME/requirements.txt`` pins what a peer needs. Its environment is made at first use, in
-``~/.cache/lyceum_warp/peers`` (or ``$LYCEUM_WARP_PEERS``), one for each set of requirements and each Python.
+``peers/NAME/requirements.txt`` pins the packages that a peer needs. Its environment is made at first use in
+``~/.cache/lyceum_warp/peers`` (or ``$LYCEUM_WARP_PEERS``), one per set of requirements and Python version.
 """
 
 import fcntl
@@ -23,7 +23,7 @@ FOLDER = experiment.FOLDER / "peers"
 
 
 def run(python: Path, worker: Path, **arguments: Any) -> dict[str, Any]:
-    """Run a worker, which reads a JSON object from stdin and prints one as its last line.
+    """Run a worker that reads a JSON object from stdin and prints one as its last line.
 
     Raises:
         experiment.Skipped: A package of the worker is missing.
@@ -43,7 +43,7 @@ def run(python: Path, worker: Path, **arguments: Any) -> dict[str, Any]:
 
 @functools.cache
 def _made(name: str) -> tuple[Path, str]:
-    """Make a peer's environment if there is none; return its Python, and the reason if that failed."""
+    """Make a peer's environment if it does not exist; return its Python, and the reason if that failed."""
     requirements = FOLDER / name / "requirements.txt"
     text = "\n".join([requirements.read_text(), sys.version, platform.machine()])
     root = Path(os.environ.get("LYCEUM_WARP_PEERS") or Path.home() / ".cache" / "lyceum_warp" / "peers")
@@ -56,7 +56,7 @@ def _made(name: str) -> tuple[Path, str]:
             return python, ""
         print(f"making a virtual environment for {name}: {folder}", flush=True)
         shutil.rmtree(folder, ignore_errors=True)
-        # this pip installs into it; a copy of pip would take seconds
+        # this pip installs into the environment; installing pip there would take seconds
         pip = [sys.executable, "-m", "pip", "--python", str(python), "--disable-pip-version-check", "--retries", "1"]
         for command in (
             [sys.executable, "-m", "venv", "--without-pip", str(folder)],
@@ -67,12 +67,12 @@ def _made(name: str) -> tuple[Path, str]:
                 shutil.rmtree(folder, ignore_errors=True)
                 said = [line for line in (done.stderr or done.stdout).splitlines() if line.strip()] or ["no message"]
                 return python, f"{name} cannot be installed: {said[-1].strip()}"
-        complete.touch()  # last: the program may be killed during the installation
+        complete.touch()  # written last, because the program may be killed during the installation
     return python, ""
 
 
 def python_of(name: str) -> Path:
-    """Return the Python of a peer's environment, which is made if there is none yet.
+    """Return the Python of a peer's environment, and make the environment if it does not exist.
 
     Raises:
         experiment.Skipped: The environment cannot be made, for example without a network.

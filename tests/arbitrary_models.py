@@ -1,11 +1,11 @@
-"""Models with every kind of element, as XML, and the rules whose results depend on the model."""
+"""XML models with every kind of element, and the rules whose results depend on the model."""
 
 from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import episode_rules as episodes
 from lyceum_warp.testing import fault_rules as faults
 from lyceum_warp.testing import state_rules as state
 
-# the rules that depend on the model; only these run if an engine is slow on the CPU or a model slow to compile
+# rules that depend on the model; only these run if an engine is slow on the CPU or a model is slow to compile
 MODEL_CHECKS = (
     buffers.check_spaces,
     state.check_restoring,
@@ -28,7 +28,7 @@ MESH = "-.1 -.1 -.1  .1 -.1 -.1  0 .1 -.1  0 0 .1"
 
 
 def text(world: str, rest: str = MOTOR, option: str = "") -> str:
-    """The XML of a model, above a floor."""
+    """Return the XML of a model above a floor."""
     return (
         f'<mujoco model="made"><option timestep="0.005">{option}</option>'
         f'<worldbody><geom name="floor" type="plane" size="5 5 .1"/><site name="here" pos="0 0 2"/>{world}</worldbody>'
@@ -105,7 +105,7 @@ MOVING = {
     ),
     "sleep": text(BALL.format(z=0.1) + ARM, option='<flag sleep="enable"/>'),
 }
-"""Models whose physics the rules put to the test."""
+"""Models on which rules check the physics."""
 
 SENSING = {
     "position sensors": text(
@@ -136,7 +136,7 @@ SENSING = {
     ),
     "no sensors": text(ARM),
 }
-"""Models whose sensors the rules put to the test."""
+"""Models on which rules check the sensors."""
 
 PLUGINS = {
     "it has no functions of SDF plugins": text(
@@ -161,4 +161,4 @@ PLUGINS = {
         ARM, actuated('<orientation name="aim" site="tip" refsite="here" kp="1"/>', '<motor joint="wrist"/>')
     ),
 }
-"""Models that only the C engine accepts, by the error of the Warp engine."""
+"""Models that only the C engine supports, by the error of the Warp engine."""

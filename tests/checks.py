@@ -1,4 +1,4 @@
-"""Helpers of several test files: states set at random, comparisons with formulas, and checks of random samples."""
+"""Shared helpers: random states, comparisons with formulas, and checks of random samples."""
 
 import numpy as np
 import torch
@@ -7,7 +7,7 @@ import lyceum_warp as lw
 
 
 def put_at_random(env: lw.Env, rng: np.random.Generator, position: float, velocity: float) -> torch.Tensor:
-    """Put every world into a random state with qpos and qvel up to the given sizes; returns the states."""
+    """Put every world into a random state with qpos and qvel up to the given sizes; return the states."""
     state = env.get_state()
     parts = env.state_space.split(state)
     for name, size in (("qpos", position), ("qvel", velocity)):
@@ -18,7 +18,7 @@ def put_at_random(env: lw.Env, rng: np.random.Generator, position: float, veloci
 
 
 def positions(env: lw.Env, state: torch.Tensor | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Copies of qpos and qvel, of the worlds or of given states, in float64."""
+    """Return copies of qpos and qvel, of the worlds or of given states, in float64."""
     parts = env.state_space.split(env.get_state() if state is None else state)
     return parts["qpos"].numpy().copy(), parts["qvel"].numpy().copy()
 

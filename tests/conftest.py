@@ -1,4 +1,4 @@
-"""Fixtures of all tests: shared environments, files with tasks, and skips on machines without a GPU."""
+"""Fixtures for all tests: shared environments, task files, and skips on machines without a GPU."""
 
 import functools
 import gc
@@ -24,7 +24,7 @@ TaskFile = Callable[[str, str], Path]
 
 @pytest.fixture(scope="session", autouse=True)
 def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The directory in which runs are recorded, also by subprocesses, instead of the user's."""
+    """Store the list of trusted runs in a temporary directory instead of the user's, also for subprocesses."""
     with pytest.MonkeyPatch.context() as patched:
         folder = tmp_path_factory.mktemp("state")
         patched.setenv("XDG_STATE_HOME", str(folder))
@@ -33,15 +33,15 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def shared_env() -> Iterator[SharedEnv]:
-    """``shared_env("hopper", engine="warp", nworld=4, ...)``: ``lw.make``, called once a file for the same arguments.
+    """Call ``lw.make`` once per file for the same arguments, as in ``shared_env("hopper", engine="warp", nworld=4)``.
 
     Every call resets the worlds with ``rand_reset(0)``, so a test may leave them in any state. A test that changes
-    parameters or attributes, or that needs many worlds, makes an environment of its own, which is freed with it.
+    parameters or attributes, or that needs many worlds, makes its own environment, which is freed with it.
     """
     made: dict[tuple[Any, ...], lw.Env] = {}
 
     def get(task: str | type[lw.Task], *, engine: str = "mujoco", nworld: int = 1, **options: Any) -> lw.Env:
-        # the repr can be a key even if the value is a list or an array
+        # the repr is hashable even if the value is a list or an array
         key = (task, engine, nworld, *sorted((name, repr(value)) for name, value in options.items()))
         if key not in made:
             made[key] = lw.make(task, engine=engine, nworld=nworld, **options)
@@ -55,9 +55,9 @@ def shared_env() -> Iterator[SharedEnv]:
 
 @pytest.fixture(scope="session")
 def task_file(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> TaskFile:
-    """``task_file("mine.py", source)``: a file with a task, at the same path in every run of the tests.
+    """Write a task file with ``task_file("mine.py", source)``; its path is the same in every run of the tests.
 
-    Warp finds compiled kernels by the task's path, so from the second run on it takes them from its cache.
+    Warp caches compiled kernels by the task's path, so later runs reuse them.
     """
     cache = getattr(pytestconfig, "cache", None)
     folder = cache.mkdir("tasks") if cache else tmp_path_factory.mktemp("tasks")
@@ -72,9 +72,9 @@ def task_file(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFact
 
 
 def settle() -> None:
-    """Exempt all live objects from garbage collection: imports and kernels are a million objects to look through.
+    """Exempt all live objects from garbage collection: imports and kernels are a million objects to scan.
 
-    Later objects are collected and counted as usual. Call it only while no object is alive that a test must free.
+    Later objects are collected and counted as usual. Do not call it while an object is alive that a test must free.
     """
     gc.collect()
     gc.freeze()
@@ -82,20 +82,19 @@ def settle() -> None:
 
 @pytest.fixture
 def freed() -> Iterator[None]:
-    """Collect garbage after the test: an environment refers to itself, and one of many worlds is large."""
+    """Collect garbage after the test: environments contain reference cycles, and one with many worlds is large."""
     yield
     gc.collect()
 
 
 @pytest.fixture(scope="module", autouse=True)
 def settled() -> None:
-    """Between two files only lasting objects are alive."""
     settle()
 
 
 @pytest.fixture
 def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
-    """Every environment that the test makes, in order."""
+    """Collect every environment that the test makes, in order."""
     made: list[lw.Env] = []
     init = lw.Env.__init__
 
@@ -122,7 +121,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _task(item: pytest.Item) -> str | None:
-    """The name of the task that is a test's parameter."""
+    """Return the name of the task that parametrizes a test."""
     callspec = getattr(item, "callspec", None)
     task = callspec.params.get("task", callspec.params.get("engines")) if callspec else None
     return task if isinstance(task, str) else None
@@ -130,7 +129,7 @@ def _task(item: pytest.Item) -> str | None:
 
 @functools.cache
 def _missing_model(task: str | None) -> str | None:
-    """Why a task's model is missing, on versions of Python for which a package that brings models has no wheel."""
+    """Return why a task's model is missing: its package may have no wheel for this version of Python."""
     if task is None or sys.version_info < (3, 13):
         return None
     try:

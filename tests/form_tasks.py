@@ -1,4 +1,4 @@
-"""Tasks with pushes and drawn dynamics, whose small models both engines simulate equally up to rounding."""
+"""Tasks with pushes and randomized dynamics, with small models on which both engines agree up to rounding."""
 
 import mujoco
 import warp as wp
@@ -67,7 +67,7 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
 
 
 class Pushed(lw.Task):
-    """Inputs that ``control`` writes: forces on a body and on a joint, and a body that is moved."""
+    """A task whose ``control`` writes inputs: forces on a body and on a joint, and the pose of a mocap body."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
     frame_skip = 3
@@ -136,7 +136,7 @@ def draw_puck(s: PuckWorld, p: PuckParams, rng: Row[wp.uint32]):
 
 
 class Drawn(lw.Task):
-    """A puck on the floor, whose mass and friction are drawn at every reset, and gravity once for each world."""
+    """A puck on the floor; mass and friction are randomized at every reset, and gravity once per world."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(PUCK))
     frame_skip = 3
@@ -154,7 +154,7 @@ def observe_gravity(s: PuckWorld, p: PuckParams, obs: Row[float]):
 
 
 class Weighed(Drawn):
-    """``Drawn`` with an observation of gravity, which is drawn once for each world."""
+    """``Drawn`` with an observation of gravity, which is randomized once per world."""
 
     obs = {"x": 1, "gravity": 1}
     World = PuckWorld
@@ -185,7 +185,7 @@ def count_steps(s0: PracticedWorld, action: Row[float], s1: PracticedWorld, p: P
 
 
 class Practiced(lw.Task):
-    """The puck starts further away, and observes it, the longer its world has practiced."""
+    """The longer a world has practiced, the further away its puck starts; the practice is observed."""
 
     model = Drawn.model
     frame_skip = 3
@@ -203,7 +203,7 @@ def draw_practice(s: PracticedWorld, p: PuckParams, rng: Row[wp.uint32]):
 
 
 class Gifted(Practiced):
-    """``Practiced`` with initial practice that is drawn once for each world; the model is the same in all worlds."""
+    """``Practiced`` with initial practice that is randomized once per world; all worlds share the model."""
 
     World = PracticedWorld
     Params = PuckParams

@@ -1,4 +1,4 @@
-"""A task that uses every feature of the task form on a small model: a puck on the floor, and a paddle that is moved."""
+"""A task that uses every feature of the task form on a small model: a puck on the floor, and a movable paddle."""
 
 import mujoco
 import warp as wp
@@ -153,7 +153,7 @@ def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uin
 
 
 class Full(lw.Task):
-    """A task with every function and every attribute; episodes begin at a keyframe, and rejected states are redrawn."""
+    """A task with every function and attribute; episodes begin at a keyframe, and rejected states are redrawn."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))
     frame_skip = 3
@@ -171,6 +171,6 @@ class Full(lw.Task):
 
 
 class Settled(Full):
-    """The same, but an episode settles before it begins: the puck starts above the floor and falls."""
+    """``Full`` with settling: the puck starts above the floor and falls before the episode begins."""
 
     settle = 4

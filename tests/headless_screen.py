@@ -1,4 +1,4 @@
-"""Run the panel in studio's viewer without a browser or a window."""
+"""Run the panel in studio's viewer without a browser or window."""
 
 from typing import Any
 
@@ -28,7 +28,7 @@ ROBOT = """
 
 
 def robot() -> mujoco.MjModel:
-    """A ball that falls, and a goal that a mouse can place."""
+    """Return a falling ball and a goal that a mouse can place."""
     return mujoco.MjModel.from_xml_string(ROBOT)
 
 
@@ -75,7 +75,7 @@ class HeadlessViewer(viewer_protocol.Viewer):
 
 
 class Bench:
-    """A panel in a separate viewer, which keeps the messages that the panel sends."""
+    """A panel in a separate viewer; it stores the messages that the panel sends."""
 
     def __init__(self, model: mujoco.MjModel, scene: Scene, **options: Any) -> None:
         self.model, self.data = model, mujoco.MjData(model)
@@ -112,7 +112,7 @@ class Bench:
         self.sent.clear()
 
     def draw(self, frame: Frame | None = None) -> list[Reply]:
-        """Draw one frame, and return the messages that the panel sent."""
+        """Draw one frame, and return the panel's messages."""
         self.given, before = frame, len(self.sent)
         imgui.NewFrame()
         self.viewer.dispatch(messages.UpdateEvent())

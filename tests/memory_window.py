@@ -1,4 +1,4 @@
-"""A window in memory: it collects frames, and sends the commands of a test."""
+"""A window in memory that collects frames and sends a test's commands."""
 
 import time
 from collections import deque
@@ -11,7 +11,7 @@ from lyceum_warp.viewer.session.clock import Session
 
 
 class MemoryWindow:
-    """Shows nothing.
+    """A window that shows nothing.
 
     Args:
         script: Called after each frame with the frame and its number; returns commands, or None to close the window.
@@ -50,7 +50,7 @@ class MemoryWindow:
 
 
 def run(session: Session, *script: Iterable[Command] | Callable[[Frame], bool]) -> MemoryWindow:
-    """Run a session: after each frame the next commands of the script. A condition is awaited first."""
+    """Run a session, and send the script's commands, one entry per frame; an entry may be a condition to wait for."""
     entries = list(script)
 
     def after(frame: Frame, number: int) -> Iterable[Command] | None:

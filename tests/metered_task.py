@@ -1,4 +1,4 @@
-"""A task for tests of metrics and of groups of observations: a ball on a rail that must not leave it."""
+"""A task with metrics and observation groups: a ball on a rail; the episode ends if it leaves the rail."""
 
 import warp as wp
 from rail_task import rail

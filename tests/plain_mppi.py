@@ -1,4 +1,4 @@
-"""MPPI, CEM and predictive sampling by their definitions, in NumPy and with one step of all worlds at a time."""
+"""MPPI, CEM and predictive sampling by their definitions, in NumPy, stepping all worlds one step at a time."""
 
 from collections.abc import Callable
 from fractions import Fraction
@@ -12,7 +12,7 @@ import lyceum_warp as lw
 
 
 def smoothed(noise: np.ndarray, betas: tuple[float, ...]) -> np.ndarray:
-    """Noise over time, (horizon, ...): the first two steps stay as they are, those after mix with the last two."""
+    """Smooth noise over time, (horizon, ...): from the third step on, each step mixes with the previous two."""
     result = noise.copy()
     for t in range(2, len(noise)):
         result[t] = betas[0] * noise[t] + betas[1] * result[t - 1] + betas[2] * result[t - 2]
@@ -20,24 +20,24 @@ def smoothed(noise: np.ndarray, betas: tuple[float, ...]) -> np.ndarray:
 
 
 def hermite(before: Any, left: Any, right: Any, after: Any, f: float) -> Any:
-    """A cubic Hermite spline by its basis functions, with slopes by central differences."""
+    """Evaluate a cubic Hermite spline by its basis functions, with slopes from central differences."""
     slopes = (right - before) / 2, (after - left) / 2
     basis = 2 * f**3 - 3 * f**2 + 1, f**3 - 2 * f**2 + f, -2 * f**3 + 3 * f**2, f**3 - f**2
     return basis[0] * left + basis[1] * slopes[0] + basis[2] * right + basis[3] * slopes[1]
 
 
 class Grid:
-    """Knots at fixed times on a line: knot j of a plan with K knots over H steps is at step j H / K."""
+    """Knots at fixed times: of K knots over H steps, knot j is at step j H / K."""
 
     def __init__(self, horizon: int, knots: int, spline: str) -> None:
         self.horizon, self.distance, self.spline, self.now = horizon, Fraction(horizon, knots), spline, 0
 
     def first(self) -> int:
-        """Number of the first knot that the plan depends on."""
+        """Return the number of the first knot that the plan depends on."""
         return self.now // self.distance - (self.spline == "cubic")
 
     def actions(self, knots: np.ndarray) -> np.ndarray:
-        """Actions of all steps; the first of ``knots``, (n, ...), is ``first()``."""
+        """Return the actions of all steps; ``knots``, (n, ...), begins with knot ``first()``."""
         result = []
         for t in range(self.horizon):
             place = (self.now + t) / self.distance
@@ -52,11 +52,12 @@ class Grid:
 
 
 class Plain:
-    """A planner by its definition, in float64. It is given standard normal numbers, and does everything else itself.
+    """A planner by its definition, in float64; only its standard normal numbers are given.
 
     Args:
-        knots: Knots over the horizon, and ``count`` of them in a plan; None for a number of its own at each step.
-        fields: Rows of model fields by name, (models, size), which worlds get in turn.
+        knots: Number of knots over the horizon, or None for an independent number at each step.
+        count: Number of knots in a plan.
+        fields: Rows of model fields by name, (models, size), which worlds use in turn.
     """
 
     def __init__(
@@ -150,7 +151,6 @@ class Plain:
             self.deviation = np.maximum(fitted, self.min_noise)
 
     def add_up(self, rewards: np.ndarray, ended: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """The returns of all worlds."""
         result = np.zeros(rewards.shape[1])
         for k in range(len(result)):
             weight, going = 1.0, True
@@ -164,7 +164,7 @@ class Plain:
         return result
 
     def roll_out(self, state: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rewards and ends of each step, and the values of the states after the last one."""
+        """Return the rewards and ends of each step, and the values of the states after the last one."""
         env = self.env
         states = state.repeat(env.nworld, 1)
         for name, rows in self.fields.items():
@@ -179,7 +179,7 @@ class Plain:
 
 
 class PlainReach(Plain):
-    """The same with the physics and the reward of the reach task in MuJoCo and NumPy."""
+    """A planner that computes the physics and the reward of the reach task with MuJoCo and NumPy."""
 
     def roll_out(self, state: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         model = self.env.model

@@ -1,4 +1,4 @@
-"""A task for tests of the planner: a ball on a rail, whose reward is not a number for actions above a limit."""
+"""A task for tests of the planner: a ball on a rail, whose reward is NaN for actions above a limit."""
 
 import mujoco
 import warp as wp
@@ -28,7 +28,7 @@ class Rail:
 class RailParams:
     dt: float
     limit: float = 0.5
-    wrong: float = wp.inf  # inf / inf is not a number
+    wrong: float = wp.inf  # inf / inf is NaN
 
 
 @wp.func

@@ -1,4 +1,4 @@
-"""A task for tests of tables among the parameters: a ball on a rail that follows a motion."""
+"""A task with a table among its parameters: a ball on a rail that follows a motion."""
 
 import warp as wp
 from rail_task import rail

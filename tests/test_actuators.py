@@ -1,5 +1,3 @@
-"""Position servos that follow velocities."""
-
 import mujoco
 import numpy as np
 import pytest

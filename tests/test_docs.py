@@ -1,4 +1,4 @@
-"""The commands and Python of pages run, and links and file names in documents and project files exist."""
+"""Commands and Python on pages run, and links and file names in documents and project files are valid."""
 
 import re
 import runpy
@@ -20,7 +20,8 @@ from lyceum_warp.viz.video import NoVideoError, check_video
 ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 WALKTHROUGHS = [page for page in PAGES if "\n```sh\n" in page.read_text()]
-"""Pages with commands. Their blocks run in one folder, in order; a block with a title is the file of that name."""
+"""Pages with commands. Their blocks run in order in one folder; a block with a title is written to a file of that
+name."""
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 
 
@@ -29,7 +30,7 @@ def name_of(path: Path) -> str:
 
 
 def python_of(page: Path) -> str:
-    """The Python blocks of a page in order, each line at its place in the page, so that a traceback names that."""
+    """Return a page's Python with its original line numbers, so that a traceback points into the page."""
     lines, language = [], None
     for line in page.read_text().splitlines():
         if line.startswith("```"):
@@ -44,7 +45,7 @@ def python_of(page: Path) -> str:
 def test_python_of_a_page_runs_in_order(page: Path, task_file: TaskFile) -> None:
     source = python_of(page)
     assert source.strip(), f"{page.name} has no Python"
-    # a file, because Warp compiles the source of functions
+    # Warp compiles functions only from a source file
     runpy.run_path(str(task_file(f"page_{page.stem}.py", source)), run_name=f"page_{page.stem}")
 
 
@@ -60,15 +61,15 @@ QUICK = {
     "eval": ["--episodes", "2", "--no-video"],
     "plan": ["--steps", "3", "--samples", "4", "--no-video"],
 }
-"""Options that make a command quick, after those on the page."""
+"""Options added to a page's commands, so that they are quick."""
 
 
 class Walkthrough:
-    """The blocks of a page, run one after another in a folder.
+    """Run the blocks of a page one after another.
 
     Args:
-        folder: The current folder, empty.
-        quick: Whether commands get the options of QUICK; a check on the Warp engine, which is slow, is then left out.
+        folder: An empty folder, which becomes the working directory.
+        quick: Whether to add the options of QUICK, and to omit slow checks on the Warp engine.
     """
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, *, quick: bool) -> None:
@@ -90,7 +91,7 @@ class Walkthrough:
 
     def command(self, words: list[str]) -> None:
         match words:
-            case ["git", "clone", address]:  # a checkout with one robot, which is another one's model
+            case ["git", "clone", address]:  # a checkout with one robot, for which another model is substituted
                 robot = self.folder / Path(address).name / "unitree_go1" / "scene.xml"
                 robot.parent.mkdir(parents=True)
                 robot.write_text(lw.gymnasium_model("ant.xml").spec().to_xml())
@@ -110,7 +111,7 @@ class Walkthrough:
 
 @pytest.fixture(autouse=True)
 def short_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Windows in memory, which close after two frames."""
+    """Replace windows by ones in memory that close after two frames."""
 
     def opened(*words: object, **options: object) -> MemoryWindow:
         return MemoryWindow(lambda frame, number: [] if number < 1 else None)
@@ -120,7 +121,7 @@ def short_views(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def empty_folder(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
-    """An empty folder, the same in every run of the tests, so that Warp finds compiled kernels in its cache."""
+    """Return an empty folder that has the same path in every run, so that Warp reuses compiled kernels."""
     cache = getattr(pytestconfig, "cache", None)
     folder = Path(cache.mkdir("walkthrough")) if cache else tmp_path / "walkthrough"
     shutil.rmtree(folder, ignore_errors=True)
@@ -149,7 +150,6 @@ def test_the_page_on_a_task_of_your_own_keeps_its_promises(empty_folder: Path, m
 
 
 def anchors(document: Path) -> set[str]:
-    """The headings of a document, as links name them."""
     headings = re.findall(r"^#+ (.+)$", document.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
@@ -173,7 +173,7 @@ def test_files_that_a_document_names_exist(document: Path) -> None:
 
 
 def test_the_map_of_the_rooms_is_current() -> None:
-    """``python docs/rooms.py`` writes it from the docstrings."""
+    """``python docs/rooms.py`` generates it from the docstrings."""
     page = (ROOT / "docs" / "architecture.md").read_text()
     assert runpy.run_path(str(ROOT / "docs" / "rooms.py"))["written"](page) == page
 

@@ -1,4 +1,4 @@
-"""Fields, parameters, replicas and refusals of environments, and environments in other processes."""
+"""Fields, parameters, replicas and errors of environments, and environments in other processes."""
 
 import copy
 import gc
@@ -42,7 +42,7 @@ def test_an_environment_is_not_pickled_or_copied(spoil: Any) -> None:
 
 
 def _use(env: lw.Env, plan: lw.MPPI, loop: lw.OpenLoop, state: torch.Tensor, connection: Connection) -> None:
-    """Send the message of each call that raises RuntimeError."""
+    """Send the messages of all calls that raise RuntimeError."""
     messages = []
     for call in (env.step, env.reset, env.get_state, lambda: env.engine.step(1), loop.run, lambda: plan(state)):
         try:
@@ -86,7 +86,7 @@ def _make_another(connection: Connection) -> None:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_an_engine_goes_with_its_environment_before_a_fork(engine: str) -> None:
-    gc.disable()  # cycles would stay
+    gc.disable()  # reference cycles would stay
     try:
         env = lw.make("hopper", nworld=64, engine=engine)
         env.get_reward(state := env.get_state(), env.action, state)
@@ -104,9 +104,6 @@ def test_an_engine_goes_with_its_environment_before_a_fork(engine: str) -> None:
         assert not hangs and child.exitcode == 0 and here.recv() == 0
     finally:
         gc.enable()
-
-
-# parameters and replicas
 
 
 def test_follow_takes_over_every_parameter_that_either_was_given() -> None:

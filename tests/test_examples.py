@@ -1,5 +1,3 @@
-"""Each program in examples/ runs and prints the expected results."""
-
 import ast
 import os
 import re
@@ -20,7 +18,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture):
-    """``run("train.py", "--nworld", "4")`` runs an example in this process, in an empty folder: the lines it prints."""
+    """Run an example in an empty folder, as in ``run("train.py", "--nworld", "4")``; return its lines."""
 
     def lines(name: str, *args: str) -> list[str]:
         monkeypatch.chdir(tmp_path)
@@ -32,7 +30,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureF
 
 
 def numbers(pattern: str, lines: list[str]) -> list[float]:
-    """The number in parentheses of a pattern, in each line that matches."""
+    """Return the number that a pattern captures in each matching line."""
     return [float(match[1]) for line in lines if (match := re.search(pattern, line))]
 
 
@@ -54,9 +52,9 @@ def test_own_policy_improves(run) -> None:
 
 
 def test_random_search_gets_a_run_without_code_for_it(run, tmp_path: Path) -> None:
-    """A folder, resumption to the bit, an evaluation and an export."""
+    """The run has a folder, resumes to the bit, and can be evaluated and exported."""
     once = numbers(r"return (-?[\d.]+)", run("random_search.py", "--out", "once", "--iterations", "6"))
-    assert max(once) == 200.0 > 1.5 * once[0]  # every step of the episode is rewarded
+    assert max(once) == 200.0 > 1.5 * once[0]  # the policy earns a reward in every step
     run("random_search.py", "--out", "twice", "--iterations", "3")
     run("random_search.py", "--out", "twice", "--iterations", "6", "--resume", "--seed", "0")
     rows = [Run.open(tmp_path / name).rows() for name in ("once", "twice")]
@@ -64,7 +62,7 @@ def test_random_search_gets_a_run_without_code_for_it(run, tmp_path: Path) -> No
     assert cli.main(["eval", "twice", "--which", "best", "--episodes", "4"]) == 0
     assert cli.main(["export", "twice", "--to", "policy.pt2"]) == 0
     assert torch.export.load("policy.pt2").module()(torch.zeros(3, 4)).shape == (3, 1)
-    assert cli.main(["train", "--resume", "twice", "--iterations", "9"]) == 2  # the class is in a program
+    assert cli.main(["train", "--resume", "twice", "--iterations", "9"]) == 2  # the class is defined in a program
 
 
 def test_plan_reaches_the_target_in_each_episode(run) -> None:
@@ -75,14 +73,14 @@ def test_plan_reaches_the_target_in_each_episode(run) -> None:
 
 
 def test_own_task_keeps_the_rules_and_steps() -> None:
-    # in a process of its own: the task is registered, and its module is __main__
+    # in a subprocess, because the task is registered and its module is __main__
     command = [sys.executable, str(EXAMPLES / "own_task.py")]
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)
     assert done.returncode == 0, done.stderr
     first, *_, last = done.stdout.splitlines()
     assert first.startswith("pendulum on the mujoco engine") and first.endswith("keeps the rules:")
-    # it hangs almost straight down, and pays 0.1 * 0.5² for the action
+    # the pendulum hangs almost straight down, and the action costs 0.1 * 0.5²
     assert last.startswith("reward after 0.04 s")
     assert numbers(r": (-[\d.]+)", [last])[0] == pytest.approx(-1.025, abs=2e-3)
 
@@ -113,7 +111,7 @@ def test_commanded_speed_trains_with_its_terms_as_curves(tmp_path: Path) -> None
 def test_torch_loop_learns_to_approach_the_target(run) -> None:
     lines = run("torch_loop.py", "--iterations", "24")
     distances = numbers(r"256 episodes ended ([\d.]+) m", lines)
-    assert len(distances) == 6  # an episode of 128 steps ends in every fourth iteration of 32
+    assert len(distances) == 6  # an episode of 128 steps ends in every fourth iteration of 32 steps
     assert distances[-1] < 0.75 * distances[0]
 
 

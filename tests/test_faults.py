@@ -1,8 +1,8 @@
-"""A world's fault stays in that world, and a wrong argument is refused with its value and how to fix it.
+"""A world's fault stays in that world; an error for a wrong argument names its value and the fix.
 
-The conformance suite covers not-a-number, infinite and out of range states and actions for every task and engine. Here
-are the faults that need a particular model. Both engines can produce each kind. The C engine has no shared pool of
-contacts, so only the Warp engine's contact overflow reaches other worlds.
+The conformance suite covers NaN, infinite and out-of-range states and actions for every task and engine. These faults
+need a particular model, and both engines can produce each kind. The C engine has no shared contact pool, so only the
+Warp engine's contact overflow affects other worlds.
 """
 
 import gc
@@ -32,14 +32,14 @@ def hopper(engine: str, **options: Any) -> lw.Env:
 
 
 def lay_down(env: lw.Env, world: int) -> None:
-    """Put a hopper on the floor, with five contacts; a standing one has none."""
+    """Lay a hopper on the floor, with five contacts; a standing one has none."""
     state, start = env.get_state(), env.state_space.parts["qpos"].start
     state[world, start + 1 : start + 3] = torch.tensor([0.05, 1.5], dtype=state.dtype)
     env.set_state(state, torch.arange(N) == world)
 
 
 def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
-    """Step an environment with a fault and one without; the other worlds must be the same to the bit."""
+    """Step an environment with a fault and one without; all other worlds must be equal to the bit."""
     others, found = torch.arange(N) != BAD, Done(0)
     generator = torch.Generator().manual_seed(0)
     for i in range(steps):
@@ -60,13 +60,10 @@ def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
     return found
 
 
-# faults that need a model of their own
-
-
 def test_too_little_memory_of_the_c_engine_is_a_fault() -> None:
-    """With less and less memory MuJoCo drops constraints, then contacts; in between it raises an error.
+    """As memory shrinks, MuJoCo drops constraints, then contacts; in between it raises an error.
 
-    Which of the three a size leads to depends on the version; each must occur, and each must be reported.
+    The version determines which size causes which of these; all three must occur and be reported.
     """
     found = Done(0)
     for memory in range(3000, 14_000, 1000):
@@ -91,7 +88,7 @@ def test_a_constraint_overflow_of_the_warp_engine_is_a_fault_of_one_world() -> N
 
 
 def test_a_contact_overflow_of_the_warp_engine_is_a_fault_of_every_world_without_room() -> None:
-    """Contacts of all worlds share one pool: each world that found no room is flagged."""
+    """All worlds share one contact pool, and each world without room is flagged."""
     env = hopper("warp", nconmax=1, njmax=64)
     lay_down(env, BAD)
     before = env.obs.clone()
@@ -108,7 +105,7 @@ def test_a_contact_overflow_of_the_warp_engine_is_a_fault_of_every_world_without
 
 
 def test_any_other_overflow_of_the_warp_engine_is_an_engine_warning() -> None:
-    """Here a contact sensor has more matches than room."""
+    """A contact sensor has more matches than its buffer holds."""
 
     def make() -> lw.Env:
         spec = lw.gymnasium_model("hopper.xml").spec()
@@ -119,7 +116,7 @@ def test_any_other_overflow_of_the_warp_engine_is_an_engine_warning() -> None:
         env = hopper("warp", model=spec, nconmax=16, njmax=64)
         opt = env.engine.m.opt  # type: ignore[attr-defined]
         opt.contact_sensor_maxmatch = 1
-        opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # the task needs no sensor, so they are off
+        opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # they are off, because the task needs no sensor
         return env
 
     env, clean = make(), make()
@@ -132,7 +129,7 @@ def test_any_other_overflow_of_the_warp_engine_is_an_engine_warning() -> None:
 def test_faults_print_nothing_over_300_steps(
     engine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """One world gets a not-a-number every five steps: the others and the console are not affected."""
+    """A NaN in one world every five steps does not affect the other worlds or the console."""
     monkeypatch.chdir(tmp_path)
     env, clean = (lw.make("hopper", engine=engine, nworld=N) for _ in range(2))
     start, only = env.state_space.parts["qvel"].start, torch.arange(N) == BAD
@@ -144,7 +141,7 @@ def test_faults_print_nothing_over_300_steps(
             state[BAD, start + i % 6] = (np.nan, np.inf, 1e200, -1e15)[i % 4]
             env.set_state(state, only, check=False)
             assert torch.isfinite(env.obs).all() and not env.done[BAD]  # the next step finds it
-            assert Done.NAN in step_both(env, clean, 5)  # beside other faults of such a state
+            assert Done.NAN in step_both(env, clean, 5)  # other faults of such a state may accompany it
     assert env.fault_counts["nan"] == 60
     assert sum(clean.fault_counts.values()) == 0
     printed = capfd.readouterr()
@@ -155,7 +152,7 @@ def test_faults_print_nothing_over_300_steps(
 @pytest.mark.parametrize("autoreset", [True, False])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_bad_warm_start_ends_with_its_episode(engine: str, autoreset: bool) -> None:
-    """Resetting only positions and velocities would keep it, and the world would have a fault at every step."""
+    """Resetting only positions and velocities would keep the warm start, and every step would have a fault."""
     env, clean = (hopper(engine, autoreset=autoreset) for _ in range(2))
     for each in (env, clean):
         lay_down(each, BAD)
@@ -180,9 +177,6 @@ def test_only_a_fault_restarts_a_world_without_automatic_resets(engine: str) -> 
     env.step()
     assert env.done_reason[BAD] == int(Done.TRUNCATED | Done.ACTION)
     assert env.time[BAD] == 0 and (env.time[[0, 2, 3]] > 0).all()
-
-
-# wrong arguments
 
 
 @pytest.mark.parametrize(
@@ -302,7 +296,6 @@ def test_masks_and_outputs_of_another_shape_or_type_are_refused(env: lw.Env) -> 
 
 
 def test_dropped_environments_are_freed() -> None:
-    """No array of an environment outlives it."""
     made = []
     for _ in range(3):
         env = lw.make("point_mass", nworld=2)

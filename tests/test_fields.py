@@ -110,7 +110,7 @@ def test_a_named_element_has_its_place_in_the_field(
 @pytest.mark.parametrize(
     ("element", "place"),
     [
-        (lw.actuator("turn"), 3),  # after the three outputs of another actuator
+        (lw.actuator("turn"), 3),  # follows the three outputs of another actuator
         (lw.ctrl("turn"), 3),
         (lw.act("slow"), 0),
         (lw.tendon("string"), 0),

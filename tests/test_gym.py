@@ -1,5 +1,3 @@
-"""Gymnasium's ids of tasks."""
-
 import subprocess
 import sys
 from pathlib import Path
@@ -55,7 +53,7 @@ def test_an_unknown_task_gets_no_id(tmp_path: Path) -> None:
 
 def test_a_task_whose_package_is_missing_says_so_when_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     class Missing(Full):
-        """A task with the model of a package that is not installed."""
+        """A task with a model from a package that is not installed."""
 
         model = lw.package_model("package_that_is_missing", "arm.xml", install="lyceum-warp[arm]")
 

@@ -39,13 +39,13 @@ TESTED_BY = {
     "done": "test_faults.py", "task": "binding", "testing": "conformance",
     "world_arrays": "test_worlds.py",
 }  # fmt: skip
-"""Tests of rooms that have none of their own name."""
+"""Tests of rooms without tests of the same name."""
 
 ACROSS = {"browser", "conformance", "fuzz", "gpu", "oracles", "stories"}
 """Folders of tests that belong to no single room."""
 
 NAMEDTUPLE = {"_fields", "_asdict", "_replace", "_make"}
-"""Public in spite of their names."""
+"""Public names that begin with an underscore."""
 
 
 def module_name(path: Path) -> str:
@@ -62,7 +62,7 @@ def room(module: str) -> str:
 
 
 def imported_modules(name: str) -> set[str]:
-    """Modules of the package that a module imports anywhere, under TYPE_CHECKING and within functions too."""
+    """Return the package's modules that a module imports, including imports under TYPE_CHECKING and in functions."""
     found = set()
     for node in ast.walk(TREES[name]):
         if isinstance(node, ast.Import):
@@ -76,9 +76,6 @@ def imported_modules(name: str) -> set[str]:
 
 
 IMPORTS = {name: imported_modules(name) for name in MODULES}
-
-
-# imports
 
 
 def test_imports_point_to_lower_rooms() -> None:
@@ -108,7 +105,7 @@ def test_no_module_imports_itself_through_others() -> None:
 
 
 def test_the_viewers_window_imports_neither_torch_nor_warp_nor_other_rooms() -> None:
-    """It draws in a process of its own, which must start quickly and stay small."""
+    """The window runs in a subprocess, which must start quickly and stay small."""
     window = sorted(name for name in MODULES if name.startswith("lyceum_warp.viewer.window"))
     code = f"import sys, {', '.join(window)}; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
@@ -130,15 +127,12 @@ def test_module_names_are_unique() -> None:
     assert not {last: names for last, names in places.items() if len(names) > 1 and last != "__main__"}
 
 
-# private names
-
-
 def is_private(name: str) -> bool:
     return name.startswith("_") and not name.endswith("__") and name not in NAMEDTUPLE
 
 
 def is_own(node: ast.Attribute) -> bool:
-    """Whether an attribute is one of self, cls or super()."""
+    """Return whether an attribute belongs to self, cls or super()."""
     value = node.value
     if isinstance(value, ast.Call):
         return isinstance(value.func, ast.Name) and value.func.id == "super"
@@ -146,7 +140,7 @@ def is_own(node: ast.Attribute) -> bool:
 
 
 def defined_names(tree: ast.AST) -> Iterator[str]:
-    """Names of functions, classes, variables and attributes that a module defines."""
+    """Yield the functions, classes, variables and attributes that a module defines."""
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             yield node.name
@@ -163,7 +157,7 @@ for module, tree in TREES.items():
 
 
 def test_no_module_uses_private_names_of_another_module() -> None:
-    """Attributes are found by name; private names of Warp, MuJoCo and torch are not defined in the package."""
+    """Attributes are matched by name only, so private names of Warp, MuJoCo and torch do not count."""
     found = []
     for name, tree in TREES.items():
         for node in ast.walk(tree):
@@ -189,7 +183,8 @@ UPSTREAM = "lyceum_warp.support.upstream"
 
 
 def private_names_of_others(tree: ast.AST) -> Iterator[str]:
-    """Private modules of other packages that a module imports, and private attributes of other packages' modules."""
+    """Yield the private modules that a module imports from other packages, and their private attributes that it
+    reads."""
     modules = set()
     for node in ast.walk(tree):
         found = []
@@ -230,7 +225,7 @@ def in_new_process(program: str) -> str:
 
 
 def test_no_submodule_has_a_public_name() -> None:
-    """Its import makes it an attribute of the package, which would hide the function of that name."""
+    """Importing it would set an attribute of the package, which would hide the function of that name."""
     assert not {room(name) for name in MODULES} & set(lw.__all__)
 
 
@@ -251,9 +246,6 @@ def test_warp_is_quiet_in_whatever_order_a_task_file_imports(first: str) -> None
         print(lw.make("point_mass", nworld=1).nworld)
     """
     assert in_new_process(program) == "1\n"
-
-
-# tests
 
 
 def test_every_room_has_tests_of_its_name() -> None:

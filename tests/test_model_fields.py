@@ -1,5 +1,3 @@
-"""Model fields that can differ between worlds: types, errors, and the constants that follow."""
-
 import mujoco
 import pytest
 import warp as wp
@@ -30,7 +28,7 @@ def test_a_model_field_has_the_type_of_an_element(name: str, shape: tuple[int, .
 
 
 def fields_of(model: mujoco.MjModel) -> list[ModelField]:
-    """Every model field that can differ between worlds."""
+    """Return every model field that can differ between worlds."""
     found = []
     for name in (*dir(model), *dir(model.opt)):
         try:

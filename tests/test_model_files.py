@@ -1,4 +1,4 @@
-"""Model files of packages and of a local folder: found when they are needed, never imported."""
+"""Find model files of packages and of a local folder when they are needed, without importing the packages."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ from lyceum_warp.binding.registry import find_task
 
 @pytest.fixture
 def menagerie(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A checkout with one robot."""
+    """Make a checkout with one robot."""
     (tmp_path / "leg").mkdir()
     (tmp_path / "leg" / "scene.xml").write_text(lw.gymnasium_model("hopper.xml").spec().to_xml())
     monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
@@ -73,8 +73,6 @@ def test_a_python_on_which_an_extra_installs_nothing_is_named_with_a_command_tha
 
 
 class Light(find_task("hopper")):  # type: ignore[misc]
-    """A hopper of half the weight."""
-
     @staticmethod
     def edit_model(spec):
         for body in spec.bodies[1:]:

@@ -1,4 +1,4 @@
-"""Open-loop rollouts give the numbers of stepping an environment, to the bit, on both engines."""
+"""Open-loop rollouts and steps of an environment give the same numbers, to the bit, on both engines."""
 
 from typing import Any
 
@@ -18,8 +18,6 @@ from lyceum_warp.openloop import OpenLoop
 ENGINES = ["mujoco", "warp"]
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
 
-
-# tasks of these tests: an arm of two joints above a floor
 
 ARM = """
 <mujoco>
@@ -54,7 +52,7 @@ class Arm:
     qvel: Row[float]
     ctrl: Row[float]
     site_xpos: Row[wp.vec3]
-    memory: Row[float]  # a sum over the steps, and the last step's draw
+    memory: Row[float]  # a sum over the steps, and the last step's random draw
 
 
 @wp.struct
@@ -125,7 +123,7 @@ def reward_of_sensors(s0: SensingArm, action: Row[float], s1: SensingArm, p: Arm
 
 
 class Forgetful(lw.Task):
-    """Actions are controls, so the C engine rolls out a horizon in one native call."""
+    """A task whose actions are controls, so that the C engine rolls out a horizon in one native call."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
     frame_skip = 3
@@ -137,7 +135,7 @@ class Forgetful(lw.Task):
 
 
 class Keepsake(lw.Task):
-    """Its memory is written at a reset and stays as it is."""
+    """A task whose memory is written only at a reset."""
 
     model, frame_skip, obs, memory = Forgetful.model, 3, Forgetful.obs, 2
     World = Arm
@@ -146,13 +144,13 @@ class Keepsake(lw.Task):
 
 
 class Servo(Forgetful):
-    """Controls depend on the state that a step starts from."""
+    """A task whose controls depend on the state before the step."""
 
     control = servo
 
 
 class Sensing(lw.Task):
-    """It reads sensors of two stages: the velocity belongs to the state, the acceleration to the last substep."""
+    """A task with two sensors: the velocity belongs to the state, the acceleration to the last substep."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
     frame_skip = 2
@@ -174,7 +172,7 @@ def rollouts(task: str | type[lw.Task], steps: int, *, engine: str, nworld: int 
 
 
 def random_actions(env: lw.Env, steps: int, seed: int) -> torch.Tensor:
-    """Actions of which many lie beyond the bounds, or beyond -1 and 1 if there are no bounds."""
+    """Return actions, many of which exceed the bounds (-1 and 1 if there are none)."""
     generator = torch.Generator().manual_seed(seed)
     bounds = (torch.from_numpy(bound) for bound in (env.action_space.low, env.action_space.high))
     low, high = (bound.nan_to_num(neginf=-1.0, posinf=1.0) for bound in bounds)
@@ -183,7 +181,7 @@ def random_actions(env: lw.Env, steps: int, seed: int) -> torch.Tensor:
 
 
 def some_state(env: lw.Env, seed: int, steps: int = 7) -> torch.Tensor:
-    """A state some random steps into an episode, with its done_reason cleared."""
+    """Return a state after some random steps of an episode, with its done_reason cleared."""
     env.rand_reset(seed)
     for action in random_actions(env, steps, seed):
         env.step(action)
@@ -200,14 +198,14 @@ def run(loop: OpenLoop, state: torch.Tensor, actions: torch.Tensor) -> dict[str,
 
 
 def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None:
-    """Compare several rollouts, from other states and under other actions each time; the later ones replay graphs."""
+    """Compare several rollouts, each from a different state with different actions; the later ones replay graphs."""
     for seed in range(rounds):
         state, actions = some_state(env, seed), random_actions(env, loop.horizon, 10 + seed)
         low, high = env.action_space.low, env.action_space.high
         assert ((actions.numpy() < low) | (actions.numpy() > high)).any() or not np.isfinite(high).any()
         found = run(loop, state, actions)
         assert not found["fault"].any() and torch.equal(loop.actions, actions)
-        ended = found["terminated"].cumsum(0) > 0  # without automatic resets an environment's end stays set
+        ended = found["terminated"].cumsum(0) > 0  # without automatic resets, terminated stays set
         env.set_state(state.expand(env.nworld, -1).contiguous())
         for t, action in enumerate(actions):
             env.step(action)
@@ -218,11 +216,8 @@ def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None
         assert len(env.final_obs.unique(dim=0)) == env.nworld, "all worlds are the same, so nothing was tested"
 
 
-# the tasks of the package
-
-
 def on_engines(task: str) -> list[object]:
-    """A task on both engines; on the Warp engine a few tasks cover most elements of a model."""
+    """Return a task's cases on both engines; on the Warp engine a few tasks cover most elements of a model."""
     few = task in ("hopper", "humanoid", "adroit_pen", "soft_ball", "reach")
     return [pytest.param(task, "mujoco"), pytest.param(task, "warp", marks=[] if few else [pytest.mark.long])]
 
@@ -230,7 +225,7 @@ def on_engines(task: str) -> list[object]:
 @pytest.mark.parametrize("task, engine", [case for task in PACKAGE for case in on_engines(task)])
 def test_a_rollout_gives_the_numbers_of_stepping(task: str, engine: str) -> None:
     steps = 3 if task == "humanoid" or task.startswith("adroit") else 5
-    # on the CPU every substep of the Warp engine is hundreds of launches, so two of them must do
+    # on the CPU a substep of the Warp engine consists of hundreds of launches, so two of them must do
     options = {"frame_skip": min(2, find_task(task).frame_skip)} if engine == "warp" else {}
     env = lw.make(task, engine=engine, nworld=4, autoreset=False, **options)
     check_against_stepping(rollouts(task, steps, engine=engine, **options), env)
@@ -238,7 +233,7 @@ def test_a_rollout_gives_the_numbers_of_stepping(task: str, engine: str) -> None
 
 @pytest.fixture
 def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Holds one entry for every rollout of a whole horizon in one native call."""
+    """Return a list that gets an entry for each rollout in one native call."""
     calls, original = [], NativeRollout.run
 
     def counting(self: NativeRollout, *args: Any) -> None:
@@ -247,9 +242,6 @@ def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     monkeypatch.setattr(NativeRollout, "run", counting)
     return calls
-
-
-# everything that a task may do
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -270,7 +262,7 @@ def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_every_kind_of_task_gives_the_numbers_of_stepping(
     task: type[lw.Task], native: bool, options: dict[str, Any], engine: str, native_calls: list[int]
 ) -> None:
-    """Memory with draws, parameters that differ between worlds, RK4 with derived fields, own controls, sensors."""
+    """Cases: memory with draws, per-world parameters, RK4 with derived fields, controls of the task, sensors."""
     loop = rollouts(task, 6, engine=engine, **options)
     check_against_stepping(loop, lw.make(task, engine=engine, nworld=4, autoreset=False, **options))
     assert len(native_calls) == (3 if native and engine == "mujoco" else 0)
@@ -278,7 +270,7 @@ def test_every_kind_of_task_gives_the_numbers_of_stepping(
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_parameters_may_change_between_rollouts(engine: str) -> None:
-    """Also from one number to one per world, after graphs were captured."""
+    """After graphs were captured, a parameter may change from one number to one per world."""
     loop, env = rollouts(Forgetful, 3, engine=engine), lw.make(Forgetful, engine=engine, nworld=4, autoreset=False)
     check_against_stepping(loop, env)
     for params in ({"cost": 5.0}, {"gain": np.array([1.0, 2.0, 3.0, 4.0]), "bound": -1.0}):
@@ -290,7 +282,7 @@ def test_parameters_may_change_between_rollouts(engine: str) -> None:
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Forgetful, Servo])
 def test_worlds_draw_from_keys_of_their_own_if_given(task: type[lw.Task], engine: str) -> None:
-    """They draw the same numbers as steps from states with these keys."""
+    """The draws equal those of steps from states with these keys."""
     env = lw.make(task, engine=engine, nworld=4, autoreset=False)
     numbers = np.array([5, 2**32 - 1, 77, 1234567890], dtype=np.uint32)
     keys = wp.zeros(4, dtype=wp.uint32, device="cpu")
@@ -317,7 +309,7 @@ def test_keys_that_do_not_fit_are_refused(shared_env: SharedEnv) -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_terminated_is_judged_for_each_state_separately(engine: str) -> None:
-    """The arm swings out and back in; only the states outside count as ends."""
+    """The arm swings out and back in; only the states outside are terminal."""
     loop = rollouts(Forgetful, 40, engine=engine, nworld=2, bound=0.05)
     loop.env.reset()
     actions = torch.zeros(40, 2, 2)
@@ -329,8 +321,6 @@ def test_terminated_is_judged_for_each_state_separately(engine: str) -> None:
     assert found["terminated"][-1, 1], "the other world swings the other way first"
 
 
-# failures
-
 BAD = 1
 
 
@@ -338,7 +328,7 @@ BAD = 1
 @pytest.mark.parametrize("task", [Forgetful, Servo])
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_an_action_that_is_not_finite_is_a_fault_of_its_world(task: type[lw.Task], engine: str, number: float) -> None:
-    """The action counts as zero; other worlds keep their numbers, and the next rollout has no fault."""
+    """The action is replaced by zero; other worlds keep their numbers, and the next rollout has no fault."""
     loop = rollouts(task, 5, engine=engine)
     state, actions = some_state(loop.env, 0), random_actions(loop.env, 5, 0)
     zeroed, wrong = actions.clone(), actions.clone()
@@ -416,12 +406,11 @@ class PushedRunaway(Runaway):
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("how", ["native", "rk4", "control"])
-@pytest.mark.parametrize("size, step", [(1e9, 1), (1e9, 5), (1e13, 1)])  # MuJoCo leaves out controls beyond 1e10
+@pytest.mark.parametrize("size, step", [(1e9, 1), (1e9, 5), (1e13, 1)])  # MuJoCo ignores controls beyond 1e10
 def test_a_world_that_diverges_has_a_fault_and_changes_no_other(size: float, how: str, step: int, engine: str) -> None:
-    """The next rollouts have no fault either.
+    """The next rollouts have no fault.
 
-    On the C engine such a world stops and keeps its last finite numbers, so only the fault shows that they are
-    meaningless.
+    On the C engine such a world stops and keeps its last finite numbers, so only the fault marks them as meaningless.
     """
     task = PushedRunaway if how == "control" else Runaway
     model = mujoco.MjSpec.from_string(RUNAWAY.format('integrator="RK4"' if how == "rk4" else ""))
@@ -448,7 +437,7 @@ def test_a_world_that_diverges_has_a_fault_and_changes_no_other(size: float, how
 
 @pytest.mark.parametrize("task", [Runaway, PushedRunaway])
 def test_a_fault_in_the_middle_is_reported_at_the_end(task: type[lw.Task]) -> None:
-    """A ball is driven into the floor, which needs more constraints than there is room for, and flies up again."""
+    """A ball is pushed into the floor, which needs more constraints than there is room for, and then flies up again."""
     loop = rollouts(task, 20, engine="warp", nworld=3, nconmax=8, njmax=2)
     loop.env.reset()
     state = loop.env.get_state()[0].clone()

@@ -1,4 +1,4 @@
-"""The options of environments and physics: checked when made, split from parameters, suggested when misspelt."""
+"""Options of environments and physics: checked when made, separated from parameters, suggested when misspelt."""
 
 import dataclasses
 import inspect
@@ -67,7 +67,7 @@ def test_a_replica_has_the_options_of_the_original_except_for_the_changes() -> N
     replica = env.replicate(nworld=3, horizon=6)
     assert replica.options.given() == {
         "nworld": 3, "horizon": 6, "integrator": "euler", "solver": {"iterations": 4},
-        "model": env.task.spec,  # as it was read, even if its file has changed
+        "model": env.task.spec,  # the spec that was loaded, even if its file has changed
     }  # fmt: skip
 
 

@@ -1,5 +1,3 @@
-"""The README's Python runs unchanged."""
-
 import re
 from pathlib import Path
 
@@ -14,7 +12,7 @@ README = Path(__file__).parent.parent / "README.md"
 def test_every_python_block_runs(task_file: TaskFile, capsys: pytest.CaptureFixture) -> None:
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     assert len(blocks) == 3
-    # Warp compiles the source of functions, so it must lie in a file, as a user's does
+    # Warp compiles functions only from a source file
     env = lw.make(str(task_file("my_hopper.py", blocks[1])), nworld=2)
     assert env.task.name == "my_hopper"
     for block in (blocks[0], blocks[2]):
@@ -25,7 +23,7 @@ def test_every_python_block_runs(task_file: TaskFile, capsys: pytest.CaptureFixt
 
 
 def test_the_task_is_shorter_than_in_the_paper() -> None:
-    """The paper's appendix takes 39 lines for Hopper without its comments."""
+    """The paper's listing of Hopper takes 39 lines without comments."""
     source = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)[1]
     lines = [line for line in source.splitlines() if line.strip() and not line.strip().startswith("#")]
     assert len(lines) < 39

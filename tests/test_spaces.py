@@ -1,5 +1,3 @@
-"""Shapes, parts and bounds of observations, actions and states."""
-
 import mujoco
 import numpy as np
 import torch

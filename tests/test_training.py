@@ -1,5 +1,3 @@
-"""Training with a run's folder: ended, continued and warm-started."""
-
 import os
 import shutil
 import signal
@@ -21,16 +19,13 @@ from lyceum_warp.runs.folder import Run
 
 @pytest.fixture
 def env(shared_env: SharedEnv) -> lw.Env:
-    """Each algorithm continues its random streams, so tests that compare numbers make environments of their own."""
+    """Tests that compare numbers make their own environments, because each algorithm continues its random streams."""
     return shared_env("point_mass", nworld=2)
 
 
 @pytest.fixture(scope="module")
 def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return six_iterations(tmp_path_factory.mktemp("runs") / "six")
-
-
-# the same folder as the command's
 
 
 def test_a_run_of_python_has_the_numbers_of_the_command(six: Path, tmp_path: Path) -> None:
@@ -90,7 +85,7 @@ def test_an_algorithm_that_has_iterated_begins_a_whole_run(six: Path, tmp_path: 
 
     lw.train(npg, folder, iterations=9, callback=callback, save_every=100)
     assert begun == [3, 3]
-    previous = folder / "previous.pt"  # as after kill -9 in iteration 6
+    previous = folder / "previous.pt"  # the state after kill -9 in iteration 6
     previous.replace(folder / "checkpoint.pt")
     lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
     assert metrics(folder) == metrics(six)[3:]
@@ -109,9 +104,6 @@ def test_bad_arguments_leave_no_folder(env: lw.Env, tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
-# which policy
-
-
 def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
     returns = [float(row["mean_return"]) for row in metrics(six) if row["mean_return"]]
     best = 2 * (returns.index(max(returns)) + 1)
@@ -127,7 +119,7 @@ def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
 
 
 def test_without_evaluations_the_best_policy_sampled_the_best_iteration(tmp_path: Path) -> None:
-    """The policy before the step of an iteration samples the episodes of that iteration."""
+    """The policy before an iteration's update samples that iteration's episodes."""
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), tmp_path / "run", iterations=4, keep_every=1)
     returns = [float(row["return_mean"]) for row in metrics(tmp_path / "run")]
@@ -136,9 +128,6 @@ def test_without_evaluations_the_best_policy_sampled_the_best_iteration(tmp_path
     if iteration > 0:
         best, numbered = (mean_action(lw.load(tmp_path / "run", which=which)) for which in ("best", iteration))
         assert torch.equal(best, numbered)
-
-
-# the end
 
 
 def test_a_callback_sees_every_iteration_and_ends_training(env: lw.Env, tmp_path: Path) -> None:
@@ -170,7 +159,7 @@ def test_an_error_in_the_callback_leaves_a_whole_run(six: Path, tmp_path: Path) 
 def test_what_ends_an_iteration_leaves_the_last_save(
     error: type[BaseException], six: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also if worlds and networks have changed since."""
+    """Worlds and networks may have changed since."""
     npg, folder = algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run"
     fit = ValueFit.__call__
 
@@ -189,11 +178,11 @@ def test_what_ends_an_iteration_leaves_the_last_save(
 
 
 class SlowToSave(lw.NPG):
-    """Saves so slowly that only the first and the last state are saved."""
+    """A learner whose saves are so slow that only the first and the last state are saved."""
 
     saves = 0
     signal_in_save = 0
-    """Number of the save during which a signal arrives."""
+    """Index of the save during which a signal arrives."""
 
     def state_dict(self) -> dict[str, Any]:
         self.saves += 1
@@ -205,7 +194,7 @@ class SlowToSave(lw.NPG):
 
 @pytest.fixture
 def sigint() -> Iterator[None]:
-    """Python's own handler of SIGINT, even if a shell made its children ignore it."""
+    """Install Python's default SIGINT handler, because a shell may make its children ignore SIGINT."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -259,11 +248,8 @@ def test_training_ends_after_its_minutes(tmp_path: Path, capsys: pytest.CaptureF
     assert not (tmp_path / "other").exists()
 
 
-# a run that was killed
-
-
 def test_a_run_continues_from_the_last_complete_state_to_the_same_numbers(six: Path, tmp_path: Path) -> None:
-    """As after kill -9 in iteration 5: iteration 3 was saved last, and iteration 4 wrote the last row."""
+    """The state is as after kill -9 in iteration 5: iteration 3 was saved, and iteration 4 wrote the last row."""
     folder = tmp_path / "run"
     states = {}
 
@@ -285,13 +271,10 @@ def test_a_run_continues_from_the_last_complete_state_to_the_same_numbers(six: P
         assert torch.equal(mean_action(lw.load(folder, which=which)), mean_action(lw.load(six, which=which)))
 
 
-# a new run from the policy of another
-
-
 def test_a_command_begins_with_the_policy_of_a_run(
     six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With its settings, on the same task with another parameter; its first iteration samples with that policy."""
+    """The new run has the old run's settings except one parameter; its first samples come from the old policy."""
     out = tmp_path / "out"
     arguments = ["train", "--from", str(six), "--which", "4", "--param", "success_distance=0.5", "--iterations", "1"]
     assert cli.main([*arguments, "--out", str(out), "--keep-every", "1", *QUIET]) == 0
@@ -352,7 +335,7 @@ def test_evaluations_and_training_with_one_seed_draw_other_states(env: lw.Env) -
 
 
 def test_ppo_trains_by_the_same_loop_from_the_shell(six: Path, tmp_path: Path) -> None:
-    """It begins with the networks of an NPG run, and resumes to the same numbers."""
+    """PPO starts with the networks of an NPG run, and resumes to the same numbers."""
     options = ["--num-steps", "16", "--minibatches", "2", "--epochs", "2", "--nworld", "4", *QUIET]
     begin = ["train", "--from", str(six), "--algorithm", "ppo", *options, "--out"]
     assert cli.main([*begin, str(tmp_path / "whole"), "--iterations", "4"]) == 0

@@ -1,4 +1,4 @@
-"""One word for one thing: words and phrases that were settled against, with their replacements.
+"""Refuse words and phrases that CONTRIBUTING.md excludes, and name their replacements.
 
 The search covers code, comments, messages and names (an underscore counts as a space), the documents, and the files
 that build and test the package. A phrase may span two lines.
@@ -54,7 +54,7 @@ SETTLED: dict[str, str] = {
     r"\bone's own\b": "of your own",
     r"\bby (itself|themselves)\b": "automatically, alone",
 }
-"""Regular expressions of phrases, in any case, with their replacements."""
+"""Case-insensitive regular expressions of phrases, with their replacements."""
 
 ALLOWED = (
     r"event\.record\(",  # torch's name
@@ -66,13 +66,13 @@ ALLOWED = (
     r'\("record", "did you mean graphs\?"\)',
     r'\(\{"record": False\}, "no parameter \'record\': did you mean graphs"\)',
 )
-"""Code that must use such a word."""
+"""Code that must contain such a word."""
 
 QUOTING = {
     "CHANGELOG.md": (r"`[^`]*`",),  # old names
     "CONTRIBUTING.md": (r"(?ms)^```.*?^```", r"\|[^|\n]*\|$", r'"[^"\n]*"'),  # examples of bad style
 }
-"""Parts of documents that quote words which were settled against."""
+"""Parts of documents that quote excluded words."""
 
 DOCUMENTS = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "bench/README.md")
 OTHERS = ("Makefile", "pyproject.toml", ".ci/run", "CITATION.cff", "constraints.txt")
@@ -90,7 +90,7 @@ NAMES = [str(path.relative_to(ROOT)) for path in FILES if path.exists() and path
 
 
 def found_in(text: str, exempt: tuple[str, ...] = ()) -> list[str]:
-    """Every phrase of a text that was settled against, as "line: 'phrase' (write ...)"."""
+    """Return each excluded phrase of a text as "line: 'phrase' (write: ...)"."""
     for pattern in exempt:
         text = re.sub(pattern, lambda found: re.sub(r"[^\n]", " ", found.group()), text, flags=re.MULTILINE)
     starts, flat = [], ""

@@ -1,4 +1,4 @@
-"""The phases of a step, a reset and a restored state leave the expected numbers in the arrays."""
+"""The phases of a step, a reset and a restored state write the expected numbers."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ ENGINES = ["mujoco", "warp"]
 
 
 class Held(PointMass):
-    """The point must stay at its target for three steps."""
+    """A point_mass whose point must stay at its target for three steps."""
 
     model = lw.package_model("lyceum_warp", "tasks/point_mass.xml")
     success_steps = 3
@@ -29,7 +29,7 @@ class Held(PointMass):
 def outcomes_with_faults(
     engine: str, *, judging: int = 1, observing: int = 1
 ) -> tuple[list[torch.Tensor], dict[str, int]]:
-    """All buffers after steps of a task with every feature, with events and faults of each kind, and fault counts."""
+    """Return all buffers, and fault counts, after steps of ``Full`` with events and faults of several kinds."""
     env = lw.make(Full, nworld=4, engine=engine, seed=2)
     own, kept = env.worlds, []
     own._judging, own._observing = judging, observing
@@ -57,7 +57,7 @@ def outcomes_with_faults(
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_rows_that_lanes_share_have_the_numbers_of_one_lane(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a GPU a warp shares a world's rows, and groups have threads of their own; here these run in turn."""
+    """On a GPU a warp's lanes share a world's rows, and each group has its own threads; here they run in turn."""
 
     def launch_three(kernel: wp.Kernel, nworld: int, args: list[Any], device: wp.Device) -> None:
         wp.launch(kernel, (nworld, 3), [*args, 3, 0], device=device)
@@ -71,7 +71,7 @@ def test_rows_that_lanes_share_have_the_numbers_of_one_lane(engine: str, monkeyp
 
 
 def test_parts_of_the_worlds_have_the_numbers_of_all_worlds_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three threads replay the launches around the C engine for a part of the four worlds each."""
+    """Each of three threads replays the launches around the C engine for a part of the four worlds."""
     together, counts = outcomes_with_faults("mujoco")
     monkeypatch.setattr(capture, "SECONDS_A_THREAD", 1e-9)
     monkeypatch.setattr(mujoco_engine, "cpu_cores", lambda: 3)
@@ -84,7 +84,7 @@ def test_parts_of_the_worlds_have_the_numbers_of_all_worlds_together(monkeypatch
 
 
 def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.Env, lw.Env]:
-    """The task whose success needs three steps and the one in which one is enough; points move fast, goals differ."""
+    """Make the tasks whose success needs three steps and one step; the points move fast, and goals differ."""
     goals = {"success_distance": np.linspace(0.3, 2.5, nworld)}
     held, plain = (lw.make(task, engine=engine, nworld=nworld, **goals, **options) for task in (Held, PointMass))
     for env in (held, plain):
@@ -96,7 +96,7 @@ def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.En
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_held_success_needs_its_steps_in_a_row_within_an_episode(engine: str) -> None:
-    """Ends of episodes and a fault restart the count; all other numbers equal the plain task's."""
+    """The end of an episode or a fault restarts the count; all other numbers equal the plain task's."""
     held, plain = held_and_plain(engine, horizon=12)
     rows, rises, falls = torch.zeros(16), 0, 0
     generator = torch.Generator().manual_seed(0)
@@ -141,7 +141,7 @@ def test_a_state_goes_on_with_the_steps_of_a_success_and_a_reset_does_not(engine
     assert env.success.tolist() == [False, True, True]
     env.set_state(full)
     assert env.success.tolist() == [False, True, True]
-    env.set_params(success_distance=0.0)  # a state is a success only if it meets the goal itself
+    env.set_params(success_distance=0.0)  # a state counts as a success only if it meets the goal
     env.set_state(full)
     assert not env.success.any()
 
@@ -169,7 +169,7 @@ def test_parameters_that_become_one_a_world_reach_captured_graphs(engine: str) -
     env = lw.make("hopper", nworld=2, engine=engine)
     action = torch.ones(2, 3)
     for _ in range(3):
-        env.step(action)  # the third replays
+        env.step(action)  # the third step replays
     env.set_params(ctrl_cost_weight=[0.0, 1.0])
     env.reset()
     env.step(action)

@@ -1,4 +1,4 @@
-"""The shortest task, as the text of a file, for tests that change a line of it."""
+"""The source of the shortest task, for tests that change a line of it."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ class Tiny(lw.Task):
 
 
 def changed(*changes: tuple[str, str]) -> str:
-    """The text with the first occurrence of each passage replaced."""
+    """Replace the first occurrence of each passage in the source."""
     source = TINY
     for old, new in changes:
         assert old in source, f"{old!r} is not in the text"
@@ -35,12 +35,11 @@ def changed(*changes: tuple[str, str]) -> str:
 
 
 def with_function(function: str) -> str:
-    """The text with one more Warp function."""
+    """Add a Warp function to the source."""
     return changed(("class Tiny", f"@wp.func\n{function}\n\nclass Tiny"))
 
 
 def write(folder: Path, source: str, name: str = "tiny.py") -> Path:
-    """Write a task's file."""
     file = folder / name
     file.write_text(source)
     return file

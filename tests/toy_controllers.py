@@ -1,4 +1,4 @@
-"""Controllers for tests, and a simulated clock with a planner that takes a given time of it."""
+"""Controllers for tests, and a simulated clock with a planner that takes simulated time."""
 
 import math
 import time
@@ -14,15 +14,15 @@ from lyceum_warp.controllers.trajectory import Trajectory
 
 
 def towards(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
-    """Push the point of point_mass to its target."""
+    """Push the point of point_mass towards its target."""
     x, y, vx, vy, tx, ty = obs
     return torch.stack([2 * (tx - x) - vx, 2 * (ty - y) - vy]).clamp(-1, 1)
 
 
 class StepPlanner:
-    """Plans whose actions hold the step of the plan's state, and the number of the action within the plan.
+    """A planner whose actions hold the step of the plan's state and the action's index within the plan.
 
-    Both are divided by 100; ``hundredths`` gives them back.
+    Both are divided by 100; ``hundredths`` converts them back.
     """
 
     def __init__(self, env: lw.Env, horizon: int = 8, seconds: float = 0.0) -> None:
@@ -50,7 +50,7 @@ def hundredths(values: torch.Tensor) -> list[int]:
 
 
 class SamplingPlanner:
-    """Plans of zeros that report the given numbers of failed samples, one after the other."""
+    """A planner of zero actions that reports given numbers of failed samples in turn."""
 
     def __init__(self, *failed: float) -> None:
         self.samples, self.failed, self.calls = 8, failed, 0
@@ -59,7 +59,7 @@ class SamplingPlanner:
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor) -> object:
         self.calls += 1
-        return object()  # the loops read the actions, and must not look at this
+        return object()  # the loops read ``actions`` and must ignore this
 
     def reset(self, seed: int | None = None) -> None:
         self.calls = 0
@@ -71,7 +71,7 @@ class SamplingPlanner:
 
 
 class SimulatedClock:
-    """A clock that moves only when a test moves it, or when the loop waits for a later moment."""
+    """A clock that advances only when a test sets it or the loop waits."""
 
     def __init__(self) -> None:
         self.time = 100.0
@@ -84,7 +84,7 @@ class SimulatedClock:
 
 
 class SimulatedPlans:
-    """Plans that take a given time of the simulated clock, one after the other, each from the newest state."""
+    """Plans that take a fixed simulated time, one after the other, each from the newest state."""
 
     def __init__(
         self, controller: Any, clock: SimulatedClock, seconds: float, first: tuple[torch.Tensor, torch.Tensor]
@@ -117,7 +117,7 @@ class SimulatedPlans:
 def simulated_run(
     env: lw.Env, *, seconds: float, steps: int, horizon: int = 8, busy: dict[int, float] | None = None
 ) -> Trajectory:
-    """An asynchronous run on the simulated clock, with a period of one second.
+    """Run the asynchronous loop on the simulated clock, with a period of one second.
 
     Args:
         env: The plant.

@@ -1,4 +1,4 @@
-"""A third engine that only follows the contract in ``lyceum_warp.engines.base``: plain MuJoCo, one world at a time."""
+"""A third engine that implements only the contract in ``engines/base.py``: plain MuJoCo, one world at a time."""
 
 import copy
 from collections.abc import Collection, Iterable
@@ -17,12 +17,12 @@ _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
 class ToyEngine(Engine):
-    """The state lies in float64 rows; a step loads each row into its world's MjData and saves it afterwards.
+    """An engine with states in float64 rows; a step loads each row into its world's MjData and saves it afterwards.
 
-    Each world has an MjModel of its own, and ``apply_model`` writes its fields into it.
+    Each world has its own MjModel, and ``apply_model`` writes the world's fields into it.
 
-    Launches between two calls of the engine are captured, so ``reset``, ``commit``, ``find_faults`` and getting the
-    state are Warp launches on those rows.
+    Launches between two engine calls are captured, so ``reset``, ``commit``, ``find_faults`` and ``get_state`` are Warp
+    launches on these rows.
     """
 
     name = "toy"
@@ -56,8 +56,6 @@ class ToyEngine(Engine):
                 self._columns[name] = self._rows[:, state_columns(model, name)]
         self.ctrl = self.arrays["ctrl"]
 
-    # fields
-
     def _load(self, w: int) -> None:
         mujoco.mj_setState(self.models[w], self.worlds[w], self._rows.numpy()[w], _SPEC)
 
@@ -76,8 +74,6 @@ class ToyEngine(Engine):
             if stage == Stage.VELOCITY:
                 mujoco.mj_fwdVelocity(model, data)
                 mujoco.mj_sensorVel(model, data)
-
-    # physics
 
     def step(self, nstep: int) -> None:
         fields = list(self.fields.values())
@@ -147,8 +143,6 @@ class ToyEngine(Engine):
             self._load(w)
             self._compute(w, stage)
             self._show(w, [field for field in fields if field.name not in STATE_FIELDS])
-
-    # state
 
     def _get_integration(self, state_out: wp.array, mask: wp.array) -> None:
         launch_rows(state.copy_rows64, mask, self._rows, state_out)

@@ -1,4 +1,4 @@
-"""Short training runs by the command and in Python, their files, and the ends of commands."""
+"""Helpers for short training runs, from the command line and in Python."""
 
 import csv
 import signal
@@ -17,19 +17,18 @@ QUIET = ["--no-video", "--no-plot"]
 
 
 def train(out: Path, *options: str, task: str = "point_mass") -> int:
-    """The exit code of a short run."""
     return cli.main(["train", task, "--out", str(out), *TINY, *QUIET, *options])
 
 
 def metrics(run: Path) -> list[dict[str, str]]:
-    """The rows of metrics.csv without measured times."""
+    """Return the rows of metrics.csv without measured times."""
     with (run / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     return [{k: v for k, v in row.items() if "time" not in k and k != "samples_per_second"} for row in rows]
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: str) -> None:
-    """The command wrote one line to stderr, which contains these words."""
+    """Check that the command wrote one line to stderr, which contains these words."""
     lines = capsys.readouterr().err.splitlines()
     (error,) = [line for line in lines if not line.startswith(("compiling kernels ", "  "))]
     assert error.startswith("lyceum-warp: ")
@@ -38,7 +37,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> None:
 
 
 def interrupted(argv: list[str]) -> int:
-    """The exit code of a command that gets a SIGINT; a signal that it does not handle fails this test only."""
+    """Return the exit code of a command that gets a SIGINT; fail the test if the command does not handle it."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         return cli.main(argv)
@@ -52,16 +51,14 @@ CONFIG = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=2,
 
 
 def algorithm(env: lw.Env, **options: Any) -> lw.NPG:
-    """NPG with the settings of ``TINY``."""
     return lw.NPG(env, config=CONFIG, **options)
 
 
 def six_iterations(folder: Path) -> Path:
-    """A run of six iterations in a new folder."""
     lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, keep_every=2)
     return folder
 
 
 def mean_action(policy: lw.GaussianPolicy) -> torch.Tensor:
-    """The action of a policy for one observation."""
+    """Return a policy's action for one observation."""
     return policy(torch.linspace(-1.0, 1.0, policy.nobs))

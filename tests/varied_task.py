@@ -1,4 +1,4 @@
-"""A task for tests of dynamics that differ between worlds: a ball on a rail, with a length and masses drawn."""
+"""A task whose dynamics differ between worlds: a ball on a rail, with a random length and masses."""
 
 import mujoco
 import warp as wp

@@ -1,11 +1,11 @@
-"""Compute numbers with the lyceum_warp of a checkout, one unit of work after another, for bench/compare.py.
+"""Compute numbers with a checkout's lyceum_warp, one unit of work after another, for bench/compare.py.
 
-compare.py runs this program once for each checkout, with the checkout first on the path. Its first answer lists the
-tasks and the learners of the checkout. Each further line on stdin is a unit, the keyword arguments of one of PARTS as
-JSON, and each line on stdout an answer. The arrays of a unit are written to the file of the program's argument, in the
-order of their computation.
+compare.py runs this program once per checkout, with the checkout first on the path. The first answer lists the
+checkout's tasks and learners. Each following line on stdin is a unit (the keyword arguments of one of PARTS as JSON),
+and each line on stdout an answer. The arrays of a unit are written to the file that the program's argument names, in
+the order of their computation.
 
-Only public names of the package are used: the two checkouts may differ in everything else.
+The program uses only public names of the package: the two checkouts may differ in everything else.
 """
 
 import contextlib
@@ -27,34 +27,34 @@ from typing import Any
 import numpy as np
 import torch
 
-torch.set_num_threads(1)  # the order of a sum depends on the number
+torch.set_num_threads(1)  # the order of a sum depends on the number of threads
 torch.manual_seed(0)
 
 LEARNERS = ("NPG", "PPO")
-"""Learners that are compared if both checkouts have them, by their public names."""
+"""Public names of the learners that are compared if both checkouts have them."""
 
 
 class MissingModel(Exception):  # noqa: N818
-    """A task's model belongs to an extra that is not installed."""
+    """The model of a task belongs to an extra that is not installed."""
 
 
 class Numbers:
-    """The arrays of a unit by their names, in the order in which they were computed."""
+    """The arrays of a unit by name, in the order of their computation."""
 
     def __init__(self) -> None:
         self.axes: dict[str, list[str]] = {}
         self.equal: list[tuple[str, str]] = []
-        """Prefixes of names whose arrays must be equal within the checkout."""
+        """Pairs of prefixes whose arrays must be equal within the checkout."""
         self._arrays: dict[str, Any] = {}
 
     def add(self, name: str, value: Any, *axes: str, along: str | None = None) -> None:
-        """Add an array, a number, a text, or every leaf of a mapping, a dataclass or a list.
+        """Add an array, a number, a string, or every leaf of a mapping, a dataclass or a list.
 
         Args:
             name: Name; names of leaves are appended.
-            value: The value. None is left out.
+            value: The value. None is omitted.
             axes: Names of the leading axes.
-            along: Name of a further first axis, along which the values of several calls are stacked.
+            along: Name of an additional leading axis, along which the values of several calls are stacked.
         """
         if dataclasses.is_dataclass(value):
             value = vars(value)
@@ -65,7 +65,7 @@ class Numbers:
             for i, part in enumerate(value):
                 self.add(f"{name}/{i}", part, *axes, along=along)
         elif value is not None:
-            # a copy, because buffers change in place
+            # copied, because buffers change in place
             array = value.detach().cpu().numpy().copy() if isinstance(value, torch.Tensor) else np.array(value)
             self.axes[name] = [*([along] if along else []), *axes]
             if along:
@@ -81,7 +81,7 @@ class Numbers:
 
 
 def make(task: str, engine: str, device: str, **options: Any) -> Any:
-    """An environment on an engine; on a GPU its numbers are the same in every run.
+    """Make an environment on an engine; on a GPU its results are reproducible.
 
     Raises:
         MissingModel: The task needs an extra that is not installed.
@@ -100,7 +100,7 @@ def placed(engine: str, device: str) -> dict[str, Any]:
 
 
 def draw_actions(env: Any, task: str, steps: int) -> torch.Tensor:
-    """Actions, (steps, nworld, nact); about a quarter of the numbers lie beyond their bounds."""
+    """Draw actions, (steps, nworld, nact); about a quarter of the numbers exceed their bounds."""
     space = env.action_space
     unit = np.random.default_rng(zlib.crc32(task.encode())).uniform(-1.3, 1.3, (steps, env.nworld, space.size))
     low, high = (np.asarray(bound, np.float64) for bound in (space.low, space.high))
@@ -110,12 +110,12 @@ def draw_actions(env: Any, task: str, steps: int) -> torch.Tensor:
 
 
 def split(env: Any, state: torch.Tensor) -> dict[str, torch.Tensor]:
-    """The parts of states by their names."""
+    """Split states into their parts, by name."""
     return {name: state[..., part] for name, part in env.state_space.parts.items()}
 
 
 def observed(env: Any) -> dict[str, Any]:
-    """Everything that an environment shows, except for its fields."""
+    """Return everything that an environment shows, except for its fields."""
     names = ("reward", "eval", "terminated", "truncated", "done", "done_reason", "success", "episode_step", "time")
     return {
         "state": split(env, env.get_state()),
@@ -129,7 +129,7 @@ def observed(env: Any) -> dict[str, Any]:
 
 
 def constants(model: Any) -> Iterator[tuple[str, Any]]:
-    """The numbers of a compiled model, by MuJoCo's names."""
+    """Yield the numbers of a compiled model, by MuJoCo's names."""
     for name in dir(model):
         if name.startswith("_") or name == "paths":
             continue
@@ -143,7 +143,7 @@ def constants(model: Any) -> Iterator[tuple[str, Any]]:
 
 
 def without_clocks(row: Mapping[str, Any]) -> dict[str, Any]:
-    """The numbers of an iteration that are no measured times; nan stands for None."""
+    """Return the numbers of an iteration without measured times; None becomes nan."""
     return {
         name: without_clocks(value) if isinstance(value, Mapping) else np.nan if value is None else value
         for name, value in row.items()
@@ -155,7 +155,7 @@ def without_clocks(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def environment(numbers: Numbers, *, task: str, engine: str, device: str, steps: int) -> None:
-    """Model, resets, steps with short episodes, getters, a fault, and a rollout of given actions."""
+    """Compare the model, resets, steps with short episodes, getters, a fault, and a rollout of given actions."""
     import lyceum_warp as lw
 
     env = make(task, engine, device, nworld=4, horizon=max(2, steps // 3))
@@ -223,22 +223,22 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "plants": ("MPPI", {"plants": 3}),
     "control": ("MPPI", {}),
 }
-"""Planners by name: the class, and settings."""
+"""Planners by name: the class and its settings."""
 
 PLAN = (
     "actions", "nominal", "knot_actions", "standard_noise", "sampled", "returns", "weights", "adapted_noise",
 )  # fmt: skip
-"""Buffers of a planner; one that a checkout lacks is reported."""
+"""Buffers of a planner; a missing one is reported."""
 
 TRAJECTORY = (
     "states", "obs", "actions", "rewards", "evals", "success", "plan_of", "plan_steps", "plan_failed", "plan_effective",
     "done_reason",
 )  # fmt: skip
-"""Fields of a trajectory that are not measured times."""
+"""Fields of a trajectory without measured times."""
 
 
 def plans(numbers: Numbers, *, task: str, engine: str, device: str, variants: Sequence[str]) -> None:
-    """Several plans of each planner along a controlled episode."""
+    """Compute several plans with each planner along a controlled episode."""
     import lyceum_warp as lw
 
     for variant in variants:
@@ -262,7 +262,7 @@ def plans(numbers: Numbers, *, task: str, engine: str, device: str, variants: Se
 
 
 def learning(numbers: Numbers, *, task: str, engine: str, device: str, learner: str, iterations: int) -> None:
-    """Iterations of a learner, and its networks afterwards."""
+    """Run iterations of a learner, and add its final networks."""
     import lyceum_warp as lw
 
     env = make(task, engine, device, nworld=4, seed=5)
@@ -277,12 +277,12 @@ def learning(numbers: Numbers, *, task: str, engine: str, device: str, learner: 
 
 
 def commands(numbers: Numbers, *, task: str, engine: str, device: str, iterations: int) -> None:
-    """A run by the command line, and the same run with a break in the middle."""
+    """Train with the command line, once without and once with an interruption."""
     where = placed(engine, device)
     flags = ["--engine", engine, "--device", where["device"], *(["--deterministic"] if where["deterministic"] else [])]
     flags += ["--samples", "1024", "--nworld", "4", "--seed", "7", "--mean-every", "2", "--mean-episodes", "2"]
     quiet = ["--no-video", "--no-plot"]
-    make(task, engine, device)  # which says whether the model is installed
+    make(task, engine, device)  # raises MissingModel if the model is not installed
     with tempfile.TemporaryDirectory(dir=".") as folder, contextlib.chdir(folder):
         command("train", task, "--iterations", str(iterations), "--out", "whole", *flags, *quiet)
         command("train", task, "--iterations", str(iterations // 2), "--out", "resumed", *flags, *quiet)
@@ -301,7 +301,7 @@ def command(*words: str) -> None:
     """Run the checkout's ``lyceum-warp``.
 
     Raises:
-        RuntimeError: It failed.
+        RuntimeError: The command failed.
     """
     program = [sys.executable, "-P", "-m", "lyceum_warp.cli", *words]
     done = subprocess.run(program, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
@@ -314,11 +314,11 @@ PARTS = {"env": environment, "plans": plans, "learners": learning, "commands": c
 """The parts of the comparison, by the names of --parts."""
 
 
-# the conversation with compare.py
+# messages to and from compare.py
 
 
 def contents() -> dict[str, Any]:
-    """What the checkout has."""
+    """Return the tasks and learners of the checkout."""
     import lyceum_warp as lw
 
     return {
@@ -329,20 +329,20 @@ def contents() -> dict[str, Any]:
 
 
 def failure(error: Exception) -> dict[str, Any]:
-    """An exception as compare.py reports it."""
+    """Describe an exception in the form that compare.py reports."""
     text = f"{type(error).__name__}: {' '.join(str(error).split())}"
     return {"text": text, "trace": traceback.format_exc(), "missing": isinstance(error, MissingModel)}
 
 
 def compute(unit: dict[str, Any], file: Path) -> dict[str, Any]:
-    """Compute a unit, and write its arrays, those before a failure included."""
+    """Compute a unit, and write its arrays, including those before a failure."""
     numbers, answer = Numbers(), {}
     try:
         PARTS[unit.pop("part")](numbers, **unit)
     except Exception as error:
         answer["failure"] = failure(error)
     np.savez(file, **numbers.arrays())
-    gc.collect()  # environments refer to themselves
+    gc.collect()  # environments contain reference cycles
     return {**answer, "axes": numbers.axes, "equal": numbers.equal}
 
 

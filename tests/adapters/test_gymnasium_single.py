@@ -1,4 +1,4 @@
-"""One world as Gymnasium's environment, which Gymnasium's own checker accepts."""
+"""Use one world as a Gymnasium environment; Gymnasium's own checker accepts it."""
 
 import warnings
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ def hopper() -> Iterator[gymnasium.Env]:
 
 @pytest.fixture(scope="module")
 def draws() -> bool:
-    """Whether this machine can draw."""
+    """Return whether this machine can render."""
     try:
         env = GymnasiumEnv("hopper", render_mode="rgb_array", render_size=(64, 48))
         assert env.render().shape == (48, 64, 3)
@@ -37,14 +37,14 @@ def draws() -> bool:
 
 
 THEIRS = ("is -infinity. This is probably too low", "is infinity. This is probably too high")
-"""What the checker says of every observation without bounds, those of Gymnasium's own robots included."""
+"""The checker's warnings about unbounded observations, which Gymnasium's own robots cause, too."""
 
 
 def test_gymnasiums_checker_has_no_complaint(hopper: gymnasium.Env, draws: bool) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(hopper.unwrapped, skip_render_check=not draws)
-        check_env(GymnasiumEnv(Full), skip_render_check=True)  # groups of observations
+        check_env(GymnasiumEnv(Full), skip_render_check=True)  # observation groups
     said = [str(warning.message) for warning in caught]
     assert not [text for text in said if not any(known in text for known in THEIRS)]
 

@@ -1,4 +1,4 @@
-"""Many worlds as Gymnasium's vector environment: its numbers, its modes, its wrappers, its errors."""
+"""Use many worlds as a Gymnasium vector environment: numbers, modes, wrappers, errors."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -22,7 +22,7 @@ N = 4
 
 @pytest.fixture(scope="module")
 def made() -> Callable[..., lw.Env]:
-    """Environments of ``Full``, whose episodes have at most 20 steps; one with automatic resets and one without."""
+    """Return a function that makes environments of ``Full`` (horizon 20), one with automatic resets and one without."""
     envs: dict[bool, lw.Env] = {}
 
     def get(*, autoreset: bool = True) -> lw.Env:
@@ -66,7 +66,7 @@ def as_array(value: Any) -> np.ndarray:
 
 
 def by_hand(env: lw.Env) -> list[dict[str, np.ndarray]]:
-    """The buffers of an environment after each step of the same actions."""
+    """Return an environment's buffers after each step of a fixed action sequence."""
     env.rand_reset(5)
     steps = []
     for action in actions():
@@ -247,16 +247,13 @@ def test_spaces_have_the_bounds_of_the_environment(vector: Callable[..., Gymnasi
     assert GymnasiumVectorEnv("hopper", dict_obs=True).single_observation_space["policy"].shape == (11,)
 
 
-# Gymnasium's wrappers
-
-
 OBSERVATION_WRAPPERS = {
     "NormalizeObservation": wrappers.vector.NormalizeObservation,
     "FlattenObservation": wrappers.vector.FlattenObservation,
     "DtypeObservation": lambda envs: wrappers.vector.DtypeObservation(envs, np.float64),
     "TransformObservation": lambda envs: wrappers.vector.TransformObservation(envs, lambda obs: np.clip(obs, -9, 9)),
 }
-"""Those that Gymnasium refuses in the mode SAME_STEP."""
+"""Wrappers of observations, which Gymnasium refuses in the mode SAME_STEP."""
 
 OTHER_WRAPPERS = {
     "ClipAction": wrappers.vector.ClipAction,
@@ -289,9 +286,6 @@ def test_a_wrapper_of_gymnasium_works(
     assert ends
 
 
-# pictures
-
-
 def test_a_picture_shows_each_world_as_it_is(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector(render_mode="rgb_array", render_size=(64, 48))
     envs.reset(seed=0)
@@ -306,9 +300,6 @@ def test_a_picture_shows_each_world_as_it_is(vector: Callable[..., GymnasiumVect
         envs.step(action)
     assert any((before != after).any() for before, after in zip(frames, envs.render() or (), strict=True))
     envs.close()
-
-
-# errors
 
 
 @pytest.mark.parametrize(

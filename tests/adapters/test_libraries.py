@@ -1,4 +1,4 @@
-"""Errors of the adapters if a library is missing or has another version."""
+"""Errors of the adapters if a library is missing or has an unsupported version."""
 
 import importlib
 import sys
@@ -10,7 +10,7 @@ from lyceum_warp.adapters.libraries import check_library
 
 
 def install(folder: Path, package: str, version: str) -> None:
-    """Let a folder say that a version of a package is installed in it."""
+    """Make a folder claim that a version of a package is installed in it."""
     info = folder / f"{package.replace('-', '_')}-{version}.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: {version}\n")

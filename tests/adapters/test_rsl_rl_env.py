@@ -1,4 +1,4 @@
-"""An environment under rsl_rl's own runner, and what its VecEnv gives."""
+"""Use an environment as rsl_rl's VecEnv, and train it with rsl_rl's own runner."""
 
 from pathlib import Path
 
@@ -38,7 +38,7 @@ def test_a_task_is_made_with_its_options() -> None:
 
 
 def test_observations_survive_the_next_step(env: lw.Env) -> None:
-    """rsl_rl stores the observations before a step once that step is done."""
+    """rsl_rl stores the observations of a step only after the next step."""
     worlds = RslRlVecEnv(env)
     first = worlds.get_observations()
     second, *_ = worlds.step(torch.ones(4, 1))
@@ -74,7 +74,7 @@ def test_a_fault_is_a_time_out_and_a_termination_is_not(shared_env: SharedEnv) -
     worlds = RslRlVecEnv(env)
     worlds.episode_length_buf = torch.tensor([0, 0, 9, 9])
     state = env.get_state()
-    state[[0, 2], env.state_space.parts["qpos"].start] = 5.0  # too far, the second at its time limit
+    state[[0, 2], env.state_space.parts["qpos"].start] = 5.0  # both leave the rail, the second one at its time limit
     env.set_state(state)
     action = torch.zeros(4, 1)
     action[1] = torch.nan
@@ -130,7 +130,7 @@ def test_bad_environments_and_actions_are_refused(env: lw.Env, shared_env: Share
 
 
 def test_rsl_rls_own_runner_learns(tmp_path: Path) -> None:
-    """The best possible return is about 250; a policy that has learned nothing is negative on average."""
+    """The best possible return is about 250; an untrained policy has a negative mean return."""
     env = lw.make("point_mass", nworld=32)
     few = env.replicate(nworld=16)
     config = runner_config(env, lw.PPOConfig(hidden=(32, 32), value_hidden=(32, 32)))
@@ -145,7 +145,7 @@ def test_rsl_rls_own_runner_learns(tmp_path: Path) -> None:
     before = mean_return()
     runner.learn(40, init_at_random_ep_len=True)
     assert mean_return() > max(before + 100.0, 150.0)
-    assert list(tmp_path.glob("model_*.pt"))  # its own checkpoints
+    assert list(tmp_path.glob("model_*.pt"))
 
 
 def test_rsl_rls_writer_gets_the_metrics(env: lw.Env, tmp_path: Path) -> None:

@@ -1,5 +1,3 @@
-"""skrl's own wrappers and PPO on Gymnasium's vector environment."""
-
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +28,7 @@ class Policy(GaussianMixin, Model):
 
 
 class Value(DeterministicMixin, Model):
-    """The value of a critic's observation, which skrl calls a state."""
+    """Estimate the value of the critic's observation, which skrl calls a state."""
 
     def __init__(self, **spaces: Any) -> None:
         Model.__init__(self, **spaces)
@@ -43,7 +41,7 @@ class Value(DeterministicMixin, Model):
 
 
 def wrapped(*, tensors: bool) -> Any:
-    """Through the wrapper for Gymnasium, or that for tensors, which was made for Isaac Lab."""
+    """Wrap an environment for skrl; tensors use the wrapper that skrl provides for Isaac Lab."""
     if not tensors:
         return wrap_env(GymnasiumVectorEnv("hopper", N), verbose=False)
     env = GymnasiumVectorEnv(Full, N, torch=True, dict_obs=True)

@@ -1,4 +1,4 @@
-"""Many worlds as Stable-Baselines3's vector environment: its numbers, its learners, its wrappers, its errors."""
+"""Use many worlds as a Stable-Baselines3 vector environment: numbers, learners, wrappers, errors."""
 
 import warnings
 
@@ -85,7 +85,7 @@ def test_an_off_policy_learner_stores_the_last_observation_and_no_time_limit(ful
     assert buffer is not None and buffer.pos == 50 and buffer.timeouts[:50].any()
     ended = np.argwhere(buffer.dones[:49])
     assert len(ended)
-    for step, world in ended:  # the next observation is not the first one of the next episode
+    for step, world in ended:  # the stored next observation is not the next episode's first one
         assert (buffer.next_observations[step, world] != buffer.observations[step + 1, world]).any()
 
 

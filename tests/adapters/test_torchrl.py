@@ -1,5 +1,3 @@
-"""TorchRL's own GymWrapper on Gymnasium's vector environment."""
-
 from typing import Any
 
 import pytest
@@ -24,7 +22,7 @@ CASES = [
     ]
     for tensors in (False, True)
 ]
-"""TorchRL 0.14 takes groups of observations and nested infos only in the mode DISABLED."""
+"""TorchRL 0.14 supports observation groups and nested infos only in the mode DISABLED."""
 
 
 def wrapped(mode: str, *, tensors: bool, task: Any) -> Any:

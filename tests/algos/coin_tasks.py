@@ -1,4 +1,4 @@
-"""Tasks for tests of the planner: they pay the action times a coin, which falls on -1 or 1 with equal probability."""
+"""Tasks for tests of the planner: the reward is the action times a coin, which is -1 or 1 with equal probability."""
 
 import warp as wp
 from rail_task import rail
@@ -54,7 +54,7 @@ def copied(s: Coin, action: Row[float], p: CoinParams, ctrl: Row[float]):
 
 
 class TossedAfter(lw.Task):
-    """The coin that pays is tossed in ``advance``, after the action: no action is better than another."""
+    """The coin of the reward is tossed in ``advance``, after the action: no action is better than any other."""
 
     model = staticmethod(lambda: rail(limits='ctrllimited="true" ctrlrange="-1 1"'))
     obs = {"coin": 1}
@@ -67,12 +67,12 @@ class TossedAfter(lw.Task):
 
 
 class TossedAfterWithControl(TossedAfter):
-    """The same with a ``control``, so that rollouts go step by step."""
+    """``TossedAfter`` with a ``control``, so that rollouts run step by step."""
 
     control = copied
 
 
 class TossedBefore(TossedAfter):
-    """The coin that pays is the one that was tossed in the last step and is remembered."""
+    """The coin of the reward was tossed in the previous step and is in memory."""
 
     reward = paid_by_coin_before_action

@@ -1,4 +1,4 @@
-"""Passes that are written out, against torch's modules and autograd."""
+"""Compare hand-written passes with torch's modules and autograd."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from lyceum_warp.algos.natural_gradient import FisherProduct, score_gradient
 
 
 def perturbed(module: nn.Module) -> nn.Module:
-    """The module with other weights, so that no part of a derivative vanishes."""
+    """Perturb a module's weights, so that no part of a derivative vanishes."""
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():
         for parameter in module.parameters():
@@ -31,7 +31,7 @@ def test_written_out_products_equal_autograds(activation: str, hidden: tuple[int
     policy = policy_of(activation, hidden)
     dense = DensePolicy.of(policy)
     assert dense is not None
-    for rows in (30, 7, 30):  # fewer rows use a part of the buffers
+    for rows in (30, 7, 30):  # fewer rows use part of the buffers
         generator = torch.Generator().manual_seed(rows)
         obs, action, weight = (torch.randn(rows, n, generator=generator) for n in (5, 2, 1))
         torch.testing.assert_close(dense(obs), policy(obs).detach())
@@ -65,12 +65,12 @@ def test_samples_and_predictions_equal_those_of_the_modules() -> None:
     value = perturbed(lw.ValueFunction(5, (7, 3), time_orders=2, normalize=True))
     value.observe(obs)
     steps, obs = torch.arange(12.0).view(4, 3), torch.randn(4, 3, 5, generator=generator)
-    # returns of about 200, rounded in float32
+    # returns are about 200, rounded to float32
     torch.testing.assert_close(DenseValue.of(value)(obs, steps), value(obs, steps).detach(), rtol=1e-5, atol=1e-4)
 
 
 class Own(nn.Sequential):
-    """A class of its own may compute anything."""
+    """A subclass, which may compute anything."""
 
 
 def hooked(network: nn.Module) -> nn.Module:

@@ -1,4 +1,4 @@
-"""NPG in several processes: the same worlds, the same update, and a run that any number of them can continue."""
+"""NPG in several processes: same worlds, same update, and a run that any number of processes can continue."""
 
 import csv
 import os
@@ -17,8 +17,8 @@ from lyceum_warp.algos import distributed
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.runs.folder import Run
 
-# everything that might differ between one process and two: unfinished episodes, a normaliser, a part of the samples
-# for the Fisher information, a smaller last mini-batch, an evaluation, restarts between iterations
+# every feature that might differ with the number of processes: unfinished episodes, a normaliser, a subset of the
+# samples for the Fisher information, a smaller last mini-batch, an evaluation, restarts between iterations
 OPTIONS = ["--samples", "600", "--nworld", "12", "--hidden", "8", "--value-hidden", "8", "--mean-every", "1",
            "--mean-episodes", "2", "--rollout", "segments", "--normalize", "--time-orders", "2",
            "--fisher-fraction", "0.34", "--min-restarts", "10"]  # fmt: skip
@@ -28,7 +28,7 @@ QUIET = ["--no-video", "--no-plot"]
 def torchrun(
     *arguments: str, options: list[str], program: tuple[str, ...] = ("-m", "lyceum_warp.cli")
 ) -> subprocess.Popen[str]:
-    """``torchrun``, from this Python, on the loopback interface."""
+    """Start ``torchrun`` with this Python on the loopback interface."""
     command = [sys.executable, "-m", "torch.distributed.run", *options, *program, *arguments]
     environment = os.environ | {"GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(
@@ -37,7 +37,7 @@ def torchrun(
 
 
 def ended(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str, str]]:
-    """Exit codes, outputs and error outputs."""
+    """Return exit codes, stdouts and stderrs."""
     try:
         outputs = [process.communicate(timeout=120) for process in processes]
     finally:
@@ -53,7 +53,7 @@ def free_port() -> int:
 
 
 def table(run: Path) -> list[dict[str, float]]:
-    """The metrics without measured times."""
+    """Return the metrics without measured times."""
     with (run / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     clocks = {name for name in rows[0] if "time" in name or name == "samples_per_second"}
@@ -61,7 +61,7 @@ def table(run: Path) -> list[dict[str, float]]:
 
 
 def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
-    """The same numbers in the tables' last rows and in the checkpoints, to rounding."""
+    """Compare the tables' last rows and the checkpoints, up to rounding."""
     row, expected = table(one)[-1], table(other)[-1]
     for name in expected:
         bound = tolerance * (10.0 if name.startswith("mean_") else 1.0)  # of whole episodes after the update
@@ -73,23 +73,23 @@ def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
         for name, tensor in wanted[part].items():
             torch.testing.assert_close(state[part][name], tensor, **close)
     torch.testing.assert_close(state["returns"], wanted["returns"], **close, equal_nan=True)
-    if tolerance < 1e-3:  # later on a foot may touch the ground a step earlier
+    if tolerance < 1e-3:  # afterwards a foot may touch the ground a step earlier
         torch.testing.assert_close(state["env"], wanted["env"], **close)
 
 
 def test_two_machines_make_the_same_update_as_one_process(tmp_path: Path) -> None:
-    """Two torchrun commands, as on two machines, against one process; one process continues their run."""
+    """Two torchrun commands stand in for two machines; a single process then continues their run."""
     two, one = tmp_path / "two", tmp_path / "one"
     arguments = ["train", "hopper", *OPTIONS, *QUIET]
     endpoint = f"--rdzv-endpoint=127.0.0.1:{free_port()}"
     launch = ["--nnodes=2", "--nproc-per-node=1", "--monitor-interval=0.1", "--rdzv-backend=c10d", endpoint,
               "--local-addr=127.0.0.1"]  # fmt: skip
     machines = [torchrun(*arguments, "--iterations", "1", "--out", str(two), options=launch) for _ in range(2)]
-    assert cli.main([*arguments, "--iterations", "1", "--out", str(one)]) == 0  # meanwhile
+    assert cli.main([*arguments, "--iterations", "1", "--out", str(one)]) == 0
     results = ended(machines)
     assert [code for code, _, _ in results] == [0, 0], results
     assert not any("terminate called" in error for _, _, error in results)
-    # only one of them writes messages
+    # only rank 0 prints
     outputs = sorted((out for _, out, _ in results), key=len)
     assert outputs[0] == ""
     assert "6 worlds each in 2 processes" in outputs[1] and "iteration    1/1" in outputs[1]
@@ -102,7 +102,7 @@ def test_two_machines_make_the_same_update_as_one_process(tmp_path: Path) -> Non
 
 PPO = ["--algorithm", "ppo", "--nworld", "12", "--num-steps", "20", "--minibatches", "7", "--hidden", "8",
        "--value-hidden", "8", "--mean-every", "1", "--mean-episodes", "2"]  # fmt: skip
-"""Unfinished episodes, a normaliser, a learning rate that adapts, samples that are left over, an evaluation."""
+"""Unfinished episodes, a normaliser, an adaptive learning rate, leftover samples, an evaluation."""
 
 
 @pytest.mark.parametrize("minibatches", [[], ["--whiten-minibatches", "--std-type", "log"]])
@@ -111,10 +111,10 @@ def test_two_processes_make_the_same_update_of_ppo_as_one(minibatches: list[str]
     arguments = ["train", "hopper", *PPO, *minibatches, *QUIET, "--iterations", "1", "--out"]
     launch = ["--standalone", "--nproc-per-node=2", "--monitor-interval=0.1", "--local-addr=127.0.0.1"]
     process = torchrun(*arguments, str(two), options=launch)
-    assert cli.main([*arguments, str(one)]) == 0  # meanwhile
+    assert cli.main([*arguments, str(one)]) == 0
     [(code, out, error)] = ended([process])
     assert code == 0 and "6 worlds each in 2 processes" in out, error
-    assert_equal_runs(two, one, tolerance=2e-3)  # Adam turns the rounding of small gradients into steps
+    assert_equal_runs(two, one, tolerance=2e-3)  # Adam turns rounding errors of small gradients into steps
     assert cli.main(["train", "--resume", str(two), "--iterations", "2", *QUIET]) == 0
 
 
@@ -122,7 +122,7 @@ def test_two_processes_make_the_same_update_of_ppo_as_one(minibatches: list[str]
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
 @pytest.mark.parametrize("algorithm", ["npg", "ppo"])
 def test_gpu_two_processes_make_the_same_update_as_one_and_end(algorithm: str, tmp_path: Path) -> None:
-    """Through NCCL, which is part of the graphs of the value fit and of PPO's epochs."""
+    """NCCL calls are captured in the graphs of the value fit and of PPO's epochs."""
     two, one = tmp_path / "two", tmp_path / "one"
     options = OPTIONS if algorithm == "npg" else PPO
     arguments = ["train", "hopper", *options, *QUIET, "--device", "cuda", "--iterations", "1", "--out"]
@@ -145,7 +145,7 @@ def test_gpu_two_processes_end_when_torchrun_is_interrupted(tmp_path: Path) -> N
         if "iteration    2/" in line:
             process.send_signal(signal.SIGTERM)
             break
-    rest, error = process.communicate(timeout=25)  # after 30 s torchrun kills them
+    rest, error = process.communicate(timeout=25)  # torchrun kills them after 30 s
     rows = table(run)
     assert f"interrupted by SIGTERM after {len(rows)} of 100000 iterations" in output + rest, (output, rest, error)
     assert Run.open(run).read()["iteration"] == len(rows) >= 2
@@ -180,7 +180,7 @@ sys.exit(main())
 
 @pytest.mark.long
 def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
-    """While they learn, they complete the iteration together; before that, the run leaves nothing behind."""
+    """During learning they complete the iteration together; before it the run leaves no files."""
     program, run = tmp_path / "interrupted.py", tmp_path / "learning"
     program.write_text(INTERRUPTED)
     arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations", "100000", "--out"]
@@ -199,19 +199,19 @@ def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_an_error_in_one_process_ends_all_and_two_processes_continue_the_run_of_one(tmp_path: Path) -> None:
-    """The error is one that only the first process can see: the folder is taken."""
+    """Only rank 0 can see the error: the folder is taken."""
     launch = ["--standalone", "--nproc-per-node=2"]
     run, other = tmp_path / "run", tmp_path / "other"
     arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations"]
     assert cli.main([*arguments, "1", "--out", str(run)]) == 0
     resume = ["train", "--resume", str(run), "--iterations", "2", *QUIET]
     processes = [torchrun(*command, options=launch) for command in ([*arguments, "1", "--out", str(run)], resume)]
-    assert cli.main([*arguments, "2", "--out", str(other)]) == 0  # meanwhile
+    assert cli.main([*arguments, "2", "--out", str(other)]) == 0
     refused, resumed = ended(processes)
     code, out, error = refused
     assert code != 0 and out == "", refused
     assert error.count(f"lyceum-warp: {run} holds a run") == 1
-    assert "lyceum_warp/algos" not in error  # no traceback of the other
+    assert "lyceum_warp/algos" not in error  # no traceback of the other rank
     code, out, error = resumed
     assert code == 0 and out.count("iteration    2/2") == 1, resumed
     assert_equal_runs(run, other, tolerance=2e-3)

@@ -1,5 +1,3 @@
-"""Evaluation of policies in whole episodes."""
-
 import math
 
 import numpy as np
@@ -13,7 +11,7 @@ from lyceum_warp.algos.evaluation import evaluation_seed
 
 
 def test_evaluate_takes_the_same_number_of_episodes_of_every_world() -> None:
-    """Worlds with short episodes contribute no more of them; the numbers are those of a plain loop."""
+    """A world with short episodes contributes no additional episodes; the results equal a plain loop's."""
     env = lw.make("hopper", nworld=4, horizon=60)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
     counts: list[tuple[int, int]] = []
@@ -60,7 +58,6 @@ def test_evaluate_needs_automatic_resets_and_a_horizon() -> None:
 
 
 def test_parameters_of_each_world_reach_the_worlds_of_the_mean_policy() -> None:
-    """Those that are changed later, too."""
     env = lw.make("point_mass", nworld=4, horizon=12, success_distance=[0.0, 9.0, 0.0, 9.0])
     config = lw.NPGConfig(samples=320, hidden=(8, 8), value_hidden=(16,), mean_every=1, mean_episodes=6)
     npg = lw.NPG(env, config=config)
@@ -71,7 +68,7 @@ def test_parameters_of_each_world_reach_the_worlds_of_the_mean_policy() -> None:
 
 
 def test_each_episode_has_dynamics_of_its_own() -> None:
-    """What resets draw differs between all episodes, what is drawn at the start differs between worlds."""
+    """Values drawn at resets differ between all episodes; values drawn at the start differ between worlds."""
     env = lw.make(Varied, nworld=3)
     policy = lw.GaussianPolicy(1, 1)
     got = lw.evaluate(env, policy, 6, seed=3)

@@ -1,4 +1,4 @@
-"""The contract of a learner: what the base class brings, and that nothing outside an algorithm assumes more."""
+"""The contract of a learner: what the base class provides, and that no code outside an algorithm assumes more."""
 
 import dataclasses
 from pathlib import Path
@@ -16,7 +16,7 @@ from lyceum_warp.runs.folder import Run
 
 
 class Constant(nn.Module):
-    """A policy other than a Gaussian, which cannot be called."""
+    """A policy that is not Gaussian and cannot be called."""
 
     nobs, nact = 6, 2
 
@@ -34,7 +34,7 @@ class DriftConfig:
 
 
 class Drift(lw.Learner):
-    """Adds noise to a constant action, and reports the least that there is."""
+    """Add noise to a constant action, and report only what is required."""
 
     algorithm = "drift"
 

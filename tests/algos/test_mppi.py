@@ -1,6 +1,6 @@
-"""MPPI against a plain version of it, in use, and in control of tasks.
+"""Compare MPPI with a plain implementation, and use it to control tasks.
 
-The planner's own arithmetic is float32; the plain version's is float64, and so the two drift apart by roundings.
+The planner computes in float32 and the plain implementation in float64, so rounding errors accumulate between them.
 """
 
 from pathlib import Path
@@ -39,13 +39,13 @@ def weighed(s0: VariedWorld, action: Row[float], s1: VariedWorld, p: VariedParam
 
 
 class Weighed(Varied):
-    """A task whose rewards depend on the masses and lengths that are drawn."""
+    """A task whose rewards depend on the randomized masses and lengths."""
 
     reward = weighed
 
 
 def place(obs: torch.Tensor) -> torch.Tensor:
-    """A value of point_mass: far from the target and fast is bad."""
+    """Return a value of point_mass that is low far from the target and at high speed."""
     return -2 * (obs[:, 0] - obs[:, 4]).abs() - 0.1 * obs[:, 2] * obs[:, 3]
 
 
@@ -55,7 +55,7 @@ def reached(seed: int) -> tuple[lw.Env, torch.Tensor]:
 
 
 def falling_hopper(plant: lw.Env) -> torch.Tensor:
-    """A hopper that leans and turns: it falls within a few steps, when exactly depends on its actions."""
+    """Put the hopper into a falling state; the step at which it falls depends on its actions."""
     plant.reset()
     state, parts = plant.get_state(), plant.state_space.parts
     state[:, parts["qpos"].start + 2], state[:, parts["qvel"].start + 2] = 0.15, 3.0
@@ -70,7 +70,7 @@ def heavy_arm() -> mujoco.MjSpec:
     return spec
 
 
-# planning of the task has other weights for the planner's worlds
+# override the reward weights that the task's planning sets
 HOPPER = dict(task="hopper", horizon=12, samples=24, temperature=0.5, noise=0.8, healthy_reward=1.0,
               forward_reward_weight=1.0, integrator="euler")  # fmt: skip
 POINT = dict(task="point_mass", horizon=9, samples=40, temperature=0.3)
@@ -98,12 +98,11 @@ CASES: dict[str, dict[str, Any]] = {
     "one_knot": POINT | dict(update="predictive_sampling", noise=0.4, knots=1, include_plan=True),
 }
 ON_WARP = ("reach", "stop", "value", "covariance", "model", "cem_smoothed", "linear", "cubic_cem")
-"""Cases that run each kernel on the Warp engine once."""
+"""Cases that run each kernel once on the Warp engine."""
 
 
 @pytest.mark.parametrize("case, engine", [*((c, "mujoco") for c in CASES), *((c, "warp") for c in ON_WARP)])
 def test_plans_equal_those_of_the_plain_version(case: str, engine: str) -> None:
-    """In actions, returns and weights, call after call, while the plant moves."""
     check_against(Plain, engine, **CASES[case])
 
 
@@ -116,7 +115,7 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
         settings["model"] = settings["model"]()
     plan = MPPI(task, engine=engine, seed=5, iterations=iterations, **settings)
     plain = kind(task, engine=engine, count=len(plan.knot_actions), **settings)
-    # random numbers depend on the seed and on how many came before: a twin draws those of every iteration
+    # random numbers depend on the seed and on the number of previous draws: a twin draws the noise of each iteration
     knots = {name: settings[name] for name in ("knots", "spline") if name in settings}
     twin = MPPI(task, seed=5, samples=plan.samples, horizon=plan.horizon, iterations=1, **knots)
     plant = lw.make(task, engine=engine, seed=3, autoreset=False)
@@ -149,7 +148,7 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
         assert summary["mean_return"] == pytest.approx(plain.returns.mean(), rel=1e-4)
         assert summary["effective_samples"] == pytest.approx(1 / (plain.weights**2).sum(), rel=1e-2)
         assert summary["failed_samples"] == 0
-        plain.knots = plan.knot_actions.double().numpy()  # low temperatures would make differences grow
+        plain.knots = plan.knot_actions.double().numpy()  # at low temperatures differences would grow
         if plan.adapted_noise is not None:
             plain.deviation = plan.adapted_noise.double().numpy()
         plant.step(action[None])
@@ -164,11 +163,8 @@ def test_the_terminal_value_belongs_to_samples_that_did_not_end() -> None:
     assert set((value.returns - stop.returns).round().tolist()) == {0.0, 100.0}
 
 
-# seeds and resets
-
-
 def numbers(plan: MPPI, state: torch.Tensor, calls: int = 4) -> list[torch.Tensor]:
-    """Every number of a few plans in a row."""
+    """Return all numbers of several consecutive plans."""
     result = []
     for _ in range(calls):
         result.append(plan(state))
@@ -200,9 +196,6 @@ def test_equal_seeds_give_equal_plans_and_a_reset_starts_again(update: str) -> N
     assert spread is None or torch.equal(spread, plan.adapted_noise)
     plan.reset(5)
     assert plan.seeds == [5] and same(numbers(plan, state), different)
-
-
-# several models
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -253,16 +246,12 @@ def test_a_sample_that_fails_in_one_model_fails() -> None:
     assert torch.isfinite(plan.model_returns[:, 0]).all()
 
 
-# failed samples
-
-
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("how", ["reward", "physics", "value"])
 def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
-    """After a reward or value that is not a number, or a rollout that diverges."""
     settings: dict[str, Any] = dict(horizon=4, samples=40, smoothing=(1, 0, 0), temperature=1.0, engine=engine)
     if how == "physics":
-        # motors so strong that only small actions keep MuJoCo's accelerations, and Warp's velocities, under 1e10
+        # motors so strong that only small actions keep MuJoCo's accelerations, and Warp's velocities, below 1e10
         settings |= dict(noise=1.0, limit=1e9, model=rail({"mujoco": 1e10, "warp": 2.5e12}[engine]))
     elif how == "value":
         settings |= dict(noise=1.0, limit=1e9, value=lambda obs: torch.where(obs[:, 0] > 0, torch.nan, 1.0))
@@ -321,9 +310,6 @@ def test_failed_samples_are_not_among_the_best(update: str, elites: int | None) 
     assert plan.summary["effective_samples"] == pytest.approx(count)
 
 
-# bounds and the plan's end
-
-
 def test_actions_stay_within_the_bounds_of_the_controls() -> None:
     plan = MPPI("reach", noise=10.0, temperature=1e-3)
     low, high = (torch.from_numpy(bound) for bound in (plan.env.action_space.low, plan.env.action_space.high))
@@ -334,7 +320,7 @@ def test_actions_stay_within_the_bounds_of_the_controls() -> None:
         assert (plan.actions >= low).all() and (plan.actions <= high).all()
         at_bounds = (plan.sampled == low) | (plan.sampled == high)
         assert at_bounds.float().mean() > 0.5
-    free = MPPI(Picky, noise=10.0, horizon=4, limit=1e9)  # its controls have no limits
+    free = MPPI(Picky, noise=10.0, horizon=4, limit=1e9)  # its controls are unlimited
     free(free.state_of())
     assert free.sampled.abs().max() > 10
 
@@ -358,7 +344,7 @@ def test_plans_move_forward_by_the_steps_that_have_passed(fill: Any) -> None:
 @pytest.mark.parametrize("spline", ["zero", "linear", "cubic"])
 @pytest.mark.parametrize("knots", [1, 3, 5, 8, 12])
 def test_a_plan_with_knots_that_moves_forward_keeps_its_actions(knots: int, spline: Any) -> None:
-    """Those of the steps that remain, also where fewer steps pass than lie between two knots."""
+    """The actions of the remaining steps stay the same, even if the shift is smaller than the distance of two knots."""
     plan = MPPI("point_mass", horizon=12, samples=4, knots=knots, spline=spline, fill="repeat", noise=0.3, seed=1)
     plan(plan.state_of())
     for shift in (0, 1, 1, 1, 2, 7, 1):
@@ -376,9 +362,6 @@ def test_steps_beyond_every_plan_leave_only_the_fill() -> None:
         plan(plan.state_of())
         plan(plan.state_of(), shift=2**31 - 1)
         assert (plan.nominal == 0.25).all()
-
-
-# the terminal value
 
 
 @wp.func
@@ -407,7 +390,7 @@ def test_equal_values_in_torch_and_in_warp_give_equal_plans(engine: str) -> None
 def test_a_value_function_gets_the_step_at_the_end_of_the_plan(engine: str) -> None:
     value = lw.ValueFunction(6, (16,), scale=50.0, time_orders=2, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        torch.nn.init.xavier_uniform_(value.network[-1].weight)  # a new one predicts 0
+        torch.nn.init.xavier_uniform_(value.network[-1].weight)  # a new value function predicts 0
         value.network[0].weight[:, 6:] *= 300  # so that ten steps make a difference
     settings = POINT | dict(engine=engine, noise=0.5)
     plan = MPPI(value=value, **settings)
@@ -451,9 +434,6 @@ def test_a_value_that_does_not_fit_is_refused_when_the_planner_is_made(value: An
         MPPI("point_mass", horizon=3, samples=7, value=value)
 
 
-# graphs, states, other models
-
-
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("words", [
     *(dict(value=value, iterations=3) for value in (None, place, place_in_warp)), *UPDATES.values(),
@@ -465,11 +445,8 @@ def test_plans_with_and_without_graphs_are_equal(words: dict[str, Any], engine: 
     assert same(numbers(replayed, state, 5), numbers(direct, state, 5))
 
 
-# in control
-
-
 def drive(task: str, steps: int, seed: int, **settings: Any) -> tuple[lw.Env, np.ndarray, np.ndarray]:
-    """Drive a plant; return it, with its rewards and evaluations up to its end or success."""
+    """Control a plant; return it, its rewards, and its evaluations up to its end or success."""
     plan = MPPI(task, seed=seed, **settings)
     plant = lw.make(task, autoreset=False, seed=seed)
     rewards, evals = [], []
@@ -504,20 +481,17 @@ def test_half_cheetah_runs() -> None:
 
 @pytest.mark.long
 def test_hopper_hops_without_falling() -> None:
-    """With the settings of its planning; with those of other tasks it falls after some 100 steps."""
+    """With the settings of other tasks it falls after about 100 steps."""
     plant, rewards, evals = drive("hopper", 130, 1)
     assert len(evals) == 130 and not plant.terminated.item()
     assert evals[-1] > 0.3 and rewards.sum() > 165, (evals[-1], rewards.sum())
 
 
-# random numbers of the task
-
-
 def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
-    """The mean sum of 100 rewards, and its standard deviation if the coins were tossed after the actions.
+    """Return the mean sum of 100 rewards, and its standard deviation if the coins were tossed after the actions.
 
     Plant and planner have equal seeds. Given the actions, the sum of action times coin over 20 runs has the variance of
-    the sum of the squared actions: coins are independent of each other and of the actions before them.
+    the sum of the squared actions: coins are independent of each other and of earlier actions.
     """
     plan = MPPI(task, engine="mujoco", horizon=4, noise=2.0, smoothing=(1, 0, 0))
     plant = lw.make(task, autoreset=False)
@@ -558,7 +532,7 @@ def test_every_sample_of_every_improvement_draws_its_own(task: type[lw.Task], en
     plan = MPPI(task, engine=engine, horizon=3, samples=200, iterations=2, seed=4, value=value)
     state = plan.state_of()
     plan(state), plan(state)
-    found = torch.stack(coins[-4:]).double()  # an earlier call checked the function
+    found = torch.stack(coins[-4:]).double()  # an earlier call checked the value function
     assert set(found.unique().tolist()) == {-1.0, 1.0}
     assert found.mean(1).abs().max() < 4 / 200**0.5
     correlation = np.corrcoef(found.numpy()) - np.eye(4)
@@ -567,9 +541,6 @@ def test_every_sample_of_every_improvement_draws_its_own(task: type[lw.Task], en
     plan.reset(4)
     plan(state), plan(state)
     assert torch.equal(torch.stack(coins[-4:]).double(), first), "draws are counted from the planner's seed"
-
-
-# attributes and worlds
 
 
 def test_settings_and_buffers_cannot_be_assigned() -> None:

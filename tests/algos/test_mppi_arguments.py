@@ -1,4 +1,4 @@
-"""The arguments of a call of MPPI: the three parts of a task's planning, and how the words of a call are sorted."""
+"""The arguments of MPPI: the three parts of a task's planning, and how keyword arguments are sorted into them."""
 
 import dataclasses
 import json
@@ -18,8 +18,6 @@ from lyceum_warp.algos.mppi_arguments import planner_arguments, task_config
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.engines import placement
 
-# the planning of a task
-
 
 @wp.struct
 class NoisyParams:
@@ -34,7 +32,7 @@ def observe_noisy(s: Rail, p: NoisyParams, obs: Row[float]):
 
 
 class Noisy(lw.Task):
-    """One of its parameters has the name of a setting."""
+    """A task with a parameter that has the name of a setting."""
 
     model, obs = staticmethod(rail), {"x": 1}
     World, Params, observe = Rail, NoisyParams, observe_noisy
@@ -87,8 +85,6 @@ def test_a_part_of_planning_must_be_a_dict() -> None:
     with pytest.raises(ValueError, match=r"settings of lw.Planning must be a dict, not \['horizon'\]"):
         Planning(settings=["horizon"])  # type: ignore[arg-type]
 
-
-# the words of a call
 
 REACH = task_config(find_task("reach"))
 
@@ -164,7 +160,7 @@ def test_words_that_do_not_fit_are_refused_in_one_line(words: dict[str, Any], me
 
 
 def test_with_a_value_the_parameters_of_planning_do_not_apply() -> None:
-    """A value function was fitted to the rewards of the task itself."""
+    """A value function was fitted to the task's own rewards."""
     plan = MPPI("hopper", horizon=2, samples=2, value=lambda obs: obs[:, 0])
     assert plan.env.task.params["healthy_reward"] == 1.0 and plan.env.task.params["forward_reward_weight"] == 1.0
     assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER and plan.settings["noise"] == 0.1
@@ -202,7 +198,7 @@ def test_settings_that_are_left_out_follow_from_the_update() -> None:
         return config.include_plan, config.elites, config.min_noise
 
     assert chosen() == chosen(update="mppi") == chosen(update="predictive_sampling") == (True, None, None)
-    assert chosen(samples=1)[0] is False  # nothing else would be tried
+    assert chosen(samples=1)[0] is False  # with the plan as its only sample it would try nothing new
     assert chosen(update="cem", samples=50) == (False, 5, (0.05,) * 7)
     assert [chosen(update="cem", samples=n)[1] for n in (1, 2, 19, 40)] == [1, 2, 2, 4]
 
@@ -215,9 +211,6 @@ def test_cem_and_predictive_sampling_are_mppi_with_another_update(planner: type[
     assert torch.equal(one(one.state_of()), other(other.state_of()))
     with pytest.raises(ValueError, match=f"update='mppi' is another planner than '{update}': call lw.MPPI with it"):
         planner("reach", update="mppi")
-
-
-# where samples are rolled out
 
 
 @pytest.mark.parametrize(
@@ -247,9 +240,6 @@ def test_auto_on_a_gpu_places_samples_by_their_number(
     options = arguments(task, **{"device": "cuda:0", "nthread": 2} | words)[1]
     assert (options.engine, options.device) == expected
     assert options.physics.nconmax is None, "only the Warp engine takes sizes"
-
-
-# reports
 
 
 def test_settings_are_what_json_can_hold() -> None:

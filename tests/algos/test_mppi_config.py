@@ -1,5 +1,3 @@
-"""Settings of MPPI and their checks."""
-
 import dataclasses
 import math
 from typing import Any

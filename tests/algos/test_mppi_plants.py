@@ -1,4 +1,4 @@
-"""Planning for several plants at a time: the plans are those of planners with one plant each."""
+"""Plan for several plants at once; the plans equal those of planners with one plant each."""
 
 from typing import Any
 
@@ -34,7 +34,7 @@ CASES: dict[str, dict[str, Any]] = {
     "frame skip": dict(task="reach", frame_skip=2),
 }
 ON_WARP = ("mppi", "cem with knots", "models", "control of the task")
-BUFFERS = ("actions", "nominal", "knot_actions", "standard_noise", "sampled", "adapted_noise")  # the second axis
+BUFFERS = ("actions", "nominal", "knot_actions", "standard_noise", "sampled", "adapted_noise")  # axis 1 is the plant
 FIRST = ("returns", "weights", "model_returns")
 
 
@@ -48,7 +48,7 @@ def test_plans_for_several_plants_are_those_of_single_planners(case: str, engine
     states = states_of(settings["task"], 3)
     together = lw.MPPI(**settings, seed=5, plants=3)
     alone = [lw.MPPI(**settings, seed=5 + i) for i in range(3)]
-    for plan in alone:  # planners with several plants have one set of models
+    for plan in alone:  # a planner of several plants has only one set of models
         for name, rows in plan.model_fields.items():
             rows.copy_(together.model_fields[name])
     for shift in (1, 2):
@@ -97,7 +97,7 @@ def test_some_plants_restart() -> None:
     plan.reset([4, 9, 1])
     assert not torch.allclose(*plan(states)[:2])
     plan.reset(9, where=torch.tensor([False, False, True]))
-    assert plan.seeds == [4, 9, 11]  # the others keep theirs
+    assert plan.seeds == [4, 9, 11]  # the others keep their seeds
     torch.testing.assert_close(plan(states)[2], lw.MPPI("point_mass", horizon=5, samples=6, update="cem", elites=2,
                                                         knots=2, seed=11)(states[2]))  # fmt: skip
 

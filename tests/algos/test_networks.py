@@ -1,5 +1,3 @@
-"""Networks and the normaliser of observations."""
-
 from typing import get_args
 
 import pytest
@@ -32,7 +30,7 @@ def test_npg_learns_with_activations_of_policy_and_value_apart() -> None:
     npg = lw.NPG(env, config=config)
     assert (npg.policy.shape["activation"], npg.value.shape["activation"]) == ("elu", "relu")
     iteration = next(npg)
-    assert iteration.kl == pytest.approx(0.5 * config.delta, rel=0.3)  # the Fisher products are right
+    assert iteration.kl == pytest.approx(0.5 * config.delta, rel=0.3)  # the Fisher products are correct
 
 
 def test_normalizer_has_mean_and_variance_of_all_portions_together() -> None:

@@ -1,4 +1,4 @@
-"""NPG as a whole: steps of the right length, exact resumption, and a task that it can learn."""
+"""NPG as a whole: correct step lengths, exact resumption, and a task that it learns."""
 
 import copy
 import dataclasses
@@ -38,7 +38,7 @@ def test_a_step_has_the_kl_divergence_that_delta_sets(env: lw.Env) -> None:
 @pytest.mark.parametrize("rollout", ["episodes", "segments"])
 def test_a_run_is_reproducible_and_resumes_to_the_bit(env: lw.Env, rollout: str) -> None:
     config = dataclasses.replace(SMALL, rollout=rollout, time_orders=2, normalize=True)
-    if rollout == "segments":  # iterations shorter than an episode, between which worlds restart
+    if rollout == "segments":  # iterations are shorter than an episode, and worlds restart between them
         config = dataclasses.replace(config, samples=16 * 5, min_restarts=1.5)
 
     def numbers(it: NPGIteration) -> dict[str, object]:
@@ -62,7 +62,7 @@ def test_a_run_is_reproducible_and_resumes_to_the_bit(env: lw.Env, rollout: str)
 
 
 def learned(env: lw.Env, iterations: int, change: Callable[[torch.Tensor, int], object]) -> list[NPGIteration]:
-    """Iterations of NPG whose rewards, (steps, nworld), are changed; the change gets the iteration's number, too."""
+    """Run NPG on modified rewards; ``change`` gets the rewards, (steps, nworld), and the iteration's number."""
     env.rand_reset(3)
     config = dataclasses.replace(SMALL, value_epochs=20, value_rate=1e-2, mean_every=0)
     npg = lw.NPG(env, config=config, seed=0)
@@ -78,7 +78,7 @@ def learned(env: lw.Env, iterations: int, change: Callable[[torch.Tensor, int], 
 
 def test_rewards_of_any_scale_learn_alike(env: lw.Env) -> None:
     plain = learned(env, 5, lambda *_: None)
-    for exponent in (-14, 14):  # rounding is the same for powers of two
+    for exponent in (-14, 14):  # a power of two does not change the rounding
         scaled = learned(env, 5, lambda reward, _, by=2.0**exponent: reward.mul_(by))  # type: ignore[misc]
         for name in ("return_mean", "explained_variance", "kl", "step_norm"):
             values = [getattr(it, name) for it in scaled]
@@ -116,7 +116,7 @@ def test_a_step_that_the_fisher_information_misjudges_is_shortened(env: lw.Env) 
 
 
 def test_statistics_of_observations_count_as_a_part_of_the_step() -> None:
-    """Observations move far away in iteration 4; the divergence between the policies that sample stays in its limit."""
+    """In iteration 4 observations jump; the KL divergence between the sampling policies stays below its limit."""
     env = lw.make("hopper", nworld=16, seed=1, nthread=1)
     config = lw.NPGConfig(samples=1600, hidden=(16,), value_hidden=(16,), mean_every=0, log_std=-2.0)
     npg = lw.NPG(env, config=config, seed=0)
@@ -143,7 +143,7 @@ def test_statistics_of_observations_count_as_a_part_of_the_step() -> None:
 
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
 def test_a_value_function_follows_returns_of_another_scale(factor: float) -> None:
-    """As after a change of the task, where all returns of the new one lie outside the range of the old one."""
+    """All new returns lie outside the old range, as after a change of the task."""
     value = lw.ValueFunction(3)
     returns = 50.0 + 10.0 * torch.randn(1000, generator=torch.Generator().manual_seed(0))
     value.rescale(returns, first=True)
@@ -175,7 +175,7 @@ def test_a_state_of_another_number_of_worlds_is_refused(env: lw.Env) -> None:
 def test_segments_continue_where_the_last_ones_ended(env: lw.Env) -> None:
     env.rand_reset(0)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=16 * 5, mean_every=0))
-    assert npg.segments  # selected automatically: 5 steps hold no episode of 12
+    assert npg.segments  # selected automatically: 5 steps are shorter than an episode of 12
     lengths, steps = [], []
     for _ in range(6):
         lengths.append(next(npg).length_mean)
@@ -183,14 +183,14 @@ def test_segments_continue_where_the_last_ones_ended(env: lw.Env) -> None:
     joined = torch.cat(steps)
     assert torch.equal(joined, (joined[0] + torch.arange(30.0)[:, None]) % 12)
     assert len(joined[0].unique()) > 5  # the worlds' episodes end at different times
-    # an episode that began in its middle does not count, whole ones do
+    # an episode whose beginning was not sampled does not count
     assert math.isnan(lengths[0])
     assert lengths[-1] == 12.0
 
 
 @pytest.mark.parametrize(("min_restarts", "begun"), [(None, 1), (2.0, 3), (0.0, 0)])
 def test_worlds_restart_where_too_few_begin_an_episode(min_restarts: float | None, begun: int) -> None:
-    """If time limits fell evenly, 40 * 5 / 128 = 1.6 worlds would begin an episode in an iteration of 5 steps."""
+    """With evenly spread time limits, 40 * 5 / 128 = 1.6 worlds would begin an episode in an iteration of 5 steps."""
     env = lw.make("point_mass", nworld=40, horizon=128)
     config = lw.NPGConfig(samples=40 * 5, hidden=(8,), value_hidden=(8,), mean_every=0, min_restarts=min_restarts)
     npg = lw.NPG(env, config=config)
@@ -205,7 +205,7 @@ def test_worlds_restart_where_too_few_begin_an_episode(min_restarts: float | Non
 
 
 def test_point_mass_learns_to_reach_the_target() -> None:
-    """A short run with the original's own settings for this task; its full run is in the README's figures."""
+    """A short run with the paper's settings for this task."""
     env = lw.make("point_mass", nworld=16)
     config = lw.NPGConfig(
         samples=16 * 256, gamma=0.97, lam=0.95, delta=0.02, hidden=(16, 16), value_hidden=(32, 32), mean_every=0
@@ -284,7 +284,7 @@ def test_a_reward_or_observation_that_is_not_finite_is_a_fault(
 
 
 def wild(task_file: TaskFile, params: dict[str, float], **changes: object) -> lw.NPG:
-    """NPG on a task whose observations or rewards are finite, but too large for float32."""
+    """Make NPG on a task whose observations or rewards are finite, but overflow float32."""
     env = lw.make(str(task_file("wild.py", WILD)), nworld=4, **params)
     plain = {"mean_every": 0, "normalize": False, "activation": "relu", "value_activation": "relu"}
     return lw.NPG(env, config=dataclasses.replace(SMALL, **plain | changes))
@@ -349,7 +349,7 @@ def test_a_value_function_that_became_not_finite_is_restored(task_file: TaskFile
 
 
 def on_gpu(**changes: object) -> lw.NPG:
-    """NPG on Hopper on a GPU after 2 iterations, when everything is compiled and captured."""
+    """Run 2 iterations of NPG on Hopper on a GPU, so that everything is compiled and captured."""
     env = lw.make("hopper", nworld=64, device="cuda")
     config = lw.NPGConfig(samples=64 * 16, rollout="segments", mean_every=0, value_batch=100, **changes)
     npg = lw.NPG(env, config=config, seed=1)
@@ -360,7 +360,7 @@ def on_gpu(**changes: object) -> lw.NPG:
 
 @pytest.mark.gpu
 def test_gpu_an_iteration_waits_for_one_copy_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every other call that makes torch wait for the device raises."""
+    """Every other synchronizing call raises."""
     npg = on_gpu(normalize=True, min_restarts=2.0)
     copies = []
 
@@ -382,7 +382,7 @@ def test_gpu_an_iteration_waits_for_one_copy_only(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.gpu
 def test_gpu_a_resumed_run_continues() -> None:
-    """A captured fit has the addresses of its optimizer's moments: after loading others it is captured again."""
+    """A captured fit holds the addresses of the optimizer's moments, so loading a state captures it again."""
     npg = on_gpu()
     saved = npg.state_dict()
     first = next(npg)
@@ -395,7 +395,7 @@ def test_gpu_a_resumed_run_continues() -> None:
 
 @pytest.mark.parametrize("kl_limit", [1.0, 1.5])  # with 1.0 many steps are shortened
 def test_written_out_and_parallel_iterations_equal_plain_ones(kl_limit: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Plain ones take autograd and all rounds of the line search, and fit the value function after the step."""
+    """The plain version uses autograd, all rounds of the line search, and a value fit after the step."""
     threads, learned = torch.get_num_threads(), []
     torch.set_num_threads(2)
     try:

@@ -1,5 +1,3 @@
-"""Hyperparameters of NPG: every wrong value is refused with its name."""
-
 import dataclasses
 import math
 

@@ -1,5 +1,3 @@
-"""Statistics of an iteration, against plain ones."""
-
 import math
 from types import SimpleNamespace
 from typing import Any
@@ -35,7 +33,7 @@ def floats(sums: EpisodeSums) -> EpisodeSums:
 def rollout() -> lw.Rollout:
     env = lw.make(Metered, nworld=6)
     rollout = lw.Rollout(env, 150)
-    rollout.running_return[0] = math.nan  # an episode that began in its middle does not count
+    rollout.running_return[0] = math.nan  # an episode whose beginning was not sampled does not count
     generator = torch.Generator().manual_seed(1)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, log_std=0.0, generator=generator)
     rollout.collect(policy, torch.randn(rollout.action.shape, generator=torch.Generator().manual_seed(0)))
@@ -43,7 +41,7 @@ def rollout() -> lw.Rollout:
 
 
 def part_of(rollout: lw.Rollout, worlds: slice) -> Any:
-    """The samples of some worlds, as of one process."""
+    """Return the samples of some worlds in the form in which a process has them."""
     return SimpleNamespace(
         **{name: getattr(rollout, name)[:, worlds] for name in NAMES},
         episode_metrics={name: sums[:, worlds] for name, sums in rollout.episode_metrics.items()},
@@ -52,7 +50,7 @@ def part_of(rollout: lw.Rollout, worlds: slice) -> Any:
 
 
 def test_episode_statistics_are_those_of_the_episodes_that_ended(rollout: lw.Rollout) -> None:
-    """In one rollout, and pooled from two parts of its worlds."""
+    """The statistics of one rollout equal those pooled from two parts of its worlds."""
     ended = rollout.done & ~rollout.episode_return.isnan()
     assert 6 < ended.sum() < rollout.done.sum()
     returns = rollout.episode_return[ended].double()
@@ -82,7 +80,7 @@ def test_value_statistics_of_two_processes_equal_those_of_all_samples() -> None:
 
 
 def test_metric_means_are_those_of_the_episodes_that_ended(rollout: lw.Rollout) -> None:
-    """In one rollout, and pooled from two parts of its worlds; nan if none ended."""
+    """The means of one rollout equal those pooled from two parts of its worlds; they are NaN if no episode ended."""
     ended = rollout.done & ~rollout.episode_return.isnan()
     expected = {name: sums[ended].mean().item() for name, sums in rollout.episode_metrics.items()}
     assert list(expected) == ["forward", "effort"] and expected["effort"] > 0.1
@@ -97,7 +95,7 @@ def test_metric_means_are_those_of_the_episodes_that_ended(rollout: lw.Rollout) 
     for processes in ([numbers(slice(None))], parts):
         assert summary(processes, 10, list(expected))["metrics"] == pytest.approx(expected, rel=1e-5)
     steps = {name: values.mean().item() for name, values in rollout.metrics.items()}
-    for count in (rollout.env.nworld, 1):  # one process, and as many as worlds
+    for count in (rollout.env.nworld, 1):  # one process, and one process per world
         shares = [numbers(slice(k, k + count)) for k in range(0, rollout.env.nworld, count)]
         assert summary(shares, 10, list(steps))["step_metrics"] == pytest.approx(steps, rel=1e-5)
     none = [part._replace(episodes=EpisodeSums(*[0.0] * 9), metrics=(0.0,) * 4) for part in parts]

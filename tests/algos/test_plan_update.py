@@ -1,4 +1,4 @@
-"""Updates of a plan that a user writes, in torch and in Warp, beside those of the package."""
+"""Compare user-written plan updates, in torch and in Warp, with the package's own."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ ENGINES = ["mujoco", "warp"]
 
 
 class EliteMean(lw.PlanUpdate):
-    """The mean of the best samples, with noise that stays as it is."""
+    """Take the mean of the best samples, and keep the noise."""
 
     def __init__(self, elites: int) -> None:
         self.elites = elites
@@ -25,7 +25,7 @@ class EliteMean(lw.PlanUpdate):
 
 
 class TorchCEM(EliteMean):
-    """CEM by its formulas in torch."""
+    """CEM by its formulas, in torch."""
 
     adapts_noise = True
 
@@ -44,7 +44,7 @@ class TorchCEM(EliteMean):
 
 
 class HalfWay(EliteMean):
-    """A step from the last plan to the mean of the best samples, half as long."""
+    """Move from the previous plan halfway to the mean of the best samples."""
 
     def fit(self, samples: lw.PlanSamples) -> None:
         samples.plan.lerp_(samples.nominal, 0.5)
@@ -58,7 +58,7 @@ def weigh_first(returns: wp.array2d[float], weights: wp.array2d[float], summary:
 
 
 class First(lw.PlanUpdate):
-    """The first sample, in a Warp kernel."""
+    """Choose the first sample, in a Warp kernel."""
 
     capturable = True
 
@@ -129,7 +129,7 @@ def test_settings_show_a_users_update_with_its_attributes() -> None:
 
 
 class Returning(EliteMean):
-    """Returns its weights instead of writing them."""
+    """Return the weights instead of writing them."""
 
     def weigh(self, samples: lw.PlanSamples) -> Any:
         return torch.softmax(samples.returns, 1)

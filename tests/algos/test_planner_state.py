@@ -1,5 +1,3 @@
-"""States that a planner is given: made from their parts, and checked."""
-
 import re
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Gaussian policies, against torch's own distribution."""
-
 import pytest
 import torch
 

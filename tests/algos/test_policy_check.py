@@ -1,4 +1,4 @@
-"""Policies with networks of the user's own: what NPG refuses, and that it learns the others as its own."""
+"""User-defined policy networks: NPG refuses unsuitable ones and learns the others like its own."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +16,7 @@ from lyceum_warp.runs.folder import Run
 
 
 class Net(nn.Module):
-    """A network whose output a function changes."""
+    """A network whose output ``change`` modifies."""
 
     def __init__(self, change: Callable[[torch.Tensor], object] = lambda mean: mean) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ class Unused(Net):
 
 
 class Counting(Net):
-    """A network that depends on how often it was called."""
+    """A network whose output depends on the number of its calls."""
 
     def forward(self, obs: torch.Tensor) -> object:
         self.calls = getattr(self, "calls", 0.0) + 1.0

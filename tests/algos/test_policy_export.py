@@ -1,5 +1,3 @@
-"""Exported policies run without the package and give the same actions."""
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
@@ -31,7 +29,7 @@ RUNS = pytest.mark.parametrize(("name", "run"), [("policy.onnx", run_onnx), ("po
 
 
 def trained(**options: object) -> lw.GaussianPolicy:
-    """A policy with weights and statistics that matter."""
+    """Make a policy with non-trivial weights and statistics."""
     torch.manual_seed(0)
     policy = lw.GaussianPolicy(5, 2, (16, 8), **options)
     with torch.no_grad():
@@ -42,14 +40,14 @@ def trained(**options: object) -> lw.GaussianPolicy:
 
 
 def compare(policy: lw.GaussianPolicy, path: Path, run: Run) -> None:
-    """For batches of other sizes than the example, one of them a single observation, some clipped."""
+    """Compare actions for batches of another size than the example, with single and clipped observations."""
     for n in (1, 7):
         obs = (40.0 * np.random.default_rng(n).standard_normal((n, 5))).astype(np.float32)
         with torch.no_grad():
             expected = policy(torch.from_numpy(obs)).numpy()
         action = run(path, obs)
         assert action.shape == (n, 2) and action.dtype == np.float32
-        np.testing.assert_allclose(action, expected, rtol=1e-5, atol=1e-5)  # roundings of three layers
+        np.testing.assert_allclose(action, expected, rtol=1e-5, atol=1e-5)  # rounding in three layers
 
 
 @RUNS

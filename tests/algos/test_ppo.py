@@ -1,4 +1,4 @@
-"""PPO as a whole: it learns, bootstraps episodes that are cut off, follows its schedules, and resumes exactly."""
+"""PPO as a whole: it learns, bootstraps truncated episodes, follows its schedules, and resumes exactly."""
 
 import copy
 import dataclasses
@@ -29,7 +29,7 @@ def made(env: lw.Env, *, seed: int = 0, **changes: Any) -> lw.PPO:
 
 
 def numbers(it: PPOIteration) -> dict[str, Any]:
-    """The numbers of an iteration without measured times."""
+    """Return an iteration's numbers without measured times."""
     return {name: value for name, value in it.row().items() if "time" not in name and name != "samples_per_second"}
 
 
@@ -37,11 +37,8 @@ def weights(ppo: lw.PPO) -> dict[str, torch.Tensor]:
     return {**ppo.policy.state_dict(), **{f"value.{name}": part for name, part in ppo.value.state_dict().items()}}
 
 
-# learning
-
-
 def test_it_learns_for_a_fixed_seed() -> None:
-    """Returns of the mean policy are at most about 250; those of the first policies are negative."""
+    """The mean policy's return is at most about 250; the first policies' returns are negative."""
     config = lw.PPOConfig(hidden=(32, 32), value_hidden=(32, 32), mean_every=40)
     ppo = lw.PPO(lw.make("point_mass", nworld=32), config=config)
     rows = [next(ppo) for _ in range(40)]
@@ -64,10 +61,10 @@ def test_a_run_is_reproducible_and_resumes_to_the_bit(changes: dict[str, Any], e
     first = [numbers(next(ppo)) for _ in range(2)]
     saved = ppo.state_dict()
     rest = [numbers(next(ppo)) for _ in range(2)]
-    torch.manual_seed(2)  # torch's own generators are left alone
+    torch.manual_seed(2)  # torch's global generators stay unchanged
     again = fresh(1)
     np.testing.assert_equal([numbers(next(again)) for _ in range(4)], first + rest)
-    resumed = fresh(2, learning_rate=1e-4)  # the state has the rate
+    resumed = fresh(2, learning_rate=1e-4)  # the state holds the rate
     next(resumed)
     resumed.load_state_dict(saved)
     np.testing.assert_equal([numbers(next(resumed)) for _ in range(2)], rest)
@@ -76,7 +73,7 @@ def test_a_run_is_reproducible_and_resumes_to_the_bit(changes: dict[str, Any], e
 
 
 def test_statistics_are_those_of_the_samples(shared_env: SharedEnv) -> None:
-    """Every episode has 10 steps; that of a world with a random start does not count."""
+    """Every episode has 10 steps; an episode with a random start does not count."""
     ppo = made(shared_env(Metered, nworld=4, horizon=10, far=1e3))
     found: list[float] = []
     for _ in range(3):
@@ -95,11 +92,8 @@ def test_statistics_are_those_of_the_samples(shared_env: SharedEnv) -> None:
     assert it.kl == pytest.approx(torch.distributions.kl_divergence(old, new).sum(-1).mean().item(), rel=1e-4)
 
 
-# advantages
-
-
 def test_an_episode_that_is_cut_off_is_worth_the_value_of_its_final_observation(env: lw.Env) -> None:
-    """World 0 goes on, 1 reaches its time limit, 2 has a fault, 3 terminates; each in the first of the steps."""
+    """In the first step, world 0 continues, 1 reaches its time limit, 2 has a fault, and 3 terminates."""
     ppo = made(env, num_steps=3, normalize=False, minibatches=1)
     state = env.get_state()
     for part, column in {"qpos": [0, 0, 0, 5], "qvel": [1, 2, 3, 4], "step": [0, 9, 0, 0]}.items():
@@ -119,7 +113,7 @@ def test_an_episode_that_is_cut_off_is_worth_the_value_of_its_final_observation(
     assert rollout.done[0].tolist() == [False, True, True, True]
     assert rollout.terminated[0].tolist() == [False, False, False, True]
     final = rollout.final_obs_groups["critic"]
-    assert final[0, 2, 1] == 3.0  # the last good observation
+    assert final[0, 2, 1] == 3.0  # the last finite observation
     with torch.no_grad():
         value, after = (ppo.value(obs, rollout.step) for obs in (rollout.obs_groups["critic"], final))
     gamma, lam = SMALL.gamma, SMALL.lam
@@ -148,9 +142,6 @@ def test_every_step_updates_the_statistics_of_observations(env: lw.Env) -> None:
     torch.testing.assert_close(1.0 / normalizer.scale.double(), seen.std((0, 1), correction=0) + 0.01)
 
 
-# schedules
-
-
 @pytest.mark.parametrize("changes, rate", [
     ({"desired_kl": 1e-9}, 1e-5), ({"desired_kl": 1e6}, 1e-2), ({"schedule": "fixed", "desired_kl": 1e-9}, 1e-3),
 ])  # fmt: skip
@@ -168,9 +159,6 @@ def test_the_weight_of_the_entropy_falls_linearly(env: lw.Env) -> None:
         ppo = made(env, schedule="fixed", entropy_coef=0.0, final_entropy_coef=final, entropy_decay=(1, 3))
         stds.append([next(ppo).std_mean for _ in range(3)])
     assert stds[1][0] == pytest.approx(stds[0][0]) and stds[1][2] > stds[0][2] + 0.02
-
-
-# networks
 
 
 def test_it_goes_on_with_given_networks_and_a_network_of_the_users_own(env: lw.Env) -> None:
@@ -201,9 +189,6 @@ def test_it_goes_on_with_given_networks_and_a_network_of_the_users_own(env: lw.E
     before = own.network.weight.detach().clone()
     assert math.isfinite(next(lw.PPO(env, own, config=SMALL)).kl)
     assert not torch.equal(own.network.weight, before)
-
-
-# runs and errors
 
 
 def test_a_run_has_the_files_of_every_run_and_continues(tmp_path: Path) -> None:

@@ -1,5 +1,3 @@
-"""The buffer of NPG's samples."""
-
 import math
 
 import pytest
@@ -11,7 +9,7 @@ import lyceum_warp as lw
 
 @pytest.mark.parametrize("graphs", [True, False])  # graphs are captured in the second step
 def test_collect_stores_inputs_and_results_of_each_step(graphs: bool) -> None:
-    """Groups that are not asked for are not stored."""
+    """Groups that were not requested are not stored."""
     env, plain = (lw.make(Metered, nworld=3, horizon=4, seed=2, graphs=g) for g in (graphs, True))
     rollout = lw.Rollout(env, 6, groups=("critic",))
     policy = lw.GaussianPolicy(1, 1, generator=torch.Generator().manual_seed(0))
@@ -62,7 +60,7 @@ def test_faults_within_a_rollout_are_counted() -> None:
     noise[1:3, 2] = math.nan
     rollout.collect(policy, noise)
     assert rollout.faults.tolist() == [0, 0, 2]
-    # a fault cuts an episode off: it is not the termination that is worth a return of 0
+    # a fault truncates the episode; it is not a termination, whose return would be 0
     assert rollout.done[1, 2] and not rollout.terminated.any()
     assert env.fault_counts["action"] == 2
     noise.zero_()

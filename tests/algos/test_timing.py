@@ -1,4 +1,4 @@
-"""Two calls at the same time, in one of torch's threads each."""
+"""Run two calls concurrently, each with one of torch's threads."""
 
 import threading
 from collections.abc import Iterator

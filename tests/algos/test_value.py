@@ -1,5 +1,3 @@
-"""Value functions."""
-
 from pathlib import Path
 
 import torch
@@ -20,7 +18,7 @@ def test_a_value_function_has_the_discount_of_the_returns_that_it_was_fitted_to(
     run.save(policy_content(0, npg.policy, value), {})
     assert lw.load_value(run).discount == 0.9
     content = torch.load(run.policy)
-    del content["value"]["shape"]["discount"]  # as older releases saved it
+    del content["value"]["shape"]["discount"]  # earlier releases saved it in this form
     torch.save(content, run.policy)
     assert lw.load_value(run).discount is None
 

@@ -1,4 +1,4 @@
-"""The regression of value functions, with and without a captured step."""
+"""The fit of value functions, with and without a captured step."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from lyceum_warp.algos.value_fit import ValueFit
 
 @pytest.mark.parametrize("activation", ["tanh", "relu", "elu"])
 def test_written_out_steps_learn_the_same_as_autograd(activation: Any) -> None:
-    """In two calls: the second continues with the moments of the first."""
+    """The second call continues with the moments of the first."""
     generator = torch.Generator().manual_seed(2)
     data = [torch.randn(50, 6, generator=generator) for _ in range(2)]  # the last mini-batch is smaller
     fits = []
@@ -50,7 +50,7 @@ def test_a_network_of_its_own_is_fitted_by_autograd() -> None:
 
 @pytest.mark.gpu
 def test_gpu_a_captured_fit_learns_the_same_as_plain_launches() -> None:
-    """In two calls: the first captures between two mini-batches, the second only replays, on other samples."""
+    """The first call captures between two mini-batches; the second only replays, on different samples."""
     samples, batch = 1000, 96  # the last mini-batch is smaller
     generator = torch.Generator("cuda").manual_seed(2)
     data = [torch.randn(samples, 6, generator=generator, device="cuda") for _ in range(2)]

@@ -1,4 +1,4 @@
-"""The comparison of two checkouts: with itself there is no difference, and a changed line is found where it counts."""
+"""Compare two checkouts: identical ones have no difference, and every changed line is found."""
 
 import json
 import os
@@ -18,7 +18,6 @@ PROGRAM = ROOT / "bench" / "compare.py"
 
 
 def copied(folder: Path, changes: dict[str, tuple[str, str]]) -> Path:
-    """A copy of the package in which files have another text."""
     shutil.copytree(ROOT / "lyceum_warp", folder / "lyceum_warp", ignore=shutil.ignore_patterns("__pycache__"))
     for name, (old, new) in changes.items():
         file = folder / "lyceum_warp" / name
@@ -33,8 +32,7 @@ QUICK: dict[str, Any] = {"engines": ("mujoco",), "parts": ("env",), "steps": 3}
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The report on a copy in which a task ends the process, another one raises an error, and point_mass has another
-    reward."""
+    """Compare with a copy in which one task exits, one raises an error, and point_mass has a changed reward."""
     changes = {
         "tasks/point_mass.py": ("return 1.0 - distance(s1)", "return 2.0 - distance(s1)"),
         "tasks/cartpole_swingup.py": ("import warp as wp\n", "import os\nos._exit(3)\n"),
@@ -59,7 +57,7 @@ def test_a_changed_reward_is_reported_with_its_numbers_and_nothing_else(report: 
     assert steps["first"] == {"step": 0, "world": 0} and (steps["count"], steps["size"]) == (12, 12)
     assert float(steps["new"]) == pytest.approx(float(steps["old"]) + 1.0, abs=1e-6)
     assert steps["largest"] == pytest.approx(1.0, abs=1e-6)
-    assert found["fault/reward"]["count"] == 2  # the reward of a transition with a fault is 0
+    assert found["fault/reward"]["count"] == 2  # a transition with a fault has a reward of 0
     old, new = unit["digests"]["steps/reward"]
     assert old != new
     old, new = unit["digests"]["steps/state/qpos"]
@@ -93,8 +91,6 @@ def test_a_name_of_neither_folder_nor_revision_is_refused() -> None:
     with pytest.raises(ValueError, match="'no_such_revision' is neither a folder with lyceum_warp/ nor a revision"):
         compare.run(compare.Options("no_such_revision", str(ROOT)))
 
-
-# arrays
 
 NAN = np.float32(np.nan)
 OTHER_NAN = np.array([0x7FC00001], np.uint32).view(np.float32)[0]
@@ -130,9 +126,6 @@ def test_names_of_one_checkout_alone_are_added_or_removed() -> None:
     assert [(each.name, each.kind) for each in found] == [("u/gone", "removed"), ("u/new", "added")]
 
 
-# the whole program
-
-
 @pytest.mark.long
 def test_every_part_of_a_revision_equals_itself(tmp_path: Path) -> None:
     if not (ROOT / ".git").exists():
@@ -164,5 +157,5 @@ def test_a_signal_ends_both_processes_and_removes_the_folders(number: signal.Sig
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Variables with which a program keeps its temporary files in a folder."""
+    """Return an environment in which a program keeps its temporary files in a folder."""
     return os.environ | {"TMPDIR": str(folder)}

@@ -1,5 +1,3 @@
-"""Test the statistics of learning curves."""
-
 import math
 
 import comparison

@@ -1,5 +1,3 @@
-"""Test the runner of experiments."""
-
 import dataclasses
 import json
 import os
@@ -27,7 +25,7 @@ RATES = {"ours": 3.0, "theirs": 2.0}
 
 @pytest.fixture
 def toy(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """An experiment whose measurements are known; ``toy.measured`` lists what was measured."""
+    """An experiment with known measurements; ``toy.measured`` lists the cases that were measured."""
     measured: list[Case] = []
 
     def cases(options: Any) -> list[Case]:
@@ -84,7 +82,7 @@ def test_stopped_run_continues_without_measuring_again(
     path = tmp_path / "toy.jsonl"
     assert toy.main("--out", path, "--contestants", "ours", "--seeds", 13) == 130
     assert "stopped; the same command continues" in capsys.readouterr().err
-    path.write_bytes(path.read_bytes()[:-9])  # as a stop leaves it
+    path.write_bytes(path.read_bytes()[:-9])  # an interrupted write leaves an incomplete line
     toy.measured.clear()
     assert toy.main("--out", path, "--contestants", "ours") == 0
     assert [(case.task, case.repeat) for case in toy.measured] == [("hop", 1), ("walk", 0), ("walk", 1)]

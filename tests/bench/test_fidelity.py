@@ -1,5 +1,3 @@
-"""Test the experiment on the agreement of the engines."""
-
 import json
 import math
 from pathlib import Path
@@ -29,7 +27,7 @@ def test_short_mode_compares_trajectories(tmp_path: Path, capsys: pytest.Capture
         low, high = found["obs"]["median"], found["obs"]["p99"]
         assert all(0.0 <= a <= b < 1e-5 for a, b in zip(low, high, strict=True))
         assert found["half_apart"] is None and found["faults"] == 0
-    assert result["pairs"]["engines"]["obs"]["p99"][-1] > 0.0  # float32 leaves a difference if worlds move
+    assert result["pairs"]["engines"]["obs"]["p99"][-1] > 0.0  # moving worlds differ by float32 rounding
     assert f"| {TASK} | 3 |" in capsys.readouterr().out
 
 
@@ -37,7 +35,7 @@ def test_other_dynamics_are_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     make = fidelity.lw.make
 
     def replaced(task: str, **words: Any) -> lw.Env:
-        """Let the C engine with longer steps stand for the Warp engine."""
+        """Use the C engine with longer steps in place of the Warp engine."""
         return make(task, **(words | ({"engine": "mujoco", "frame_skip": 60} if words["engine"] == "warp" else {})))
 
     monkeypatch.setattr(fidelity.lw, "make", replaced)
@@ -47,7 +45,7 @@ def test_other_dynamics_are_apart(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_half_apart_counts_worlds_that_were_ever_apart() -> None:
     error = torch.zeros(6, 4)
-    error[2:, 0], error[4:, 1], error[3, 2] = 1.0, 1.0, 1.0  # apart after 3, 5 and 4 steps, and never
+    error[2:, 0], error[4:, 1], error[3, 2] = 1.0, 1.0, 1.0  # worlds drift apart after 3, 5 and 4 steps, and never
     assert fidelity.half_apart(error) == 4
     assert fidelity.half_apart(error[:, [1, 3]]) == 5
     assert fidelity.half_apart(error[:, [3]]) is None and fidelity.half_apart(error[:, []]) is None

@@ -1,5 +1,3 @@
-"""Test the experiment on the seconds until a return is reached."""
-
 import json
 from pathlib import Path
 

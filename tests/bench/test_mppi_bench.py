@@ -1,5 +1,3 @@
-"""Test MPPI's experiment, in the short mode."""
-
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,7 @@ def test_python_environments_earn_our_rewards(task: str) -> None:
         pytest.importorskip("gymnasium_robotics")
     env = lw.make(task, autoreset=False, nthread=1, seed=3)
     theirs = mppi.python_mppi.ENVS[task](lw.make(task, nthread=1).model)
-    env.step(torch.full_like(env.action, 0.1))  # not from the initial state
+    env.step(torch.full_like(env.action, 0.1))  # leave the initial state
     theirs.set_state(env.get_state()[0].numpy())
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):

@@ -1,5 +1,3 @@
-"""Test the learning curves of NPG and of its peers, in the short mode."""
-
 import contextlib
 import dataclasses
 from pathlib import Path
@@ -15,7 +13,7 @@ from lyceum_warp.algos.rollout_buffer import Rollout
 
 
 def case(contestant: str, **changes: Any) -> Any:
-    """The short mode's, with fewer samples."""
+    """Return the short mode's case with fewer samples."""
     found = npg.cases(npg.Options(short=True, contestants=(contestant,), threads=1))[0]
     return dataclasses.replace(found, samples=500, nworld=found.nworld and 4, **changes)
 
@@ -48,11 +46,11 @@ def test_gymnasium_fills_the_buffer_with_the_numbers_of_our_environments() -> No
     for world in range(nworld):
         ends = ours.done[:, world].nonzero()
         assert len(ends), "no episode ended in these steps, so that this test shows too little"
-        until = int(ends[0]) + 1  # the next episode begins elsewhere
+        until = int(ends[0]) + 1  # the next episode begins in a different state
         for name in ("obs", "action", "final_obs", "reward", "step", "terminated", "done", "episode_length"):
             mine, theirs = (getattr(rollout, name)[:until, world] for rollout in (ours, fed))
             assert torch.allclose(mine.float(), theirs.float(), atol=1e-4), name
-        # the first, shortened episodes count in neither
+        # the first, shortened episodes count in neither buffer
         assert torch.equal(ours.episode_return[:until, world].isnan(), fed.episode_return[:until, world].isnan())
     later = fed.done.cumsum(0).roll(1, 0) > 0
     assert not fed.episode_return[1:][later[1:]].isnan().any()
@@ -102,5 +100,5 @@ def test_tables_and_figure_come_from_results_alone(tmp_path: Path) -> None:
     assert found["NPG, Gymnasium's environments (sync)"][7] == "3.00 (3.00 to 3.00)"
     assert len(agreement.rows) == 10 and "differ at 0 of 10 points" in agreement.title
     npg.figure(rows).savefig(tmp_path / "npg.png")
-    # a run that was stopped early is drawn, too
+    # runs that were stopped early are plotted, too
     npg.figure([rows[0], row("npg", 1, [[0, 0.0, 5.0], [50_000, 2.0, 9.0]])])

@@ -1,5 +1,3 @@
-"""Test the experiment of very long runs."""
-
 import json
 import re
 from pathlib import Path
@@ -17,7 +15,7 @@ FAULTS = ("--short", "--parts", "faults", "--threads", "1", "--nworld", "16")
 
 @pytest.fixture
 def work(request: pytest.FixtureRequest, pytestconfig: pytest.Config, tmp_path: Path) -> Path:
-    """A folder of the test's own at the same path in every run, so that kernels are compiled once, without states."""
+    """Return the test's folder, without states; its path is the same in every run, so kernels are compiled once."""
     cache = getattr(pytestconfig, "cache", None)
     folder: Path = cache.mkdir(request.node.name) if cache else tmp_path / "work"
     for file in folder.glob("*.pt"):
@@ -26,7 +24,6 @@ def work(request: pytest.FixtureRequest, pytestconfig: pytest.Config, tmp_path: 
 
 
 def run(out: Path, *words: str) -> list[dict[str, Any]]:
-    """The results of a run."""
     assert experiment.main(soak.EXPERIMENT, ["--out", str(out), *words]) == 0
     return [json.loads(line)["result"] for line in out.read_text().splitlines()]
 
@@ -58,7 +55,7 @@ def test_another_machine_continues_in_the_folder_of_states(
 ) -> None:
     words = (*FAULTS, "--steps", "1600", "--work", str(work))
     first = run(tmp_path / "here.jsonl", *words)
-    assert run(tmp_path / "there.jsonl", *words)[0]["found"] == first[1]["found"]  # its last row may be lost
+    assert run(tmp_path / "there.jsonl", *words)[0]["found"] == first[1]["found"]  # the last row may be lost
     for file in work.glob("*.pt"):
         file.unlink()
     (tmp_path / "here.jsonl").write_text((tmp_path / "here.jsonl").read_text().splitlines(keepends=True)[0])

@@ -1,5 +1,3 @@
-"""Test the experiment throughput, with the smallest cases."""
-
 import json
 from pathlib import Path
 from typing import Any
@@ -57,7 +55,7 @@ def test_rates_are_measured_by_cores_and_worlds(tmp_path: Path, capsys: pytest.C
 
 @pytest.mark.parametrize("task", ["cartpole", "herb_reach"])
 def test_python_tasks_are_ours(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Gymnasium's version of a task, from our states under our actions, returns our observations and rewards."""
+    """From equal states and actions, Gymnasium's version of a task returns the same observations and rewards."""
     monkeypatch.syspath_prepend(str(BENCH / "peers" / "environments"))
     import gymnasium
     import numpy as np

@@ -1,4 +1,4 @@
-"""A task in which one function, which a parameter chooses, writes one element too far or too early."""
+"""A task in which a function that is chosen by a parameter writes before or behind its array."""
 
 import warp as wp
 

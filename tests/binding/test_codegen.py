@@ -1,4 +1,4 @@
-"""Kernels are made once for the same functions, under the same name in every process."""
+"""The same functions produce one set of kernels, with the same names in every process."""
 
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ def test_another_function_makes_other_kernels(tmp_path: Path) -> None:
 
 
 def test_a_module_of_kernels_has_the_same_name_until_its_task_is_made_again(tmp_path: Path) -> None:
-    """Warp finds compiled kernels by the module's name."""
+    """Warp caches compiled kernels by the module's name."""
     file = tiny_task.write(tmp_path, tiny_task.TINY)
     first = kernels(file).judge.module.name
     assert first == f"lyceum_warp.generated.{find_task(file).__module__}.Tiny"

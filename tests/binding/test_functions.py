@@ -13,7 +13,7 @@ from lyceum_warp.task import FUNCTIONS, Task
 MEANT = {
     name: f"def {function.signature}:\n    {function.default or 'obs[0] = 1.0'}" for name, function in FUNCTIONS.items()
 }
-"""Every function of the table, as in a task's file."""
+"""Every function of the table, as written in a task's file."""
 
 
 def source_of(folder: Path, text: str) -> TaskSource:

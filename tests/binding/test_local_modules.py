@@ -1,5 +1,3 @@
-"""A task's file finds and imports the modules beside it."""
-
 import sys
 from pathlib import Path
 

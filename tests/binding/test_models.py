@@ -109,7 +109,7 @@ PAIRS = """<mujoco model="pairs"><worldbody>
 
 
 def test_a_pair_that_is_listed_twice_makes_one_contact(caplog: pytest.LogCaptureFixture) -> None:
-    """MuJoCo would make it twice, and MuJoCo Warp once."""
+    """MuJoCo would create two contacts and MuJoCo Warp one."""
     assert mujoco.MjModel.from_xml_string(PAIRS).npair == 2
     with caplog.at_level("INFO"):
         model = compile_model(mujoco.MjSpec.from_string(PAIRS), (), PHYSICS)
@@ -153,7 +153,7 @@ def test_a_model_that_mujoco_refuses_is_named() -> None:
 
 
 def test_a_replica_has_the_model_of_its_original(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also after a caller edits the MjSpec, or if each call of the task's ``model`` returns another model."""
+    """Later edits of the MjSpec, or a ``model`` that returns a different model at each call, have no effect."""
     spec = lw.gymnasium_model("hopper.xml").spec()
     env = lw.make("hopper", model=spec)
     spec.geom("torso_geom").density = 5000

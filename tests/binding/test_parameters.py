@@ -191,7 +191,7 @@ def test_a_table_of_another_type_is_refused(model: mujoco.MjModel) -> None:
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_functions_read_tables_which_change_in_place(engine: str) -> None:
-    """After graphs were captured: with the same shape, another shape, and with one value per world."""
+    """Graphs were captured before; new tables have the same shape, a different shape, or one value per world."""
     env = lw.make(Follow, engine=engine, nworld=2)
 
     def first_steps() -> torch.Tensor:
@@ -214,7 +214,7 @@ def test_functions_read_tables_which_change_in_place(engine: str) -> None:
 
 
 def test_other_environments_get_the_tables() -> None:
-    """A replica of another size, scratch worlds, followers, a planner, and the evaluation of a trained policy."""
+    """A larger replica, scratch worlds, followers, a planner, and the evaluation of a policy get the tables."""
     motion = np.array([[0.25, 0.0]])
     env = lw.make(Follow, motion=motion, gain=[1.0, 2.0], nworld=2)
     motion[:] = 9.0  # the environment has a copy
@@ -236,7 +236,7 @@ def test_other_environments_get_the_tables() -> None:
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("found", ["number", "nan"])
 def test_check_task_finds_a_read_out_of_a_table(task_file: Any, found: str, engine: str) -> None:
-    """Also if NaN lies beyond the table, so that the episode ends with a fault."""
+    """The read is reported even if it returns NaN, which ends the episode with a fault."""
     source = (Path(__file__).parent.parent / "table_task.py").read_text()
     wrong = source.replace("p.motion.shape[0] - 1)", "p.motion.shape[0])")
     value = {"number": "0.0", "nan": "wp.nan"}[found]

@@ -1,5 +1,3 @@
-"""Tasks are found by name, by file and by class, and registered."""
-
 import importlib.util
 import sys
 from collections.abc import Callable
@@ -20,7 +18,7 @@ Load = Callable[[str, str], ModuleType]
 
 @pytest.fixture
 def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Load:
-    """``load("name", source)``: import a file as a module of that name, and undo its registrations after the test."""
+    """Import a file as a module with ``load("name", source)``, and undo its registrations after the test."""
     monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
 
     def imported(name: str, source: str) -> ModuleType:

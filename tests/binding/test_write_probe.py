@@ -1,4 +1,4 @@
-"""Functions that write out of range are refused before they damage memory."""
+"""Refuse functions that write out of range before they damage memory."""
 
 import subprocess
 import sys
@@ -24,7 +24,7 @@ ROWS = {
     "randomize": (11, 6, "qpos", "the model has 6"),
     "randomize of a stream": (12, 1, "rng", "a stream has 1"),
 }
-"""By the name of a function: its number in the task, the size and the name of its row, and the source of that size."""
+"""For each function: its number in the task, the size and the name of its row, and the declaration of that size."""
 
 PROGRAM = """
 import sys

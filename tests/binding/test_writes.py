@@ -1,4 +1,4 @@
-"""The analysis of what a Warp function writes into its arguments."""
+"""Analyse which arguments a Warp function writes."""
 
 import sys
 from typing import Any
@@ -48,7 +48,7 @@ def fill_both(s: World, p: Params):
     s.qvel[0] = 1.0
 
 
-# a struct whose fields are named by the form in which they are written
+# each field of this struct is named after the expression that writes it
 
 
 @wp.struct
@@ -167,7 +167,7 @@ def uses_rows(s: Uses, p: Params):
     row = s.before
     for i in range(int(p.gain)):
         if i > 0:
-            row[0] = 1.0  # another row from the second round on
+            row[0] = 1.0  # a different row from the second iteration on
         row = s.after
     first, second = Uses(), Uses()
     first.before = s.in_a_struct
@@ -189,7 +189,7 @@ def test_a_row_that_cannot_be_followed_counts_as_written() -> None:
 @wp.func
 def reads_only(s: World, p: Params, obs: Row[float]):
     position = s.mocap_pos[0]
-    position[0] = 1.0  # a copy
+    position[0] = 1.0
     turned = s.xmat[0]
     turned[0, 1] = 2.0
     row = s.qpos

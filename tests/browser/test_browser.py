@@ -1,4 +1,4 @@
-"""The viewer in a real browser: what a page shows, and what its user does."""
+"""The viewer in a real browser: what a page shows, and how it responds to input."""
 
 import contextlib
 import http.server
@@ -33,9 +33,9 @@ from lyceum_warp.viewer.session.window_process import Window
 pytestmark = pytest.mark.browser
 
 SECONDS = 120.0
-"""Time limit for a page: without a GPU it draws a few frames a second."""
+"""Time limit for a page, in seconds; without a GPU a browser draws only a few frames per second."""
 INPUT_SECONDS = 6.0
-"""Time limit for a key or a click to reach the session; a busy browser may lose it."""
+"""Time limit for a key or a click to reach the session, in seconds; a busy browser may lose it."""
 VIEW = {"width": 1000, "height": 640}
 FLAGS = (
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
@@ -43,10 +43,10 @@ FLAGS = (
 )  # fmt: skip
 
 STEPS = 60
-LEFT = (24, 92)  # the second controller of the panel's list, in pixels
-PAUSE = (106, 178)  # its button in the mode "passive"
-SCRUBBER = (20, 316, 282)  # left, right and height of its slider
-MIDDLE = (500, 300)  # of the block
+LEFT = (24, 92)  # the second controller in the panel's list, in pixels
+PAUSE = (106, 178)  # the pause button in the mode "passive"
+SCRUBBER = (20, 316, 282)  # left end, right end and height of the slider
+MIDDLE = (500, 300)  # centre of the block
 
 MODEL = """
 <mujoco>
@@ -82,7 +82,7 @@ def observe_block(s: BlockWorld, p: BlockParams, obs: Row[float]):
 
 
 class Block(lw.Task):
-    """A red block on a rail, which a browser without a GPU draws quickly."""
+    """A red block on a rail, which a browser without a GPU renders quickly."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(MODEL))
     obs = {"x": 1}
@@ -91,7 +91,7 @@ class Block(lw.Task):
 
 
 class WatchedWindow(Window):
-    """Keeps the last frame and the user's commands, and sends those of a test."""
+    """Store the last frame and the user's commands, and send the commands of a test."""
 
     def __init__(self, *given: Any) -> None:
         self.last: Frame | None = None
@@ -112,8 +112,6 @@ class WatchedWindow(Window):
 
 
 class Viewer:
-    """A session in a thread, and its window."""
-
     def __init__(self, session: Session) -> None:
         self.session, self.window = session, WatchedWindow(session.stage.scene)
         self.thread = threading.Thread(target=session.run, args=(self.window,), daemon=True)
@@ -133,8 +131,6 @@ class Viewer:
 
 
 class Tab:
-    """A page of a viewer."""
-
     def __init__(self, page: Page, viewer: Viewer, address: str | None = None) -> None:
         self.page, self.viewer = page, viewer
         self.log: list[str] = []
@@ -155,13 +151,13 @@ class Tab:
         return self
 
     def frames(self, number: int) -> None:
-        """Wait for some frames of the browser."""
+        """Wait until the browser has drawn some frames."""
         self.page.evaluate(
             "n => new Promise(done => { const f = () => n-- > 0 ? requestAnimationFrame(f) : done(); f(); })", number
         )
 
     def repeat(self, act: Callable[[int], None], until: Callable[[], Any]) -> None:
-        """Act until a condition holds, with seconds in between, because another key or click might undo it."""
+        """Repeat an action until a condition holds, with pauses, because a second key or click might undo the first."""
         for attempt in range(20):
             act(attempt)
             end = time.monotonic() + INPUT_SECONDS
@@ -172,7 +168,7 @@ class Tab:
         raise AssertionError("the page did not do it")
 
     def press(self, keys: str, until: Callable[[], Any]) -> None:
-        """Press keys, such as "Control+ArrowRight", for as long as the page needs to see each of them."""
+        """Press keys, such as "Control+ArrowRight", long enough for the page to register each of them."""
 
         def act(attempt: int) -> None:
             names = keys.split("+")
@@ -193,18 +189,17 @@ class Tab:
             self.frames(1)
 
     def click_near(self, x: float, y: float, until: Callable[[], Any]) -> None:
-        """Click at a place of the panel, or a little above or below it."""
+        """Click at a point of the panel, or slightly above or below it."""
         self.repeat(lambda attempt: self.click(x, y + (0, 0, 20, -20, 0, 40, -40)[attempt % 7]), until)
 
     def release(self) -> None:
-        """Release the mouse and Control."""
         self.page.mouse.up(button="left")
         self.page.mouse.up(button="right")
         self.page.keyboard.up("Control")
         self.frames(2)
 
     def place(self) -> float:
-        """The horizontal middle of the red block, from 0 to 1."""
+        """Return the horizontal centre of the red block, from 0 to 1."""
         self.frames(3)
         picture = np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")).astype(int)
         red, green, blue = picture.transpose(2, 0, 1)
@@ -219,8 +214,8 @@ def push(action: float) -> Callable[[torch.Tensor], torch.Tensor]:
 
 @pytest.fixture(scope="module")
 def launch() -> Iterator[Callable[[], Browser]]:
-    """Start a browser without a display or a GPU: LYCEUM_WARP_BROWSER, playwright's own, or the system's."""
-    with sync_playwright() as playwright:  # an event loop runs in this thread until then
+    """Start a headless browser: LYCEUM_WARP_BROWSER, playwright's own, or the system's."""
+    with sync_playwright() as playwright:  # it runs an event loop in this thread until it is closed
         candidates = [os.environ.get("LYCEUM_WARP_BROWSER"), playwright.chromium.executable_path]
         candidates += map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"))
         program = next((found for found in candidates if found and Path(found).exists()), None)
@@ -237,7 +232,7 @@ def browser(launch: Callable[[], Browser]) -> Iterator[Browser]:
 
 
 def new_context(browser: Browser) -> BrowserContext:
-    """A browser without cookies, with pictures small enough for a machine without a GPU."""
+    """Open a context without cookies, with pictures small enough for a machine without a GPU."""
     return browser.new_context(viewport=VIEW, device_scale_factor=0.25)  # type: ignore[arg-type]
 
 
@@ -250,7 +245,7 @@ def context(browser: Browser) -> Iterator[BrowserContext]:
 
 @pytest.fixture(scope="module")
 def viewer() -> Iterator[Viewer]:
-    """Two worlds, two policies and an episode in which the block goes to the right."""
+    """Show two worlds, two policies, and an episode in which the block moves to the right."""
     episode = lw.control(lw.make(Block, autoreset=False), lambda state, obs: torch.ones(1), steps=STEPS, seed=0)
     env = lw.make(Block, nworld=2)
     session = Session(env, controllers={"right": push(1.0), "left": push(-1.0)}, episodes={"right": episode}, seed=0)
@@ -269,7 +264,7 @@ def shared_tab(viewer: Viewer, browser: Browser) -> Iterator[Tab]:
 
 @pytest.fixture
 def tab(shared_tab: Tab) -> Tab:
-    """The page, paused in the mode "passive", at the first step of an episode."""
+    """Return the page, paused in the mode "passive" at the first step of an episode."""
     viewer = shared_tab.viewer
     shared_tab.release()
     viewer.window.extra += [SetPaused(True), SetMode("passive"), Reset(random=False)]
@@ -347,7 +342,7 @@ def test_another_browser_controls_after_one_is_closed_or_killed(
         tab.logs("role=controller")
         paused = viewer.status.paused
         tab.press("Space", lambda: viewer.status.paused != paused)  # noqa: B023
-        address = tab.page.url  # the cookie stays
+        address = tab.page.url  # the cookie remains
         tab.page.close()
     assert viewer.window.is_open()
 
@@ -384,7 +379,7 @@ def test_pages_of_other_sites_cannot_reach_the_viewer(viewer: Viewer, context: B
 
 
 def test_ctrl_c_ends_the_command_and_closes_its_port(context: BrowserContext, tmp_path: Path) -> None:
-    # a shell's background jobs ignore Ctrl-C
+    # a shell makes its background jobs ignore Ctrl-C
     obey = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
     program = f"{obey}; import lyceum_warp.cli; sys.exit(lyceum_warp.cli.main())"
     command = [sys.executable, "-c", program, "view", "point_mass"]

@@ -1,5 +1,3 @@
-"""Flags made from options, and values as NAME=VALUE."""
-
 import dataclasses
 from typing import Annotated
 

@@ -1,5 +1,3 @@
-"""lyceum-warp check: the rules of an environment from a shell."""
-
 import pytest
 import tiny_task
 from conftest import TaskFile

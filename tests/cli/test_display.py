@@ -1,5 +1,3 @@
-"""Progress and tables on the terminal."""
-
 import contextlib
 import dataclasses
 import io
@@ -30,7 +28,7 @@ def first(npg: lw.NPG) -> lw.Iteration:
 
 @contextlib.contextmanager
 def shown_on(console: Console, npg: lw.NPG, total: int = 10) -> Iterator[display.Display]:
-    """The display of a run, after its first line."""
+    """Show the display of a run after its first line."""
     shown = display.Display(console)
     with shown.training(Run(Path("run"), {}), npg, total):
         console.file.truncate(0)
@@ -47,7 +45,7 @@ def test_the_first_line_names_the_task_the_worlds_the_algorithm_and_the_folder(n
 
 
 def line(npg: lw.NPG, iteration: lw.Iteration, **changes: object) -> str:
-    """The line of an iteration without a terminal."""
+    """Return the line that an iteration prints without a terminal."""
     console = Console(file=io.StringIO(), width=120, highlight=False)
     with shown_on(console, npg) as shown:
         shown(dataclasses.replace(iteration, samples_per_second=29_412.0, **changes))
@@ -97,7 +95,7 @@ def test_the_table_of_a_run_has_at_most_15_rows_with_evaluations_first() -> None
 
 
 def test_the_table_leaves_out_what_the_task_does_not_have(first: lw.Iteration) -> None:
-    row = first.row()  # of HalfCheetah, which has no success, with no ended episode
+    row = first.row()  # HalfCheetah has no success, and no episode has ended
     shown = table([row])
     assert "reward" in shown and f"{first.reward_mean:.3g}" in shown
     assert not any(word in shown for word in ("success", "return", "policy"))

@@ -1,5 +1,3 @@
-"""lyceum-warp eval."""
-
 import json
 import shutil
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""lyceum-warp export."""
-
 import shutil
 from pathlib import Path
 

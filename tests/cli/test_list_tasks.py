@@ -1,5 +1,3 @@
-"""lyceum-warp tasks."""
-
 import importlib.util
 import subprocess
 import sys
@@ -17,7 +15,7 @@ INSTALL = "pip install 'lyceum-warp[hand]'"
 
 
 def rows(out: str) -> dict[str, list[str]]:
-    """The words of each task's row by its name; descriptions and notes are indented."""
+    """Return the words of each task's row, by name; descriptions and notes are indented."""
     table, _, legend = out.partition("\n\n")
     assert legend.startswith("obs, act: ")
     heading, *lines = table.splitlines()
@@ -27,7 +25,7 @@ def rows(out: str) -> dict[str, list[str]]:
 
 @pytest.fixture
 def without_the_hand(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """The extra "hand" is not installed; the current folder is empty."""
+    """Hide the ``hand`` extra, and change to an empty working directory."""
     find = importlib.util.find_spec
 
     def find_others(name: str, *args: Any) -> Any:

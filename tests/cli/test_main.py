@@ -1,5 +1,3 @@
-"""The program: help texts, unknown commands, what it loads, and its version."""
-
 import subprocess
 import sys
 

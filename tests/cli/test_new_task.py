@@ -1,4 +1,4 @@
-"""lyceum-warp new: a task file for any model, and the models and names that it refuses."""
+"""Test lyceum-warp new: it writes a task file for any model, and refuses unsuitable models and names."""
 
 import importlib.util
 import re
@@ -40,15 +40,15 @@ SENSED = text(
     + '<sensor><gyro site="imu"/><jointpos joint="hinge"/><jointvel joint="hinge"/><jointpos joint="wrist"/>'
     '<jointvel joint="wrist"/></sensor>',
 )
-"""Its sensors measure every joint, and the motion of the body that floats."""
+"""A model whose sensors measure every joint and the motion of the floating body."""
 
-# without those that take long, whatever the model
+# without the slow checks that do not depend on the model
 QUICK_CHECKS = tuple(check for check in CHECKS if check not in (episodes.check_memory, indices.check_bounds))
 
 
 @pytest.fixture
 def folder(pytestconfig: pytest.Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty current folder, the same in every run of the tests, so that Warp finds compiled kernels in its cache."""
+    """Change to an empty directory that has the same path in every run, so that Warp reuses compiled kernels."""
     cache = getattr(pytestconfig, "cache", None)
     folder = Path(cache.mkdir("new")) if cache else tmp_path / "new"
     shutil.rmtree(folder, ignore_errors=True)
@@ -58,7 +58,7 @@ def folder(pytestconfig: pytest.Config, tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def new(name: str, xml: str) -> Path:
-    """The task file that the command writes for a model."""
+    """Return the task file that the command writes for a model."""
     Path(f"{name}.xml").write_text(xml)
     assert cli.main(["new", name, "--model", f"{name}.xml"]) == 0
     return Path(f"{name}.py")
@@ -77,7 +77,8 @@ def test_a_new_task_observes_the_state_and_those_sensors_that_measure_it(folder:
     assert (task.frame_skip, task.horizon, task.keyframe, task.action_range) == (4, 500, "home", (-1.0, 1.0))
     assert env.field("qpos", "hinge")[0] == pytest.approx(0.3)
     state = [env.field(name)[0].float() for name in ("qpos", "qvel", "act")]
-    measured = env.field("sensordata")[0]  # the gyro's three numbers, the clock, the touch, and two of the user
+    # gyro (3 numbers), clock, touch sensor, user sensor (2 numbers)
+    measured = env.field("sensordata")[0]
     wanted = [*(value for field in state for value in field.tolist()), *measured[:3].tolist(), measured[4].item()]
     assert env.obs[0].tolist() == pytest.approx(wanted)
     assert env.obs[0, 13:24].abs().max() > 0  # worlds start with different velocities
@@ -88,7 +89,7 @@ def test_a_new_task_observes_the_state_and_those_sensors_that_measure_it(folder:
 def test_a_model_whose_sensors_measure_every_joint_is_observed_through_them_alone(folder: Path) -> None:
     task = find_task(new("sensed", SENSED))
     assert task.obs == {"sensors": 7}
-    unsensed = SENSED.replace('<gyro site="imu"/>', '<gyro site="end"/>')  # the floating body is not measured
+    unsensed = SENSED.replace('<gyro site="imu"/>', '<gyro site="end"/>')  # no sensor measures the floating body
     assert list(find_task(new("unsensed", unsensed)).obs) == ["position", "velocity", "sensors"]
 
 

@@ -1,5 +1,3 @@
-"""lyceum-warp plan, called as a shell would."""
-
 import dataclasses
 import inspect
 import json
@@ -51,7 +49,7 @@ def test_a_run_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.Captu
     assert config["planner"]["horizon"] == 10 and config["planner"]["noise"] == 0.3 and config["seed"] == 3
     report = json.loads((out / "report.json").read_text())
     assert report["episodes"] == 2 and report["steps"] == 80
-    with np.load(out / "episode-001.npz", allow_pickle=False) as file:  # as a user without this package would
+    with np.load(out / "episode-001.npz", allow_pickle=False) as file:  # a user without this package can read it, too
         assert file["actions"].shape == (40, 2) and file["rewards"].shape == (40,)
     # the same controller, called from Python, gives the same episode
     env = lw.make("point_mass", autoreset=False, horizon=40)
@@ -74,7 +72,7 @@ def test_real_time_keeps_the_rate_of_the_world(tmp_path: Path, capsys: pytest.Ca
     assert "async" in capsys.readouterr().out
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["mode"] == "async" and report["deadline_ms"] == pytest.approx(20.0)
-    assert 0.5 < report["real_time_factor"] < 1.01  # 40 steps of 20 ms, and however late a busy machine was
+    assert 0.5 < report["real_time_factor"] < 1.01  # 40 steps of 20 ms; a busy machine may be late
 
 
 def test_a_value_function_of_a_run_changes_plans(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

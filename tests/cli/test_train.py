@@ -1,5 +1,3 @@
-"""lyceum-warp train: new runs, resumed runs, refused ones, and runs that are interrupted."""
-
 import inspect
 import json
 import os
@@ -72,7 +70,7 @@ def test_a_task_file_is_trained_and_evaluated(
     rows = metrics(out)
     assert [row["iteration"] for row in rows] == ["1", "2"]
     assert [bool(row["mean_return"]) for row in rows] == [False, True]
-    monkeypatch.chdir("/")  # the task is found from another folder, too
+    monkeypatch.chdir("/")  # the task is found from another working directory, too
     assert cli.main(["eval", str(tmp_path / out), "--episodes", "2", "--video"]) == 0
     video = tmp_path / out / "eval.mp4"
     assert f"video: {video if video.exists() else 'none: '}" in capsys.readouterr().out
@@ -142,7 +140,7 @@ def test_a_resumed_run_shows_the_same(tmp_path: Path) -> None:
     assert len(list(out.glob("events.out.tfevents.*"))) == 2
     config = Run.open(out).config
     assert (config.pop("tensorboard"), config.pop("video_every")) == (False, 0)
-    (out / "config.json").write_text(json.dumps(config))  # of an earlier release
+    (out / "config.json").write_text(json.dumps(config))  # written by an earlier release
     assert cli.main([*resume, "4"]) == 0
 
 
@@ -154,7 +152,7 @@ def physics(env: lw.Env) -> tuple[int, int, int, bool]:
 def test_a_run_keeps_its_physics(tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     options = ["--integrator", "euler", "--solver", "iterations=7", "--solver", "ls_iterations=9", "--deterministic"]
-    assert train(out, "--iterations", "1", *options, task="hopper") == 0  # whose own integrator is RK4
+    assert train(out, "--iterations", "1", *options, task="hopper") == 0  # its own integrator is RK4
     solver = {"iterations": 7, "ls_iterations": 9}
     given = {"integrator": "euler", "solver": solver, "deterministic": True}
     assert Run.open(out).config["physics"] == given
@@ -356,7 +354,7 @@ def test_the_default_number_of_worlds_depends_on_the_device() -> None:
 
 
 def assert_continues(out: Path, output: str, trained: Path) -> None:
-    """A run that was interrupted after its third iteration has lost nothing, and prints how to continue it."""
+    """Check that a run that was interrupted after iteration 3 lost no iteration and prints how to continue."""
     done = Run.open(out).read()["iteration"]
     assert f"after {done} of 2000 iterations" in output
     assert f"lyceum-warp train --resume {out} --iterations 2000" in output
@@ -371,7 +369,7 @@ def assert_continues(out: Path, output: str, trained: Path) -> None:
 def test_an_interrupted_run_ends_after_the_iteration_and_continues(
     moment: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Within this process: while it samples, learns, or writes. The tests of plan interrupt a command from outside."""
+    """The signal arrives in this process while the run samples, learns or writes."""
     out = tmp_path / "run"
     owner: Any = {"step": lw.Env, "save": Run}.get(moment, lw.NPG)
     original, calls = getattr(owner, moment), []

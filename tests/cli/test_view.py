@@ -1,5 +1,3 @@
-"""lyceum-warp view, called as a shell would, with a window in memory."""
-
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ from lyceum_warp.viewer.protocol import Frame, Scene
 
 
 class Opened:
-    """Collects the scenes and the frames of the windows that the command opens."""
+    """Collect the scenes and frames of the windows that the command opens."""
 
     def __init__(self) -> None:
         self.scenes: list[Scene] = []

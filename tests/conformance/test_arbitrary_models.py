@@ -1,4 +1,4 @@
-"""Tasks of arbitrary models keep the rules on every engine that supports the model; others refuse it in a line."""
+"""Tasks of arbitrary models obey the rules on every engine that supports the model; others refuse it in one line."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from lyceum_warp.testing import CHECKS, check_task
 from lyceum_warp.testing import episode_rules as episodes
 
 OPTIONS: dict[str, dict[str, Any]] = {
-    "mujoco": {  # without a check that takes long and does not depend on the model
+    "mujoco": {  # without a slow check that does not depend on the model
         "nworld": 3, "steps": 20, "frame_skip": 2, "checks": [c for c in CHECKS if c is not episodes.check_memory],
     },
     "warp": {"nworld": 2, "steps": 20, "horizon": 6, "frame_skip": 1, "checks": MODEL_CHECKS},
@@ -56,8 +56,6 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 
 class Moving(lw.Task):
-    """Moves, and observes positions and velocities."""
-
     horizon = 15
 
 
@@ -87,20 +85,17 @@ def start_sensing(s: SensingWorld, p: Params, rng: Row[wp.uint32]):
 
 
 class Sensing(lw.Task):
-    """Moves, and observes its sensors."""
-
     horizon = 15
 
 
 def moving(model: str) -> type[lw.Task]:
-    """A task of a model that observes positions and velocities."""
+    """Return a task of a model that observes positions and velocities."""
     spec = mujoco.MjSpec.from_string(model)
     compiled = spec.copy().compile()
     return type("Moving", (Moving,), {"model": spec, "obs": {"position": compiled.nq, "velocity": compiled.nv}})
 
 
 def sensing(model: str) -> type[lw.Task]:
-    """A task of a model that observes its sensors."""
     spec = mujoco.MjSpec.from_string(model)
     obs = {"velocity": 1, "sensors": spec.copy().compile().nsensordata}
     own = {"World": SensingWorld, "observe": sense, "reward": judge, "randomize": start_sensing}
@@ -168,7 +163,7 @@ def test_fields_of_some_models_are_the_same_on_both_engines_and_in_mujoco() -> N
 
 
 def test_an_equality_constraint_is_switched_on_at_a_reset_alike_on_both_engines() -> None:
-    """The engine takes over booleans, too."""
+    """The engine accepts boolean fields, too."""
     ends = []
     for engine in ("mujoco", "warp"):
         env = lw.make(moving(RICH), engine=engine, nworld=2, fields=["eq_active"])
@@ -203,7 +198,7 @@ def test_a_field_of_no_numbers_rolls_out(engine: str) -> None:
     assert rollout.reward.abs().min() > 0
 
 
-# models without actuators, in tasks with actions of their own
+# models without actuators, in tasks that define actions
 
 
 @wp.struct
@@ -235,7 +230,7 @@ def judge_pushed(s0: PushedWorld, action: Row[float], s1: PushedWorld, p: Params
 
 
 class Pushed(lw.Task):
-    """Pushes a joint of a model without actuators."""
+    """A task that pushes a joint of a model without actuators."""
 
     World, observe, control, randomize, reward = PushedWorld, look, push, start_pushed, judge_pushed
     model = mujoco.MjSpec.from_string(text(ARM, ""))

@@ -1,4 +1,4 @@
-"""Copies of Warp functions that check every index find mistakes and compute the same numbers."""
+"""Index-checked copies of Warp functions find mistakes and compute the same numbers."""
 
 import re
 import sys
@@ -41,7 +41,7 @@ class Batch:
     sensordata: wp.array2d[float]
 
 
-# functions without mistakes, in every form that Warp supports
+# correct functions, in every form that Warp supports
 
 ORDER = wp.constant(wp.vec3i(2, 1, 0))
 
@@ -143,7 +143,7 @@ FINDINGS = [
 
 
 KEPT: list[wp.array] = []
-"""Arrays that others only point to."""
+"""Arrays that other arrays point to, stored here so that they are not freed."""
 
 
 DEVICE = wp.get_device("cpu")

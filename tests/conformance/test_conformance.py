@@ -1,4 +1,4 @@
-"""Every task of the package keeps the rules of an environment on both engines, and some tasks on a toy engine."""
+"""Every task of the package obeys the rules on both engines, and some tasks also on a toy engine."""
 
 import pytest
 from conftest import settle
@@ -12,28 +12,27 @@ from lyceum_warp.testing import state_rules as state
 from lyceum_warp.testing.episode_rules import check_memory
 
 EVERY_RULE = ("hopper", "humanoid", "adroit_pen", "soft_ball")
-"""Tasks for which all rules are checked on both engines. Together they use most features of models."""
+"""Tasks for which all rules are checked on both engines; together they use most features of models."""
 OF_THE_TASK = tuple(check for check in CHECKS if check is not check_memory)
-"""Rules for other tasks on the C engine, without the slow rule about memory, which depends little on the task."""
+"""Rules for other tasks on the C engine, without the slow memory rule, which depends little on the task."""
 OF_THE_STATE = (
     buffers.check_addresses, buffers.check_getters, state.check_restoring, state.check_purity, state.check_determinism,
     state.check_reset,
 )  # fmt: skip
-"""Rules for other tasks on the Warp engine, whose steps take milliseconds on a CPU. Functions of these tasks are
-checked on the C engine, and other tests compare the engines."""
+"""Rules for other tasks on the Warp engine, which is slow on a CPU; the C engine and other tests cover the rest."""
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
 
 
 @pytest.fixture(autouse=True)
 def settled_again() -> None:
-    """Drop objects of earlier tests, because the rule about memory counts all objects."""
+    """Drop objects of earlier tests, because the memory rule counts all objects."""
     settle()
 
 
 def options(task: str, engine: str) -> dict[str, int]:
-    """The number of steps of the long rules. For hopper it suffices to find a leak of one number per step.
+    """Return the number of steps of the long rules; hopper gets enough to find a leak of one number per step.
 
-    On a CPU a step of the Warp engine takes milliseconds, so that other tasks take few steps there.
+    On a CPU a step of the Warp engine takes milliseconds, so other tasks take few steps there.
     """
     if engine == "mujoco":
         return {"steps": 1000 if task == "hopper" else 300 if task in EVERY_RULE else 150}

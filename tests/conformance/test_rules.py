@@ -1,4 +1,4 @@
-"""The check of every rule fails if an environment is changed in one place so that it breaks the rule."""
+"""Every rule fails if one place of an environment is changed to violate it."""
 
 import itertools
 from collections.abc import Callable, Iterable
@@ -23,7 +23,7 @@ Function = Callable[..., Any]
 
 
 def then(extra: Callable[[Any], object]) -> Callable[[Function], Function]:
-    """Decorator for a method: call a function after each call."""
+    """Return a decorator for a method that calls a function after each call."""
 
     def wrap(method: Function) -> Function:
         def longer(self: Any, *args: Any, **kwargs: Any) -> Any:
@@ -74,7 +74,7 @@ def spoil_rewards(env: lw.Env) -> None:
 
 
 def count_steps_as_none(method: Function) -> Function:
-    """Let judged states draw the noise of the reset."""
+    """Judge states with the step counter at zero, so that they draw the reset's noise."""
 
     def judge(self: Worlds, *args: Any, **kwargs: Any) -> None:
         kept = self.counters.step.numpy().copy()
@@ -161,7 +161,7 @@ BREAKS: list[Break] = [
     ("bad_warmstart", MujocoEngine, "__init__", then(keep_warm_start)),
     ("not_finite", lw.Env, "step", then(spoil_rewards)),
 ]
-"""Rules, and changes of a function that break them for hopper."""
+"""Rules with patched functions that violate them, for hopper."""
 
 FULL_BREAKS: list[Break] = [
     ("groups", lw.Env, "step", then(another_critic)),
@@ -179,12 +179,12 @@ FULL_BREAKS: list[Break] = [
     ("keyframe", MujocoEngine, "__init__", then(from_the_default)),
     ("rejection", Worlds, "_redraw", nothing),
 ]
-"""Rules and changes for the task with every feature."""
+"""Rules with patched functions for the task with every feature."""
 
 SETTLED_BREAKS: list[Break] = [
     ("settle", MujocoEngine, "settle", at_once),
 ]
-"""Rules and changes for its variant that settles."""
+"""Rules with patched functions for its variant that settles."""
 
 ALL_BREAKS = [
     *(("hopper", *broken) for broken in BREAKS),

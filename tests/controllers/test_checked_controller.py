@@ -1,4 +1,4 @@
-"""Checks of controllers and their actions, conversion of time steps, and descriptions in trajectories."""
+"""Check controllers and their actions, convert time steps, and describe controllers in trajectories."""
 
 import math
 from collections.abc import Callable

@@ -1,5 +1,3 @@
-"""Reports: numbers, JSON and rows."""
-
 import dataclasses
 import json
 import math
@@ -29,7 +27,7 @@ def episode(env: lw.Env) -> Trajectory:
 
 
 def with_plan_times(episode: Trajectory, times: np.ndarray) -> Trajectory:
-    """The episode with other planning times; the first plan takes one second."""
+    """Replace an episode's planning times; the first plan takes one second."""
     plans = len(times) + 1
     return dataclasses.replace(
         episode, plan_times=torch.tensor([1.0, *times], dtype=torch.float64), plan_of=torch.zeros_like(episode.plan_of),
@@ -64,7 +62,6 @@ def test_a_quantile_of_too_few_plans_is_missing(episode: Trajectory, times: np.n
 
 
 def test_the_interval_of_the_success_is_wilsons(episode: Trajectory) -> None:
-    """Published values."""
     for successes, low, high in ((8, 0.4902, 0.9433), (0, 0, 0.2775), (10, 0.7225, 1)):
         ten = [
             dataclasses.replace(episode, success=torch.ones(40, dtype=torch.bool) & (i < successes)) for i in range(10)

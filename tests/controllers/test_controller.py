@@ -1,5 +1,3 @@
-"""The protocols of a controller."""
-
 import ast
 import inspect
 

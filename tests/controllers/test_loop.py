@@ -1,5 +1,3 @@
-"""The synchronous loop."""
-
 import pytest
 import torch
 from toy_controllers import StepPlanner, hundredths, towards

@@ -1,5 +1,3 @@
-"""Run episodes of a policy as trajectories."""
-
 import pytest
 import torch
 from conftest import SharedEnv

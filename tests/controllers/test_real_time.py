@@ -1,4 +1,4 @@
-"""The loop in real time: on a simulated clock, on which every time is exact, and with a thread on the real clock."""
+"""The real-time loop: on a simulated clock with exact times, and with a thread on the real clock."""
 
 import math
 import subprocess
@@ -23,9 +23,6 @@ def env() -> lw.Env:
     return lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
 
 
-# the simulated clock
-
-
 def test_a_fast_planner_is_one_step_behind(env: lw.Env) -> None:
     episode = simulated_run(env, seconds=0.3, steps=6)
     assert episode.times.tolist() == pytest.approx([0, 1, 2, 3, 4, 5])
@@ -42,7 +39,7 @@ def test_a_fast_planner_is_one_step_behind(env: lw.Env) -> None:
 
 def test_a_slow_planner_misses_its_deadlines(env: lw.Env) -> None:
     episode = simulated_run(env, seconds=2.5, steps=9)
-    # the plan from state 1 ends at 3.5; the next plan starts from the newest state and takes from 3.5 to 6
+    # the plan from state 1 ends at 3.5; the next plan starts from the newest state and lasts from 3.5 to 6
     assert episode.plan_of.tolist() == [0, 0, 0, 0, 1, 1, 2, 2, 2]
     assert episode.plan_steps[:3].tolist() == [0, 1, 3]
     assert episode.ages.tolist() == pytest.approx([0, 1, 2, 3, 3, 4, 3, 4, 5])
@@ -65,9 +62,6 @@ def test_a_slow_step_does_not_delay_the_schedule(env: lw.Env) -> None:
     report = control_report(episode)
     assert report.misses == 0 and report.late_ticks == 2 and report.tick_delay_max_ms == pytest.approx(1250)
     assert report.tick_jitter_ms == pytest.approx(np.std([0, 0, 1250, 250, 0, 0], ddof=1))
-
-
-# the thread, with long periods and even longer planning times
 
 
 def planner_threads() -> list[threading.Thread]:
@@ -123,9 +117,6 @@ def test_a_policy_acts_on_the_state_of_its_plan_until_the_episode_ends(env: lw.E
 def test_a_period_that_is_not_positive_is_refused(env: lw.Env, period: object) -> None:
     with pytest.raises(ValueError, match=f"period must be a positive number of seconds, not {period!r}"):
         control_async(env, towards, period=period)  # type: ignore[arg-type]
-
-
-# errors
 
 
 @pytest.mark.parametrize("fails_at", [1, 3, 5])

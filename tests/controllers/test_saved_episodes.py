@@ -1,5 +1,3 @@
-"""Load saved episodes for playback."""
-
 import dataclasses
 import json
 import os

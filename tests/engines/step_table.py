@@ -1,4 +1,4 @@
-"""Generate models of every element that both engines take, and tables of their combinations."""
+"""Generate models with every element that both engines support, and tables of their combinations."""
 
 import functools
 import itertools
@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 
 Case = dict[str, str]
-"""A level of every factor, by the factors' names."""
+"""A level for each factor, by the factor's name."""
 
 GENERAL = "<general {place} {kind} {extra}/>"
 DRIVES = {
@@ -27,14 +27,14 @@ DRIVES = {
     "dcmotor": '<dcmotor {place} motorconst=".5" resistance="1" {extra}/>',
     "user": GENERAL.replace("{kind}", 'dyntype="user" gaintype="user" biastype="user" actdim="1"'),
 }  # fmt: skip
-"""Actuators by their dynamics."""
+"""Actuators by their type of dynamics."""
 
 DRIVE_GROUPS = {
     "instant": ("motor", "servo", "damper"),
     "filtered": ("integrator", "filter", "filterexact"),
     "special": ("muscle", "dcmotor", "user"),
 }
-"""Drives of one model, which has each of them on each of the places."""
+"""Groups of drives; a model has every drive of one group at every place."""
 
 PLACES = {
     "joint": 'joint="hip"',
@@ -116,7 +116,7 @@ STAGES = {
     "energy": "energy",
     "acceleration": "qacc qfrc_actuator",
 }
-"""Fields that a task's World may ask for, by the stage that computes them."""
+"""Fields that a task's World may request, by the stage that computes them."""
 
 FIELDS = {
     "nothing": "",
@@ -125,7 +125,7 @@ FIELDS = {
     "velocities": " ".join(STAGES[name] for name in ("camlight", "com velocity", "velocity")),
     "everything": " ".join(STAGES.values()).replace("subtree_linvel ", ""),
 }
-"""Fields of several stages."""
+"""Requested fields, which may span several stages."""
 
 FLAGS = {
     "": "",
@@ -167,7 +167,7 @@ REFUSED: list[tuple[Mapping[str, tuple[str, ...]], str]] = [
     ({"integrator": ("discrete",), "flex": ("rope",)}, "flex edge stiffness and damping are not supported"),
     ({"integrator": ("discrete",), "noslip": ("2",)}, "noslip solver not implemented for the discrete integrator"),
 ]  # fmt: skip
-"""Combinations that MuJoCo or MuJoCo Warp refuses, and the error of each."""
+"""Combinations that MuJoCo or MuJoCo Warp refuses, with their errors."""
 
 UNKNOWN = {
     "mjTRN_SO3": "MuJoCo Warp refuses it",
@@ -194,11 +194,10 @@ UNKNOWN = {
     "mjDSBL_AUTORESET": "MuJoCo Warp refuses it",
     "mjNDISABLE": "it is a number of flags",
 }
-"""Members of MuJoCo's enums that no model of the table has, with the reason."""
+"""Members of MuJoCo's enums that occur in no model of the table, with the reasons."""
 
 
 def xml(case: Case) -> str:
-    """The model of a case."""
     delay = "" if case["delay"] == "none" else f'delay=".005" nsample="4" interp="{case["delay"]}"'
     actuators = []
     for drive, (name, place) in itertools.product(DRIVE_GROUPS[case["drives"]], PLACES.items()):
@@ -264,7 +263,6 @@ def xml(case: Case) -> str:
 
 
 def fields_of(case: Case) -> list[str]:
-    """The fields that a case's World asks for."""
     names = (FIELDS | STAGES)[case["asked"]].split()
     if SENSORS[case["sensors"]] and case["flags"] != "no constraints":
         names.append("sensordata")
@@ -272,7 +270,6 @@ def fields_of(case: Case) -> list[str]:
 
 
 def model_of(case: Case) -> mujoco.MjModel:
-    """The compiled model of a case."""
     spec = mujoco.MjSpec.from_string(xml(case))
     if "energy" in fields_of(case):
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
@@ -282,12 +279,12 @@ def model_of(case: Case) -> mujoco.MjModel:
 
 
 def is_refused(case: Case) -> bool:
-    """Whether a case is among those that MuJoCo or MuJoCo Warp refuses."""
+    """Return whether MuJoCo or MuJoCo Warp refuses a case."""
     return any(all(case.get(name) in levels for name, levels in match.items()) for match, _ in REFUSED)
 
 
 def singles() -> Iterator[Case]:
-    """Every level of every factor beside the first levels of the others."""
+    """Yield each level of each factor combined with the first levels of the other factors."""
     for name, levels in FACTORS.items():
         for level in levels:
             case = PLAIN | {name: level}
@@ -296,10 +293,10 @@ def singles() -> Iterator[Case]:
 
 @functools.cache
 def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
-    """Cases in which any two (or three, ...) levels of different factors that can be combined occur together.
+    """Return cases that together contain each combination of two (or three, ...) levels of different factors.
 
-    A greedy search: each case begins with a combination that is still missing, and the other factors take the level
-    that adds the most of those that are missing.
+    A greedy search: each case starts with a combination that is still missing, and the other factors take the level
+    that adds the most missing combinations. Refused combinations are omitted.
     """
     rng = random.Random(seed)
     missing: dict[tuple[tuple[str, str], ...], None] = {}
@@ -310,7 +307,7 @@ def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
     while missing:
         first = next(iter(missing))
         if (case := _completed(dict(first), rng, missing, strength)) is None:
-            del missing[first]  # refused with any levels of the other factors
+            del missing[first]  # refused with all levels of the other factors
             continue
         for part in itertools.combinations(((name, case[name]) for name in FACTORS), strength):
             missing.pop(part, None)
@@ -319,7 +316,7 @@ def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
 
 
 def _completed(case: Case, rng: random.Random, missing: Mapping[Any, None], strength: int) -> Case | None:
-    """A case with the given levels, and for the other factors, in random order, the levels that add the most."""
+    """Complete a case: the other factors, in random order, take the level that adds the most missing combinations."""
     rest = [name for name in FACTORS if name not in case]
     rng.shuffle(rest)
     for name in rest:
@@ -337,7 +334,7 @@ def _completed(case: Case, rng: random.Random, missing: Mapping[Any, None], stre
 
 
 def title(case: Case) -> str:
-    """The levels of a case that differ from the plain one."""
+    """Return the levels of a case that differ from the plain case."""
     return ", ".join(f"{name}={level}" for name, level in case.items() if level != PLAIN[name]) or "plain"
 
 
@@ -362,4 +359,4 @@ ENUMS: dict[str, Reader] = {
     "mjtEnableBit": lambda m: _bits(mujoco.mjtEnableBit, m.opt.enableflags),
     "mjtDisableBit": lambda m: _bits(mujoco.mjtDisableBit, m.opt.disableflags),
 }
-"""MuJoCo's enums, and how to find their members in a model."""
+"""MuJoCo's enums, with functions that list the members in a model."""

@@ -1,4 +1,4 @@
-"""The deterministic mode sorts contacts and rows, and shares scratch memory among graphs."""
+"""The deterministic mode sorts contacts and rows, and graphs share scratch memory."""
 
 import contextlib
 import copy
@@ -26,13 +26,13 @@ from lyceum_warp.fields import describe
 
 @pytest.fixture
 def without_allocators(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Warp has allocators of its own on CUDA devices only; on the CPU the engine runs without."""
+    """Remove Warp's custom allocators, which exist only on CUDA devices, so that the engine runs on the CPU."""
     monkeypatch.setattr(wp, "ScopedAllocator", lambda *args: contextlib.nullcontext())
 
 
 @pytest.mark.usefixtures("without_allocators")
 def test_the_deterministic_engine_steps_as_the_warp_engine_does() -> None:
-    """On the CPU the two differ only in the order of sums."""
+    """On the CPU the two engines differ only in the order of sums."""
     envs = [lw.make("humanoid", engine=engine, nworld=3, horizon=3) for engine in (DeterministicEngine, WarpEngine)]
     ordered, plain = envs
     for _ in range(4):
@@ -48,7 +48,7 @@ def test_the_deterministic_engine_steps_as_the_warp_engine_does() -> None:
 
 @pytest.mark.usefixtures("without_allocators")
 def test_scratch_is_reserved_before_graphs_are_captured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For 256 worlds and more, if it fits into memory and into Warp's buffers."""
+    """Scratch is reserved for 256 worlds or more, if it fits into memory and into Warp's buffers."""
     engine: Any = lw.make("hopper", engine=DeterministicEngine, nworld=2).engine
     assert not engine._scratch.blocks
     engine.nworld = 1000
@@ -69,12 +69,12 @@ def test_scratch_is_reserved_before_graphs_are_captured(monkeypatch: pytest.Monk
     assert 100_010 <= block.size < 100_010 + 512
 
 
-# on a GPU the order of contacts and rows is random; these tests shuffle it, and expect it to be restored
+# on a GPU the order of contacts and rows is random; these tests shuffle them, and check that sorting restores the order
 
 
 @pytest.fixture(scope="module", params=["dense", "sparse"])
 def forwarded(request: pytest.FixtureRequest) -> tuple[WarpEngine, CanonicalOrder]:
-    """Humanoids that lie on the ground, with contacts and limits, and the order for their model and data."""
+    """Return an engine with humanoids on the ground, in contact and at limits, and the model's canonical order."""
     model = copy.copy(lw.make("humanoid").model)
     model.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{request.param.upper()}")
     engine = WarpEngine(model, 3, wp.get_device("cpu"), [describe(model, "qpos")])
@@ -123,7 +123,7 @@ def test_shuffled_rows_are_sorted_into_the_same_order(forwarded: tuple[WarpEngin
         kinds = np.minimum(wanted["type"][w, :n], 5)
         groups = {key: rng.random() for key in zip(kinds, wanted["id"][w, :n], strict=True)}
         keys = [groups[kind, i] for kind, i in zip(kinds, wanted["id"][w, :n], strict=True)]
-        shuffle = np.argsort(keys, kind="stable")  # rows of one constraint come together and in order
+        shuffle = np.argsort(keys, kind="stable")  # rows of one constraint stay adjacent and ordered
         place = np.argsort(shuffle)
         for name in names:
             array = getattr(d.efc, name).numpy()
@@ -152,7 +152,7 @@ def test_shuffled_rows_are_sorted_into_the_same_order(forwarded: tuple[WarpEngin
 def test_a_contact_field_that_is_not_sorted_is_refused(
     forwarded: tuple[WarpEngine, CanonicalOrder], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A new version of MuJoCo Warp may add one."""
+    """A new version of MuJoCo Warp may add such a field."""
     engine, _ = forwarded
     known = {name: kind for name, kind in order.Contacts.vars.items() if name != "adhesion"}  # type: ignore[attr-defined]
     monkeypatch.setattr(order.Contacts, "vars", known)
@@ -160,11 +160,8 @@ def test_a_contact_field_that_is_not_sorted_is_refused(
         CanonicalOrder(copy.copy(engine.m), engine.d)
 
 
-# scratch memory
-
-
 class Capturing:
-    """A fake CUDA device during a capture: Warp allocates some memory within the capture, and some outside."""
+    """A fake CUDA device during a capture: Warp allocates some memory in the capture, and some outside it."""
 
     is_capturing = True
 
@@ -192,17 +189,17 @@ def test_captured_launches_share_their_scratch(monkeypatch: pytest.MonkeyPatch) 
     for sizes in ([1000, 2000], [512, 1500, 1000], [4000]):
         scratch.open()
         launches.append([range(start := scratch.allocate(size), start + size) for size in sizes])
-    for pieces in launches:  # the buffers of one launch do not overlap and lie within the block
+    for pieces in launches:  # the buffers of one launch lie in the block and do not overlap
         for before, after in itertools.pairwise(pieces):
             assert before.stop <= after.start
         assert pieces[0].start == launches[0][0].start and pieces[-1].stop <= pieces[0].start + 5120
     assert (scratch.peak, scratch.largest) == (4096, 4096)
-    more = scratch.allocate(2000)  # the block is used up
+    more = scratch.allocate(2000)  # the block is full
     assert more not in range(launches[0][0].start, launches[0][0].start + 5120)
     scratch.deallocate(more, 2000)
     assert not device.freed
     for within in (True, False):
-        device.stream.is_capturing, device.is_capturing = within, within  # part of the graph, or no capture at all
+        device.stream.is_capturing, device.is_capturing = within, within  # in the graph, or without any capture
         assert scratch.allocate(300) == -300
         scratch.deallocate(-300, 300)
     assert device.freed == [-300, -300] and scratch.peak == 4096 + 2048

@@ -43,7 +43,7 @@ N = 3
 def compiled(spec: mujoco.MjSpec | None = None) -> mujoco.MjModel:
     spec = spec or mujoco.MjSpec.from_string(XML)
     for body in spec.bodies[1:]:
-        body.simple = 0  # so that inertial frames can move
+        body.simple = 0  # allows inertial frames to move
     return spec.compile()
 
 
@@ -60,7 +60,7 @@ def make(
     initial: np.ndarray | None = None,
     written: tuple[str, ...] = (),
 ) -> Engine:
-    """An engine whose named model fields differ between worlds, after a reset."""
+    """Return an engine whose named model fields differ between worlds, after a reset."""
     kept = [describe(model, name) for name in (*STATE, *fields)]
     kept += [describe(model, name, written=True) for name in written]
     dynamics = [describe_model_field(model, name) for name in names]
@@ -71,16 +71,18 @@ def make(
 
 
 def worlds(nworld: int = N, *chosen: int) -> wp.array:
-    """A mask of the chosen worlds; without any, of all."""
+    """Return a mask of the chosen worlds; without any, of all worlds."""
     return wp.array([not chosen or w in chosen for w in range(nworld)], dtype=bool)
 
 
 def draw(engine: Engine, seed: int = 0, *chosen: int) -> None:
-    """Scale every model field of the chosen worlds, or of all, by random numbers, and apply them."""
+    """Scale every model field of the chosen worlds (by default all) by random factors, and apply the fields."""
     rng = np.random.default_rng(seed)
     for name in sorted(engine.dynamics):
         array, own = engine.arrays[name].numpy(), engine.nominal[name].numpy()
-        shape = (*array.shape[:-1], 1) if name == "body_inertia" else array.shape  # it must stay one of a body
+        shape = (
+            (*array.shape[:-1], 1) if name == "body_inertia" else array.shape
+        )  # one factor per body keeps the inertia valid
         drawn = own * rng.uniform(0.8, 1.2, size=shape).astype(np.float32)
         if name == "body_ipos":
             drawn[:, 1:] += 0.01
@@ -90,7 +92,7 @@ def draw(engine: Engine, seed: int = 0, *chosen: int) -> None:
 
 
 def run(engine: Engine, steps: int = 5, nstep: int = 2) -> np.ndarray:
-    """Coordinates and velocities after some steps under fixed controls, (nworld, nq + nv)."""
+    """Return positions and velocities after some steps under fixed controls, (nworld, nq + nv)."""
     for _ in range(steps):
         engine.ctrl.numpy()[:] = (0.5, -0.3, 0.2)
         engine.step(nstep)
@@ -105,9 +107,6 @@ def state_of(engine: Engine) -> wp.array:
     state = wp.zeros((engine.nworld, engine.state_size), dtype=wp.float64)
     engine.get_state(state)
     return state
-
-
-# physics
 
 
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
@@ -141,7 +140,7 @@ def test_worlds_run_as_plain_mujoco_does_on_their_models(engine: type[Engine]) -
     draw(made)
     draw(plain)
     steps = [(run(made, 1), run(plain, 1)) for _ in range(5)]
-    assert np.ptp(steps[-1][1], axis=0).max() > 0.01  # the models matter
+    assert np.ptp(steps[-1][1], axis=0).max() > 0.01  # the models differ in effect
     for got, expected in steps:
         if engine is MujocoEngine:
             np.testing.assert_array_equal(got, expected)
@@ -204,9 +203,6 @@ def test_a_mass_that_is_not_positive_is_a_fault_of_its_world() -> None:
         np.testing.assert_array_equal(made.fault.numpy() != 0, [False, True, False])
 
 
-# states
-
-
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_restored_state_brings_its_model(engine: type[Engine]) -> None:
     made, other = make(engine, *DRAWN), make(engine, *DRAWN)
@@ -228,7 +224,7 @@ def test_a_model_that_becomes_nominal_again_runs_as_before(engine: type[Engine])
     draw(made)
     for name, nominal in made.nominal.items():
         made.arrays[name].numpy()[:] = nominal.numpy()
-    for _ in range(2):  # the second time nothing changes
+    for _ in range(2):  # the second pass changes nothing
         made.apply_model(worlds())
     np.testing.assert_array_equal(run(made), run(untouched))
 
@@ -236,7 +232,7 @@ def test_a_model_that_becomes_nominal_again_runs_as_before(engine: type[Engine])
 @pytest.mark.parametrize(("integrator", "current"), [("implicitfast", ()), ("RK4", ("xpos",))])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_rollout_honours_the_model_of_each_state(engine: type[Engine], integrator: str, current: tuple[str]) -> None:
-    """On the C engine the first case is one native call, and the second takes step after step."""
+    """The C engine runs the first case in one native call and the second step by step."""
     model = copy.copy(MODEL)
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     source, planner = (make(engine, *DRAWN, fields=current, model=model) for _ in range(2))
@@ -246,7 +242,7 @@ def test_a_rollout_honours_the_model_of_each_state(engine: type[Engine], integra
     controls = wp.array(np.full((4, N, MODEL.nu), 0.3), dtype=float)
     names = ("qpos", "qvel", "body_mass", *current)
     buffers = {name: wp.zeros((5, *source.arrays[name].shape), dtype=source.arrays[name].dtype) for name in names}
-    for _ in range(2):  # the second time no model changes
+    for _ in range(2):  # in the second pass no model changes
         planner.rollout(state, controls, 2, buffers)
         for t in range(4):
             for name, buffer in buffers.items():
@@ -261,11 +257,8 @@ def test_a_rollout_honours_the_model_of_each_state(engine: type[Engine], integra
         source.set_state(state, worlds())
 
 
-# settling
-
-
 class WholeWarpEngine(WarpEngine):
-    """A Warp engine that settles worlds among all others, as the deterministic one does."""
+    """A Warp engine whose settling passes include all worlds, as in the deterministic engine."""
 
     partial_refresh = False
 
@@ -307,7 +300,7 @@ def test_models_are_applied_and_worlds_settled_within_graphs() -> None:
 
     for engine, enabled in ((captured, True), (direct, False)):
         calls = Graphs(CPU, enabled=enabled).sequence(phases(engine))
-        for seed in range(4):  # the first runs, the second captures
+        for seed in range(4):  # the first pass runs the launches, the second captures them
             rng = np.random.default_rng(seed)
             for name in engine.dynamics:
                 array = engine.arrays[name].numpy()
@@ -315,9 +308,6 @@ def test_models_are_applied_and_worlds_settled_within_graphs() -> None:
             for call in calls:
                 call()
     np.testing.assert_array_equal(shown(captured), shown(direct))
-
-
-# inputs and initial states
 
 
 @pytest.mark.parametrize("name", ["xfrc_applied", "qfrc_applied", "mocap_pos"])
@@ -361,9 +351,6 @@ def test_an_initial_state_of_another_size_is_refused() -> None:
         make(MujocoEngine, initial=np.zeros(3))
 
 
-# placement
-
-
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
 def test_worlds_of_different_models_take_more_memory(engine: type[Engine]) -> None:
     dynamics = [describe_model_field(MODEL, name) for name in DRAWN]
@@ -382,7 +369,7 @@ SLIDERS = """<mujoco><worldbody>
 
 
 def test_inverse_weights_of_bodies_that_only_slide_or_turn_are_those_of_a_compiled_model() -> None:
-    """MuJoCo gives directions that cannot move the weight 0, unlike MuJoCo Warp's ``set_const``."""
+    """MuJoCo gives weight 0 to directions in which a body cannot move, unlike MuJoCo Warp's ``set_const``."""
     model = mujoco.MjModel.from_xml_string(SLIDERS)
     engine = make(WarpEngine, "body_mass", nworld=2, model=model)
     for scale in (1.0, 2.0):

@@ -1,4 +1,4 @@
-"""Both engines treat fields, controls, resets and options alike, including those that no task of the package uses."""
+"""Both engines treat fields, controls, resets and options alike, even those that no task of the package uses."""
 
 import gc
 from pathlib import Path
@@ -87,7 +87,7 @@ def test_lagged_fields_belong_to_the_new_state_after_a_reset(file: Path, engine:
     torch.testing.assert_close(env.obs[:, :2], torch.full((2, 2), 0.5))
     for _ in range(6):
         env.step(torch.ones(2, 1))
-        if not env.done.any():  # they are one substep behind the state
+        if not env.done.any():  # these fields lag the state by one substep
             assert (env.obs[:, 0] != env.obs[:, 1]).all()
     assert env.truncated.all()
     torch.testing.assert_close(env.obs[:, :2], torch.full((2, 2), 0.5))
@@ -96,7 +96,9 @@ def test_lagged_fields_belong_to_the_new_state_after_a_reset(file: Path, engine:
 CLEARED = TASK.replace('lagged = ("sensordata",)', 'lagged = cleared = ("sensordata",)').replace("Filtered", "Cleared")
 
 
-@pytest.mark.parametrize("fields", [[], ["xpos"], ["qacc"]])  # others are computed at the beginning of an episode
+@pytest.mark.parametrize(
+    "fields", [[], ["xpos"], ["qacc"]]
+)  # the listed fields are computed at the start of an episode
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_cleared_fields_are_zero_when_an_episode_begins(task_file: TaskFile, engine: str, fields: list[str]) -> None:
     env = lw.make(task_file("cleared.py", CLEARED), engine=engine, nworld=2, fields=fields)
@@ -117,7 +119,7 @@ def test_cleared_fields_are_zero_when_an_episode_begins(task_file: TaskFile, eng
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_controls_are_saved_and_reset_with_the_state(file: Path, engine: str) -> None:
-    """A filtering control continues from restored controls, and starts from zero after a reset."""
+    """A filtered control continues from restored controls, and starts from zero after a reset."""
     env = lw.make(file, engine=engine, nworld=2, horizon=0)
     action = torch.ones(2, 1)
 
@@ -149,7 +151,7 @@ def test_a_view_of_a_field_outlives_its_environment(engine: str) -> None:
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_additional_fields_leave_the_numbers_unchanged(file: Path, engine: str) -> None:
-    """Only the state is longer, by the field of the acceleration stage."""
+    """Only the state grows, by the field of the acceleration stage."""
     plain = lw.make(file, engine=engine, nworld=2, seed=3)
     other = lw.make(file, engine=engine, nworld=2, seed=3, fields=["qacc_warmstart", "xpos", "qacc"])
     parts = list(plain.state_space.parts)
@@ -204,7 +206,7 @@ def test_integrator_and_solver_options_reach_the_engine(engine: str) -> None:
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_fields_that_the_task_does_not_read_are_kept_if_listed(engine: str) -> None:
-    """Sensors are enabled only if a listed field needs them."""
+    """A sensor is enabled only if a listed field needs it."""
     env = lw.make("adroit_pen", engine=engine, fields=["sensordata", "cfrc_ext"])
     size = env.state_space.size  # includes the contact forces
     env.step()
@@ -218,7 +220,7 @@ def test_fields_that_the_task_does_not_read_are_kept_if_listed(engine: str) -> N
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_a_rollout_leaves_the_state_fields_at_its_end(engine: str) -> None:
-    """Also if the C engine rolls out a whole horizon in one native call."""
+    """The C engine rolls out the horizon in one native call."""
     env = lw.make("hopper", engine=engine, nworld=2, autoreset=False, frame_skip=2)
     state = wp.from_torch(env.get_state())
     controls = wp.full((3, 2, env.model.nu), 0.5, dtype=float, device="cpu")
@@ -250,7 +252,7 @@ def test_the_contact_pool_has_room_for_one_world_in_which_everything_touches() -
 
 
 def test_partial_passes_give_the_same_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forward passes of restarting worlds, in groups of one, give the numbers of forward passes of all worlds."""
+    """Forward passes of only the restarting worlds give the same numbers as passes of all worlds."""
     runs = []
     for partial in (True, False):
         monkeypatch.setattr(WarpEngine, "partial_refresh", partial)
@@ -272,7 +274,7 @@ def test_partial_passes_give_the_same_run(monkeypatch: pytest.MonkeyPatch) -> No
 def test_an_overflow_in_the_first_state_of_an_episode_is_reported(
     partial: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first step reports it; here a world starts with more contacts than fit."""
+    """A world starts with too many contacts; the first step reports it."""
     monkeypatch.setattr(WarpEngine, "partial_refresh", partial)
     spec = lw.gymnasium_model("humanoid.xml").spec()
     spec.body("torso").pos[2] = 0.1

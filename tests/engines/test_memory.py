@@ -1,5 +1,3 @@
-"""Whether worlds fit into memory: one estimate for each engine, checked before anything is allocated."""
-
 import os
 import types
 from pathlib import Path
@@ -39,12 +37,12 @@ def test_check_fit_first_frees_what_torch_keeps_on_a_gpu(monkeypatch: pytest.Mon
 
 
 def test_the_warp_engine_s_estimate_covers_its_arrays() -> None:
-    """The arrays of MuJoCo Warp's data, of the group, and temporary ones."""
+    """The estimate includes MuJoCo Warp's data, the refresh group, and temporary arrays."""
     for task in ("hopper", "humanoid"):
         env = lw.make(task, engine="warp", nworld=64)
         engine: Any = env.engine
         found = sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays_in(engine.d)) / 64
-        pool = engine.spare * 500 / 64  # additional contacts, for all worlds together
+        pool = engine.spare * 500 / 64  # additional contacts, shared by all worlds
         estimate = type(engine).bytes_per_world(env.model, engine.fields.values())
         assert found - pool < estimate < 1.6 * found, task
         assert estimate < env.bytes_per_world < 1.3 * estimate
@@ -61,13 +59,12 @@ def arrays_in(data: Any) -> list[wp.array]:
 
 
 def resident() -> int:
-    """Bytes of this process in memory."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 @pytest.mark.parametrize("fields", [(), ("xpos",)])
 def test_the_c_engine_s_estimate_covers_a_world_that_has_no_mjdata_of_its_own(fields: tuple[str, ...]) -> None:
-    """An MjData takes 165 kB even of a small model."""
+    """An MjData takes 165 kB even for a small model."""
     env = lw.make("hopper", fields=fields, nthread=2)
     own = 4 * (2 * env.obs_space.size + 2 * env.action_space.size) + 8 * env.state_space.size
     assert own < env.bytes_per_world

@@ -1,4 +1,4 @@
-"""Devices by name, engine="auto", options of engines, and the placement of few worlds and of a planner's samples."""
+"""Devices by name, engine="auto", options of engines, and where few worlds and a planner's samples run."""
 
 import types
 from typing import Any
@@ -33,7 +33,7 @@ def model() -> mujoco.MjModel:
 
 @pytest.fixture
 def gpu(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """A CUDA device that is there by name only."""
+    """Return a stand-in for a CUDA device, which can be found but not used."""
     device = types.SimpleNamespace(is_cpu=False, is_cuda=True, alias="cuda:0", free_memory=10**9)
     found = placement.find_device
     monkeypatch.setattr(placement, "find_device", lambda name: device if str(name).startswith("cuda") else found(name))
@@ -99,7 +99,7 @@ def test_options_are_read_from_the_signature_of_an_engine(model: mujoco.MjModel)
 def test_worlds_that_do_not_fit_are_refused_before_the_engine_is_made(
     engine: Any, model: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Memory that the caller allocates counts, too."""
+    """Memory that the caller allocates is counted, too."""
     cpu = wp.get_device("cpu")
     each = placement.bytes_per_world(engine, model, cpu, [])
     assert each > 8 * mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION.value)
@@ -119,7 +119,7 @@ def test_few_worlds_move_from_a_gpu_to_cpu_cores_with_auto_only() -> None:
 
 
 def test_a_plant_moves_from_a_gpu_to_a_cpu_core(gpu: Any) -> None:
-    """Also with engine="warp": beside a planner its steps would wait for the GPU."""
+    """On the GPU its steps would wait for the planner, so a plant with engine="warp" moves, too."""
     for engine, device in (("auto", "cuda:0"), ("warp", "cuda:0")):
         assert options_for_plant(engine, device) == ON_CPU
     for engine, device in (("auto", None), ("warp", "cpu"), ("mujoco", "cpu"), (ToyEngine, "cuda:0")):
@@ -127,7 +127,7 @@ def test_a_plant_moves_from_a_gpu_to_a_cpu_core(gpu: Any) -> None:
 
 
 def test_place_samples_chooses_by_the_number_of_samples(gpu: Any) -> None:
-    """With engine="auto" on a GPU; an engine that was chosen stays."""
+    """Only engine="auto" is moved; an explicit engine is used unchanged."""
 
     def chosen(
         samples: int,

@@ -87,7 +87,7 @@ def only(engine: Engine, *worlds: int) -> wp.array:
 
 
 def begin(engine: Engine, mask: wp.array, seed: int) -> None:
-    """Episodes in the masked worlds, in states drawn at random, some beyond a limit or in contact."""
+    """Begin episodes in the masked worlds, in random states, some beyond a limit or in contact."""
     rng, chosen = np.random.default_rng(seed), mask.numpy().astype(bool)
     engine.reset(mask)
     write(engine, "qpos", chosen, engine.arrays["qpos"].numpy() + 0.1 * rng.normal(size=engine.arrays["qpos"].shape))
@@ -112,12 +112,12 @@ def put(engine: Engine, state: np.ndarray, mask: wp.array) -> None:
 
 
 def shown(engine: Engine) -> dict[str, np.ndarray]:
-    """Copies of all derived fields."""
+    """Return copies of all derived fields."""
     return {name: engine.arrays[name].numpy().copy() for name in engine.fields if name in FIELDS.split()}
 
 
 def full_forward(engine: Engine) -> dict[str, np.ndarray]:
-    """The same fields from MuJoCo's own forward pass in separate data."""
+    """Compute the same fields with MuJoCo's own forward pass in separate data."""
     state = state_of(engine)[:, : engine.integration_size]
     spec, names = mujoco.mjtState.mjSTATE_INTEGRATION.value, [n for n in FIELDS.split() if n in engine.fields]
     if isinstance(engine, WarpEngine):
@@ -136,7 +136,7 @@ def full_forward(engine: Engine) -> dict[str, np.ndarray]:
 
 
 def check_current(engine: Engine, *, whole: bool = False, worlds: slice = slice(None)) -> None:
-    """Compare every field, and every sensor of the position and velocity stages, with a full forward pass."""
+    """Compare all fields, and all sensors of the position and velocity stages, with a full forward pass."""
     found, wanted = shown(engine), full_forward(engine)
     columns = early_sensor_columns(engine.model)
     for name, value in found.items():
@@ -147,7 +147,7 @@ def check_current(engine: Engine, *, whole: bool = False, worlds: slice = slice(
 
 
 class WholeWarpEngine(WarpEngine):
-    """A Warp engine without forward passes of only a few worlds."""
+    """A Warp engine that cannot run a forward pass of only a few worlds."""
 
     partial_refresh = False
 
@@ -169,7 +169,7 @@ def make(kind: type[Engine], sensors: str, equality: str = "") -> Engine:
 
 @pytest.mark.parametrize("sensors", SENSORS)
 def test_a_refresh_equals_a_full_forward_pass(kind: type[Engine], sensors: str) -> None:
-    """After a restart, after steps, after a restored state, after a change; histories included."""
+    """Check restarts, steps, restored states and changed states, including sensor histories."""
     engine = make(kind, sensors)
     for steps in (1, 3):
         check_current(engine, whole=True)
@@ -213,7 +213,7 @@ def test_sensors_of_the_acceleration_stage_stay_as_the_last_substep_left_them(ki
     assert np.abs(left[:, late]).max() > 0
     engine.refresh_current(everyone(engine))
     np.testing.assert_array_equal(shown(engine)["sensordata"], left)
-    # an event: two worlds are pushed
+    # two worlds are pushed, as an event does
     before, chosen = state_of(engine), only(engine, 0, 2)
     write(engine, "qvel", chosen.numpy(), engine.arrays["qvel"].numpy() + 1.0)
     engine.commit(chosen)
@@ -223,7 +223,7 @@ def test_sensors_of_the_acceleration_stage_stay_as_the_last_substep_left_them(ki
     np.testing.assert_array_equal(pushed[:, late], left[:, late])
     np.testing.assert_array_equal(pushed[[1, 3]], left[[1, 3]])
     assert (pushed[[0, 2]] != left[[0, 2]]).any()
-    # a restored world shows the sensors of its state, before and after another refresh
+    # a restored world has its state's sensor values, before and after another refresh
     engine.step(1)
     put(engine, before, only(engine, 1))
     engine.refresh_current(everyone(engine))
@@ -240,7 +240,7 @@ def test_no_refresh_adds_to_a_sensors_history(kind: type[Engine]) -> None:
         engine.refresh_current(everyone(engine))
         np.testing.assert_array_equal(state_of(engine), before)
         engine.refresh(only(engine, 1))
-        size = engine.integration_size  # a restart's sensors of the acceleration stage belong to its first state
+        size = engine.integration_size  # acceleration-stage sensors of a restart belong to its first state
         np.testing.assert_array_equal(state_of(engine)[:, :size], before[:, :size])
     before = state_of(engine)
     begin(engine, only(engine, 2), 5)
@@ -265,7 +265,6 @@ def test_a_refresh_uses_the_equality_constraints_of_each_world(kind: type[Engine
 
 
 def test_the_sensor_of_a_limit_that_ended_is_zero(kind: type[Engine]) -> None:
-    """Also if the state was set, not stepped to."""
     engine = make(kind, "limits")
     knee = int(engine.model.joint("knee").qposadr[0])
     column = state_columns(engine.model, "qpos").start + knee
@@ -282,7 +281,8 @@ def test_the_sensor_of_a_limit_that_ended_is_zero(kind: type[Engine]) -> None:
 
 
 def test_fields_of_two_states_do_not_mix_in_an_mjdata_that_worlds_use_in_turn() -> None:
-    """Fields that the stage after a step does not compute are another world's in the MjData that computes it."""
+    """The post-step stage runs in a shared MjData; fields that it does not compute hold another world's values
+    there."""
     model, device = model_of(SENSORS["mixed"]), wp.get_device("cpu")
     for lagged, current in ((), ("xpos",)), (("cvel",), ("xpos",)), (("cvel", "xpos"), ("sensordata",)):
         fields = [describe(model, name, lagged=name in lagged) for name in (*lagged, *current, "qacc", "qvel")]
@@ -302,7 +302,7 @@ def test_fields_of_two_states_do_not_mix_in_an_mjdata_that_worlds_use_in_turn() 
             rows = np.concatenate([engine.arrays[field.name].numpy() for engine in apart])
             np.testing.assert_array_equal(together.arrays[field.name].numpy(), rows, err_msg=f"{field.name} {lagged}")
             assert len(np.unique(rows.reshape(4, -1), axis=0)) == 4, field.name
-    early = early_sensor_columns(model)  # of the current state, beside sensors of the last substep
+    early = early_sensor_columns(model)  # sensors of the current state; the others are the last substep's
     for state, shown in zip(together.batch.state, together.arrays["sensordata"].numpy(), strict=True):
         data = mujoco.MjData(model)
         mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)

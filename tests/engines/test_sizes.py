@@ -1,4 +1,4 @@
-"""Room for contacts and constraints covers those that a task may turn on, or a warning is logged."""
+"""Buffers for contacts and constraints cover what a task may enable, or a warning is logged."""
 
 import mujoco
 import pytest

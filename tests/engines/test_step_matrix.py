@@ -1,4 +1,4 @@
-"""The Warp engine's step equals MuJoCo Warp's own to the bit, with any element of a model and any field of World."""
+"""The Warp engine's step equals MuJoCo Warp's to the bit, with any element of a model and any field of World."""
 
 import copy
 import itertools
@@ -26,7 +26,7 @@ SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 @pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
 def device(request: pytest.FixtureRequest) -> wp.Device:
-    """A device on which steps repeat to the bit; on a GPU in the deterministic mode."""
+    """Return a device on which steps are reproducible to the bit; on a GPU the mode is deterministic."""
     return wp.get_device(request.param)
 
 
@@ -37,7 +37,7 @@ def make(model: mujoco.MjModel, names: list[str], device: wp.Device, dynamics: S
 
 
 def begin(engine: WarpEngine, mask: wp.array, seed: int) -> None:
-    """Episodes in the masked worlds, in states drawn at random."""
+    """Begin episodes in the masked worlds, in random states."""
     rng, chosen, model = np.random.default_rng(seed), mask.numpy(), engine.model
     engine.reset(mask)
     qpos, qvel = engine.arrays["qpos"].numpy(), engine.arrays["qvel"].numpy()
@@ -58,10 +58,10 @@ def state_of(engine: WarpEngine, m: mjw.Model, d: mjw.Data) -> np.ndarray:
 
 
 def plain(function: Callable[[mjw.Model, mjw.Data], None], m: mjw.Model, d: mjw.Data) -> None:
-    """A step or a forward pass of MuJoCo Warp's own, with the velocities that its constraints read.
+    """Run MuJoCo Warp's own step or forward pass, but let constraints read the current velocities.
 
-    ``make_constraint`` reads the velocities of bodies that the last forward pass computed. Here they are the current
-    ones, in every stage of a step: the engine's steps are functions of the state alone by design.
+    MuJoCo Warp's ``make_constraint`` reads the bodies' velocities of the last forward pass. The engine recomputes them,
+    so that a step depends only on the state.
     """
 
     def make_constraint(m: mjw.Model, d: mjw.Data) -> None:
@@ -75,7 +75,7 @@ def plain(function: Callable[[mjw.Model, mjw.Data], None], m: mjw.Model, d: mjw.
 
 
 def check(case: Case, device: wp.Device) -> None:
-    """Steps and fields of an engine against MuJoCo Warp's own."""
+    """Compare steps and fields of an engine with MuJoCo Warp's own."""
     model, names = table.model_of(case), table.fields_of(case)
     engine = make(model, names, device)
     begin(engine, wp.full(N, True, dtype=bool, device=device), 1)
@@ -97,7 +97,7 @@ def check(case: Case, device: wp.Device) -> None:
     last = {name: getattr(d, name).numpy().copy() for name in names}
     set_state(m, d, found)
     plain(mjw.forward, m, d)
-    if "energy" in names:  # MuJoCo Warp's own forward pass loses the kinetic energy that a sensor shows
+    if "energy" in names:  # MuJoCo Warp's own forward pass loses the kinetic energy of an energy sensor
         mjw.energy_pos(m, d)
         mjw.energy_vel(m, d)
     late = np.setdiff1d(np.arange(model.nsensordata), early_sensor_columns(model))
@@ -124,7 +124,7 @@ def check_or_refuse(case: Case, device: wp.Device) -> None:
 
 @pytest.mark.parametrize("case", table.covering(2), ids=table.title)
 def test_a_step_equals_mujoco_warps_own_to_the_bit(case: Case, device: wp.Device) -> None:
-    """With any two levels of the table's factors together."""
+    """The cases cover all combinations of two levels of different factors."""
     check_or_refuse(case, device)
 
 
@@ -146,7 +146,7 @@ LADEN = table.PLAIN | {
 
 @pytest.mark.parametrize("asked", table.STAGES)
 def test_a_step_goes_on_from_the_fields_of_any_stage(asked: str, device: wp.Device) -> None:
-    """The step computes the parts that the field needs, and does not repeat parts that are already computed."""
+    """The step computes the parts that a field needs, and does not repeat parts that are already computed."""
     check(LADEN | {"asked": asked}, device)
 
 
@@ -159,11 +159,11 @@ OF_ANOTHER_MODEL = {
     "tendon_solref_fri": {"tendons": "friction"}, "tendon_solimp_fri": {"tendons": "friction"},
     "pair_solreffriction": {"cone": "elliptic"},
 }  # fmt: skip
-"""Levels that a model needs beside ``DRAWN``, so that a field has an effect."""
+"""Levels that a model needs in addition to ``DRAWN``, so that a field has an effect."""
 
 
 def touching(model: mujoco.MjModel) -> np.ndarray:
-    """A state at limits, with contacts and saturated actuators, in all worlds, (N, integration size)."""
+    """Return a state at limits, with contacts and saturated actuators, in all worlds, (N, integration size)."""
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     data.qpos[model.joint("elbow").qposadr[0]] = 0.1
     data.qvel[:] = 0.05 * rng.normal(size=model.nv)
@@ -175,13 +175,13 @@ def touching(model: mujoco.MjModel) -> np.ndarray:
 
 
 def drawn_fields() -> list[Any]:
-    """All fields; of those from which nothing follows, MuJoCo Warp takes every world's row, and they take long."""
+    """Return all fields; those without derived constants are long tests, because MuJoCo Warp reads their rows."""
     return [name if constants else pytest.param(name, marks=pytest.mark.long) for name, constants in _FIELDS.items()]
 
 
 @pytest.mark.parametrize("name", drawn_fields())
 def test_a_drawn_field_acts_as_in_an_edited_model(name: str, device: wp.Device) -> None:
-    """Also if it is zero in the model. Equal to the bit, unless constants follow from the field."""
+    """Some fields are zero in the model. Results are equal to the bit if no constants are derived."""
     case = DRAWN | OF_ANOTHER_MODEL.get(name, {})
     spec = mujoco.MjSpec.from_string(table.xml(case))
     for body in spec.bodies[1:]:
@@ -189,7 +189,7 @@ def test_a_drawn_field_acts_as_in_an_edited_model(name: str, device: wp.Device) 
     model = spec.compile()
     edited, field = copy.copy(model), describe_model_field(model, name)
     value = field.value(edited)
-    most = 3.0 if name == "dof_solref" else 1.1  # most joints slip, at a force that is the same for any solref
+    most = 3.0 if name == "dof_solref" else 1.1  # most joints slip, with a force that does not depend on solref
     drawn = value * np.random.default_rng(0).uniform(1.0, most, size=value.shape) + 0.03 * (value == 0)
     if name.endswith("quat"):
         drawn = value + 0.05
@@ -232,7 +232,7 @@ def test_refused_combinations_are_refused(levels: dict[str, tuple[str, ...]], re
 
 
 def test_the_table_knows_every_member_of_mujocos_enums() -> None:
-    """An element of a new MuJoCo fails here until the table has it, or says why it does not."""
+    """An element of a new MuJoCo version fails here until the table has it or gives a reason."""
     models = [table.model_of(case) for case in table.singles()]
     for enum, members in table.ENUMS.items():
         found = {int(member) for model in models for member in members(model)}

@@ -1,7 +1,7 @@
-"""Give random command lines to ``lyceum-warp``.
+"""Run ``lyceum-warp`` with random command lines.
 
-A case is "COMMAND SEED", or the name of a minimal case in ``minimal_cases.py``. The flags come from the help texts, so
-that a new one is attacked, too.
+A case is "COMMAND SEED", or the name of a minimal case in ``minimal_cases.py``. The flags are read from the help texts,
+so new ones are included.
 """
 
 import contextlib
@@ -45,20 +45,20 @@ SMALL: dict[str, dict[str, tuple[str, ...]]] = {
     "view": {},
     "bench": {},
 }  # fmt: skip
-"""Commands with flags that make them short."""
+"""Commands, with flags that make them quick."""
 
 FIRST = {"tasks": "", "new": "my_task", "eval": "good", "export": "good"} | dict.fromkeys(
     ("train --resume good", "train --from good"), ""
 )
-"""First arguments of commands; a task by default."""
+"""First arguments of commands; the default is a task."""
 
 _OMIT = ("--help", "--video", "--video-every", "--view", "--frame-skip")
-"""Flags that print or start other processes, and one with which a single native call can take hours."""
+"""Flags that print or start other processes, and a flag with which a single native call can take hours."""
 
 
 @functools.cache
 def flags(command: str) -> tuple[str, ...]:
-    """The flags of a command, as its help text lists them."""
+    """Return the flags that a command's help text lists."""
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         cli.main([command.split()[0], "--help"])
@@ -88,7 +88,6 @@ def _line(command: str, first: str, flags: dict[str, tuple[str, ...]]) -> list[s
 
 
 def words(command: str, random: Random) -> list[str]:
-    """A random command line."""
     given = dict(SMALL[command])
     first = FIRST.get(command, "point_mass")
     others = []
@@ -115,7 +114,6 @@ def words(command: str, random: Random) -> list[str]:
 
 
 def attack(case: str) -> str:
-    """Run a case."""
     from minimal_cases import COMMANDS
 
     if case in COMMANDS:
@@ -124,7 +122,7 @@ def attack(case: str) -> str:
 
 
 def run(line: list[str]) -> str:
-    """Run a command line in a folder with a run, and check how it ends."""
+    """Run a command line in a folder with a run, and check its outcome."""
     os.chdir(HERE.parent)
     shutil.rmtree(HERE, ignore_errors=True)
     HERE.mkdir()
@@ -172,7 +170,7 @@ def warm_up() -> None:
         assert cli.main(_line("train", "point_mass", SMALL["train"])) == 0
         (HERE / "out").rename(RUN)
     for command in SMALL:
-        if command != "bench":  # another process
+        if command != "bench":  # it starts another process
             run(_line(command, FIRST.get(command, "point_mass"), SMALL[command]))
 
 

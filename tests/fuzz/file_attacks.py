@@ -1,4 +1,4 @@
-"""Read files that were damaged at random: files of runs, saved episodes, models and tables.
+"""Read randomly damaged files: files of runs, saved episodes, models and tables.
 
 A case is "KIND SEED", or the name of a minimal case in ``minimal_cases.py``.
 """
@@ -29,7 +29,7 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.viz.video import NoVideoError
 
 REFUSALS = (ValueError, OSError, ImportError, NoVideoError, FloatingPointError)
-"""The errors that the package documents for bad files and arguments."""
+"""Documented errors for bad files and arguments."""
 BASE, CASE, CANARY = Path("base").absolute(), Path("case").absolute(), Path("canary").absolute()
 
 TASK = """
@@ -78,13 +78,11 @@ SIZES = "--samples 16 --nworld 2 --hidden 4 --value-hidden 4 --mean-every 2 --me
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A kind of file."""
-
     file: str
     mutate: Callable[[bytes, Random], bytes]
     readers: tuple[str, ...]
     names: tuple[str, ...] = ()
-    """Words that an error may contain instead of the file's name."""
+    """Words that an error may contain in place of the file's name."""
 
 
 _checkpoint = functools.partial(mutations.mutated_checkpoint, canary=CANARY)
@@ -151,17 +149,17 @@ READERS: dict[str, Callable[[], object]] = {
     "table": lambda: lw.make(SLIDE_PY, motion=CASE / "table.npy").step(),
 }  # fmt: skip
 WITHOUT = {"load alone": "run/policy.pt", "resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}
-"""Files that are removed so that a reader falls back to another file."""
+"""Files that are deleted so that a reader falls back to another file."""
 SLIDE_PY = str(BASE / "slide.py")
 _NEW = ("--trust", "--out", "case/new", "--iterations", "1", "--no-video", "--no-plot")
 
 
 class RefusedError(Exception):
-    """A command ended with 2 and one line on stderr."""
+    """A command exited with 2 and printed one line to stderr."""
 
 
 def command(*words: object) -> None:
-    """Run a command in this process, and raise RefusedError if it ended with 2, ProblemError if with another error."""
+    """Run a command in this process; raise RefusedError if it exited with 2, and ProblemError for any other error."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = cli.main([str(word) for word in words])
@@ -173,7 +171,6 @@ def command(*words: object) -> None:
 
 
 def attack(case: str) -> str:
-    """Run a case."""
     from minimal_cases import FILES
 
     if case in FILES:
@@ -227,13 +224,12 @@ def _check_refusal(where: str, kind: Kind, error: BaseException, before: Mapping
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    """The files of a folder, by their paths."""
     files = [path for path in folder.rglob("*") if path.is_file() and path.suffix != ".pyc"]
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def warm_up() -> None:
-    """Make the base folder, unless an earlier process made it, and run every reader once."""
+    """Make the base folder, unless an earlier process made it, and call every reader once."""
     lyceum_warp.cli.view.view = lambda *args, **options: None  # no window
     torch.set_num_threads(1)
     if not BASE.exists():
@@ -255,11 +251,11 @@ def _make(folder: Path) -> None:
     command("train", "point_mass", "--horizon", "8", "--out", folder / "run", *options)
     motion = f"motion={folder / 'table.npy'}"
     command("train", folder / "slide.py", "--out", folder / "kept", "--param", motion, *options)
-    for run in ("run", "kept"):  # so that the files have the same length every time
+    for run in ("run", "kept"):  # gives the files a constant length
         path = folder / run / "metrics.csv"
         path.write_text(re.sub(r"\d+\.\d{9,}", lambda found: found[0][:8], path.read_text()))
     config = json.loads((folder / "kept/config.json").read_text())
-    # so that the kept copies are read
+    # makes readers use the run's copies
     config |= {"task": "/nowhere/slide.py", "params": {"motion": "/nowhere/table.npy"}}
     (folder / "kept/config.json").write_text(json.dumps(config, indent=2))
     plant = lw.make("point_mass", autoreset=False, horizon=4)

@@ -1,7 +1,7 @@
-"""Run attacks in a subprocess, each within limits of time and memory, and collect the problems.
+"""Run attacks in a subprocess, each with a limited time and memory, and collect the problems.
 
-A program of attacks calls ``serve``; a test calls ``attacks``. By hand, ``python tests/fuzz/PROGRAM.py CASE ...``
-repeats cases and prints their tracebacks; it makes its files in the current folder.
+An attack program calls ``serve``; a test calls ``attacks``. ``python tests/fuzz/PROGRAM.py CASE ...`` repeats cases by
+hand, prints their tracebacks, and writes its files into the current directory.
 """
 
 import contextlib
@@ -20,17 +20,17 @@ from pathlib import Path
 from typing import Any
 
 MEMORY = 512 * 2**20
-"""Bytes of address space that a case may add to the size after the warm-up."""
+"""Additional bytes of address space that a case may use after the warm-up."""
 PATIENCE = 3.0
-"""Seconds between interrupts as by Ctrl-C, which must end a command."""
+"""Seconds between interrupts like Ctrl-C, which must end a command."""
 LIMIT = 60.0
-"""Seconds after which the process of a case ends with a traceback, because interrupts did not end the case."""
+"""Seconds after which a case that ignores interrupts is killed with a traceback."""
 ROOT = Path(__file__).parents[2]
 
 
 @dataclasses.dataclass
 class Outcome:
-    """The outcome of a case: "refused", "worked", "interrupted", or a problem in one line."""
+    """The outcome of a case: "refused", "worked", "interrupted", or a one-line description of a problem."""
 
     case: str
     did: str
@@ -39,11 +39,11 @@ class Outcome:
 
 
 Attack = Callable[[str], str]
-"""Runs a case, and returns its outcome. Raises ProblemError if it breaks a rule."""
+"""Run a case and return its outcome; raise ProblemError if it breaks a rule."""
 
 
 class ProblemError(Exception):
-    """A rule that a case broke, in one line."""
+    """A case broke a rule; the message is one line."""
 
     def __init__(self, text: str, error: BaseException | None = None) -> None:
         super().__init__(text if error is None else f"{text}: {place(error)}")
@@ -51,7 +51,7 @@ class ProblemError(Exception):
 
 
 def place(error: BaseException) -> str:
-    """An error's type, the innermost function of the package in its traceback, and its message."""
+    """Return an error's type, the innermost package function in its traceback, and its message."""
     frames = traceback.extract_tb(error.__traceback__)
     frames = [f for f in frames if "lyceum_warp/" in f.filename and "/tests/" not in f.filename]
     where = f"{Path(frames[-1].filename).name}:{frames[-1].name}" if frames else "outside"
@@ -62,7 +62,7 @@ _OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "co
 
 
 def out_of_memory(error: BaseException) -> bool:
-    """Whether an error or one of its causes is a failed allocation, not an error of the package."""
+    """Return whether an error or one of its causes is a failed allocation rather than an error of the package."""
     one: BaseException | None = error
     while one is not None:
         own = type(one).__module__.startswith("lyceum_warp")
@@ -73,7 +73,7 @@ def out_of_memory(error: BaseException) -> bool:
 
 
 def serve(attack: Attack, warm_up: Callable[[], None]) -> None:
-    """Run the cases in the command line; ``warm_up`` loads their modules before the memory is limited."""
+    """Run the cases of the command line; ``warm_up`` loads their modules before memory is limited."""
     results = sys.argv[2] if sys.argv[1:2] == ["--results"] else None
     cases = sys.argv[3:] if results else sys.argv[1:]
     os.environ["XDG_STATE_HOME"] = str(Path("state").absolute())
@@ -96,7 +96,7 @@ def serve(attack: Attack, warm_up: Callable[[], None]) -> None:
 
 
 def _guarded(attack: Attack, case: str) -> Outcome:
-    """Run a case, and interrupt it as by Ctrl-C if it takes long."""
+    """Run a case, and interrupt it like Ctrl-C if it takes too long."""
     before = signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))
     try:
         signal.setitimer(signal.ITIMER_REAL, PATIENCE, PATIENCE)
@@ -106,7 +106,7 @@ def _guarded(attack: Attack, case: str) -> Outcome:
         return Outcome(case, "broke a rule", str(problem), text[-4000:])
     except KeyboardInterrupt:
         return Outcome(case, "interrupted")
-    except BaseException as error:  # a defect of the attack itself
+    except BaseException as error:  # a defect of the attack program
         return Outcome(case, "failed", f"the attack failed: {place(error)}", traceback.format_exc()[-4000:])
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
@@ -114,7 +114,7 @@ def _guarded(attack: Attack, case: str) -> Outcome:
 
 
 def attacks(program: str, cases: Sequence[str], folder: Path) -> dict[str, Outcome]:
-    """Run cases in a subprocess, and in a new one after each that died."""
+    """Run cases in a subprocess, and start a new one after each crash."""
     outcomes: dict[str, Outcome] = {}
     results = folder / "results.txt"
     environment = os.environ | {"MALLOC_ARENA_MAX": "1", "PYTHONPATH": str(ROOT), "COLUMNS": "120"}
@@ -138,5 +138,4 @@ def attacks(program: str, cases: Sequence[str], folder: Path) -> dict[str, Outco
 
 
 def replay(program: str, case: str) -> str:
-    """The command that repeats a case."""
     return f"in an empty folder: PYTHONPATH={ROOT} {sys.executable} {Path(__file__).parent / program} {case!r}"

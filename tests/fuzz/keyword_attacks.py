@@ -1,7 +1,7 @@
-"""Call the public functions with random values for each of their arguments.
+"""Call public functions with random values for each of their arguments.
 
-A case is "CALL SEED", or the name of a minimal case in ``minimal_cases.py``. The arguments come from the signatures,
-so that a new one is attacked, too.
+A case is "CALL SEED", or the name of a minimal case in ``minimal_cases.py``. The arguments are read from the
+signatures, so new ones are included.
 """
 
 import dataclasses
@@ -35,12 +35,12 @@ OBJECTS: tuple[Any, ...] = (
     Path("x"), (1, 2), ("qpos",), ("nothing",), {"iterations": 1e9}, {"x": torch.zeros(2)}, frozenset(), "auto",
     "hopper", Exception("x"), iter(()), slice(2),
 )  # fmt: skip
-"""Values that a program may give by mistake."""
+"""Values that a program may pass by mistake."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Call:
-    """A function, valid arguments, and the names of arguments that its signature lacks."""
+    """A function, valid arguments, and the names of keyword arguments that its signature does not list."""
 
     function: Callable[..., Any]
     valid: Callable[[], dict[str, Any]]
@@ -48,7 +48,7 @@ class Call:
 
     @property
     def names(self) -> list[str]:
-        """The names of the arguments to attack; videos are made by another process."""
+        """Return the names of the arguments to attack, without videos, which a subprocess makes."""
         variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
         found = [name for name, p in inspect.signature(self.function).parameters.items() if p.kind not in variable]
         return [name for name in dict.fromkeys((*found, *self.more)) if name != "video_every"]
@@ -56,7 +56,7 @@ class Call:
 
 @functools.cache
 def _env(**options: Any) -> lw.Env:
-    """An environment that cases share; each leaves it in any state."""
+    """Make an environment that cases share and may leave in any state."""
     return lw.make("point_mass", horizon=4, **options)
 
 
@@ -101,7 +101,6 @@ CALLS = {
 
 
 def attack(case: str) -> str:
-    """Run a case."""
     from minimal_cases import KEYWORDS
 
     if case in KEYWORDS:

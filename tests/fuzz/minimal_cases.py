@@ -1,4 +1,4 @@
-"""List minimal cases of failures that were fixed: files, arguments and command lines."""
+"""List minimal cases of fixed failures: files, arguments and command lines."""
 
 import io
 import json
@@ -14,7 +14,7 @@ def _json(**changes: Any) -> Callable[[bytes], bytes]:
 
 
 def _saved(change: Callable[[dict[str, Any]], Any]) -> Callable[[bytes], bytes]:
-    """Change the content of a file of torch."""
+    """Change the content of a torch file."""
 
     def changed(data: bytes) -> bytes:
         content = torch.load(io.BytesIO(data), weights_only=True)
@@ -38,7 +38,7 @@ def _shape(**sizes: Any) -> Callable[[bytes], bytes]:
 
 
 def _info(**changes: Any) -> Callable[[bytes], bytes]:
-    """Change the description of a saved episode."""
+    """Change the metadata of a saved episode."""
 
     def changed(data: bytes) -> bytes:
         with np.load(io.BytesIO(data)) as file:
@@ -52,7 +52,7 @@ def _info(**changes: Any) -> Callable[[bytes], bytes]:
 
 
 def _header(data: bytes) -> bytes:
-    """Put a shape of 40 GB into a table's header."""
+    """Declare a shape of 40 GB in a table's header."""
     return data.replace(b"(40, 2), }        ", b"(9999999999,), }  ")
 
 
@@ -88,7 +88,7 @@ FILES: dict[str, tuple[str, str, Change]] = {
     "a table whose header asks for 40 GB": ("table.npy", "table", _header),
     "a table whose header does not end": ("table.npy", "table", lambda data: data.replace(b"}", b"(", 1)),
 }  # fmt: skip
-"""A kind of file, a reader and a change. The file must be refused, or read if the change does not matter."""
+"""Cases as (kind of file, reader, change). The file must be refused, or read if the change does not matter."""
 
 KEYWORDS: dict[str, tuple[str, dict[str, Any]]] = {
     "fields that are a tensor": ("make", {"fields": torch.tensor(3)}),
@@ -107,7 +107,7 @@ KEYWORDS: dict[str, tuple[str, dict[str, Any]]] = {
     "a run that is a list": ("load", {"run": []}),
     "resume that is a number": ("train", {"resume": 7}),
 }
-"""A call and arguments that it must refuse by their names or values."""
+"""Cases as (call, arguments); the error must name an argument or its value."""
 
 COMMANDS = {
     "a negative number of steps": "check point_mass --steps -5",

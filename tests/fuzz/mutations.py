@@ -1,4 +1,4 @@
-"""Mutate files and values at random: a seed alone determines a mutation."""
+"""Mutate files and values at random; the seed determines the mutation."""
 
 import csv
 import io
@@ -24,11 +24,11 @@ TEXTS = (
     "%s{}", "\u202e\u0301", "ä" * 20, "x" * 5000,
 )  # fmt: skip
 VALUES = (*NUMBERS, *TEXTS, None, True, False, [], {}, [0], [[1.5]], [None], {"x": 1}, {"": []})
-"""Values of JSON's types, most of them wrong in any place."""
+"""Values of JSON's types, most of them invalid anywhere."""
 
 
 class Canary:
-    """An object whose pickle writes a file when it is loaded without care."""
+    """An object whose pickle writes a file if it is loaded unsafely."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -38,7 +38,7 @@ class Canary:
 
 
 def mutated_bytes(data: bytes, random: Random) -> bytes:
-    """Bytes with one to four places deleted, repeated, flipped, overwritten, inserted or cut off."""
+    """Delete, repeat, flip, overwrite, insert or cut off bytes at one to four places."""
     for _ in range(random.choice((1, 1, 1, 2, 4))):
         start = random.randrange(len(data) + 1)
         stop = start + random.randint(1, 64)
@@ -52,7 +52,7 @@ def mutated_bytes(data: bytes, random: Random) -> bytes:
 
 
 def mutated_value(tree: Any, random: Random, values: tuple[Any, ...] = VALUES) -> Any:
-    """A nested value with one entry changed, dropped or added."""
+    """Change, drop or add one entry of a nested value."""
     if isinstance(tree, dict | list) and tree and random.random() < 0.8:
         entries: dict[Any, Any] = dict(tree) if isinstance(tree, dict) else dict(enumerate(tree))
         name, kind = random.choice(list(entries)), random.randrange(8)
@@ -64,14 +64,14 @@ def mutated_value(tree: Any, random: Random, values: tuple[Any, ...] = VALUES) -
             entries[name] = mutated_value(entries[name], random, values)
         return entries if isinstance(tree, dict) else list(entries.values())
     if isinstance(tree, torch.Tensor) and random.random() < 0.8:
-        huge = torch.zeros(1).expand(10**9)  # a shape of 4 GB in four bytes
+        huge = torch.zeros(1).expand(10**9)  # a shape of 4 GB backed by four bytes
         other = tree.to(random.choice((torch.float64, torch.bool, torch.complex64, torch.int64)))
         return random.choice((huge, other, tree.flatten()[:-1], tree[None], tree.to_sparse(), tree * math.nan))
     return [tree] if random.random() < 0.1 else random.choice(values)
 
 
 def mutated_json(data: bytes, random: Random) -> bytes:
-    """A JSON document with bytes or an entry changed, or nested too deep."""
+    """Change bytes or an entry of a JSON document, or nest it too deeply."""
     if random.random() < 0.3:
         return mutated_bytes(data, random)
     if random.random() < 0.05:
@@ -80,7 +80,7 @@ def mutated_json(data: bytes, random: Random) -> bytes:
 
 
 def mutated_csv(data: bytes, random: Random) -> bytes:
-    """A table with bytes, a cell or a row changed, dropped or added."""
+    """Change bytes of a table, or change, drop or add a cell or a row."""
     if random.random() < 0.4:
         return mutated_bytes(data, random)
     long_cell = "1" * 200_000
@@ -101,7 +101,7 @@ _PLAIN = [str(value) for value in (*NUMBERS, *TEXTS) if "\0" not in str(value)]
 
 
 def mutated_xml(data: bytes, random: Random) -> bytes:
-    """A model with bytes, elements or attributes changed, dropped or added."""
+    """Change bytes of a model, or change, drop or add elements or attributes."""
     if random.random() < 0.3:
         return mutated_bytes(data, random)
     root = ET.fromstring(data)
@@ -126,7 +126,7 @@ def mutated_xml(data: bytes, random: Random) -> bytes:
 
 
 def _mutated_archive(data: bytes, random: Random, main: str, hostile: bytes) -> bytes:
-    """An archive with an entry dropped, repeated, renamed, changed, or replaced by a hostile one."""
+    """Drop, repeat, rename, change or replace an entry of an archive."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         entries = [(name, archive.read(name)) for name in archive.namelist()]
     mains = [entry for entry in entries if entry[0].endswith(main)]
@@ -138,14 +138,14 @@ def _mutated_archive(data: bytes, random: Random, main: str, hostile: bytes) -> 
     ))  # fmt: skip
     file = io.BytesIO()
     with warnings.catch_warnings(), zipfile.ZipFile(file, "w") as archive:
-        warnings.simplefilter("ignore")  # a name twice
+        warnings.simplefilter("ignore")  # the same name twice
         for entry in (*entries[:place], *new, *entries[place + 1 :]):
             archive.writestr(*entry)
     return file.getvalue()
 
 
 def mutated_checkpoint(data: bytes, random: Random, canary: Path) -> bytes:
-    """A file of torch with bytes, entries of the archive, the pickle or the saved values changed."""
+    """Change bytes, archive entries, the pickle or the saved values of a torch file."""
     kind = random.randrange(4)
     if kind == 0:
         return mutated_bytes(data, random)
@@ -164,7 +164,7 @@ def _saved(array: np.ndarray) -> bytes:
 
 
 def mutated_episode(data: bytes, random: Random, canary: Path) -> bytes:
-    """An archive of numpy with bytes, entries, arrays or the description of the episode changed."""
+    """Change bytes, archive entries, arrays or the metadata of a saved episode."""
     kind = random.randrange(4)
     if kind == 0:
         return mutated_bytes(data, random)
@@ -185,7 +185,7 @@ def mutated_episode(data: bytes, random: Random, canary: Path) -> bytes:
 
 
 def mutated_table(data: bytes, random: Random, canary: Path) -> bytes:
-    """An array of numpy with bytes, its shape, its type or its numbers changed."""
+    """Change bytes, the shape, the type or the numbers of a NumPy array file."""
     kind = random.randrange(5)
     if kind == 0:
         return mutated_bytes(data, random)

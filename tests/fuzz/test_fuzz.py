@@ -1,4 +1,4 @@
-"""Damaged files, random command lines and random arguments either work or are refused by an error that says why.
+"""Damaged files, random command lines and random arguments work or are refused with an error that gives the reason.
 
 A failure names its case and the command that repeats it.
 """
@@ -28,7 +28,7 @@ FEW = {
         "export": 2, "plan": 4, "view": 4, "bench": 1,
     },
 }  # fmt: skip
-"""The number of cases of each kind, for every program of attacks."""
+"""Numbers of cases of each kind, by attack program."""
 _MANY = {"file_attacks.py": 150, "keyword_attacks.py": 200, "command_attacks.py": 50}
 MANY = {program: dict.fromkeys(FEW[program], count) for program, count in _MANY.items()}
 """The numbers for ``make test-all``."""
@@ -43,7 +43,7 @@ def cases(counts: Mapping[str, int], first: int) -> list[str]:
 
 @pytest.fixture(scope="module")
 def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """``outcomes(program, many)``: the outcomes of its many cases, or else of its few and its minimal cases.
+    """Return ``outcomes(program, many)``, which runs the many cases of a program, or the few and the minimal ones.
 
     The folder has the same path in every run of the tests, because Warp caches compiled kernels by a task's path.
     """

@@ -1,4 +1,4 @@
-"""Tests that need a GPU: steps never wait for the host, replayed graphs equal direct launches, determinism."""
+"""Tests that need a GPU: no step waits for the host, graphs equal direct launches, runs are reproducible."""
 
 import contextlib
 import gc
@@ -24,7 +24,7 @@ CUDA = "cuda:0"
 
 @contextlib.contextmanager
 def nothing_waits() -> Iterator[None]:
-    """Every call that waits for the device raises."""
+    """Make every call that waits for the device raise an exception."""
     patch = pytest.MonkeyPatch()
 
     def forbid(name: str) -> Callable[..., None]:
@@ -118,7 +118,7 @@ def run(env: lw.Env, steps: int) -> list[torch.Tensor]:
 
 
 def test_a_graph_of_torch_that_is_no_longer_used_leaves_a_capture_unharmed() -> None:
-    """Python deletes it whenever it collects garbage, and CUDA forbids that during a capture."""
+    """Python deletes it during any garbage collection, and CUDA forbids that during a capture."""
     env = lw.make("hopper", nworld=8, device=CUDA)
     env.step()
     graph, x = torch.cuda.CUDAGraph(), torch.zeros(4, device=CUDA)
@@ -165,7 +165,7 @@ def test_a_capture_leaves_running_graphs_unharmed() -> None:
 
 @pytest.mark.parametrize("task", ["hopper", "humanoid", "half_cheetah"])
 def test_deterministic_runs_are_equal_to_the_bit(task: str) -> None:
-    """Thousands of worlds are more blocks than the device runs at once."""
+    """Thousands of worlds need more blocks than the device runs at once."""
     env = lw.make(task, nworld=8192, device=CUDA, deterministic=True)
     first = run(env, 50)
     for a, b in zip(first, run(env, 50), strict=True):
@@ -180,7 +180,7 @@ def test_memory_of_the_deterministic_mode_is_as_measured_in_advance() -> None:
         return torch.cuda.mem_get_info(CUDA)[0]
 
     few = lw.make("hopper", nworld=256, device=CUDA, deterministic=True)
-    few.step()  # allocates the memory that any number of worlds needs
+    few.step()  # allocates memory that does not depend on the number of worlds
     engine = few.engine
     assert isinstance(engine, DeterministicEngine)
     sizes = ScratchSizes.probe(engine._captured_step)
@@ -196,7 +196,7 @@ def test_memory_of_the_deterministic_mode_is_as_measured_in_advance() -> None:
         env.rand_reset()
         estimated, taken = sizes.bytes_of(nworld) + nworld * plain, before - free()
         assert 0.8 * estimated < taken < 1.2 * estimated, (nworld, estimated, taken)
-        assert made - free() < 0.1 * taken  # graphs find their scratch
+        assert made - free() < 0.1 * taken  # graphs reuse the reserved scratch
         del env
     with pytest.raises(ValueError, match=r"nworld=\d+ at most"):
         lw.make("hopper", nworld=int(1.3 * most), device=CUDA, deterministic=True)
@@ -208,7 +208,7 @@ def test_memory_of_the_deterministic_mode_is_as_measured_in_advance() -> None:
 
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_restarting_worlds_get_the_fields_of_a_full_forward_pass(deterministic: bool) -> None:
-    """Also where the fields are computed within a loop of the step's graph."""
+    """The fields are computed inside a loop of the step's graph."""
     env, other = (lw.make("humanoid", nworld=512, device=CUDA, deterministic=deterministic) for _ in range(2))
     other.engine.partial_refresh = False  # type: ignore[attr-defined]
     seen = 0
@@ -228,7 +228,7 @@ def test_restarting_worlds_get_the_fields_of_a_full_forward_pass(deterministic: 
 
 
 def test_a_fault_among_few_humanoids_leaves_the_others_unchanged() -> None:
-    """The pool of contacts has room for an out of range world even where there are only a few worlds."""
+    """The contact pool has room for an out-of-range world even if there are only a few worlds."""
     from lyceum_warp.testing import CHECKS
 
     checks = [check for check in CHECKS if check.__name__ in ("check_bad_state", "check_bad_action")]

@@ -1,5 +1,3 @@
-"""Adapters on a GPU: tensors without waiting for the device, and the same numbers under NumPy."""
-
 from typing import Any
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Worlds of different models on a GPU: graphs of applied models and settled worlds, against the C engine."""
+"""Worlds with different models on a GPU, in graphs, compared with the C engine."""
 
 import mujoco
 import numpy as np
@@ -19,11 +19,11 @@ pytestmark = pytest.mark.gpu
 
 DRAWN = "body_mass body_inertia geom_friction geom_quat dof_damping dof_armature actuator_gear gravity".split()
 N = 200
-CHOSEN = [0, 3, *range(50, 150)]  # more than a group takes
+CHOSEN = [0, 3, *range(50, 150)]  # more than one refresh group holds
 
 
 def draws(model: mujoco.MjModel, turn: int) -> dict[str, np.ndarray]:
-    """Factors on model fields in each world; those of a few worlds differ from turn to turn."""
+    """Return factors for model fields in each world; in a few worlds they change from turn to turn."""
     found = {}
     for name in DRAWN:
         size = describe_model_field(model, name).size
@@ -38,7 +38,7 @@ def draws(model: mujoco.MjModel, turn: int) -> dict[str, np.ndarray]:
 def write(engine: Engine, name: str, factors: np.ndarray) -> None:
     array = engine.arrays[name]
     values = engine.nominal[name].numpy().reshape(1, -1) * factors
-    if name == "geom_quat":  # a slope
+    if name == "geom_quat":  # makes the floor a slope
         angles = 0.1 * np.arange(N) / N
         values.reshape(N, -1, 4)[:, 0] = np.stack([np.cos(angles), 0 * angles, np.sin(angles), 0 * angles], axis=1)
     wp.copy(array, wp.array(values.reshape(array.numpy().shape), dtype=array.dtype, device=engine.device))

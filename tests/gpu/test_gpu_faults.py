@@ -1,4 +1,4 @@
-"""Faults under load: many worlds on a GPU, some of them broken at random moments."""
+"""Faults under load: some of many worlds on a GPU get faults at random steps."""
 
 import pytest
 import torch

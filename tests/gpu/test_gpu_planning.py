@@ -1,5 +1,3 @@
-"""Planning on a GPU."""
-
 from typing import Any
 
 import pytest
@@ -35,7 +33,7 @@ def plant(task: str) -> lw.Env:
 @pytest.mark.parametrize("task, horizon", [("reach", 16), ("half_cheetah", 8), ("cartpole_swingup", 20)])
 def test_plans_agree_with_those_of_the_cpu(task: str, horizon: int) -> None:
     env = plant(task)
-    # a high temperature: a low one would let rounding choose between samples
+    # at a low temperature rounding could choose between samples
     gpu, cpu = (
         lw.MPPI(task, device=device, engine=engine, horizon=horizon, samples=30, temperature=10.0, seed=3)
         for device, engine in ((CUDA, "warp"), ("cpu", "mujoco"))
@@ -62,7 +60,7 @@ def test_plans_for_several_plants_are_those_of_single_planners(update: str) -> N
             plan(states[i])
             torch.testing.assert_close(together.standard_noise[:, i], plan.standard_noise)
             torch.testing.assert_close(together.returns[i], plan.returns, rtol=1e-3, atol=1e-3)
-            # a difference of roundings may choose other elites: from the same returns, the same plan
+            # rounding differences may change the elites, so compare plans computed from identical returns
             if torch.equal(together.returns[i], plan.returns):
                 torch.testing.assert_close(actions[i].to(CUDA), plan.actions[0])
             plan.actions.copy_(together.actions[:, i])
@@ -86,7 +84,7 @@ def test_actions_lie_where_the_states_do(of_plants: str, of_plan: str) -> None:
 
 @pytest.mark.parametrize("update", UPDATES)
 def test_every_update_on_a_gpu_equals_that_on_the_cpu_for_the_same_returns(update: str) -> None:
-    """The first improvement's returns differ by rounding, and the order of samples that are almost equal may, too."""
+    """The first improvement's returns differ by rounding, which may swap samples that are almost equal."""
     gpu, cpu = (
         lw.MPPI("reach", device=device, engine=engine, samples=200, seed=3, **UPDATES[update])
         for device, engine in ((CUDA, "warp"), ("cpu", "mujoco"))

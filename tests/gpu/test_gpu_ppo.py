@@ -1,4 +1,4 @@
-"""PPO on a GPU: captured epochs beside direct ones, no waiting for the device, and runs that continue."""
+"""PPO on a GPU: captured epochs equal direct ones, no synchronization, and exact resumption."""
 
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ def made(**changes: Any) -> lw.PPO:
     {}, {"std_type": "log", "whiten_minibatches": True, "minibatches": 5, "clip_value_loss": False},
 ])  # fmt: skip
 def test_captured_epochs_have_the_numbers_of_direct_ones(changes: dict[str, Any]) -> None:
-    """Over iterations with an entropy weight that changes, which the graph must read on the device."""
+    """The entropy weight changes between iterations; the graph must read it on the device."""
     changes = {"schedule": "fixed", "final_entropy_coef": 0.1, "entropy_decay": (1, 4)} | changes
     captured, direct = made(**changes), made(**changes)
     direct.minibatches.captures = False
@@ -45,7 +45,7 @@ def test_the_learning_rate_adapts_within_a_graph() -> None:
 
 def test_an_iteration_waits_for_the_device_only_at_its_end() -> None:
     ppo = made()
-    for _ in range(2):  # kernels are loaded, graphs captured
+    for _ in range(2):  # the first call loads kernels, the second captures
         next(ppo)
     with nothing_waits():
         ppo.sample()

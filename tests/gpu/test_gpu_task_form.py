@@ -1,4 +1,4 @@
-"""A task with every feature of the task form on a GPU: its rules, the C engine's numbers, and no waiting."""
+"""A task with every feature of the task form on a GPU: rules, the C engine's numbers, and no synchronization."""
 
 import pytest
 import torch
@@ -23,7 +23,7 @@ def test_worlds_on_a_gpu_have_the_numbers_of_the_c_engine() -> None:
         gpu.step(action.cuda())
         cpu.step(action)
         for name in gpu.obs_groups:
-            # float32 against float64: a contact may begin in another substep of a few worlds
+            # float32 and float64 differ: in a few worlds a contact may begin in a different substep
             error = (gpu.obs_groups[name].cpu() - cpu.obs_groups[name]).abs().amax(dim=1)
             assert error.median() < 1e-5
             assert (error < 1e-2).float().mean() > 0.9

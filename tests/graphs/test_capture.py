@@ -1,4 +1,4 @@
-"""Phases that are made of launches become graphs, with the same numbers in the same order."""
+"""Phases that consist of launches become graphs, with the same numbers in the same order."""
 
 import gc
 import threading
@@ -21,7 +21,7 @@ def append(digit: int, number_inout: wp.array[int]):
 
 
 class Digits:
-    """Phases that append a digit each to a number, and count how often they are called."""
+    """Phases that each append a digit to a number and count their calls."""
 
     def __init__(self) -> None:
         self.number = wp.zeros(1, dtype=int, device="cpu")
@@ -92,7 +92,7 @@ def test_threads_have_a_part_of_the_worlds_each_in_phases_that_allow_it(monkeypa
         for call in calls:
             call()
         assert digits.numpy().tolist() == [1234] * 5
-    # the first calls launch for all worlds, the second calls capture that, and later calls capture two parts if allowed
+    # the first calls launch for all worlds, the second ones capture them, later ones capture two parts if possible
     assert sizes == [5, 5, 5, 5, 5, 5, 5, 5, *(2, 2, 3, 3), *(2, 3)]
 
 
@@ -103,7 +103,7 @@ def count_down(number_inout: wp.array[int], turns_inout: wp.array[int]):
 
 
 def test_a_graph_holds_only_the_launches_of_its_own_thread() -> None:
-    """Another thread launches, copies, loops and captures graphs meanwhile, and gets its own numbers."""
+    """Meanwhile another thread launches, copies, loops and captures its own graphs, and gets its own numbers."""
     mine, captured = Digits(), []
     cpu, number, turns, copied = wp.get_device("cpu"), *(wp.full(1, 3, dtype=int, device="cpu") for _ in range(3))
     own = Digits()
@@ -124,7 +124,7 @@ def test_a_graph_holds_only_the_launches_of_its_own_thread() -> None:
         thread.start()
         thread.join()
 
-    # captures of the package take a lock, so this one must be Warp's own
+    # the package's captures take a lock, so this one uses Warp directly
     mine.phase(1).run()
     with wp.ScopedCapture(device=cpu) as capture:
         mine.phase(1).run()
@@ -187,12 +187,12 @@ def test_forget_captures_again_what_the_phases_launch_now() -> None:
 
 
 def test_what_is_no_longer_used_is_deleted_after_a_capture() -> None:
-    """Deleting a graph of torch during a capture would make the capture fail."""
+    """Deleting a torch graph during a capture would make the capture fail."""
     digits, captures, deleted = Digits(), 0, []
 
     class Unused:
         def __init__(self) -> None:
-            self.itself = self  # only a collection finds it
+            self.itself = self  # only the garbage collector finds it
 
         def __del__(self) -> None:
             deleted.append(captures)
@@ -200,7 +200,7 @@ def test_what_is_no_longer_used_is_deleted_after_a_capture() -> None:
     def run() -> None:
         nonlocal captures
         captures += 1
-        [[] for _ in range(10_000)]  # enough new objects for a collection
+        [[] for _ in range(10_000)]  # enough new objects to trigger a collection
         captures += 1
 
     calls = Graphs(wp.get_device("cpu"), enabled=True).sequence([digits.phase(1), Phase("run", run)])

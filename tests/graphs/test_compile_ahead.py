@@ -47,7 +47,7 @@ print(built.modules, built.known)
 def test_compiling_is_reported_and_done_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A process of its own compiles; this one, which does not have these kernels, finds them in its cache."""
+    """A subprocess compiles into a new cache, from which this process then loads the kernels."""
     script, cache = tmp_path / "script.py", tmp_path / "cache"
     script.write_text(SCRIPT)
     env = {**os.environ, "WARP_CACHE_PATH": str(cache)}
@@ -77,5 +77,5 @@ def test_kernels_of_a_new_task_are_reported_on_the_c_engine_too(
     modules = len(list(tmp_path.rglob("*.o")))
     env.step()
     lw.make(str(file), engine="mujoco")
-    assert len(list(tmp_path.rglob("*.o"))) == modules  # the step compiles no further module
+    assert len(list(tmp_path.rglob("*.o"))) == modules  # the step compiles no additional module
     assert capsys.readouterr().err == ""

@@ -1,4 +1,4 @@
-"""A rehearsal finds the kernels that a function would launch, by names of Warp that must not change."""
+"""A rehearsal finds the kernels that a function would launch; it relies on names in Warp that must not change."""
 
 import inspect
 import subprocess
@@ -46,7 +46,7 @@ def launch(mask: wp.array, row: wp.array, rows: wp.array) -> None:
 
 @pytest.fixture
 def arrays() -> tuple[wp.array, wp.array, wp.array]:
-    """A mask, a row of ones and three rows of zeros."""
+    """Return a mask, a row of ones and three rows of zeros."""
     mask = wp.full(3, True, dtype=bool, device="cpu")
     return mask, wp.full(2, 1, dtype=wp.float64, device="cpu"), wp.zeros((3, 2), dtype=wp.float64, device="cpu")
 
@@ -55,7 +55,7 @@ def test_a_rehearsal_notes_launches_instead_of_making_them(arrays: tuple[wp.arra
     flag = wp.zeros(1, dtype=int, device="cpu")
     with rehearse() as rehearsal:
         launch(*arrays)
-        wp.capture_if(flag, on_true=lambda: launch(*arrays))  # for any flag
+        wp.capture_if(flag, on_true=lambda: launch(*arrays))  # runs for any flag
         wp.capture_while(flag, while_body=lambda: launch(*arrays))
     assert list(rehearsal.modules) == [(fill_rows64.module, None)]
     assert not arrays[2].numpy().any()
@@ -76,7 +76,7 @@ def test_a_rehearsal_restores_warp_also_after_an_error(arrays: tuple[wp.array, w
 
 
 def test_overlapping_rehearsals_of_two_threads_take_turns(arrays: tuple[wp.array, wp.array, wp.array]) -> None:
-    """The second waits for the first, and Warp is restored in the end."""
+    """The second waits for the first, and Warp is restored at the end."""
     before, order = originals(), []
     inside, release = threading.Event(), threading.Event()
 
@@ -139,7 +139,7 @@ def test_warp_has_the_internals_that_compiling_ahead_reads(arrays: tuple[wp.arra
 
 
 def test_a_rehearsal_finds_every_module_that_a_step_loads() -> None:
-    """In a process of its own: MuJoCo Warp must launch nothing by other functions than those that are replaced."""
+    """Runs in a subprocess: MuJoCo Warp launches kernels only through the patched functions."""
     done = subprocess.run([sys.executable, "-c", WHOLE_STEP], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()

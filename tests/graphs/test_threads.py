@@ -1,4 +1,4 @@
-"""Environments that are made, stepped and dropped in parallel threads produce the same numbers as in one thread."""
+"""Environments that are made, stepped and dropped in parallel threads give the same numbers as in one thread."""
 
 import threading
 from collections.abc import Callable
@@ -12,7 +12,7 @@ CASES = [("warp", "hopper", 1), ("mujoco", "hopper", 2), ("warp", "hopper", 3), 
 
 
 def numbers(engine: str, task: str, seed: int, envs: int) -> list[torch.Tensor]:
-    """Observations, rewards and states of environments, one after the other."""
+    """Return observations, rewards and states of environments that run one after the other."""
     found = []
     for _ in range(envs):
         env = lw.make(task, engine=engine, nworld=3, seed=seed)
@@ -30,7 +30,7 @@ def numbers(engine: str, task: str, seed: int, envs: int) -> list[torch.Tensor]:
 
 
 def in_threads(*functions: Callable[[], list[torch.Tensor]]) -> list[list[torch.Tensor] | Exception]:
-    """Results or errors of functions that run in parallel."""
+    """Run functions in parallel threads; return their results or errors."""
     results: list[list[torch.Tensor] | Exception] = [RuntimeError("did not end")] * len(functions)
 
     def call(i: int) -> None:

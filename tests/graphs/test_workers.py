@@ -1,4 +1,4 @@
-"""Threads run all parts of a graph in parallel, raise the error of any, and end with their pool."""
+"""Threads run all parts of a graph in parallel, raise any part's error, and end with their pool."""
 
 import gc
 import signal
@@ -19,7 +19,7 @@ def test_calls_run_side_by_side_on_the_threads() -> None:
     together, threads = threading.Barrier(3), []
 
     def call() -> None:
-        together.wait(10)  # returns only once three threads have called it
+        together.wait(10)  # returns once three threads have called it
         threads.append(threading.current_thread())
 
     workers = Workers(3)
@@ -29,7 +29,7 @@ def test_calls_run_side_by_side_on_the_threads() -> None:
 
 
 def test_calls_start_the_threads_that_they_need_and_the_last_reference_ends_them() -> None:
-    before = own_threads()  # threads of other tests' engines, which may end meanwhile
+    before = own_threads()  # threads of other tests' engines may end in the meantime
     workers = Workers(3)
     assert not own_threads() - before
     for calls in (1, 2, 3, 2):
@@ -44,13 +44,13 @@ def test_calls_start_the_threads_that_they_need_and_the_last_reference_ends_them
 
 
 def test_an_interrupt_waits_for_the_calls_that_still_work() -> None:
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it in background processes
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell makes background processes ignore it
     ended: list[bool] = []
     begun = threading.Event()
 
     def late() -> None:
         begun.wait()
-        time.sleep(0.05)  # the caller waits by now
+        time.sleep(0.05)  # the caller is waiting by now
         signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)  # type: ignore[arg-type]
         time.sleep(0.2)
         ended.append(True)

@@ -1,4 +1,4 @@
-"""Compile kernels for a GPU, which needs Warp's compiler but no GPU."""
+"""Compile kernels for a GPU; this needs Warp's compiler but no GPU."""
 
 import pkgutil
 from importlib import import_module
@@ -15,7 +15,6 @@ NAMES = [name for _, name, _ in pkgutil.iter_modules(kernels.__path__, f"{kernel
 
 
 def kernels_of(values: object) -> list[wp.Kernel]:
-    """The kernels among an object's values."""
     return [value for value in vars(values).values() if isinstance(value, wp.Kernel)]
 
 
@@ -23,7 +22,6 @@ SHARED = [made for name in NAMES if (made := [k for k in kernels_of(import_modul
 
 
 def compiled(module: wp.Module, folder: Path) -> str:
-    """The PTX code of a module."""
     if not (archs := wp.get_cuda_supported_archs()):
         pytest.skip("this build of Warp does not compile for GPUs")
     (made,) = wp.compile_aot_module(module, arch=archs[0], module_dir=folder, use_ptx=True)

@@ -13,7 +13,7 @@ SPLINES = ["zero", "linear", "cubic"]
 def interpolated(
     values: np.ndarray, horizon: int, count: int, spline: str, phase: int = 0, models: int = 1, limit: float = np.inf
 ) -> np.ndarray:
-    """Actions from knots, (nknot, samples, nact)."""
+    """Interpolate actions from knots, (nknot, samples, nact)."""
     _, samples, nact = values.shape
     out = wp.zeros((horizon, samples * models, nact), dtype=float, device="cpu")
     bounds = [wp.array(np.full(nact, sign * limit), dtype=float, device="cpu") for sign in (-1, 1)]
@@ -36,7 +36,7 @@ def test_interpolated_actions_equal_the_plain_version_at_every_phase(horizon: in
 
 @pytest.mark.parametrize("spline, degree", [("zero", 0), ("linear", 1), ("cubic", 2)])
 def test_knots_of_a_polynomial_give_the_polynomial(spline: str, degree: int) -> None:
-    """A cubic spline with slopes from central differences reproduces parabolas."""
+    """A cubic spline with slopes from central differences reproduces parabolas exactly."""
     horizon, count = 12, 3
     number = knots.knot_count(horizon, count, spline)
     places = np.arange(number) - (spline == "cubic")

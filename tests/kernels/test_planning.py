@@ -1,4 +1,4 @@
-"""Compare noise and weights of planning with their formulas, and check value functions in Warp."""
+"""Compare planning noise and weights with their formulas, and check value functions in Warp."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from lyceum_warp.kernels import planning, random
 
 @pytest.fixture(scope="module")
 def many() -> MPPI:
-    """Many samples with little noise, so that no action is clipped."""
+    """Make a planner with many samples and little noise, so that no action is clipped."""
     return MPPI("point_mass", horizon=8, samples=4000, noise=[0.02, 0.05], temperature=1e9)
 
 
@@ -22,7 +22,7 @@ def first_state(seed: int) -> torch.Tensor:
 
 
 def test_noise_is_standard_normal_and_independent(many: MPPI) -> None:
-    """Independent between steps, actions, samples, plans and seeds."""
+    """The noise is independent between steps, actions, samples, plans and seeds."""
     many.reset(0)
     draws = []
     for seed in (0, 0, 1):
@@ -46,7 +46,7 @@ def test_noise_is_standard_normal_and_independent(many: MPPI) -> None:
 
 
 def test_samples_have_keys_of_their_own_and_none_of_a_plant() -> None:
-    """With equal seeds and world indices of planner and plant."""
+    """Planner and plant have equal seeds and world indices."""
     n = 256
     found, plants = [], []
     mask, episode = wp.full(n, True, dtype=bool, device="cpu"), wp.zeros(n, dtype=int, device="cpu")
@@ -66,7 +66,7 @@ def test_samples_have_keys_of_their_own_and_none_of_a_plant() -> None:
 
 @pytest.mark.parametrize("betas", [(0.25, 0.8, 0.0), (1.0, 0.0, 0.0), (0.5, 0.3, 0.2)])
 def test_smoothed_noise_has_the_spread_of_the_formula(betas: tuple[float, float, float]) -> None:
-    """With the default weights the standard deviation is scaled by 1, 1, 0.838, 0.716, ..."""
+    """The default weights scale the standard deviation by 1, 1, 0.838, 0.716, ..."""
     plan = MPPI("point_mass", horizon=12, samples=4000, noise=[0.02, 0.05], smoothing=betas)
     plan(plan.state_of())
     added = (plan.sampled - plan.nominal[:, None]).double().numpy()

@@ -40,7 +40,7 @@ def draw_vectors(rng_inout: wp.array2d[wp.uint32], one_out: wp.array2d[float], m
 
 
 def draws(counters: np.ndarray) -> np.ndarray:
-    """Four draws of each row (seed, world, episode, step)."""
+    """Return four draws for each row (seed, world, episode, step)."""
     columns = [wp.array(column, dtype=int, device="cpu") for column in counters.T]
     rng = wp.zeros((len(counters), 1), dtype=wp.uint32, device="cpu")
     values = wp.zeros((len(counters), 4), dtype=float, device="cpu")
@@ -66,7 +66,7 @@ def test_a_vector_has_the_draws_of_its_elements_in_turn() -> None:
 
 
 def test_different_counters_give_different_draws() -> None:
-    """Also counters with equal sums."""
+    """Counters with equal sums give different draws, too."""
     counters = np.array(list(itertools.product(range(6), range(6), range(6), range(6))))
     found = draws(counters)
     assert len(np.unique(found[:, 0])) > 0.999 * len(counters)

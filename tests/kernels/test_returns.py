@@ -1,5 +1,3 @@
-"""Compare advantages and returns with their definitions."""
-
 import numpy as np
 import warp as wp
 
@@ -7,7 +5,7 @@ from lyceum_warp.kernels import returns
 
 
 def test_advantages_and_returns_bootstrap_at_time_limits_only() -> None:
-    """With a truncation in world 0 and a termination in world 1."""
+    """World 0 has a truncation and world 1 a termination."""
     steps, worlds, gamma, lam = 9, 3, 0.9, 0.8
     rng = np.random.default_rng(0)
     reward, value, next_value = rng.normal(size=(3, steps, worlds)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Compare quaternion functions with MuJoCo's own, on random numbers and at edge cases."""
+"""Compare quaternion functions with MuJoCo's, for random numbers and edge cases."""
 
 from collections.abc import Callable
 
@@ -54,7 +54,7 @@ def unit(rows: np.ndarray) -> np.ndarray:
 
 
 def inputs() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Two quaternions, a vector and an angle in each row, in float32; the first rows are special ones."""
+    """Return two quaternions, a vector and an angle per row, in float32; the first rows are edge cases."""
     rng = np.random.default_rng(0)
     a, b = (unit(rng.normal(size=(N, 4))) for _ in range(2))
     v, angle = rng.normal(size=(N, 3)), rng.uniform(-7, 7, N)
@@ -77,7 +77,7 @@ def found() -> dict[str, np.ndarray]:
 
 
 def mju(function: Callable[..., None], size: int, *columns: np.ndarray) -> np.ndarray:
-    """The results of one of MuJoCo's functions, row by row."""
+    """Return the results of one of MuJoCo's functions, row by row."""
     results = np.zeros((N, size))
     for row, *values in zip(results, *(column.astype(float) for column in columns), strict=True):
         function(row, *values)
@@ -114,7 +114,7 @@ def test_rotation_vectors_are_those_of_mujoco(found: dict[str, np.ndarray]) -> N
     a, b, _, _ = inputs()
     check(found["to_rotvec"], mju(lambda row, q: mujoco.mju_quat2Vel(row, q, 1.0), 3, a), 1e-5)
     difference = mju(mujoco.mju_subQuat, 3, a, b)
-    close = np.linalg.norm(difference, axis=1) < 3.1  # at pi, both signs are correct
+    close = np.linalg.norm(difference, axis=1) < 3.1  # near pi both signs are correct
     assert close.mean() > 0.95
     check(found["difference"][close], difference[close], 1e-5)
     check(found["angle"], np.linalg.norm(difference, axis=1), 1e-5)
@@ -169,8 +169,6 @@ def test_random_rotations_are_uniform_and_independent() -> None:
             ]
         check_uniform(np.stack(columns, axis=1))
 
-
-# in a task
 
 FREE = """
 <mujoco>

@@ -1,5 +1,3 @@
-"""Compare shared terms with their published definitions."""
-
 import mujoco
 import numpy as np
 import pytest
@@ -151,7 +149,7 @@ def angles(a: wp.array[wp.vec3], b: wp.array[wp.vec3], out: wp.array[float]):
 
 
 def test_angle_between_is_exact_for_small_and_for_straight_angles() -> None:
-    """An arc cosine in float32 returns 0 for angles below 2e-4."""
+    """An arc cosine in float32 would return 0 for angles below 2e-4."""
     wanted = np.array([0.0, 1e-5, 1e-3, 0.5, np.pi / 2, 3.0, np.pi - 1e-5, np.pi])
     a = np.tile([2.0, 0.0, 0.0], (len(wanted), 1))
     b = 0.3 * np.stack([np.cos(wanted), np.sin(wanted), 0.0 * wanted], axis=1)
@@ -228,7 +226,7 @@ def stand_up(yaw: wp.array[float], qpos: wp.array2d[float], after: wp.array[int]
 
 
 def test_put_upright_turns_a_free_body_about_the_vertical() -> None:
-    """The first coordinate belongs to another joint, and does not change."""
+    """The first coordinate belongs to another joint and does not change."""
     spec = mujoco.MjSpec.from_string(
         "<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body>"
         "<body name='free'><freejoint/><geom size='.1'/></body></worldbody></mujoco>"

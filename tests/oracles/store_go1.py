@@ -1,6 +1,6 @@
 """Store reference data of mjlab's Go1 for the tests: trajectories, reward terms and observations.
 
-It needs mjlab 1.6.0 with MuJoCo 3.11, so run it in a virtual environment of its own:
+It needs mjlab 1.6.0 with MuJoCo 3.11, so run it in a separate virtual environment:
 
     python -m venv mjlab && mjlab/bin/pip install mjlab==1.6.0
     mjlab/bin/python tests/oracles/store_go1.py tests/data/go1_mjlab.npz
@@ -40,18 +40,18 @@ OPTIONS = (
 
 
 def names(model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> list[str]:
-    """Names of a model's elements, without mjlab's prefix and suffixes."""
+    """Return the names of a model's elements without mjlab's prefix and suffixes."""
     found = [mujoco.mj_id2name(model, kind, i) or "" for i in range(count)]
     return [name.removeprefix("robot/").removesuffix("_joint").replace("_collision", "") for name in found]
 
 
 def model_arrays(model: mujoco.MjModel) -> dict[str, Any]:
-    """Constants of the model except for visual meshes, and the names of their bodies and geoms."""
+    """Return the model's constants, without visual meshes, and the names of its bodies and geoms."""
     kind = mujoco.mjtObj
     bodies = names(model, kind.mjOBJ_BODY, model.nbody)
     geoms = names(model, kind.mjOBJ_GEOM, model.ngeom)
     rows = {
-        "body": [i for i, name in enumerate(bodies) if name != "terrain"],  # an extra body, fixed to the world
+        "body": [i for i, name in enumerate(bodies) if name != "terrain"],  # an additional body, fixed to the world
         "geom": [i for i, name in enumerate(geoms) if name],
         "actuator": actuators(model),
     }
@@ -63,14 +63,14 @@ def model_arrays(model: mujoco.MjModel) -> dict[str, Any]:
 
 
 def actuators(model: mujoco.MjModel) -> list[int]:
-    """Indices of the actuators in the order of the joints."""
+    """Return the indices of the actuators in the order of the joints."""
     joints = names(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt)[1:]
     own = names(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu)
     return [own.index(name) for name in joints]
 
 
 def trajectories(model: mujoco.MjModel) -> dict[str, Any]:
-    """Trajectories of the C engine under random controls: two from the default pose, two tumbling."""
+    """Run the C engine under random controls: two trajectories start in the default pose, two tumble."""
     rng = np.random.default_rng(0)
     home, order = model.key_qpos[0], actuators(model)
     qpos, controls = np.zeros((TRAJECTORIES, SUBSTEPS + 1, 19)), np.zeros((TRAJECTORIES, SUBSTEPS, 12))
@@ -95,7 +95,7 @@ def trajectories(model: mujoco.MjModel) -> dict[str, Any]:
 
 
 def judged_states(env: ManagerBasedRlEnv) -> dict[str, Any]:
-    """States along random steps, with the results of mjlab's functions; poses and contacts are current."""
+    """Return states along random steps with the results of mjlab's functions; poses and contacts are current."""
     torch.manual_seed(0)
     robot, command = env.scene["robot"], env.command_manager.get_term("twist")
     feet = env.scene["feet_ground_contact"]
@@ -113,7 +113,7 @@ def judged_states(env: ManagerBasedRlEnv) -> dict[str, Any]:
         if step % EVERY:
             continue
         kept = {name: value.clone() for name, value in vars(feet._air_time_state).items()}, swing.peak_heights.clone()
-        feet.update(env.physics_dt)  # update clocks and contacts to this state; the step left them one substep behind
+        feet.update(env.physics_dt)  # update timers and contacts to this state; the step left them one substep behind
         swing.peak_heights[:] = 0.15 * torch.rand_like(swing.peak_heights)
         origins = env.scene.env_origins
         qpos = env.sim.data.qpos.clone()
@@ -151,14 +151,13 @@ def judged_states(env: ManagerBasedRlEnv) -> dict[str, Any]:
 
 
 def noiseless(env: ManagerBasedRlEnv, group: str) -> torch.Tensor:
-    """An observation group without noise."""
+    """Return an observation group without noise."""
     manager = env.observation_manager
     terms = zip(manager.active_terms[group], manager._group_obs_term_cfgs[group], strict=True)
     return torch.cat([term.func(env, **term.params) for _, term in terms], dim=-1)
 
 
 def main(path: str) -> None:
-    """Store everything in a file."""
     cfg = load_env_cfg(TASK)
     cfg.scene.num_envs, cfg.seed = 3, 0
     env = ManagerBasedRlEnv(cfg, device="cpu")

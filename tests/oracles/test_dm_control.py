@@ -18,21 +18,17 @@ TASKS = ["cartpole", "cartpole_swingup"]
 
 @pytest.fixture(scope="module")
 def dm_cartpole() -> mujoco.MjModel:
-    """dm_control's cartpole, loaded from its file without importing dm_control."""
+    """Load dm_control's cartpole from its file, without importing dm_control."""
     package = importlib.util.find_spec("dm_control")
     if package is None or not package.submodule_search_locations:
         pytest.skip("dm_control, whose cartpole.xml is the reference, is not installed: pip install dm_control")
     return mujoco.MjModel.from_xml_path(str(Path(package.submodule_search_locations[0], "suite", "cartpole.xml")))
 
 
-# the model
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_model_has_dm_controls_masses_joints_and_motor(
     shared_env: SharedEnv, dm_cartpole: mujoco.MjModel, task: str
 ) -> None:
-    """Masses, inertias, joints and motor are dm_control's."""
     ours, theirs = shared_env(task).model, dm_cartpole
     for name in (
         "body_mass", "body_inertia", "body_pos", "body_ipos", "body_iquat",
@@ -47,11 +43,8 @@ def test_model_has_dm_controls_masses_joints_and_motor(
     assert ours.opt.disableflags & contacts == theirs.opt.disableflags & contacts == contacts
 
 
-# dm_control's own tasks on this package's model
-
-
 class Physics:
-    """The interface of dm_control's cartpole physics, whose own class (1.0.50) does not support MuJoCo 4 models."""
+    """The interface of dm_control's cartpole physics; its own class (1.0.50) does not support MuJoCo 4 models."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model, self.data = model, mujoco.MjData(model)
@@ -84,14 +77,14 @@ class Physics:
 
 
 def balance_task(*, swing_up: bool = False, sparse: bool = False) -> Any:
-    """dm_control's task, the reference for rewards and observations."""
+    """Return dm_control's task, the reference for rewards and observations."""
     module = pytest.importorskip("dm_control.suite.cartpole")
     return module.Balance(swing_up=swing_up, sparse=sparse, random=0)
 
 
 @pytest.mark.parametrize("sparse", [False, True])
 def test_cartpole_has_dm_controls_reward_and_observation(shared_env: SharedEnv, sparse: bool) -> None:
-    """At random states near the goal and far from it, under actions beyond the control range."""
+    """States are random, near the goal and far from it; actions exceed the control range."""
     env = shared_env("cartpole", nworld=NWORLD, autoreset=False, sparse=sparse)
     theirs, balanced, physics = balance_task(sparse=sparse), balance_task(sparse=True), Physics(env.model)
     rng, rewards = np.random.default_rng(0), []

@@ -28,12 +28,12 @@ FORCE_PARTS = ("contact_force",)
 
 
 PARAMS = {"go1_velocity": {"fall_angle": 0.5}, "soft_ball": {"reach": 0.15}}
-"""Parameters with which random field values end some episodes."""
+"""Parameters with which random field values terminate some episodes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """Bounds of the difference between the engines after one substep: maximum over coordinates, then over worlds."""
+    """Bounds of the engines' difference after one substep: maximum over coordinates, quantiles over worlds."""
 
     qpos_median: float
     qpos_p95: float
@@ -42,7 +42,7 @@ class Bounds:
 
 
 # Each bound is three to four times the difference measured with mujoco and mujoco_warp 4.0.0 on the CPU, over 320
-# states along random rollouts. A float32 position of about 1 is exact to 6e-8.
+# states along random rollouts. A float32 position of about 1 has a precision of 6e-8.
 ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median, 95 %
     "adroit_door": Bounds(1.5e-7, 7e-7, 2e-5, 3.5e-4),  # 4.1e-8, 1.9e-7; 6.2e-6, 9.6e-5
     "adroit_hammer": Bounds(6e-7, 8e-7, 3e-4, 4e-4),  # 1.6e-7, 2.2e-7; 8.0e-5, 1.1e-4
@@ -56,7 +56,7 @@ ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median
     "cartpole_swingup": Bounds(2e-7, 4e-7, 4e-8, 1e-7),  # 6.2e-8, 1.1e-7; 1.2e-8, 2.9e-8
     "go1_velocity": Bounds(4e-7, 1.5e-6, 4e-5, 3e-4),  # 9.8e-8, 4.4e-7; 1.1e-5, 8.7e-5
     "half_cheetah": Bounds(1e-7, 1e-6, 1e-5, 1e-4),  # 3.2e-8, 2.9e-7; 3.0e-6, 2.9e-5
-    # contacts of arms and fingers are rare; MuJoCo Warp finds fewer points than C where two boxes touch
+    # contacts of arms and fingers are rare; MuJoCo Warp finds fewer contact points than C between two boxes
     "herb_reach": Bounds(4e-7, 8e-7, 5e-5, 2e-4),  # 1.1e-7, 2.2e-7; 1.3e-5, 4.8e-5
     "hopper": Bounds(1e-7, 2e-7, 1e-6, 5e-6),  # 3.0e-8, 5.5e-8; 2.9e-7, 1.6e-6
     "humanoid": Bounds(2e-7, 4e-7, 3e-5, 1.2e-4),  # 5.6e-8, 1.1e-7; 8.8e-6, 3.9e-5
@@ -77,29 +77,29 @@ ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median
 
 @dataclasses.dataclass
 class Engines:
-    """One task on both engines, with one substep per step, and states for both."""
+    """One task on both engines, with one substep per step, and states that both can represent."""
 
     task: str
     c: lw.Env
     warp: lw.Env
     states: list[torch.Tensor]
-    """States along a random rollout of the unchanged task, (NWORLD, size) each; every number is one of float32."""
+    """States along a random rollout of the unchanged task, (NWORLD, size) each, rounded to float32."""
 
     def action(self, rng: np.random.Generator) -> torch.Tensor:
-        """Random actions for every world, some beyond the control range."""
+        """Return random actions for every world, some beyond the control range."""
         return random_action(self.c, rng, 1.3)
 
 
 def random_action(env: lw.Env, rng: np.random.Generator, reach: float) -> torch.Tensor:
     low, high = env.action_space.low, env.action_space.high
     assert low is not None and high is not None
-    low, high = np.nan_to_num(low, neginf=-1.0), np.nan_to_num(high, posinf=1.0)  # where there are no bounds
+    low, high = np.nan_to_num(low, neginf=-1.0), np.nan_to_num(high, posinf=1.0)  # unbounded actions get bounds
     values = (low + high) / 2 + reach * (high - low) / 2 * rng.uniform(-1.0, 1.0, env.action.shape)
     return torch.from_numpy(values.astype(np.float32))
 
 
 def rollout_states(env: lw.Env) -> list[torch.Tensor]:
-    """Every sixth state of 60 random steps, including fallen and reset worlds."""
+    """Return every sixth state of 60 random steps, including fallen and reset worlds."""
     rng, states = np.random.default_rng(0), []
     counters = [env.state_space.parts[name] for name in ("step", "key", "episode")]
     for i in range(60):
@@ -115,7 +115,7 @@ def rollout_states(env: lw.Env) -> list[torch.Tensor]:
 
 @pytest.fixture(scope="module", params=DEVICES)
 def device(request: pytest.FixtureRequest) -> str:
-    """The Warp engine's device; the C engine always runs on the CPU."""
+    """Return the Warp engine's device; the C engine always runs on the CPU."""
     return str(request.param)
 
 
@@ -139,12 +139,12 @@ def outcome(env: lw.Env) -> Outcome:
 
 
 def relative_error(a: torch.Tensor, b: torch.Tensor) -> float:
-    """Largest difference, relative to the larger of 1 and the value."""
+    """Return the largest difference, relative to the larger of 1 and the value."""
     return ((a - b).abs() / b.abs().clamp(min=1.0)).max().item() if a.numel() else 0.0
 
 
 def check_same(ours: Outcome, other: Outcome, force_parts: dict[str, slice] | None = None) -> None:
-    """Compare within 1e-5, and flags exactly.
+    """Compare numbers within 1e-5, and flags exactly.
 
     Force parts of the observation are compared within 1e-3 of their maximum, or 0.01 N if a task clips them.
     """
@@ -161,7 +161,7 @@ def check_same(ours: Outcome, other: Outcome, force_parts: dict[str, slice] | No
 
 
 def judge(env: lw.Env, before: Outcome, action: torch.Tensor, after: Outcome) -> Outcome:
-    """The results of the task's functions for given field values, without any physics."""
+    """Return the results of the task's functions for given field values, without physics."""
     kept = []
     for batch, values in ((env.worlds.before, before), (env.worlds.after, after)):
         for name, value in values.items():
@@ -172,26 +172,26 @@ def judge(env: lw.Env, before: Outcome, action: torch.Tensor, after: Outcome) ->
             field.copy_(value)
     env.worlds.judge_transition(action)
     result = outcome(env)
-    for field, value in kept:  # MuJoCo Warp never recomputes the position of the world body
+    for field, value in kept:  # MuJoCo Warp never recomputes the world body's position
         field.copy_(value)
     env.rand_reset(0)
     return result
 
 
 def test_both_engines_have_the_same_spaces(engines: Engines) -> None:
-    """States of one engine can be set on the other."""
+    """A state of one engine can be set on the other."""
     assert engines.c.state_space == engines.warp.state_space
     assert engines.c.obs_space == engines.warp.obs_space
     assert engines.c.timestep == engines.warp.timestep
 
 
 def test_the_same_field_values_are_judged_alike(engines: Engines) -> None:
-    """With random values near those of simulated states."""
+    """The values are random, near those of simulated states."""
     rng = torch.Generator().manual_seed(0)
     numpy_rng = np.random.default_rng(1)
     fallen = 0
     for state in engines.states[:4]:
-        for env in (engines.c, engines.warp):  # noise of observations follows the states' counters
+        for env in (engines.c, engines.warp):  # observation noise depends on the states' counters
             env.set_state(state.to(env.action.device))
         after = engines.c.worlds.after
         fields: Outcome = {name: torch_view(getattr(after, name)).clone() for name in engines.c.task.types}
@@ -211,14 +211,14 @@ def test_the_same_field_values_are_judged_alike(engines: Engines) -> None:
 
 
 def test_the_same_positions_and_velocities_are_observed_alike(engines: Engines) -> None:
-    """Each engine computes all other fields from them."""
+    """Each engine computes all other fields from positions and velocities."""
     parts = {name: part for name, part in engines.c.obs_space.parts.items() if name in FORCE_PARTS}
     largest = 0.0
     for state in engines.states:
         results = []
         for env in (engines.c, engines.warp):
             env.set_state(state.to(env.action.device))
-            # a state includes the fields of the last substep; the reset phases recompute them on each engine
+            # a state includes fields of the last substep; the reset phases recompute them on each engine
             for phase in env.worlds.reset_phases(randomly=False):
                 if phase.name != "restart":
                     phase.run()
@@ -229,7 +229,7 @@ def test_the_same_positions_and_velocities_are_observed_alike(engines: Engines) 
 
 
 def test_one_substep_leaves_the_engines_a_rounding_apart(engines: Engines) -> None:
-    """From equal states under equal actions, within the bounds of ONE_STEP."""
+    """States and actions are equal; ONE_STEP holds the bounds."""
     assert engines.task in ONE_STEP, f"add bounds of {engines.task} to ONE_STEP; pytest -rP shows the differences"
     rng = np.random.default_rng(3)
     errors: dict[str, list[torch.Tensor]] = {"qpos": [], "qvel": []}
@@ -259,7 +259,7 @@ def test_one_substep_leaves_the_engines_a_rounding_apart(engines: Engines) -> No
 def test_fifty_steps_leave_the_engines_a_rounding_apart_whatever_the_task_writes(
     task: type[lw.Task], params: dict[str, float], device: str
 ) -> None:
-    """With inputs written by ``control``, and random masses, frictions and gravity, over 150 substeps."""
+    """``control`` writes inputs; masses, frictions and gravity are random; the steps take 150 substeps."""
     c = lw.make(task, nworld=8, seed=1, **params)
     warp = lw.make(task, nworld=8, seed=1, engine="warp", device=device, **params)
     start, rng, worst, far = positions_of(c), np.random.default_rng(0), 0.0, 0.0

@@ -1,8 +1,8 @@
-"""Compare tasks with their environments in Gymnasium, on the C engine.
+"""Compare tasks with their Gymnasium environments on the C engine.
 
-Both run the same C code in float64. From equal states, warm start included, they differ only by the rounding of
+Both run the same C code in float64. From equal states, warm start included, they differ only by rounding of
 observations and rewards to float32. The tests read the tasks' attribute ``gymnasium`` and Gymnasium's registry and
-signatures, so a new task needs no change here.
+signatures, so they include new tasks automatically.
 """
 
 import dataclasses
@@ -35,7 +35,6 @@ TASKS = [name for name, id in IDS.items() if id in OWN]
 
 
 def fields(task: str) -> set[str]:
-    """The fields that a task reads."""
     return set(find_task(task).scope["World"].vars)
 
 
@@ -50,7 +49,7 @@ WITH_FORCES = [task for task in TASKS if "cfrc_ext" in fields(task)]
 class SensorStage:
     """Mixin for a Gymnasium environment: Newton solver, and contact forces from the last substep's sensor stage.
 
-    Gymnasium computes ``cfrc_ext`` once more after the last substep. Here a sensor makes the model compute it, as in
+    Gymnasium computes ``cfrc_ext`` again after the last substep. Here a sensor makes the model compute it, as in
     lyceum_warp.
     """
 
@@ -68,13 +67,13 @@ class SensorStage:
 
 
 def unchanged(task: str) -> type[mujoco_env.MujocoEnv]:
-    """Gymnasium's class."""
+    """Return Gymnasium's class."""
     return load_env_creator(OWN[IDS[task]].entry_point)
 
 
 @functools.cache
 def oracle(task: str) -> type[mujoco_env.MujocoEnv]:
-    """Gymnasium's class, with the mixin above if the task observes contact forces."""
+    """Return Gymnasium's class, with the mixin above if the task observes contact forces."""
     base = unchanged(task)
     return type(base.__name__, (SensorStage, base), {}) if task in WITH_FORCES else base
 
@@ -88,14 +87,12 @@ def make_theirs(task: str, **options: Any) -> Any:
 
 
 def relative_error(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Largest difference, relative to the larger of 1 and the value."""
+    """Return the largest difference, relative to the larger of 1 and the value."""
     return float(np.max(np.abs(ours - theirs) / np.maximum(1.0, np.abs(theirs)), initial=0.0))
 
 
 @dataclasses.dataclass
 class Step:
-    """One step of both environments."""
-
     obs: np.ndarray
     gym_obs: np.ndarray
     reward: float
@@ -122,7 +119,7 @@ class Step:
 
 
 class Pair:
-    """One world and Gymnasium's environment, put into the same states and stepped with the same actions."""
+    """One world and Gymnasium's environment, in the same states and with the same actions."""
 
     def __init__(self, ours: lw.Env, theirs: Any, seed: int = 0) -> None:
         assert ours.nworld == 1
@@ -134,7 +131,7 @@ class Pair:
         self.held = self.action()
 
     def put(self, change: Callable[[mujoco.MjData], None] = lambda data: None) -> None:
-        """Put both into a state of Gymnasium's reset after a change, with a warm start, all rounded to float32."""
+        """Reset Gymnasium, apply a change, and copy the state with a warm start to both, rounded to float32."""
         data = self.theirs.data
         mujoco.mj_resetData(self.theirs.model, data)
         self.theirs.reset_model()
@@ -149,15 +146,15 @@ class Pair:
         for name in parts.keys() - {"step", "key", "episode", "done_reason", "metrics"}:
             # lagged fields come from the forward pass above
             parts[name].copy_(torch.from_numpy(np.ravel(getattr(data, name))))
-        parts["done_reason"].zero_()  # the common state has not ended
+        parts["done_reason"].zero_()  # the shared state has not ended
         self.ours.set_state(state)
 
     def action(self) -> np.ndarray:
-        """A random action, in one of four cases beyond the control range."""
+        """Return a random action; one in four is beyond the control range."""
         return np.float32(self.middle + 1.33 * self.reach * self.rng.uniform(-1.0, 1.0, self.middle.shape))
 
     def step(self) -> Step:
-        if self.rng.random() < 0.7:  # else repeat the last action, so that the robot moves further
+        if self.rng.random() < 0.7:  # otherwise repeat the last action, so that the robot moves further
             self.held = self.action()
         self.ours.step(torch.from_numpy(self.held[None]))
         obs, reward, terminated, truncated, info = self.theirs.step(self.held.astype(np.float64))
@@ -177,7 +174,7 @@ class Pair:
         )
 
     def run(self, nstep: int, restart: int = 200) -> list[Step]:
-        """Steps from a common state; they restart from another state after a termination or ``restart`` steps."""
+        """Step both from a shared state; after a termination or ``restart`` steps, restart from a new one."""
         steps: list[Step] = []
         since = restart
         for _ in range(nstep):
@@ -197,9 +194,6 @@ def check(steps: list[Step]) -> None:
     assert max(step.metric_error for step in steps) <= 1e-4
 
 
-# which environments have a task
-
-
 def test_every_mujoco_environment_of_gymnasium_has_a_task() -> None:
     latest = [spec.id for spec in OWN.values() if spec.version == 5]
     assert len(latest) == 11
@@ -207,16 +201,13 @@ def test_every_mujoco_environment_of_gymnasium_has_a_task() -> None:
 
 
 def test_every_named_environment_is_registered() -> None:
-    """Otherwise a misspelt id would leave a task out of all comparisons."""
+    """A misspelt id would silently exclude a task from all comparisons."""
     assert not {name: id for name, id in IDS.items() if id not in gymnasium.registry}
-
-
-# steps
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_a_thousand_steps_have_gymnasiums_numbers(task: str) -> None:
-    """Random actions, some beyond the control range."""
+    """Some of the random actions are beyond the control range."""
     pair = Pair(make_ours(task), make_theirs(task))
     assert pair.ours.timestep == pytest.approx(pair.theirs.dt, rel=1e-12)
     assert pair.ours.obs.shape == (1, *pair.theirs.observation_space.shape)
@@ -227,7 +218,7 @@ def test_a_thousand_steps_have_gymnasiums_numbers(task: str) -> None:
     steps = pair.run(1000, min(horizon, 200))
     obs_error, reward_error = max(step.obs_error for step in steps), max(step.reward_error for step in steps)
     ends = sum(step.gym_terminated for step in steps)
-    print(f"{task}: obs within {obs_error:.1e}, reward within {reward_error:.1e}, {ends} ends")  # pytest -rP shows it
+    print(f"{task}: obs within {obs_error:.1e}, reward within {reward_error:.1e}, {ends} ends")  # shown by pytest -rP
     check(steps)
     assert ends >= 10 if has(task, "terminated") else ends == 0
     for step in steps:
@@ -236,7 +227,7 @@ def test_a_thousand_steps_have_gymnasiums_numbers(task: str) -> None:
 
 
 def evaluation(info: Mapping[str, Any]) -> float | None:
-    """The expected metric, if Gymnasium's info contains it: a distance, a height or a position."""
+    """Return the expected metric, if Gymnasium's info contains it: a distance, a height or a position."""
     if "reward_dist" in info:
         return -info["reward_dist"]
     if "reward_linup" in info:
@@ -259,7 +250,7 @@ def test_a_pendulum_is_evaluated_by_its_angle_or_height(task: str, metric: Calla
 
 
 def test_the_force_at_the_end_of_the_rail_is_gymnasiums() -> None:
-    """The test puts the cart there, because with random actions the pole falls first."""
+    """The test places the cart there, because the pole falls earlier under random actions."""
     pair = Pair(make_ours("inverted_double_pendulum"), make_theirs("inverted_double_pendulum"))
 
     def drive_to_the_end(data: mujoco.MjData) -> None:
@@ -276,7 +267,7 @@ def test_the_force_at_the_end_of_the_rail_is_gymnasiums() -> None:
 
 
 def test_a_cylinder_is_pushed_as_in_gymnasium() -> None:
-    """The test puts the cylinder beside the hand, which random actions hardly ever reach."""
+    """The test places the cylinder beside the hand, which random actions hardly ever reach."""
     pair = Pair(make_ours("pusher"), make_theirs("pusher"))
     model, (low, high) = pair.theirs.model, pair.theirs.model.jnt_range[:7].T
 
@@ -293,12 +284,12 @@ def test_a_cylinder_is_pushed_as_in_gymnasium() -> None:
         start = pair.theirs.data.qpos[7:9].copy()
         check([pair.step() for _ in range(10)])
         moved.append(np.linalg.norm(pair.theirs.data.qpos[7:9] - start))
-    assert min(moved) > 5e-4  # m; a cylinder that nothing touches stays where it is
+    assert min(moved) > 5e-4  # m; an untouched cylinder does not move
 
 
 @pytest.mark.parametrize("task", WITH_FORCES)
 def test_gymnasiums_unchanged_class_differs_only_in_contact_forces(task: str) -> None:
-    """With the Newton solver and without contact costs, everything but the contact forces agrees."""
+    """With the Newton solver and without contact costs, everything except the contact forces agrees."""
     weights = {name: 0.0 for name in keywords(task) if name in ("contact_cost_weight", "impact_cost_weight")}
     assert weights
     theirs: Any = unchanged(task)(**weights)
@@ -321,7 +312,7 @@ RANGES = [(task, name) for task in HEALTHY for name in inspect.signature(unchang
 
 @pytest.mark.parametrize(("task", "bounded"), [*((task, None) for task in HEALTHY), *RANGES])
 def test_a_state_is_terminal_where_gymnasium_says_so(task: str, bounded: str | None) -> None:
-    """With random states on both sides of all bounds, or of one range while the others are wide."""
+    """States are random, on both sides of all bounds, or of one range while the others are wide."""
     wide = {name: (-1e6, 1e6) for other, name in RANGES if other == task and bounded not in (None, name)}
     if bounded is not None and math.isinf(max(keywords(task)[bounded])):
         wide[bounded] = (keywords(task)[bounded][0], 2.0)
@@ -330,7 +321,7 @@ def test_a_state_is_terminal_where_gymnasium_says_so(task: str, bounded: str | N
 
 
 def share_of_ill_states(ours: lw.Env, theirs: Any, spread: float) -> float:
-    """Compare the terminations of random states; returns the share of terminal states."""
+    """Compare the terminations of random states; return the share of terminal states."""
     rng = np.random.default_rng(0)
     state = ours.get_state()
     parts = ours.state_space.split(state)
@@ -346,12 +337,9 @@ def share_of_ill_states(ours: lw.Env, theirs: Any, spread: float) -> float:
     return float(np.mean(ill))
 
 
-# resets
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_the_first_observation_is_gymnasiums_of_the_same_state(task: str) -> None:
-    """After a random reset and after the fixed one."""
+    """Both the random and the fixed reset are compared."""
     ours, theirs = make_ours(task, nworld=16), make_theirs(task)
     for start in (ours.rand_reset, ours.reset):
         start()
@@ -375,7 +363,7 @@ RESETS = [
 
 @pytest.mark.parametrize(("task", "times"), RESETS)
 def test_random_resets_have_the_distribution_of_gymnasiums(task: str, times: float) -> None:
-    """2,000 resets each, with Gymnasium's noise scale and three times this scale."""
+    """Each side resets 2,000 times, with Gymnasium's noise scale and with three times this scale."""
     option = {} if times == 1.0 else {"reset_noise_scale": keywords(task)["reset_noise_scale"] * times}
     theirs, ours = make_theirs(task, **option), make_ours(task, nworld=250, **option)
     theirs.reset(seed=0)
@@ -394,7 +382,7 @@ def test_random_resets_have_the_distribution_of_gymnasiums(task: str, times: flo
 def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
     """Compare two (n, k) samples: each coordinate, and each pair of coordinates.
 
-    Fewer than one in 10,000 pairs from equal distributions fails these thresholds; the seeds are fixed.
+    Fewer than one in 10,000 pairs of samples from equal distributions exceeds these thresholds; the seeds are fixed.
     """
     n = len(a)
     assert a.shape == b.shape and np.isfinite(b).all()
@@ -411,7 +399,7 @@ def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
     for edge in (np.min, np.max):
         assert np.abs(edge(a, axis=0) - edge(b, axis=0))[bounded].max(initial=0.0) < 0.05 * np.ptp(a)
     assert (ks_distance(a, b) < 2.6 * math.sqrt(2.0 / n)).all()
-    # dependence of coordinates: their correlation, and the distance of pairs from the mean
+    # dependence between coordinates: their correlation, and the distance of pairs from the mean
     assert np.abs(np.corrcoef(a.T) - np.corrcoef(b.T)).max() < 5.5 * math.sqrt(2.0 / n)
     pairs = np.array(list(itertools.combinations(range(a.shape[1]), 2)))[:200].T
     lengths = [np.hypot(x[:, pairs[0]], x[:, pairs[1]]) for x in (a, b)]
@@ -419,28 +407,26 @@ def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
 
 
 def ks_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The Kolmogorov-Smirnov distance of two (n, k) samples, for each column."""
+    """Return the Kolmogorov-Smirnov distance of two (n, k) samples, for each column."""
     order = np.argsort(np.concatenate([a, b]), axis=0)
     ranks = np.cumsum(np.where(order < len(a), 1.0 / len(a), -1.0 / len(b)), axis=0)
     return np.abs(ranks).max(axis=0)
 
 
-# keyword parameters
-
 IGNORED = {("humanoid_standup", "uph_cost_weight")}
-"""Parameters that Gymnasium 1.4 documents and ignores."""
+"""Parameters that Gymnasium 1.4 documents but ignores."""
 
 
 @functools.cache
 def keywords(task: str) -> dict[str, Any]:
-    """Keyword parameters of Gymnasium's class with their defaults, without the model file and the camera."""
+    """Return the keyword parameters of Gymnasium's class with defaults, without the model file and the camera."""
     parameters = inspect.signature(unchanged(task)).parameters.values()
     others = ("xml_file", "default_camera_config")
     return {p.name: p.default for p in parameters if p.kind is not p.VAR_KEYWORD and p.name not in others}
 
 
 def variants(default: Any) -> list[Any]:
-    """Values other than the default; for a range, the side to narrow."""
+    """Return values other than the default; for a range, the side to narrow."""
     if isinstance(default, bool):
         return [not default]
     if isinstance(default, tuple):
@@ -451,12 +437,12 @@ def variants(default: Any) -> list[Any]:
 
 
 def cases() -> list[Any]:
-    """(task, parameter, variant) for every parameter; variants after the first are long, except sides of a range."""
+    """Return (task, parameter, variant) for every parameter; later variants are long, except sides of a range."""
     found = []
     for task in TASKS:
         for name, default in keywords(task).items():
             if name == "reset_noise_scale":
-                continue  # compared by the distributions above
+                continue  # the tests of distributions above cover it
             for i, variant in enumerate(variants(default)):
                 marks = pytest.mark.long if i and not isinstance(default, tuple) else ()
                 found.append(pytest.param(task, name, variant, marks=marks))
@@ -471,7 +457,7 @@ class Numbers:
     steps: list[tuple[float, float, bool]]
 
     def changed(self, default: "Numbers") -> float:
-        """The share of terminal steps if terminations differ from the default's, else the share of changed steps."""
+        """Return the share of terminal steps if terminations differ from the default's, or else of changed steps."""
         ends, default_ends = ([step[2] for step in numbers.steps] for numbers in (self, default))
         if ends != default_ends:
             return float(np.mean(ends))
@@ -497,7 +483,7 @@ def default_numbers(task: str) -> Numbers:
 
 
 def narrowed(task: str, name: str, side: str) -> tuple[float, float]:
-    """A range with one side narrowed, by bisection, so that some but not all steps change."""
+    """Narrow one side of a range by bisection, so that some but not all steps change."""
     low, high = keywords(task)[name]
     inner, outer = (high, low) if side == "low" else (low, high)
     inner, outer = (float(np.clip(bound, -1e3, 1e3)) for bound in (inner, outer))
@@ -525,9 +511,9 @@ def test_every_parameter_of_gymnasium_has_its_default(task: str) -> None:
 
 @pytest.mark.parametrize(("task", "name", "variant"), cases())
 def test_a_parameter_has_the_effect_of_gymnasiums(task: str, name: str, variant: Any) -> None:
-    """On results and on the size of the observation.
+    """Compare the effect on results and on the size of the observation.
 
-    Some ranges exclude the initial state, which Gymnasium checks only after a step; so worlds reset automatically.
+    Some ranges exclude the initial state, which Gymnasium checks only after a step, so worlds reset automatically.
     """
     value = narrowed(task, name, variant) if variant in ("low", "high") else variant
     default, changed = default_numbers(task), numbers(task, **{name: value})
@@ -565,7 +551,7 @@ def halve_timestep(root: ET.Element) -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_a_changed_model_file_has_the_effect_of_gymnasiums(task: str, tmp_path: Path) -> None:
-    """The option ``model`` accepts a changed copy of the file, as Gymnasium's ``xml_file`` does."""
+    """The option ``model`` accepts a modified copy of the file, as Gymnasium's ``xml_file`` does."""
     tree = ET.parse(make_theirs(task).fullpath)
     halve_timestep(tree.getroot())
     for motor in tree.getroot().iterfind("actuator/*"):

@@ -1,4 +1,4 @@
-"""Compare tasks with their environments in Gymnasium-Robotics, on the C engine.
+"""Compare tasks with their Gymnasium-Robotics environments on the C engine.
 
 A task names its environment in the attribute ``gymnasium``. For a new task, add states to SPECIAL that reach its
 bonuses.
@@ -41,18 +41,17 @@ TASKS = sorted(ENTRIES)
 
 
 def relative_error(ours: np.ndarray | float, theirs: np.ndarray | float) -> float:
-    """Largest difference, relative to the larger of 1 and the value."""
+    """Return the largest difference, relative to the larger of 1 and the value."""
     return float(np.max(np.abs(ours - theirs) / np.maximum(1.0, np.abs(theirs))))
 
 
 def geoms(pair: mujoco.MjsPair) -> set[str]:
-    """The names of the two geoms of a pair."""
     return {pair.geomname1, pair.geomname2}
 
 
 @functools.cache
 def oracle_class(name: str) -> type[MujocoEnv]:
-    """Their environment with the task's changes of the model, and without duplicate contact pairs."""
+    """Return their environment with the task's changes of the model, and without duplicate contact pairs."""
     registered: Any = load_env_creator(ENTRIES[name])
 
     class Oracle(registered):  # type: ignore[misc]
@@ -68,7 +67,7 @@ def oracle_class(name: str) -> type[MujocoEnv]:
 
 
 def registered(name: str) -> Any:
-    """Their environment without changes."""
+    """Make their unchanged environment."""
     return gymnasium.make(IDS[name], disable_env_checker=True).unwrapped
 
 
@@ -91,13 +90,13 @@ class Pair:
         self._simulate, self.theirs.do_simulation = self.theirs.do_simulation, self._with_our_controls
 
     def _with_our_controls(self, ctrl: np.ndarray, frames: int) -> None:
-        # actions become controls in float32 here and in float64 there, a difference that would grow over many steps
+        # actions become controls in float32 here and in float64 there; over many steps the difference would grow
         ours = self.ours.state_space.split(self.ours.get_state())["ctrl"][0].numpy()
         np.testing.assert_allclose(ours, ctrl, atol=2e-7)
         self._simulate(ours, frames)
 
     def reset(self) -> None:
-        """Begin an episode in a random initial state of ours."""
+        """Begin an episode in one of our random initial states."""
         self.ours.rand_reset()
         first = self.ours.obs[0].numpy().astype(np.float64)
         self.put()
@@ -127,7 +126,7 @@ class Pair:
         self.ours.set_state(state)
 
     def _move(self, body: str, pos: np.ndarray, quat: np.ndarray) -> None:
-        """Place a mocap body of our model; in their model it may be a mocap body, a fixed body or a site."""
+        """Place a mocap body of our model; their model may have a mocap body, a fixed body or a site instead."""
         model, data = self.theirs.model, self.theirs.data
         if (id := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body)) < 0:
             model.site(body).pos[:] = pos
@@ -137,7 +136,6 @@ class Pair:
             data.mocap_pos[mocap], data.mocap_quat[mocap] = pos, quat
 
     def step(self, action: np.ndarray) -> None:
-        """Step both."""
         action = action.astype(np.float32)
         self.ours.step(torch.from_numpy(action[None]))
         self.obs, self.reward, self.terminated, truncated, info = self.theirs.step(action.astype(np.float64))
@@ -146,7 +144,7 @@ class Pair:
         self.goals += self.success
 
     def check(self) -> None:
-        """Compare the results of the step, to the rounding of float32."""
+        """Compare the results of the step, up to float32 rounding."""
         assert relative_error(self.ours.obs[0].numpy().astype(np.float64), self.obs) <= 1e-5
         assert relative_error(self.ours.reward.item(), float(self.reward)) <= 1e-5
         assert self.ours.terminated.item() == self.terminated
@@ -159,7 +157,6 @@ class Pair:
 
 
 def mocap_bodies(model: mujoco.MjModel) -> dict[str, int]:
-    """Indices of the mocap bodies by name."""
     return {model.body(i).name: int(mocap) for i, mocap in enumerate(model.body_mocapid) if mocap >= 0}
 
 
@@ -168,14 +165,14 @@ class Special:
     """A state that random actions do not reach."""
 
     reward: float
-    """Their reward of the next step, within 0.1."""
+    """The reward that their next step returns, within 0.1."""
     joints: dict[str, float]
-    """Coordinates of some joints."""
+    """Positions of some joints."""
     moved: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
-    """Positions and orientations of some mocap bodies."""
+    """Poses of some mocap bodies."""
 
     def fields(self, env: lw.Env) -> dict[str, np.ndarray]:
-        """The fields of this state that differ from the environment's own."""
+        """Return the fields of this state that differ from the environment's own."""
         parts = env.state_space.split(env.get_state()[0])
         fields = {name: parts[name].numpy().copy() for name in ("qpos", "mocap_pos", "mocap_quat")}
         for joint, value in self.joints.items():
@@ -187,13 +184,13 @@ class Special:
 
 
 def pen(reward: float, angle: float, up: float) -> Special:
-    """The pen at a height above the palm, with an angle between its axis and the target's."""
+    """Return a state with the pen at a height above the palm, at an angle to the target."""
     turn = (np.pi / 2 - angle) / 2
     return Special(reward, {"OBJTx": -up}, {"target": (0.2, 0.2, 0.2, np.cos(turn), 0.0, np.sin(turn), 0.0)})
 
 
 def ball(reward: float, up: float, aside: float) -> Special:
-    """The ball at a height and at a distance to the side of the target, which is 0.2 m above the table."""
+    """Return a state with the ball at a height and a sideways distance; the target is 0.2 m above the table."""
     joints = {"OBJTx": aside, "OBJTy": 0.0, "OBJTz": up - 0.035}
     return Special(reward, joints, {"target": (0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0)})
 
@@ -223,7 +220,7 @@ MakePair = Callable[..., Pair]
 
 @pytest.fixture
 def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
-    """``make_pair(theirs, sparse=True)``: our environment and theirs, by default the oracle."""
+    """Return ``make_pair(theirs, sparse=True)``, which pairs our environment with theirs, by default the oracle."""
 
     def make(theirs: Any = None, **params: Any) -> Pair:
         ours = shared_env(task, autoreset=False, horizon=0, nthread=1, **params)
@@ -233,7 +230,7 @@ def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
 
 
 def test_random_actions_lead_to_the_same_numbers(make_pair: MakePair) -> None:
-    """Five episodes of 200 steps from random initial states; a quarter of the actions is out of range."""
+    """Run five episodes of 200 steps from random initial states; a quarter of the actions is out of range."""
     pair = make_pair()
     for _ in range(5):
         pair.reset()
@@ -245,12 +242,11 @@ def test_random_actions_lead_to_the_same_numbers(make_pair: MakePair) -> None:
 
 
 def pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """The pairs of geoms that the model lists."""
     return list(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
 
 
 def test_the_registered_environment_agrees_until_contacts_differ(make_pair: MakePair, task: str) -> None:
-    """Their unchanged model, until there is a contact that only they have, or that they count twice."""
+    """Compare with their unchanged model until a contact occurs that ours lacks or that theirs counts twice."""
     pair = make_pair(registered(task))
     ours, theirs = pair.ours.model, pair.theirs.model
     ghosts = set(np.flatnonzero(ours.geom_contype != theirs.geom_contype))
@@ -288,9 +284,6 @@ def test_bonuses_and_success_are_theirs(make_pair: MakePair, task: str, reward_t
     assert reward_type == "dense" or rewards == {10.0, -0.1}
 
 
-# models and spaces
-
-
 def test_spaces_and_parameters_are_theirs(shared_env: SharedEnv, task: str) -> None:
     ours, theirs = shared_env(task, autoreset=False, horizon=0, nthread=1), registered(task)
     low, high = theirs.action_space.low, theirs.action_space.high
@@ -307,11 +300,11 @@ KINDS = {
     "site": mujoco.mjtObj.mjOBJ_SITE, "tendon": mujoco.mjtObj.mjOBJ_TENDON,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR, "sensor": mujoco.mjtObj.mjOBJ_SENSOR, "dof": None, "wrap": None,
 }  # fmt: skip
-"""The kinds of elements, with the types for looking up their names."""
+"""Kinds of elements, with the types for looking up their names."""
 
 
 def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, str]]:
-    """Fields of elements of their model that differ from ours, with the elements' names."""
+    """Return the fields in which elements of their model differ from ours, with the elements' names."""
     found = set()
     for kind, named in KINDS.items():
         fields = [name for name in dir(theirs) if name.startswith(f"{kind}_")]
@@ -337,9 +330,6 @@ def test_model_is_theirs_except_for_edits(shared_env: SharedEnv, task: str) -> N
         )
     for name in ("timestep", "integrator", "cone", "solver", "iterations", "noslip_iterations", "tolerance"):
         assert getattr(ours.opt, name) == getattr(theirs.opt, name), name
-
-
-# resets
 
 
 def test_fixed_resets_put_everything_where_the_model_does(make_pair: MakePair, task: str) -> None:

@@ -1,7 +1,7 @@
 """Compare go1_velocity with mjlab's Mjlab-Velocity-Flat-Unitree-Go1: model, observations, rewards and terminations.
 
-store_go1.py stored the numbers of mjlab's environment, so the tests do not need mjlab. They were stored after a forward
-pass, so mjlab's poses and contacts are current.
+The tests read mjlab's numbers from a file that store_go1.py wrote, so they do not need mjlab. mjlab's poses and
+contacts are current, because a forward pass preceded each observation.
 """
 
 from pathlib import Path
@@ -24,9 +24,6 @@ LAST_ACTION, CONTACT_TIME, AIR_TIME = slice(8, 20), slice(20, 24), slice(24, 28)
 ENCODER_BIAS, PEAK_HEIGHT = slice(0, 12), slice(12, 16)  # in lasting memory
 
 
-# the model
-
-
 def test_model_has_mjlabs_bodies_and_geoms(shared_env: SharedEnv) -> None:
     model = shared_env("go1_velocity").model
     assert [model.body(i).name for i in range(model.nbody)] == STORED["bodies"].tolist()
@@ -47,7 +44,7 @@ def test_model_has_mjlabs_options(shared_env: SharedEnv, name: str) -> None:
 
 @pytest.mark.parametrize("i", range(4))
 def test_trajectories_of_the_model_equal_mjlabs(shared_env: SharedEnv, i: int) -> None:
-    """200 substeps of MuJoCo under the same controls, from standing and tumbling, with self-collisions."""
+    """Run 200 substeps of MuJoCo under equal controls, standing and tumbling, with self-collisions."""
     model = shared_env("go1_velocity").model
     data, wanted = mujoco.MjData(model), STORED["trajectory/qpos"][i]
     data.qpos, data.qvel = wanted[0], STORED["trajectory/qvel0"][i]
@@ -61,9 +58,6 @@ def test_trajectories_of_the_model_equal_mjlabs(shared_env: SharedEnv, i: int) -
         tangled += int((bodies[data.contact.geom] > 0).all(axis=1).sum())
     assert touching > 100
     assert tangled > 0 or i < 2
-
-
-# the environment
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +75,7 @@ def stored(name: str) -> torch.Tensor:
 
 
 def mjlabs_states(env: lw.Env, *, heading: bool) -> torch.Tensor:
-    """The stored states, with the final commands, or with ``heading`` with headings from which the commands follow."""
+    """Return the stored states with their commands or, with ``heading``, with headings that determine the commands."""
     state = env.get_state()
     parts = env.state_space.split(state)
     parts["qpos"].copy_(stored("qpos"))
@@ -116,11 +110,11 @@ def test_stored_states_hold_every_kind_of_command_and_contact() -> None:
 
 @pytest.mark.parametrize("term", TERMS)
 def test_terms_of_the_reward_equal_mjlabs(env: lw.Env, term: str) -> None:
-    """Each term separately, with mjlab's weight and all other weights zero."""
+    """Each term is compared alone, with mjlab's weight and all other weights zero."""
     after = mjlabs_states(env, heading=False)
     before = after.clone()
     env.state_space.split(before)["memory"][:, LAST_ACTION] = stored("previous_action")
-    if term == "soft_landing":  # mjlab's forces are current, ours are one substep late
+    if term == "soft_landing":  # mjlab's forces are current, ours lag by one substep
         times = env.state_space.split(after)["memory"][:, CONTACT_TIME]
         times += 0.005 * (times > 0)
     weight = float(STORED[f"weight/{term}"])

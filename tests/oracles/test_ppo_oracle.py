@@ -1,4 +1,4 @@
-"""Compare an update of PPO with rsl_rl's update, from equal weights and samples."""
+"""Compare a PPO update with rsl_rl's, from equal weights and samples."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -26,7 +26,7 @@ def double() -> Iterator[None]:
 
 
 def samples(ppo: lw.PPO) -> dict[str, torch.Tensor]:
-    """Samples near the policy and the value function, so that some ratios and values are clipped."""
+    """Return samples near the policy and the value function, so that some ratios and values are clipped."""
     env, generator = ppo.env, torch.Generator().manual_seed(1)
 
     def drawn(*shape: int) -> torch.Tensor:
@@ -44,7 +44,7 @@ def samples(ppo: lw.PPO) -> dict[str, torch.Tensor]:
 
 
 def theirs(ppo: lw.PPO, given: dict[str, torch.Tensor]) -> Any:
-    """rsl_rl's PPO with the same weights, and a storage with the samples."""
+    """Return rsl_rl's PPO with the same weights, and a storage with the samples."""
     env = ppo.env
     other = OnPolicyRunner(RslRlVecEnv(env), runner_config(env, ppo.config), None, "cpu").alg
     for network in (other.actor, other.critic):
@@ -71,7 +71,7 @@ def test_an_update_gives_rsl_rls_parameters(
 ) -> None:
     config = lw.PPOConfig(**{"hidden": (16, 8), "value_hidden": (8,), "num_steps": STEPS, "normalize": False} | changes)
     ppo = lw.PPO(shared_env(Metered, nworld=N, horizon=10), config=config)
-    for module in (ppo.policy, ppo.value):  # last layers near zero have small gradients
+    for module in (ppo.policy, ppo.value):  # with last layers near zero, gradients are small
         torch.nn.init.xavier_uniform_(module.network[-1].weight, generator=torch.Generator().manual_seed(0))
     given = samples(ppo)
     other = theirs(ppo, given)

@@ -90,7 +90,7 @@ def test_every_flipped_bit_of_a_tensor_is_refused(run: Run) -> None:
 
 @pytest.mark.parametrize("every", [61, pytest.param(7, marks=pytest.mark.long)])
 def test_a_file_with_a_flipped_bit_has_the_same_content_or_is_refused(run: Run, every: int) -> None:
-    """Among every seventh bit is the mark of a folder, after which torch reads no numbers."""
+    """One of every seven bits marks a zip entry as a folder, so that torch reads no numbers."""
     data = run.checkpoint.read_bytes()
     saved = read_checkpoint(run.checkpoint)
     weights = saved["policy"].pop("state")

@@ -1,5 +1,3 @@
-"""The types of a configuration's entries, and errors of settings that name the file."""
-
 import json
 from pathlib import Path
 from typing import Any

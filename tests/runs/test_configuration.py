@@ -1,5 +1,3 @@
-"""A learner as config.json, and back."""
-
 import json
 from pathlib import Path
 from typing import Any
@@ -43,7 +41,7 @@ def test_a_learner_is_made_again_from_its_description(kind: str) -> None:
 @pytest.mark.parametrize(
     ("saved", "options"),
     [
-        (None, PhysicsOptions()),  # a run from before there was a choice
+        (None, PhysicsOptions()),  # a run that is older than this option
         ({"integrator": None, "solver": {}, "deterministic": False, "unroll": False}, PhysicsOptions()),
         (
             {"integrator": "euler", "solver": {"iterations": 7}, "deterministic": True, "unroll": False},
@@ -76,7 +74,7 @@ def test_the_configuration_of_another_programs_learner_has_no_hyperparameters() 
 
 
 def test_processes_of_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The number of threads is not a setting of the run, so that another number of processes may continue it."""
+    """The number of threads is not saved with the run, so a different number of processes may continue it."""
     monkeypatch.setattr("lyceum_warp.runs.configuration.cpu_cores", lambda: 6)
     learner = read(BASE | {"nworld": 4}).learner(Team(1, 2, "cpu", neighbours=2))
     assert (learner.env.options.nthread, learner.env.nworld, learner.env.first_world) == (3, 2, 2)

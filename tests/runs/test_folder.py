@@ -1,5 +1,3 @@
-"""The folder of a run: creation, its files, and what is refused."""
-
 import json
 import resource
 import subprocess
@@ -120,7 +118,7 @@ def test_load_returns_the_same_policy(run: Run) -> None:
 
 
 def test_a_failed_save_keeps_the_old_checkpoint(run: Run) -> None:
-    """As on a full disk: no file may grow beyond half of the checkpoint."""
+    """A file size limit stands for a full disk."""
     before, limits = run.checkpoint.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limits[1]))
     try:

@@ -1,5 +1,3 @@
-"""Only one process writes a run: locks, when they are taken over, and what their former holder does."""
-
 import contextlib
 import json
 import os
@@ -29,7 +27,7 @@ os.kill(os.getpid(), 9)
 
 
 def held(folder: Path, *, seconds: float = 0.0, **changes: Any) -> None:
-    """Write the lock of a process that runs, last touched some seconds ago."""
+    """Write the lock of a running process, last touched some seconds ago."""
     pid = os.getppid()
     owner = {"host": platform.node(), "pid": pid, "started": lock._started(pid), "token": "theirs"}
     (folder / "lock").write_text(json.dumps(owner | changes))
@@ -39,7 +37,6 @@ def held(folder: Path, *, seconds: float = 0.0, **changes: Any) -> None:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """A run of two iterations."""
     lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run", iterations=2)
     return tmp_path / "run"
 
@@ -114,7 +111,7 @@ def test_a_lock_is_touched_while_it_is_held(tmp_path: Path, monkeypatch: pytest.
 def test_the_lock_of_another_host_is_only_taken_over_on_request(
     content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However old it is: clocks of hosts differ."""
+    """The lock's age does not matter, because the clocks of hosts differ."""
     held(tmp_path, seconds=1e6)
     if content == "damaged":
         (tmp_path / "lock").write_text("half a li")
@@ -133,7 +130,7 @@ def test_the_lock_of_another_host_is_only_taken_over_on_request(
 def test_a_writer_whose_lock_was_taken_over_writes_nothing_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its own end leaves the lock of the other one."""
+    """When it ends, it leaves the new holder's lock."""
     folder, found, takers = tmp_path / "run", {}, []
 
     def callback(iteration: lw.Iteration) -> None:

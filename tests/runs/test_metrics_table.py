@@ -1,5 +1,3 @@
-"""The table of a run's iterations."""
-
 import csv
 from pathlib import Path
 
@@ -14,7 +12,7 @@ def table(tmp_path: Path) -> Path:
 
 
 def test_a_new_column_is_empty_in_earlier_rows(table: Path) -> None:
-    """As after an update of the task, or of the package; the order of a row's names does not matter."""
+    """An update of the task or package may add a column; the order of a row's names does not matter."""
     append_row(table, {"iteration": 1, "kl": 0.5})
     append_row(table, {"iteration": 2, "kl": None, "metrics/forward, m": 1.5})
     append_row(table, {"metrics/forward, m": 2.5, "iteration": 3})
@@ -43,7 +41,7 @@ def test_cut_drops_rows_without_a_checkpoint(table: Path) -> None:
     for i in (1, 2, 3):
         append_row(table, {"iteration": i, "value": 0.5})
     with table.open("a") as file:
-        file.write("4,0.")  # a row that was cut off when the process ended
+        file.write("4,0.")  # an incomplete row
     whole = table.read_text()
     cut_rows(table, 2)
     assert [row["iteration"] for row in read_metrics(table)] == [1, 2]

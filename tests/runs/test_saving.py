@@ -1,4 +1,4 @@
-"""When a run is saved, and what is left of it if its folder cannot be written."""
+"""Decide when a run is saved, and save what is possible if its folder cannot be written."""
 
 import os
 import resource
@@ -32,18 +32,15 @@ def test_saves_take_a_small_share_of_the_time(seconds: float, wait: float, npg: 
     saver = Saver(Run.create(tmp_path / "run", {}), npg)
     saver.save()
     assert saver.saved == 0 and not saver.due()
-    saver._seconds = seconds  # as it takes with more worlds
+    saver._seconds = seconds  # simulate the duration of a save with more worlds
     saver._when -= 0.9 * wait
     assert not saver.due()
     saver._when -= 0.2 * wait
     assert saver.due()
 
 
-# folders that cannot be written
-
-
 def trained_with(folder: Path, at_three: Callable[[], Any]) -> OSError:
-    """Train while something happens to the folder after the third iteration."""
+    """Train, and call a function after the third iteration."""
 
     def callback(iteration: lw.Iteration) -> None:
         if iteration.iteration == 3:
@@ -55,7 +52,7 @@ def trained_with(folder: Path, at_three: Callable[[], Any]) -> OSError:
 
 
 def test_a_file_that_cannot_be_written_ends_the_run_and_leaves_its_last_save(six: Path, tmp_path: Path) -> None:
-    """As on a full disk: no file may grow beyond the policy's size, so the complete state is not saved."""
+    """A file size limit stands for a full disk: the policy fits, the complete state does not."""
     folder, limits = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
     size = 2 * os.path.getsize(six / "policy.pt")
     assert size < os.path.getsize(six / "checkpoint.pt")

@@ -1,4 +1,4 @@
-"""A run's copies of its task: what is kept, and what later commands use after files have moved or changed."""
+"""A run's copies of its task: what is copied, and which files later commands use after a move or an edit."""
 
 import shutil
 from pathlib import Path
@@ -67,7 +67,7 @@ SMALL = lw.NPGConfig(samples=40, hidden=(4,), value_hidden=(4,), mean_every=1, m
 
 @pytest.fixture
 def folder(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
-    """A folder with a task, at the same path in every run of the tests, so that Warp finds compiled kernels."""
+    """Return a folder with a task, at the same path in every run of the tests, so that Warp reuses compiled kernels."""
     cache = getattr(pytestconfig, "cache", None)
     folder = Path(cache.mkdir("kept_task")) if cache else tmp_path
     shutil.rmtree(folder)
@@ -80,7 +80,6 @@ def folder(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
 
 
 def trained(folder: Path) -> Path:
-    """A run of two iterations."""
     out, table = folder / "run", folder / "mine" / "goal.npy"
     arguments = ["train", str(folder / "mine" / "slide.py"), "--out", str(out), "--param", f"goal={table}", *TINY]
     assert cli.main([*arguments, *QUIET, "--iterations", "2"]) == 0
@@ -88,23 +87,22 @@ def trained(folder: Path) -> Path:
 
 
 def env_of(folder: Path) -> Env:
-    """An environment as a run has it."""
     run = Run.open(folder)
     saved = Configuration.of(run)
     return run_env(run, saved.options, saved.params)
 
 
 def returns(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The line of returns that eval prints."""
+    """Return the line of returns that eval prints."""
     capsys.readouterr()
     assert cli.main(["eval", *arguments, "--episodes", "2"]) == 0
     output = capsys.readouterr()
-    print(output.err)  # for ``refused``, which reads it
+    print(output.err)  # ``refused`` reads it
     return next(line for line in output.out.splitlines() if line.strip().startswith("return"))
 
 
 def test_a_run_goes_on_after_its_task_has_moved(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The model's includes, its meshes and the tables have moved with it."""
+    """The model's includes and meshes and the tables move with the task."""
     out = trained(folder)
     before = returns(capsys, str(out))
     assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
@@ -147,7 +145,7 @@ URDF = """<robot name="arm"><mujoco><compiler meshdir="../meshes" strippath="tru
 
 @pytest.mark.parametrize("kind", ["attached", "urdf", "python"])
 def test_all_files_of_a_model_are_copied(kind: str, folder: Path) -> None:
-    """Of a model that attaches another one, of a URDF, and of one that was made in Python."""
+    """The models attach another model, are a URDF, or are made in Python."""
     robot = folder / "mine" / "robot"
     (robot / "arm.urdf").write_text(URDF)
     (robot / "whole.xml").write_text(
@@ -250,7 +248,7 @@ def test_a_run_that_begins_with_another_uses_its_copy_of_the_model(
     env = env_of(warm)
     assert np.array_equal(env.model.body_mass, masses)
     assert cli.main(["train", "--resume", str(warm), "--iterations", "2", *QUIET]) == 0
-    if not moved:  # a task that is named is used as it is now
+    if not moved:  # a task that is given by name is used in its current form
         arguments[4] = str(folder / "new")
         assert cli.main([*arguments, "1", str(folder / "mine" / "slide.py")]) == 0
         env = env_of(folder / "new")
@@ -269,7 +267,7 @@ def test_a_run_of_python_keeps_a_model_that_was_made_there(tmp_path: Path, capsy
 
 
 def test_python_names_a_task_and_a_model_that_have_changed(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """The algorithm is made of them, so they are used as they are."""
+    """The changed files are used, because the algorithm was made from them."""
     file, table, out = folder / "mine" / "slide.py", folder / "mine" / "goal.npy", folder / "run"
 
     def train(iterations: int, **words: Any) -> None:
@@ -289,9 +287,8 @@ def test_python_names_a_task_and_a_model_that_have_changed(folder: Path, caplog:
 
 
 def test_a_task_of_a_program_is_evaluated_with_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its file may train when it is run."""
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=SMALL), tmp_path / "run", iterations=1)
-    Run.open(tmp_path / "run").amend(task=None)  # as for a class of a notebook
+    Run.open(tmp_path / "run").amend(task=None)  # as saved for a class of a notebook
     assert cli.main(["eval", str(tmp_path / "run")]) == 2
     refused(
         capsys,
@@ -319,7 +316,7 @@ EDITS = [
     lambda text: "",
     None,
 ]
-"""Edits of a task's files during training; None deletes them."""
+"""Edits of a task's files during training; None deletes a file."""
 
 
 def test_a_run_keeps_to_the_source_that_it_was_started_with(folder: Path) -> None:

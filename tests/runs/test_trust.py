@@ -1,4 +1,4 @@
-"""A run folder of another user runs no code and reads no file that it names, before this user allows it."""
+"""A run folder of another user runs no code and reads no file that it names until this user trusts it."""
 
 import json
 import shutil
@@ -29,7 +29,7 @@ SOURCE = tiny_task.changed(
 
 @pytest.fixture(scope="module")
 def made(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Runs of a task's file and of a task of the package, at one path in every run of the tests, for Warp's cache."""
+    """Make runs of a task file and of a task of the package; the path is constant, for Warp's cache."""
     cache = getattr(pytestconfig, "cache", None)
     folder = Path(cache.mkdir("trust")) if cache else tmp_path_factory.mktemp("trust")
     shutil.rmtree(folder)
@@ -45,14 +45,14 @@ def made(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture
 def witness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file that the task's file makes whenever it is run."""
+    """Return the path of a file that the task file writes whenever it is run."""
     monkeypatch.setenv("WITNESS", str(tmp_path / "witness"))
     return tmp_path / "witness"
 
 
 @pytest.fixture
 def theirs(made: Path, witness: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The run of the task's file as another user gets it: elsewhere, without the original files and the record."""
+    """Copy the run of the task file as another user receives it: elsewhere, without the original files, untrusted."""
     folder = made / "theirs"
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(made / "own", folder, copy_function=shutil.copy)
@@ -98,7 +98,7 @@ def test_a_foreign_run_is_refused_until_it_is_trusted(
     arguments = [word if word != "2" else "3" for word in command]
     assert cli.main(arguments) == 0  # trusted from now on
     (theirs / "task" / "told.py").write_text(SOURCE + "\n")
-    assert cli.main(command) == 2  # but not with another content
+    assert cli.main(command) == 2  # but not with changed content
 
 
 def outside(folder: Path) -> Path:
@@ -158,7 +158,7 @@ ATTACKS = [names_a_task, names_a_file_outside, names_an_absolute_file, brings_a_
 def test_a_run_of_a_named_task_is_refused_once_it_names_a_file(
     attack: Callable[[Path], Path], made: Path, witness: Path, tmp_path: Path
 ) -> None:
-    """The folder was recorded before it was edited."""
+    """The folder was trusted before it was edited."""
     folder = Path(shutil.copytree(made / "named", tmp_path / "named"))
     file = attack(folder)
     run = Run.open(folder)
@@ -176,7 +176,7 @@ def test_a_link_out_of_the_folder_is_refused(link: str, made: Path, witness: Pat
     folder = Path(shutil.copytree(made / "own", tmp_path / "own"))
     change(folder, task="/home/other/told.py:Told")
     kept = folder / "task" / "told.py"
-    if link == "file":  # of the same content, which may be replaced later
+    if link == "file":  # its content is equal, but it may be replaced later
         kept.rename(tmp_path / "told.py")
         kept.symlink_to(tmp_path / "told.py")
     else:

@@ -1,4 +1,4 @@
-"""Only a transition ends an episode, and both engines give the same reason for the same fault."""
+"""Only a transition ends an episode, and both engines report the same reason for the same fault."""
 
 import gymnasium
 import numpy as np
@@ -59,7 +59,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 
 class Leave(lw.Task):
-    """A pole whose episodes can begin in a state for which ``terminated`` holds, and which can leave such states."""
+    """A pole that may start in, and later leave, states for which ``terminated`` holds."""
 
     model, frame_skip, obs, memory, horizon = "inverted_pendulum.xml", 2, {"angle": 1, "speed": 1}, 1, 50
 
@@ -76,7 +76,7 @@ def test_a_fresh_state_does_not_end_an_episode(autoreset: bool, engine: str) -> 
     assert env.get_terminated(fresh).any()
     assert not env.done.any() and not env.done_reason.any()
     env.step()
-    assert env.terminated.any()  # of the worlds that stay in such a state
+    assert env.terminated.any()  # some worlds stay in such a state
     if not autoreset:
         assert torch.equal(env.terminated, env.get_terminated(env.get_state()))
     env.set_state(fresh)

@@ -1,4 +1,4 @@
-"""Tasks in a notebook: cells run one after another in one module, and a cell may be run again."""
+"""Tasks in a notebook: cells run one after another in one module, and may run again."""
 
 import sys
 import types
@@ -17,7 +17,7 @@ from lyceum_warp.binding.registry import find_task
 def notebook(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
     module = types.ModuleType("notebook_of_a_test")
     monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))  # what a cell registers goes with the test
+    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))  # undoes a cell's registrations after the test
     return module
 
 
@@ -31,7 +31,7 @@ def test_a_task_keeps_the_functions_of_its_own_cell(notebook: types.ModuleType, 
     first = tiny_task.with_function(evaluate)
     second = tiny_task.changed(("s.qpos[0]", "2.0"), ("class Tiny", "class Other"))
     for i, cell in enumerate((first, second)):
-        run_cell(notebook, tiny_task.write(tmp_path, cell, f"cell{i}.py"))  # Warp reads the source from the file
+        run_cell(notebook, tiny_task.write(tmp_path, cell, f"cell{i}.py"))  # Warp reads the source from a file
     tiny, other = lw.make(notebook.Tiny), lw.make(notebook.Other)
     for env in (tiny, other):
         env.step()

@@ -1,4 +1,4 @@
-"""What a task writes wrongly while it runs stays in its world, is named, and never makes a state that cannot be set."""
+"""Invalid values that a task writes stay in their world, are named, and never make an invalid state."""
 
 import mujoco
 import pytest
@@ -123,12 +123,12 @@ def test_a_draw_that_cannot_be_simulated_is_a_fault_of_its_world(engine: str) ->
     env.set_params(damping=[1.0, -1.0, 1.0])
     env.rand_reset()
     state = env.get_state()
-    assert torch.equal(env.get_obs(state), env.obs)  # scratch worlds take the same states
+    assert torch.equal(env.get_obs(state), env.obs)  # scratch worlds have the same states
     env.step()
     assert [lw.Done(reason) for reason in env.done_reason.tolist()] == [0, lw.Done.MODEL, 0]
     assert env.reward[1] == 0.0
     env.set_params(damping=[1.0, 1.0, 1.0])
-    env.step()  # this episode began with the bad draw
+    env.step()  # this episode began with the invalid draw
     env.step()
     assert env.done_reason.tolist() == [0, 0, 0]
     assert env.fault_counts["model"] == 2
@@ -152,5 +152,5 @@ def test_an_event_in_memory_leaves_the_physics_in_double_precision() -> None:
 def test_the_memory_of_a_world_counts_its_model_fields() -> None:
     drawn, plain = lw.make("hopper", dynamics=["body_mass", "geom_friction"]), lw.make("hopper")
     state = 8 * (drawn.state_space.shape[0] - plain.state_space.shape[0])
-    assert state == 8 * 20  # a number of the state takes eight bytes
+    assert state == 8 * 20  # a number in the state takes eight bytes
     assert drawn.bytes_per_world > plain.bytes_per_world + state

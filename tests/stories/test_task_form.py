@@ -1,6 +1,6 @@
-"""The whole task form through the public interface: dynamics that differ between worlds, groups, noise, own actions.
+"""Test the task form through the public interface: dynamics that differ between worlds, groups, noise, custom actions.
 
-The rules of ``check_task`` cover each feature for any task; here are the stories that need a task of their own.
+The rules of ``check_task`` cover each feature for any task; these tests need particular tasks.
 """
 
 from pathlib import Path
@@ -27,7 +27,7 @@ def copied(s: PuckWorld, action: Row[float], p: PuckParams, ctrl: Row[float]):
 
 
 class DrawnWithControl(Drawn):
-    """The same with a ``control``, so that rollouts go step by step."""
+    """``Drawn`` with a ``control``, so that rollouts run step by step."""
 
     control = copied
 
@@ -55,7 +55,7 @@ def draw_wind(s: WindyWorld, p: PuckParams, rng: Row[wp.uint32]):
 
 
 class Windy(lw.Task):
-    """A force that is drawn at a reset and blows through the episode."""
+    """A force that is drawn at a reset and stays constant during the episode."""
 
     model = Drawn.model
     obs = {"x": 1, "wind": 1}
@@ -70,7 +70,6 @@ def random_actions(env: lw.Env, steps: int, seed: int = 0) -> torch.Tensor:
 
 
 def mass(env: lw.Env, state: torch.Tensor | None = None) -> torch.Tensor:
-    """The puck's mass in every world."""
     if state is None:
         return env.field("body_mass")[:, 1].clone()
     return state[:, env.state_space.parts["body_mass"]][:, 1]
@@ -81,9 +80,6 @@ def step_without_events(env: lw.Env, action: torch.Tensor) -> None:
     for phase in env.worlds.step_phases():
         if not phase.name.startswith("event"):
             phase.run()
-
-
-# dynamics that differ between worlds
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -174,9 +170,6 @@ def test_getters_judge_states_with_the_dynamics_of_the_state() -> None:
     assert torch.equal(obs[:, 4], mass(env, after).float())
 
 
-# faults and resets
-
-
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(("name", "reason"), [("cost", lw.Done.REWARD), ("noise", lw.Done.OBSERVATION)])
 def test_a_number_that_is_not_finite_is_a_fault_of_its_world(name: str, reason: lw.Done, engine: str) -> None:
@@ -191,7 +184,7 @@ def test_a_number_that_is_not_finite_is_a_fault_of_its_world(name: str, reason: 
         assert env.done_reason.tolist() == [0, int(reason), 0]
         assert env.truncated[1] and env.reward[1] == 0 and (env.episode_metrics["cost"][1] == 0)
         for obs in (*env.obs_groups.values(), *env.final_obs_groups.values()):
-            assert torch.isfinite(obs).all()  # no learner meets them, not even after the reset
+            assert torch.isfinite(obs).all()  # learners never see such values, not even after the reset
         if reason == lw.Done.OBSERVATION:
             assert torch.equal(env.final_obs[1], good)
         assert torch.equal(env.get_state()[others], fine.get_state()[others])
@@ -202,7 +195,7 @@ def test_a_number_that_is_not_finite_is_a_fault_of_its_world(name: str, reason: 
     assert torch.isfinite(judged).all()
     env.set_params(**{name: value})
     assert torch.equal(env.get_reward(before, action, after)[others], judged[others])
-    assert env.get_reward(before, action, after)[1] != 0  # no fault is left behind
+    assert env.get_reward(before, action, after)[1] != 0  # the fault has not persisted
 
 
 def test_a_rejected_draw_changes_no_lasting_memory() -> None:
@@ -244,9 +237,6 @@ def test_model_fields_that_events_change_are_nominal_again_after_a_reset(engine:
     assert (damping == np.float32(0.2)).all()
 
 
-# rollouts and planners
-
-
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Drawn, DrawnWithControl])
 def test_a_rollout_takes_the_model_of_the_state_or_the_nominal_one(task: type[lw.Task], engine: str) -> None:
@@ -261,7 +251,7 @@ def test_a_rollout_takes_the_model_of_the_state_or_the_nominal_one(task: type[lw
 
     def rewards(start: torch.Tensor, **options: Any) -> torch.Tensor:
         loop = OpenLoop(lw.make(task, nworld=3, engine=engine, autoreset=False, seed=9), 4, **options)
-        for _ in range(3):  # the third replays graphs
+        for _ in range(3):  # the third call replays graphs
             loop.state.copy_(start)
             loop.actions.copy_(actions)
             loop.run()
@@ -319,7 +309,6 @@ def test_inputs_that_a_reset_draws_act_in_steps_and_in_rollouts(engine: str) -> 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_rollout_has_the_numbers_of_stepping_without_events(engine: str) -> None:
-    """With groups, noise, inputs, substeps, memory and drawn dynamics."""
     env = lw.make(Full, nworld=3, engine=engine, autoreset=False, horizon=0)
     loop = OpenLoop(lw.make(Full, nworld=3, engine=engine, autoreset=False, seed=5), 4)
     for action in random_actions(env, 3, seed=1):
@@ -352,9 +341,6 @@ def test_a_planner_plans_for_a_task_with_every_feature(engine: str) -> None:
         env.step(action.expand(2, -1).contiguous())
     assert action.shape == (3,) and action.abs().max() <= 1.0 and action.abs().max() > 0.0
     assert torch.isfinite(plan.returns).all() and plan.summary["failed_samples"] == 0.0
-
-
-# actions of a task's own
 
 
 def test_actions_of_a_task_have_its_names_and_its_range() -> None:
@@ -404,21 +390,18 @@ class Tiny"""),
     assert action[0] > 0.0
 
 
-# mistakes
-
-
 def line(text: str) -> tuple[str, str]:
-    """A line more in the class."""
+    """Add a line to the class."""
     return '    obs = {"x": 1}', f'    obs = {{"x": 1}}\n    {text}'
 
 
 def field(text: str) -> tuple[str, str]:
-    """A field more in World."""
+    """Add a field to World."""
     return "    qpos: Row[float]", f"    qpos: Row[float]\n    {text}"
 
 
 def function(text: str) -> tuple[str, str]:
-    """A Warp function more before the class."""
+    """Add a Warp function before the class."""
     return "class Tiny", f"@wp.func\n{text}\n\nclass Tiny"
 
 

@@ -1,6 +1,6 @@
-"""Mistakes in a task's file: each is one line that says what is wrong and how to fix it; then the file is read again.
+"""Mistakes in a task file: the error is one line that names the mistake and its fix; the corrected file then loads.
 
-tests/binding has the same messages module by module. Here are those that newcomers met.
+tests/binding tests the same messages by module; these are the mistakes that newcomers made.
 """
 
 from pathlib import Path
@@ -35,7 +35,7 @@ OWN_WORLD = "@wp.struct\nclass World:\n    qpos: Row[float]\n"
 
 
 def function(text: str) -> tuple[str, str]:
-    """A Warp function more before the class."""
+    """Add a Warp function before the class."""
     return "class Tiny", f"@wp.func\n{text}\n\nclass Tiny"
 
 

@@ -1,4 +1,4 @@
-"""A user's task in a file of its own, with everything that a task may use, on both engines."""
+"""A user's task in its own file, with every feature that a task may use, on both engines."""
 
 import importlib.util
 import sys
@@ -218,9 +218,10 @@ def test_scaled_actions_under_rk4_keep_the_rules(module: ModuleType, path: Path,
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_fields_equal_mj_forward_of_the_state(module: ModuleType, engine: str) -> None:
-    """After a step, an automatic reset, set_state and rand_reset, also for a field that the task does not read.
+    """The fields are current after a step, an automatic reset, set_state and rand_reset, even if the task reads none of
+    them.
 
-    The accelerometer is of the last substep; it belongs to the state only after a reset.
+    The accelerometer belongs to the last substep; only after a reset it belongs to the state.
     """
     env = lw.make("follow_target", engine=engine, nworld=3, horizon=5, fields=["xipos"])
     centers = env.field("xipos")
@@ -293,7 +294,7 @@ def test_controls_come_from_the_task_or_are_scaled_to_their_ranges(module: Modul
     env = lw.make("follow_target", engine=engine, nworld=2, gain=[1.0, 10.0])
     env.reset()
     env.step(torch.full((2, 2), 0.5))
-    wanted = torch.tensor([[0.5, 0.5], [3.0, 1.0]])  # the second world's gain leads beyond the ranges
+    wanted = torch.tensor([[0.5, 0.5], [3.0, 1.0]])  # the second world's gain exceeds the control ranges
     torch.testing.assert_close(env.field("ctrl"), wanted)
     np.testing.assert_array_equal(env.action_space.high, [3, 1])
 

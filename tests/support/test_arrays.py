@@ -1,5 +1,3 @@
-"""Views of the same memory under another shape or in torch."""
-
 import pytest
 import torch
 import warp as wp

@@ -1,5 +1,3 @@
-"""``help`` shows functions, arguments and attributes with their docstrings."""
-
 import pydoc
 import re
 
@@ -20,7 +18,7 @@ def test_help_of_task_shows_every_function_and_every_attribute() -> None:
         assert function.signature in text
     for name in (name for name in Task.__annotations__ if name != "scope"):
         assert f"{name}: " in text
-    assert "w, x, y, z" in text  # the order of quaternions
+    assert "w, x, y, z" in text  # the quaternion's order
 
 
 @pytest.mark.parametrize("kind", [lw.Env, lw.Task, lw.NPGConfig, lw.Iteration, lw.OpenLoop, lw.Trajectory,

@@ -1,5 +1,3 @@
-"""Files that are replaced whole."""
-
 import os
 from pathlib import Path
 from typing import Any
@@ -29,7 +27,7 @@ def test_replaced_keeps_the_old_file_after_an_exception(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("failures", [1, 2])
 def test_replaced_tries_a_second_time(failures: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a network, or while another program holds the file open."""
+    """A network drive, or a program that holds the file open, may cause the first failure."""
     path, replace = tmp_path / "file.txt", os.replace
     errors = [PermissionError(13, "Permission denied", str(path)) for _ in range(failures)]
 

@@ -1,5 +1,3 @@
-"""Ctrl-C and SIGTERM within a program."""
-
 import signal
 from collections.abc import Iterator
 
@@ -10,7 +8,7 @@ from lyceum_warp.support.interrupts import Interrupted, obeyed, postponed, signa
 
 @pytest.fixture(autouse=True)
 def default_handlers() -> Iterator[None]:
-    """A shell that starts the tests in the background makes them ignore SIGINT."""
+    """Restore the default handlers: a shell that starts the tests in the background makes them ignore SIGINT."""
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -64,8 +62,8 @@ def test_a_second_signal_is_handled_at_once_if_it_may_insist() -> None:
             signal.raise_signal(signal.SIGINT)
             reached.append(2)
         assert raised.value.number == signal.SIGINT and reached == [1]
-        signal.raise_signal(signal.SIGTERM)  # is ignored
-    with pytest.raises(KeyboardInterrupt), postponed(insist=True):  # outside of a command
+        signal.raise_signal(signal.SIGTERM)  # ignored
+    with pytest.raises(KeyboardInterrupt), postponed(insist=True):  # outside a command
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

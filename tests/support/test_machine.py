@@ -1,5 +1,3 @@
-"""CPU cores and memory that this process may use."""
-
 import os
 
 import pytest

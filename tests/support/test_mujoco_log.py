@@ -1,5 +1,3 @@
-"""MuJoCo's warnings in Python's log."""
-
 import logging
 from pathlib import Path
 

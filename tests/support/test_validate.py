@@ -1,5 +1,3 @@
-"""Checks of values that users pass."""
-
 from typing import Any
 
 import numpy as np

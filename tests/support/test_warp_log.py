@@ -1,4 +1,4 @@
-"""Warp starts without remarks on a CUDA driver that no code asked for."""
+"""Warp starts without printing that a CUDA driver is missing."""
 
 import subprocess
 import sys
@@ -21,7 +21,7 @@ def test_an_environment_on_the_cpu_prints_nothing() -> None:
 
 @WITHOUT_GPU
 def test_warp_prints_the_remark_without_the_package() -> None:
-    """Otherwise the test above shows nothing."""
+    """If this fails, the test above proves nothing."""
     assert "CUDA" in printed("import warp as wp; wp.config.log_level = wp.LOG_WARNING; wp.init()")[1]
 
 

@@ -1,4 +1,4 @@
-"""The formulas of go1_velocity in NumPy, on MuJoCo's own kinematics, for the tests of the task."""
+"""The formulas of go1_velocity in NumPy, based on MuJoCo's own kinematics."""
 
 from pathlib import Path
 from typing import Any
@@ -20,11 +20,11 @@ NOISELESS = {
     for part in ("linear_velocity", "angular_velocity", "gravity", "joint_position", "joint_velocity")
 }
 STILL: dict[str, Any] = {**NOISELESS, "command_seconds": NEVER, "push_seconds": NEVER}
-"""Parameters without noise and without events."""
+"""Parameters that disable noise and events."""
 
 
 class State:
-    """The parts of the worlds' states, in float64, and what MuJoCo computes from them."""
+    """The parts of the worlds' states in float64, with derived kinematics from MuJoCo."""
 
     def __init__(self, env: lw.Env, state: torch.Tensor | None = None) -> None:
         parts = env.state_space.split(env.get_state() if state is None else state)
@@ -83,7 +83,7 @@ class State:
 
 
 def expected_terms(s0: State, action: np.ndarray, s1: State, model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """The weighted terms of the reward, per second, each (nworld,)."""
+    """Return the weighted terms of the reward, per second, each (nworld,)."""
     c = s0.command()
     amount = np.linalg.norm(c[:, :2], axis=1) + np.abs(c[:, 2])
     active, std = amount > 0.05, np.where(amount[:, None] < 0.05, [0.05, 0.05, 0.1], [0.3, 0.3, 0.6])
@@ -109,7 +109,7 @@ def expected_terms(s0: State, action: np.ndarray, s1: State, model: mujoco.MjMod
 
 
 def random_steps(env: lw.Env, steps: int, size: float = 1.0) -> list[torch.Tensor]:
-    """Actions that are similar from step to step, each (nworld, 12)."""
+    """Return actions that are correlated over time, each (nworld, 12)."""
     generator, found = torch.Generator().manual_seed(1), [torch.zeros(env.nworld, 12)]
     for _ in range(steps):
         found.append(0.8 * found[-1] + 0.6 * size * torch.randn(env.nworld, 12, generator=generator))

@@ -13,7 +13,7 @@ from conftest import SharedEnv
 import lyceum_warp as lw
 
 GOALS = {"adroit_hammer": "success_distance", "adroit_door": "success_angle", "adroit_relocate": "success_distance"}
-"""The threshold of each task's success."""
+"""The success threshold of each task."""
 
 
 @pytest.fixture(params=sorted(GOALS))
@@ -22,7 +22,7 @@ def task(request: pytest.FixtureRequest) -> str:
 
 
 def steps(env: lw.Env, n: int = 5) -> None:
-    """Take random actions, with a fixed seed."""
+    """Take random actions with a fixed seed."""
     rng = torch.Generator().manual_seed(0)
     for _ in range(n):
         env.step(2 * torch.rand(env.action.shape, generator=rng) - 1)
@@ -36,7 +36,7 @@ def test_metrics_add_up_to_the_reward(shared_env: SharedEnv, task: str) -> None:
 
 
 def test_palm_weight_turns_the_first_term_around(shared_env: SharedEnv, task: str) -> None:
-    """The planner's settings reward a near palm; the task itself rewards a far palm, as the original does."""
+    """The planner's settings reward a near palm; the task itself, like the original, rewards a distant palm."""
     env, turned = (shared_env(task, nworld=4, nthread=1, palm_weight=weight) for weight in (0.1, -0.1))
     assert lw.MPPI(task, horizon=2, samples=2, nthread=1).env.task.params["palm_weight"] == -1.0
     for each in (env, turned):
@@ -50,7 +50,7 @@ def test_palm_weight_turns_the_first_term_around(shared_env: SharedEnv, task: st
 
 
 def test_success_has_a_threshold(task: str) -> None:
-    """With thresholds on both sides of the worlds' values."""
+    """The thresholds lie on both sides of the worlds' values."""
     env = lw.make(task, engine="mujoco", nworld=4, nthread=1)
     steps(env)
     assert not env.success.any()

@@ -7,7 +7,6 @@ import lyceum_warp as lw
 
 
 def formula(obs: np.ndarray, near: float, goal: float, reach: np.ndarray | float, drop: float) -> np.ndarray:
-    """The reward, computed from the observation."""
     distance = np.linalg.norm(obs[:, 39:42], axis=1)
     similarity = (obs[:, 33:36] * obs[:, 36:39]).sum(axis=1)
     reward = similarity - distance
@@ -47,7 +46,7 @@ def test_every_threshold_takes_effect() -> None:
 
 
 def test_success_needs_more_than_20_steps_at_the_goal() -> None:
-    """A reset clears the count, and the state includes it."""
+    """A reset clears the count; the count is part of the state."""
     env = lw.make("adroit_pen", engine="mujoco", nworld=3, horizon=0, goal_similarity=-2.0, goal_distance=10.0)
     still = torch.zeros(3, 24)
     for i in range(25):
@@ -70,7 +69,7 @@ def test_success_needs_more_than_20_steps_at_the_goal() -> None:
 
 def test_a_smaller_target_range_gives_smaller_angles() -> None:
     env = lw.make("adroit_pen", engine="mujoco", nworld=200, target_range=np.linspace(0.01, 0.4, 200), seed=2)
-    upright = env.obs[:, 38].numpy()  # the cosine of both angles
+    upright = env.obs[:, 38].numpy()  # the product of both angles' cosines
     assert (upright >= np.cos(np.linspace(0.01, 0.4, 200)) ** 2 - 1e-6).all()
     assert 0.7 < upright.min() < 0.95
 

@@ -25,7 +25,7 @@ def test_simple_shapes_replace_the_meshes_and_keep_the_masses(shared_env: Shared
 
 
 def test_a_scripted_grasp_lifts_the_pot_in_every_world(shared_env: SharedEnv) -> None:
-    """To the handles, closed, up: success within an episode, and a reward of nearly 6.5."""
+    """The grippers go to the handles, close and rise; success within an episode, with a reward of nearly 6.5."""
     env = shared_env("aloha_lift", nworld=3, autoreset=False)
     model, start = env.model, positions(env)[0]
     waypoints = np.zeros((3, 3, 14))
@@ -57,7 +57,7 @@ def test_a_scripted_grasp_lifts_the_pot_in_every_world(shared_env: SharedEnv) ->
 @pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("place", [None, (0.05, 0.01, 0.1)])
 def test_random_resets_draw_the_pots_place_and_yaw(place: tuple[float, ...] | None) -> None:
-    """Both handles stay in reach: the yaw is drawn around 90 degrees."""
+    """Both handles stay within reach: the yaw is drawn around 90 degrees."""
     env = lw.make("aloha_lift", engine="mujoco", nworld=1000, **({} if place is None else {"place": place}))
     env.rand_reset(0)
     qpos, qvel = positions(env)

@@ -17,7 +17,7 @@ GOAL = np.array([0.0, 0.2, 0.5])
 
 
 def places(env: lw.Env, state: torch.Tensor | None = None) -> dict[str, np.ndarray]:
-    """Positions of ball, palm and fingers, from MuJoCo's kinematics in float64."""
+    """Return the positions of ball, palm and fingers, from MuJoCo's kinematics in float64."""
     data, found = mujoco.MjData(env.model), []
     for row in positions(env, state)[0]:
         data.qpos[:] = row
@@ -29,7 +29,7 @@ def places(env: lw.Env, state: torch.Tensor | None = None) -> dict[str, np.ndarr
 
 
 def reward(place: dict[str, np.ndarray]) -> np.ndarray:
-    """Lyceum's reward, with the corrected distance to the goal in its second stage."""
+    """Return Lyceum's reward, with the corrected distance to the goal in its second stage."""
     ball = place["ball"]
     palm = np.minimum(np.linalg.norm(place["palm"] - ball, axis=1), 0.5) / 0.5
     goal = np.minimum(np.linalg.norm(GOAL - ball, axis=1), 0.5) / 0.5
@@ -38,7 +38,7 @@ def reward(place: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def put_balls(env: lw.Env, place: np.ndarray) -> torch.Tensor:
-    """The current states, with the ball at a given place in each world."""
+    """Return the current states, with the ball at a given position in each world."""
     state = env.get_state()
     env.state_space.split(state)["qpos"][:, 9:12] = torch.from_numpy(place)
     return state
@@ -60,7 +60,7 @@ def test_arm_starts_above_the_ball_and_holds_still_without_speeds(shared_env: Sh
 
 
 def test_observation_and_reward_equal_lyceums_formulas(shared_env: SharedEnv) -> None:
-    """With the ball in the hand, at its edge, and far away."""
+    """The ball is in the hand, at its edge, or far away."""
     env = shared_env("arm_hand_pickup", nworld=64, autoreset=False)
     rng = np.random.default_rng(0)
     state = env.get_state()
@@ -99,7 +99,7 @@ def test_success_needs_a_fifth_of_a_second_at_the_goal(shared_env: SharedEnv) ->
 
 
 def test_the_hand_can_pick_up_the_ball_and_hold_it_at_the_goal(shared_env: SharedEnv) -> None:
-    """A scripted hand descends, closes, and moves to the goal by its Jacobian."""
+    """A scripted hand descends and closes; inverse kinematics with its Jacobian then moves it to the goal."""
     model = shared_env("arm_hand_pickup").model
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)

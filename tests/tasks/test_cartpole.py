@@ -9,7 +9,7 @@ import lyceum_warp as lw
 
 
 def put(env: lw.Env, qpos: np.ndarray) -> None:
-    """Put each world at rest at a position of cart and pole."""
+    """Put each world at rest with given positions of cart and pole."""
     state = env.get_state()
     parts = env.state_space.split(state)
     parts["qpos"].copy_(torch.from_numpy(qpos))

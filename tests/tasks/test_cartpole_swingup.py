@@ -1,4 +1,4 @@
-"""The cartpole_swingup task: Lyceum's formulas and the resets. oracles/test_dm_control.py compares its model."""
+"""The cartpole_swingup task: Lyceum's formulas and resets. oracles/test_dm_control.py compares its model."""
 
 import mujoco
 import numpy as np
@@ -15,13 +15,13 @@ NWORLD = 256
 
 
 def tolerance(x: np.ndarray, margin: float, value_at_margin: float = 0.1) -> np.ndarray:
-    """dm_control's tolerance around zero with the quadratic sigmoid, as Lyceum uses it."""
+    """Compute dm_control's tolerance around zero with the quadratic sigmoid, as used in Lyceum."""
     scaled = np.abs(x) / margin * np.sqrt(1.0 - value_at_margin)
     return np.where(scaled < 1.0, 1.0 - scaled**2, 0.0)
 
 
 def pole_direction(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The zz and xz elements of the pole's rotation matrix in each world."""
+    """Return the zz and xz elements of the pole's rotation matrix in each world."""
     data, matrices = mujoco.MjData(model), []
     for row in qpos:
         data.qpos[:] = row
@@ -39,9 +39,9 @@ def cartpole_reward(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, a
 
 
 def test_reward_evaluation_and_observation_equal_lyceums_formulas(shared_env: SharedEnv) -> None:
-    """At random states beyond the rail and the margins, under actions beyond the control range.
+    """The states are random, beyond the rail and the margins; the actions exceed the control range.
 
-    The reward sees the action as given, not the clipped control.
+    The reward gets the given action, not the clipped control.
     """
     env = shared_env("cartpole_swingup", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
@@ -71,9 +71,6 @@ def test_reward_evaluation_and_observation_equal_lyceums_formulas(shared_env: Sh
         cartpole_reward(env.model, *positions(env, after), action.numpy().astype(np.float64)),
     )
     check_formula(env.get_eval(after), pole_direction(env.model, positions(env, after)[0])[0])
-
-
-# resets
 
 
 @pytest.mark.parametrize("scale", [None, 0.3])

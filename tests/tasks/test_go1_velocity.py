@@ -1,4 +1,4 @@
-"""The go1_velocity task: formulas in NumPy on MuJoCo's own kinematics, clocks, commands, pushes, draws, curriculum.
+"""The go1_velocity task: formulas, contact timers, commands, pushes, random draws and curriculum.
 
 tests/oracles/test_mjlab.py compares it with mjlab.
 """
@@ -19,14 +19,11 @@ NWORLD = 64
 
 
 def roll_out(env: lw.Env, steps: int, size: float = 1.0) -> torch.Tensor:
-    """Random steps; returns the last action."""
+    """Take random steps, and return the last action."""
     actions = random_steps(env, steps, size)
     for action in actions:
         env.step(action)
     return actions[-1]
-
-
-# observations
 
 
 def observation(s: State, bias: np.ndarray | float) -> np.ndarray:
@@ -55,7 +52,7 @@ def test_forces_are_zero_until_the_first_substep(shared_env: SharedEnv) -> None:
     assert not env.field("sensordata").any() and not env.obs_groups["critic"][:, -12:].any()
     for _ in range(10):
         roll_out(env, 1, 0.0)
-    assert (env.field("sensordata")[:, 2::3].abs() > 1.0).any(dim=1).float().mean() > 0.9  # standing on their feet
+    assert (env.field("sensordata")[:, 2::3].abs() > 1.0).any(dim=1).float().mean() > 0.9  # the robots stand
 
 
 def test_noise_of_the_policys_observations_is_uniform_and_the_critic_has_none(shared_env: SharedEnv) -> None:
@@ -68,9 +65,6 @@ def test_noise_of_the_policys_observations_is_uniform_and_the_critic_has_none(sh
     assert not noise[:, 33:].any()
     sizes = np.repeat([0.5, 0.2, 0.05, 0.01, 1.5], [3, 3, 3, 12, 12])
     check_uniform(noise[:, :33] / (sizes * (1 + 1e-3)))
-
-
-# rewards
 
 
 def test_every_term_of_the_reward_equals_its_formula(shared_env: SharedEnv) -> None:
@@ -95,11 +89,8 @@ def test_every_term_of_the_reward_equals_its_formula(shared_env: SharedEnv) -> N
     assert min(seen[name] for name in terms) > 20
 
 
-# contacts
-
-
 def test_clocks_count_substeps_of_contact_and_of_flight(shared_env: SharedEnv) -> None:
-    """Compared with MuJoCo's own contacts after every substep."""
+    """Compare with MuJoCo's own contacts after every substep."""
     env = shared_env("go1_velocity", nworld=4, autoreset=False, **STILL)
     model = mujoco.MjModel.from_xml_path(GO1)
     feet = [model.geom(f"{leg}_foot").id for leg in LEGS]
@@ -146,9 +137,6 @@ def test_peak_heights_grow_in_the_air_and_end_at_landings_not_at_resets(shared_e
     assert not s.contact_time.any() and not s.air_time.any() and not s.last_action.any()
 
 
-# commands
-
-
 @pytest.mark.usefixtures("freed")
 def test_commands_have_mjlabs_distribution() -> None:
     env = lw.make("go1_velocity", nworld=4000, seed=0)
@@ -178,11 +166,11 @@ def test_commands_change_when_their_time_is_over(shared_env: SharedEnv) -> None:
         torch.testing.assert_close(memory[~due, 6], before[~due, 6] - DT, atol=1e-6, rtol=0)
         assert (memory[due, 6] >= 3).all() and (memory[due, 6] <= 8).all()
         changes, before = changes + int(due.sum()), memory
-    assert 0.4 * NWORLD < changes < 0.8 * NWORLD  # within 6 s, of 3 to 8
+    assert 0.4 * NWORLD < changes < 0.8 * NWORLD  # the steps take 6 s, commands change every 3 to 8 s
 
 
 def test_headings_determine_the_yaw_rate_of_their_worlds(shared_env: SharedEnv) -> None:
-    """The robot turns the shorter way, at most at the maximum yaw rate."""
+    """The robot turns in the shorter direction, at most at the maximum yaw rate."""
     env = shared_env("go1_velocity", nworld=4, autoreset=False, **STILL)
     state = env.get_state()
     parts = env.state_space.split(state)
@@ -214,9 +202,6 @@ def test_the_curriculum_widens_commands_at_each_stage() -> None:
             values, width = memory[free, column], bounds[1] - bounds[0]
             assert bounds[0] <= values.min() < bounds[0] + 0.02 * width
             assert bounds[1] >= values.max() > bounds[1] - 0.02 * width
-
-
-# events, ends, draws
 
 
 def test_pushes_add_velocity_in_the_worlds_axes(shared_env: SharedEnv) -> None:
@@ -298,7 +283,7 @@ def test_an_episode_ends_when_the_trunk_tilts_by_more_than_seventy_degrees(share
 
 
 def test_actions_move_the_servos_targets_away_from_the_default_pose(shared_env: SharedEnv) -> None:
-    """Actions are not clipped; the force limit of the servos bounds their effect."""
+    """Actions are not clipped; the servos' force limits bound their effect."""
     env = shared_env("go1_velocity", nworld=NWORLD)
     bias, action = State(env).bias, 10 * random_steps(env, 1)[0]
     env.step(action)
@@ -309,7 +294,7 @@ def test_actions_move_the_servos_targets_away_from_the_default_pose(shared_env: 
 
 
 def test_both_engines_agree_over_a_step(shared_env: SharedEnv) -> None:
-    """Observations, memory and rewards, from states along random steps."""
+    """Compare observations, memory and rewards from states along random steps."""
     mine, theirs = (shared_env("go1_velocity", engine=engine, nworld=4, **STILL) for engine in ("mujoco", "warp"))
     for action in random_steps(mine, 12):
         theirs.set_state(mine.get_state())

@@ -1,4 +1,4 @@
-"""The herb_reach task: HERB's published numbers, formulas, resets, targets within reach, success."""
+"""The herb_reach task: HERB's published numbers, formulas, resets, reachable targets, success."""
 
 import mujoco
 import numpy as np
@@ -11,8 +11,6 @@ import lyceum_warp as lw
 
 NWORLD = 64
 SIDES = ("left", "right")
-
-# the robot
 
 MASSES = {  # kg; Barrett D1005 AC-02, and for the BH280 Barrett's mass properties
     "wam_base": 9.97059584,
@@ -44,7 +42,7 @@ ARM = {  # range in rad (Barrett D1001, tables 5 and 6; HERB turns the first joi
 }
 FINGERS = {"j00": 180, "j10": 180, "j01": 140, "j11": 140, "j21": 140, "j02": 48, "j12": 48, "j22": 48}  # degrees
 
-# of the WAM's links in Barrett's frames, whose z axis is the next joint's: moments (xx, yy, zz, xy, xz, yz)
+# the WAM's links in Barrett's frames, whose z axis is the next joint's: moments (xx, yy, zz, xy, xz, yz)
 INERTIAS = {
     "wam1": (0.13488033, 0.11328369, 0.09046330, -0.00213041, -0.00012485, 0.00068555),
     "wam2": (0.02140958, 0.01377875, 0.01558906, 0.00027172, 0.00002461, -0.00181920),
@@ -64,7 +62,7 @@ def matrix(values: tuple[float, ...]) -> np.ndarray:
 
 
 def turn(angle: float) -> np.ndarray:
-    """The rotation by an angle about x."""
+    """Return the rotation by an angle about x."""
     return np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
 
 
@@ -86,7 +84,7 @@ def test_model_has_the_published_masses_limits_and_torques(shared_env: SharedEnv
 
 @pytest.mark.parametrize("side", SIDES)
 def test_model_has_the_published_inertias(shared_env: SharedEnv, side: str) -> None:
-    """Barrett's frames are rotated about x from the model's, by +90 and -90 degrees alternately."""
+    """Barrett's frames are rotated about x by +90 and -90 degrees alternately, relative to the model's."""
     model = shared_env("herb_reach").model
     for i, (name, values) in enumerate(INERTIAS.items()):
         body = model.body(f"{side}/{name}")
@@ -100,7 +98,7 @@ def test_model_has_the_published_inertias(shared_env: SharedEnv, side: str) -> N
 
 
 def test_palms_are_where_the_published_chain_puts_them(shared_env: SharedEnv) -> None:
-    """Denavit-Hartenberg transforms from the first joint on, at random angles."""
+    """The transforms are Denavit-Hartenberg's, from the first joint on, at random angles."""
     model = shared_env("herb_reach").model
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     for _ in range(20):
@@ -120,7 +118,7 @@ def test_palms_are_where_the_published_chain_puts_them(shared_env: SharedEnv) ->
 
 
 def test_arms_stay_where_they_are_without_torque(shared_env: SharedEnv) -> None:
-    """Gravity is compensated; actions add torque."""
+    """Gravity is compensated."""
     env = shared_env("herb_reach", nworld=2, autoreset=False)
     before = positions(env)[0]
     for _ in range(50):
@@ -129,7 +127,7 @@ def test_arms_stay_where_they_are_without_torque(shared_env: SharedEnv) -> None:
 
 
 def test_a_finger_moves_with_one_motor(shared_env: SharedEnv) -> None:
-    """The fingertip follows by 45 degrees per 140, and both spread joints move together."""
+    """The fingertip turns by 45 degrees per 140; both spread joints move together."""
     env = shared_env("herb_reach", nworld=1, autoreset=False)
     env.reset()
     action = torch.zeros(1, 22)
@@ -142,11 +140,8 @@ def test_a_finger_moves_with_one_motor(shared_env: SharedEnv) -> None:
         assert angle[f"j{i}1"] > 1.0 and angle[f"j{i}2"] == pytest.approx(angle[f"j{i}1"] * 45 / 140, abs=0.05)
 
 
-# formulas
-
-
 def palms(env: lw.Env, qpos: np.ndarray) -> np.ndarray:
-    """Both palms in each world, (nworld, 2, 3), from MuJoCo's kinematics in float64."""
+    """Return both palms in each world, (nworld, 2, 3), from MuJoCo's kinematics in float64."""
     data, found = mujoco.MjData(env.model), []
     for row in qpos:
         data.qpos[:] = row
@@ -156,7 +151,6 @@ def palms(env: lw.Env, qpos: np.ndarray) -> np.ndarray:
 
 
 def targets(env: lw.Env) -> np.ndarray:
-    """Both targets in each world, (nworld, 2, 3)."""
     return env.state_space.split(env.get_state())["mocap_pos"].numpy().reshape(-1, 2, 3).copy()
 
 
@@ -172,7 +166,7 @@ def put_targets(env: lw.Env, offset: np.ndarray) -> None:
 
 
 def test_reward_evaluation_and_observation_equal_their_formulas(shared_env: SharedEnv) -> None:
-    """After a step, far from the targets and close to them, for every term of the reward."""
+    """States after a step, far from the targets and close to them, cover every term of the reward."""
     env = shared_env("herb_reach", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
     for near in (False, True):
@@ -199,9 +193,6 @@ def test_reward_evaluation_and_observation_equal_their_formulas(shared_env: Shar
         assert terms["precision"].max() > 0.3 or not near
 
 
-# resets
-
-
 @pytest.mark.usefixtures("freed")
 def test_random_resets_draw_targets_before_each_shoulder_and_arms_near_home() -> None:
     env = lw.make("herb_reach", engine="mujoco", nworld=2000)
@@ -220,7 +211,7 @@ def test_random_resets_draw_targets_before_each_shoulder_and_arms_near_home() ->
 
 
 def test_both_hands_reach_their_targets_at_once(shared_env: SharedEnv) -> None:
-    """At the boxes' corners and at random targets, inverse kinematics finds angles within limits, without contacts."""
+    """For the boxes' corners and random targets, inverse kinematics finds angles within limits and without contacts."""
     env = shared_env("herb_reach", nworld=16)
     model, rng = env.model, np.random.default_rng(0)
     corners = np.stack(np.meshgrid([0.6, 0.95], [0.1, 0.6], [0.7, 1.3]), axis=-1).reshape(-1, 1, 3)
@@ -231,7 +222,7 @@ def test_both_hands_reach_their_targets_at_once(shared_env: SharedEnv) -> None:
 
 
 def reachable(model: mujoco.MjModel, goals: np.ndarray, start: np.ndarray) -> bool:
-    """Whether damped least squares, from given angles, brings both palms to their targets without contacts."""
+    """Return whether damped least squares, from given angles, brings both palms to their targets without contacts."""
     data, jacobian = mujoco.MjData(model), np.zeros((3, 30))
     arms = np.r_[0:7, 15:22]
     data.qpos[arms] = start[arms]
@@ -250,11 +241,8 @@ def reachable(model: mujoco.MjModel, goals: np.ndarray, start: np.ndarray) -> bo
     return False
 
 
-# success
-
-
 def test_success_needs_both_hands_for_ten_steps() -> None:
-    """One hand is not enough; a step away restarts the count, and a reset clears it."""
+    """One hand is not enough; a step off the target restarts the count, and a reset clears it."""
     env = lw.make("herb_reach", engine="mujoco", nworld=4, autoreset=False, horizon=0)
     offset = np.array([[0.0, 0.0], [0.06, 0.0], [0.0, 0.06], [0.045, -0.045]])
     put_targets(env, offset)
@@ -271,5 +259,5 @@ def test_success_needs_both_hands_for_ten_steps() -> None:
     assert env.success.tolist() == [False, False, False, True]
     env.rand_reset(0)
     assert not env.success.any()
-    env.set_state(state)  # the count belongs to the state
+    env.set_state(state)  # the count is part of the state
     assert env.success.tolist() == [True, False, False, True]

@@ -14,12 +14,11 @@ ARM = [f"joint{i}" for i in range(1, 8)]
 
 
 def cube(env: lw.Env) -> np.ndarray:
-    """Position and quaternion of the cube in each world."""
     return positions(env)[0][:, 9:]
 
 
 def put_cube(env: lw.Env, height: float) -> None:
-    """Put the cube into the air, beside the hand, in every world."""
+    """Put the cube in the air beside the hand, in every world."""
     state = env.get_state()
     env.state_space.split(state)["qpos"][:, 9:] = torch.tensor([0.3, 0.5, height, 1.0, 0.0, 0.0, 0.0])
     env.set_state(state)
@@ -59,7 +58,7 @@ def test_arm_without_commands_stands_still(shared_env: SharedEnv) -> None:
 
 
 def test_a_scripted_grasp_lifts_the_cube_in_every_world(shared_env: SharedEnv) -> None:
-    """Above the cube, down, closed, up: success within an episode, and a reward of nearly 6.5."""
+    """The gripper descends, closes and rises: the lift succeeds within an episode, with a reward of nearly 6.5."""
     env = shared_env("panda_lift", nworld=4, autoreset=False)
     start, at = positions(env)[0], cube(env)
     waypoints = np.zeros((3, 4, 8))
@@ -99,7 +98,7 @@ def test_reward_weighs_terms_between_0_and_1(
 
 
 def test_success_needs_ten_steps_in_a_row_above_the_goal() -> None:
-    """A cube that falls from 0.5 m is above the goal for 7 steps, from 1.6 m for 13. The state includes the count."""
+    """A falling cube is above the goal for 7 steps from 0.5 m and 13 from 1.6 m; the state includes the count."""
     env = lw.make("panda_lift", engine="mujoco", nworld=1, autoreset=False, horizon=0)
     for height, steps in ((0.5, 0), (1.6, 4)):
         env.rand_reset(0)

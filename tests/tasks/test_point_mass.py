@@ -1,5 +1,3 @@
-"""The point_mass task: Lyceum's formulas, its physics and its resets."""
-
 import numpy as np
 import torch
 from checks import check_formula, check_uniform, positions, put_at_random

@@ -11,9 +11,7 @@ import lyceum_warp as lw
 
 NWORLD = 256
 
-# the arm
-
-BODIES = {  # parent, position in it, mass, moments of inertia (of capsules and spheres of 1,000 kg/m^3)
+BODIES = {  # parent, position in it, mass, moments of inertia (capsules and spheres of 1,000 kg/m^3)
     "shoulder": ("world", (0, -0.6, 0), 24.311738, (1.2153105, 1.2145685, 0.1205579)),
     "lift": ("shoulder", (0.1, 0, 0), 10.471976, (0.1267109, 0.1267109, 0.0481711)),
     "upper_roll": ("lift", (0, 0, 0), 0.284838, (0.0012536, 0.0012536, 0.0000556)),
@@ -37,7 +35,7 @@ RANGES = np.array([joint[2] for joint in JOINTS.values()])
 
 
 def test_model_has_the_published_arms_masses_joints_and_motors(shared_env: SharedEnv) -> None:
-    """The published arm is the one in the paper's code."""
+    """The paper's code contains the published arm."""
     env = shared_env("reach")
     model = env.model
     assert (model.nq, model.nv, model.nu, model.nmocap) == (7, 7, 7, 1)
@@ -80,11 +78,8 @@ def test_three_seconds_of_controls_end_where_the_original_arm_ended(shared_env: 
     np.testing.assert_allclose(data.qpos, last, atol=1e-6)
 
 
-# formulas
-
-
 def finger(env: lw.Env, qpos: np.ndarray) -> np.ndarray:
-    """The finger's position in each world, from MuJoCo's kinematics in float64."""
+    """Return the finger's position in each world, from MuJoCo's kinematics in float64."""
     data, found = mujoco.MjData(env.model), []
     for row in qpos:
         data.qpos[:] = row
@@ -94,7 +89,7 @@ def finger(env: lw.Env, qpos: np.ndarray) -> np.ndarray:
 
 
 def errors(env: lw.Env, state: torch.Tensor | None = None) -> np.ndarray:
-    """Vectors from the target to the hand, (nworld, 3)."""
+    """Return vectors from the target to the hand, (nworld, 3)."""
     state = env.get_state() if state is None else state
     target = env.state_space.split(state)["mocap_pos"].numpy()
     return finger(env, positions(env, state)[0]) - target
@@ -105,7 +100,7 @@ def reward(error: np.ndarray) -> np.ndarray:
 
 
 def test_reward_evaluation_and_observation_equal_lyceums_formulas(shared_env: SharedEnv) -> None:
-    """After steps and for given states, with a different target in each world."""
+    """The test compares states after steps and states that are set; each world has a different target."""
     env = shared_env("reach", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
     assert env.obs.shape == (NWORLD, 20)
@@ -124,9 +119,6 @@ def test_reward_evaluation_and_observation_equal_lyceums_formulas(shared_env: Sh
     check_formula(env.get_eval(after), np.linalg.norm(errors(env, after), axis=1))
 
 
-# resets
-
-
 def targets(env: lw.Env) -> np.ndarray:
     return env.state_space.split(env.get_state())["mocap_pos"].numpy().copy()
 
@@ -134,7 +126,7 @@ def targets(env: lw.Env) -> np.ndarray:
 @pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("scale", [None, (0.1, 0.5, 0.0)])
 def test_random_resets_draw_the_target_from_its_box(scale: tuple[float, float, float] | None) -> None:
-    """The arm starts at zero and at rest; each world draws a target of its own."""
+    """The arm starts at zero and at rest; each world draws its own target."""
     env = lw.make("reach", engine="mujoco", nworld=2000, **({} if scale is None else {"target_range": scale}))
     env.rand_reset(0)
     size = np.array(scale or (0.3, 0.2, 0.25))
@@ -162,9 +154,6 @@ def test_random_start_draws_every_joint_from_its_range() -> None:
     assert not env.done.any()
 
 
-# success
-
-
 def put_targets(env: lw.Env, distance: np.ndarray) -> None:
     """Move each world's target to a distance from its hand, along x."""
     state = env.get_state()
@@ -175,7 +164,7 @@ def put_targets(env: lw.Env, distance: np.ndarray) -> None:
 
 
 def test_success_needs_ten_steps_at_the_target() -> None:
-    """Even if a much larger distance is allowed. A reset clears the count, and the state includes it."""
+    """A larger distance does not shorten the ten steps. A reset clears the count, which is part of the state."""
     env = lw.make("reach", engine="mujoco", nworld=3, success_distance=np.array([0.05, 0.05, 0.99]), horizon=0)
     put_targets(env, np.array([0.0, 0.06, 0.0]))
     still = torch.zeros(3, 7)

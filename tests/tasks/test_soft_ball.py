@@ -1,4 +1,4 @@
-"""The soft_ball task: squeezing and lifting the ball, observations, rewards, resets and the end of episodes."""
+"""The soft_ball task: squeezing and lifting the ball, observations, rewards, resets and ends of episodes."""
 
 import mujoco
 import numpy as np
@@ -11,11 +11,11 @@ import lyceum_warp as lw
 from lyceum_warp.engines.warp.sizes import probe_sizes
 
 OPEN, CLOSED = -1.0, 0.7
-LOW = -1.0  # the gripper around the ball on the floor
+LOW = -1.0  # the gripper's height at which it surrounds the ball on the floor
 
 
 def vertices(env: lw.Env) -> np.ndarray:
-    """The ball's vertices in each world, from MuJoCo's kinematics in float64, (nworld, n, 3)."""
+    """Return the ball's vertices in each world, from MuJoCo's kinematics in float64, (nworld, n, 3)."""
     data, found = mujoco.MjData(env.model), []
     for qpos in positions(env)[0]:
         data.qpos[:] = qpos
@@ -33,7 +33,7 @@ def hold(env: lw.Env, steps: int, *action: float) -> None:
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_a_gripped_ball_is_squeezed_and_lifted_to_the_target(shared_env: SharedEnv, engine: str) -> None:
-    """The fingers compress the ball by millimetres, and it bulges upwards."""
+    """The fingers compress the ball by millimetres, and the ball bulges upwards."""
     env = shared_env("soft_ball", engine=engine, nworld=1, autoreset=False)
     env.reset()
     hold(env, 20, 0.0, LOW, OPEN)
@@ -88,7 +88,7 @@ def test_a_crushed_or_lost_ball_ends_the_episode(shared_env: SharedEnv, axis: in
 
 
 def test_random_resets_place_ball_and_target(shared_env: SharedEnv) -> None:
-    """The ball keeps its shape, and stands on the floor."""
+    """The ball keeps its shape and rests on the floor."""
     env = shared_env("soft_ball", nworld=64)
     ball, widths = env.obs[:, 6:9].numpy(), env.obs[:, 12:15].numpy()
     target = ball + env.obs[:, 18:21].numpy()
@@ -100,7 +100,7 @@ def test_random_resets_place_ball_and_target(shared_env: SharedEnv) -> None:
 
 
 def test_sizes_for_a_flex_hold_bursts_of_contacts(shared_env: SharedEnv) -> None:
-    """Pressing the fingers into the ball needs more constraints than twice the probe's peak."""
+    """Pressing the fingers into the ball needs more than twice as many constraints as the probe's peak."""
     model = shared_env("soft_ball").model
     assert probe_sizes(model) >= (256, 512)
     env = shared_env("soft_ball", engine="warp", nworld=4, autoreset=False)

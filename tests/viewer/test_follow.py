@@ -59,7 +59,7 @@ def test_a_run_that_does_not_come_is_reported(tmp_path: Path) -> None:
 
 
 def trained(folder: Path, callback: Callable[[lw.Iteration], object] | None = None) -> tuple[list[Any], list[Any]]:
-    """The numbers of a run: its rows without times, and its policy."""
+    """Return a run's rows without measured times, and its policy."""
     env = lw.make("point_mass", nworld=2, engine="mujoco", seed=3)
     npg = lw.NPG(env, config=lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,)), seed=3)
     run = lw.train(npg, folder, iterations=4, callback=callback)

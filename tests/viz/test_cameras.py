@@ -1,5 +1,3 @@
-"""Cameras of videos."""
-
 import mujoco
 import numpy as np
 import pytest

@@ -1,5 +1,3 @@
-"""Plots of a controller's episodes."""
-
 import sys
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Plots of learning curves."""
-
 import math
 from pathlib import Path
 

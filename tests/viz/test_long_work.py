@@ -1,5 +1,3 @@
-"""Progress of work that may take long."""
-
 import io
 
 from rich.console import Console

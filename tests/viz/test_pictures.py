@@ -1,5 +1,3 @@
-"""Pictures of worlds."""
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Videos of a policy while it is trained."""
-
 import logging
 from pathlib import Path
 

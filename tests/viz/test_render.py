@@ -1,5 +1,3 @@
-"""The program that draws videos."""
-
 import mujoco
 import numpy as np
 from varied_task import ball

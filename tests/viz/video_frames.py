@@ -1,4 +1,4 @@
-"""Videos as the tests read them."""
+"""Read videos for tests."""
 
 import json
 import subprocess
@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-# in a small process: imageio forks, and after all other tests there may be too little memory to fork this one
+# in a small process: imageio forks, and this process may be too large to fork after all other tests
 PROGRAM = """
 import json, sys
 import imageio.v2 as imageio
@@ -24,6 +24,7 @@ with imageio.get_reader(sys.argv[1]) as reader:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Rate, shape and number of the frames; of each the brightest pixel, the number and mean column of red ones."""
+    """Return rate, shape and number of frames; per frame the brightest pixel, and the red pixels' count and mean
+    column."""
     done = subprocess.run([sys.executable, "-c", PROGRAM, str(path)], capture_output=True, text=True, check=True)
     return dict(json.loads(done.stdout))

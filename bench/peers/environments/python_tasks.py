@@ -1,7 +1,7 @@
-"""Define tasks for Gymnasium and for dm_control, with the formulas and the models of lyceum_warp's tasks.
+"""Define tasks for Gymnasium and dm_control with the formulas and models of lyceum_warp's tasks.
 
-Gymnasium has all tasks but cartpole and herb_reach, dm_control has cartpole. The others are written here
-with NumPy, as the library's users write them. This file runs in environments of peers and does not import lyceum_warp.
+Gymnasium has all tasks except cartpole and herb_reach, and dm_control has cartpole. The others are written here in
+NumPy, as users of the libraries would. This file runs in peers' virtual environments and does not import lyceum_warp.
 """
 
 from pathlib import Path
@@ -33,11 +33,11 @@ GYMNASIUM = {
 """Gymnasium's names of the tasks."""
 
 JUDGE_NEW_STATE = {"humanoid_standup", "reacher", "pusher", "inverted_pendulum", "inverted_double_pendulum"}
-"""Tasks whose step in Gymnasium reads no state from before the physics."""
+"""Tasks whose step in Gymnasium uses no state from before the physics."""
 
 
 class CartpoleEnv(MujocoEnv):
-    """dm_control's cartpole balance; ``lyceum_warp/tasks/cartpole.py`` is the same task."""
+    """dm_control's cartpole balance, the same task as ``lyceum_warp/tasks/cartpole.py``."""
 
     metadata = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}
 
@@ -66,7 +66,7 @@ class CartpoleEnv(MujocoEnv):
 
 
 class HerbReachEnv(MujocoEnv):
-    """Two arms that reach for targets; ``lyceum_warp/tasks/herb_reach.py`` is the same task."""
+    """Two arms that reach for targets, the same task as ``lyceum_warp/tasks/herb_reach.py``."""
 
     metadata = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}
 
@@ -93,7 +93,7 @@ class HerbReachEnv(MujocoEnv):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         self.do_simulation(action, self.frame_skip)
-        mujoco.mj_kinematics(self.model, self.data)  # a step leaves positions of sites behind
+        mujoco.mj_kinematics(self.model, self.data)  # mj_step leaves site positions one step behind
         return self._get_obs(), self._get_rew(0.0, action)[0], False, False, {}
 
     def reset_model(self) -> np.ndarray:
@@ -116,7 +116,7 @@ POSITIONS = {
 
 
 def dm_control_env(task: str, seed: int) -> Any:
-    """The task as an environment of dm_control: its own cartpole, or Gymnasium's formulas on dm_control's physics."""
+    """Make a dm_control environment: its own cartpole, or Gymnasium's formulas on dm_control's physics."""
     from dm_control import mujoco as dm_mujoco
     from dm_control import suite
     from dm_control.rl import control
@@ -125,7 +125,7 @@ def dm_control_env(task: str, seed: int) -> Any:
         return suite.load("cartpole", "balance", task_kwargs={"random": seed})
 
     class FromGymnasium(control.Task):
-        """Observation, reward and end by an environment of Gymnasium that works on dm_control's model and data."""
+        """A task that takes observation, reward and end from a Gymnasium environment on dm_control's model and data."""
 
         def __init__(self, env: Any, physics: Any) -> None:
             self.env, self.position = env, POSITIONS.get(task, lambda env: env.data.qpos[0])
@@ -157,7 +157,7 @@ def dm_control_env(task: str, seed: int) -> Any:
             return 0.0 if ends and not self.env.is_healthy else None
 
     class FromStep(FromGymnasium):
-        """The same for a task that judges only the new state: by Gymnasium's step, without its physics."""
+        """A task that judges only the new state, by Gymnasium's step without its physics."""
 
         def __init__(self, env: Any, physics: Any) -> None:
             super().__init__(env, physics)

@@ -1,7 +1,7 @@
 """Measure environment steps per second of other libraries, as a worker of bench/venvs.py.
 
-It reads a JSON object (contestant, task, envs, threads, seconds, warm, seed) and prints one. Actions are uniform in
-their bounds, drawn before the clock starts; an episode restarts within its last step if the library can do so.
+It reads a JSON object (contestant, task, envs, threads, seconds, warm, seed) and prints one. Actions are uniform within
+their bounds and drawn before the clock starts. An episode restarts within its last step if the library supports it.
 """
 
 import json
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 KEPT_ACTIONS = 4096
-"""Actions of all environments that are drawn before the clock starts, enough for at least 16 steps."""
+"""Total number of actions that are drawn before the clock starts; they cover at least 16 steps."""
 
 ENVPOOL = {
     "hopper": "Hopper-v5",
@@ -35,7 +35,7 @@ ENVPOOL = {
 
 
 def draw(low: np.ndarray, high: np.ndarray, envs: int, seed: int) -> np.ndarray:
-    """Draw actions of some steps, which are then repeated, (steps, envs, nact)."""
+    """Draw actions for several steps, (steps, envs, nact), which are then repeated."""
     return np.random.default_rng(seed).uniform(low, high, (max(16, KEPT_ACTIONS // envs), envs, *low.shape))
 
 
@@ -72,10 +72,10 @@ class Gymnasium:
 
 
 class DmControl:
-    """dm_control's environments in persistent processes, or with one environment in this one.
+    """dm_control's environments in persistent subprocesses, or one environment in this process.
 
-    Its authors recommend processes (github.com/google-deepmind/dm_control/issues/94). Each process steps its share of
-    the environments and gets one message a step; actions and results are in shared memory.
+    Its authors recommend subprocesses (github.com/google-deepmind/dm_control/issues/94). Each process steps its share
+    of the environments and gets one message per step; actions and results are in shared memory.
     """
 
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
@@ -153,7 +153,7 @@ class Share:
 
 
 class EnvPool:
-    """EnvPool: all environments step together."""
+    """EnvPool, whose environments all step together."""
 
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
         import envpool
@@ -164,13 +164,13 @@ class EnvPool:
         self.env.reset()
 
     def step(self, t: int) -> np.ndarray:
-        """Return the number of each environment's step in its episode."""
+        """Return each environment's step count within its episode."""
         return self.env.step(self.actions[t])[-1]["elapsed_step"]
 
     def transition_share(self) -> float:
-        """Return the share of environment steps that are transitions, in 200 further steps.
+        """Return the share of environment steps that are transitions, measured over 200 additional steps.
 
-        The step after the end of an episode ignores its action and returns the first observation of a new one.
+        The step after the end of an episode ignores its action and returns the first observation of the next episode.
         """
         first = [np.mean(self.step(t % len(self.actions)) == 0) for t in range(200)]
         return 1.0 - float(np.mean(first))
@@ -191,12 +191,12 @@ CONTESTANTS: dict[str, Callable[..., Any]] = {
 def timed(
     step: Callable[[int], None], period: int, warm: int, seconds: float, wait: Callable[[], None] = lambda: None
 ) -> tuple[int, float]:
-    """Return the number of steps, and their seconds.
+    """Return the number of steps and the seconds that they took.
 
     Args:
-        step: Makes a step with the actions of a number below the period.
-        period: After how many steps the actions are repeated.
-        warm: Steps before the clock starts.
+        step: Takes a step with the actions of an index below ``period``.
+        period: Number of steps after which the actions repeat.
+        warm: Number of steps before the clock starts.
         seconds: Duration of the measurement.
         wait: Waits for the end of asynchronous steps.
     """
@@ -212,7 +212,7 @@ def timed(
             count += 1
         wait()
         now = time.perf_counter()
-        if now - began < 0.01:  # else reading the clock would count
+        if now - began < 0.01:  # otherwise reading the clock would take a noticeable time
             block *= 2
     return count, now - start
 

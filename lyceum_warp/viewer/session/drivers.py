@@ -204,7 +204,7 @@ Control = PolicyControl | WorldControl
 
 
 def controls(given: Mapping[str, Any], env: Env) -> dict[str, Control]:
-    """Tell policies from controllers of one world, by their number of arguments, and check them.
+    """Distinguish policies from controllers of one world by their number of arguments, and check them.
 
     Args:
         given: Controllers by name; see ``lw.view``.

@@ -1,8 +1,8 @@
 """Roll out a planner's plan and samples again to get their paths, in a thread.
 
-A planner keeps no positions. This module rolls out the actions of some samples from the plan's initial state, in worlds
-of the planner's own task, model and time step. Their random streams differ from the planner's: in a task that draws
-random numbers during an episode, the paths are other draws.
+A planner stores no positions. This module rolls out the actions of some samples from the plan's initial state, in
+worlds of the planner's own task, model and time step. Their random streams differ from the planner's, so in a task that
+draws random numbers during an episode the paths differ from those that the planner evaluated.
 """
 
 import dataclasses
@@ -145,7 +145,7 @@ class TraceRollouts:
         return Traces(paths, view.best, ended, time.perf_counter())
 
     def _put(self, state: torch.Tensor) -> None:
-        """Copy the parts of the planner's state into every row; the rows have further parts for further fields."""
+        """Copy the parts of the planner's state into every row; the rows may have parts for additional fields."""
         parts = self.env.state_space.parts
         state = state.to(self._states.device)
         for name, part in self._parts.items():

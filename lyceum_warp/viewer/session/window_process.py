@@ -112,7 +112,7 @@ class Window:
     def wants_frame(self) -> bool:
         """Whether the window can draw another frame now; until then the caller need not make one.
 
-        The window draws about 60 frames a second while a page is open, and takes four a second otherwise.
+        While a page is open the window draws about 60 frames per second, otherwise four.
         """
         return self._pending is None and time.monotonic() >= self._next and not self._ended
 

@@ -62,7 +62,7 @@ def test_frames_hold_every_point_of_the_curves(shared_env: SharedEnv) -> None:
     np.testing.assert_array_equal(points[:, 1], rewards)
     np.testing.assert_allclose(points[:, 0], env.timestep * np.arange(1, 21))
     session.obey(protocol.StepBy(-5))
-    session.obey(protocol.StepBy(6))  # a step after five that are restored
+    session.obey(protocol.StepBy(6))  # one step after five restored ones
     np.testing.assert_allclose(session.stage.frame().samples[:, 0], [env.timestep * 21])
 
 

@@ -34,7 +34,7 @@ def test_a_planner_keeps_its_rate_and_shows_its_plan() -> None:
     assert frame.status.time < 4 * (time.monotonic() - begun)
     assert frame.traces.shape == (7, 9, 3) and frame.best == 0 and len(frame.ghosts) == 1
     assert frame.status.plan_ms > 0 and session.stage.paused is False
-    np.testing.assert_allclose(np.ptp(frame.traces[:, 0], axis=0), 0.0, atol=1e-12)  # the paths begin together
+    np.testing.assert_allclose(np.ptp(frame.traces[:, 0], axis=0), 0.0, atol=1e-12)  # the paths begin at the same point
     assert np.isfinite(np.concatenate([frame.samples for frame in window.frames])).all()
 
 
@@ -71,7 +71,7 @@ def test_an_episode_of_a_plant_that_ends_is_followed_by_another() -> None:
 
 
 class Slow:
-    """A controller whose calls wait from the seventh on, and that notes its calls and resets in order."""
+    """A controller whose calls block from the seventh on, and that logs its calls and resets in order."""
 
     def __init__(self) -> None:
         self.inside, self.log, self.release = 0, [], threading.Event()

@@ -42,7 +42,7 @@ def test_a_site_a_body_or_the_tasks_choice_is_traced() -> None:
 
 
 def test_paths_are_those_that_the_samples_take(shared_env: SharedEnv) -> None:
-    """Each path is where the plant itself would go under the actions of the sample."""
+    """The plant follows each path under the actions of the sample."""
     plant = lw.make("reach", autoreset=False, fields=["site_xpos"])
     mppi = lw.MPPI("reach", samples=6, horizon=5)
     control = WorldControl("mppi", mppi)

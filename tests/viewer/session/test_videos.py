@@ -57,7 +57,7 @@ def taker(shared_env: SharedEnv, tmp_path: Path) -> VideoTaker:
 
 
 def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make a video on a machine that draws two poses a second, until one pose is drawn and others wait."""
+    """Make a video on a machine that renders two poses per second, until one pose is rendered and others wait."""
     drawn, draw = threading.Event(), drawing.Drawing.draw
 
     def slow(self: drawing.Drawing, shot: Any) -> None:

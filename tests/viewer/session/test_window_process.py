@@ -34,7 +34,7 @@ def shared_window() -> Iterator[Window]:
 
 
 def page(window: Window, path: str = "") -> bytes:
-    """What a browser gets that was opened with the address."""
+    """Return the response that a browser gets after opening the viewer's address."""
     browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
     with browser.open(window.address, timeout=10) as first:
         address = urllib.parse.urljoin(first.url, path)
@@ -57,7 +57,7 @@ def wait_until(done: object) -> bool:
 
 
 def is_alive(pid: int) -> bool:
-    """Whether a process runs; one that ended and is not waited for does not."""
+    """Return whether a process runs; a zombie does not."""
     with contextlib.suppress(FileNotFoundError):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     return False
@@ -143,11 +143,11 @@ def test_close_ends_the_process_and_leaves_nothing_open(capfd: pytest.CaptureFix
             assert page(window)
         window.close()
         assert window._process.returncode != -signal.SIGKILL and not is_alive(pid) and not window.is_open()
-        window.show(frame_of(MODEL, DATA))  # no effect
+        window.show(frame_of(MODEL, DATA))  # has no effect
         assert threading.active_count() == threads
         before, descriptors = descriptors, len(os.listdir("/proc/self/fd"))
         assert before in (None, descriptors)
-    assert capfd.readouterr() == ("", "")  # of studio
+    assert capfd.readouterr() == ("", "")  # studio prints nothing
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
@@ -193,7 +193,7 @@ time.sleep(60)
 
 @pytest.mark.parametrize(("number", "fork"), [(signal.SIGKILL, True), (signal.SIGINT, False)])
 def test_window_ends_with_the_session(number: int, fork: bool, tmp_path: Path) -> None:
-    """A fork of the session holds the connection open."""
+    """A fork of the session keeps the connection open."""
     program = tmp_path / "program.py"
     program.write_text(PROGRAM.format(tests=str(Path(__file__).parents[2]), fork=fork))
     with subprocess.Popen([sys.executable, str(program)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as session:

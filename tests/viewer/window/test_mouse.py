@@ -16,7 +16,7 @@ def bench() -> Bench:
 
 
 def drag(bench: Bench, body: str, *, paused: bool) -> list[Perturb]:
-    """Drag a body by half a metre, as studio reports it; what the session is sent."""
+    """Drag a body by half a metre, as studio reports it; return the messages to the session."""
     perturb, data = bench.viewer.perturb, bench.viewer.data
     perturb.select = bench.model.body(body).id
     perturb.flexselect = perturb.skinselect = -1
@@ -57,10 +57,10 @@ def test_dragged_body_is_placed_while_paused_and_only_when_it_moves(bench: Bench
 
 @pytest.mark.parametrize("paused", [False, True])
 def test_push_ends_when_its_person_has_left(bench: Bench, paused: bool) -> None:
-    """A browser that is closed in the middle of a drag never lets go of the button."""
+    """A browser that is closed during a drag never releases the button."""
     drag(bench, "ball", paused=paused)
     bench.sent.clear()
-    bench.panel.mouse.let_go()  # of another thread; nothing is drawn from here on
+    bench.panel.mouse.let_go()  # called by another thread; no frame is drawn after this
     bench.panel.mouse.let_go()
     (end,) = bench.sent
     assert isinstance(end, Perturb) and not end.forces.any() and end.qpos is None

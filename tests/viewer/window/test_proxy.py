@@ -30,7 +30,7 @@ UPGRADE = (
 
 
 class Upstream:
-    """A private server that keeps every byte it gets."""
+    """A private server that stores all received bytes."""
 
     def __init__(self, answer: bytes | None = None) -> None:
         headers = b"Access-Control-Allow-Origin: *\r\nSet-Cookie: a=b\r\nCache-Control: no-cache\r\nConnection: close"
@@ -80,7 +80,7 @@ def token(proxy: Proxy) -> str:
 
 
 def answer_to(proxy: Proxy, lines: list[str], *, rest: bytes = b"") -> bytes:
-    """Everything that the proxy answers to the lines of a head."""
+    """Return the proxy's complete response to the lines of a request head."""
     with socket.create_connection(("127.0.0.1", proxy.port), timeout=10) as client:
         if not any("Connection: " in line for line in lines):
             lines = [*lines, "Connection: close"]
@@ -96,7 +96,7 @@ def status(answer: bytes) -> int:
 
 
 def entered(proxy: Proxy) -> tuple[str, str]:
-    """The cookie that the token is exchanged for, and its path."""
+    """Exchange the token for a cookie; return the cookie and its path."""
     answer = answer_to(proxy, [f"GET /?token={token(proxy)} HTTP/1.1", "Host: 127.0.0.1"]).decode()
     found = re.search(r"\r\nSet-Cookie: ([^;]*); Path=(/[^;]*)/;", answer)
     assert found is not None
@@ -107,7 +107,7 @@ def get(
     proxy: Proxy, path: str = "/PATH/", *headers: str, host: str = "HOST", cookie: str = "lyceum-warp=VALUE",
     method: str = "GET", rest: bytes = b"",
 ) -> bytes:  # fmt: skip
-    """The answer to a request, in which words in capitals stand for the proxy's port, path, cookie and token."""
+    """Return the response to a request; words in capitals stand for the proxy's port, path, cookie and token."""
     own, below = entered(proxy)
     words = {"HOST": "127.0.0.1:PORT", "PORT": str(proxy.port), "PATH": below.strip("/"), "TOKEN": token(proxy),
              "VALUE": own.partition("=")[2]}  # fmt: skip
@@ -145,7 +145,7 @@ def test_the_token_becomes_a_cookie_and_leaves_the_address(proxy: Proxy, upstrea
 
 
 class Jar(http.cookiejar.CookieJar):
-    """Cookies as a browser sends them: to every port of their host, below their path."""
+    """A cookie jar that behaves like a browser's: it sends a host's cookies to all ports, below their path."""
 
     def sent_to(self, address: str) -> str | None:
         asked = urllib.request.Request(address)
@@ -258,7 +258,7 @@ def test_a_link_on_another_page_leads_to_the_viewer_if_it_has_the_token(proxy: P
     "host", ["127.0.0.1", "127.0.0.1:9000", "localhost:9000", "Localhost:80", "[::1]:9000", "192.168.0.7:8080"]
 )
 def test_addresses_of_this_machine_are_accepted_at_any_port(proxy: Proxy, host: str) -> None:
-    """A port may be forwarded."""
+    """The port may be forwarded."""
     assert status(get(proxy, "/PATH/", f"Origin: http://{host.lower()}", host=host)) == 200
 
 
@@ -297,7 +297,7 @@ def test_a_slow_head_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
         socket.create_connection(("127.0.0.1", proxy.port), timeout=10) as client,
         pytest.raises(ConnectionError),
     ):
-        for byte in b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + 600 * b"a":  # each byte is in time, all are not
+        for byte in b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + 600 * b"a":  # all bytes take too long
             client.send(bytes([byte]))
             time.sleep(0.02)
 
@@ -322,7 +322,7 @@ def test_a_client_that_takes_nothing_is_dropped(monkeypatch: pytest.MonkeyPatch)
             client.connect(("127.0.0.1", proxy.port))
             client.sendall(f"GET {path}/ HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: {key}\r\n\r\n".encode())
             wait_until(lambda: upstream.ended == 1)
-            with pytest.raises(ConnectionError):  # a connection that waits for the client would take this
+            with pytest.raises(ConnectionError):  # a connection that waits for the client would accept this
                 for _ in range(1000):
                     client.send(b"x")
                     time.sleep(0.01)
@@ -333,7 +333,7 @@ def test_a_client_that_takes_nothing_is_dropped(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.fixture
 def echo() -> Iterator[tuple[Proxy, list[ServerConnection], list[float]]]:
-    """A proxy before a WebSocket server of the library that studio uses, its open connections, and times of silence."""
+    """Run a proxy before a WebSocket server of studio's library; yield it, open connections and times of silence."""
     opened: list[ServerConnection] = []
     quiet: list[float] = []
 

@@ -22,7 +22,7 @@ def ghost(x: float, opacity: float = 0.3) -> Ghost:
 
 def test_ghost_has_the_models_moving_geoms_in_its_colour() -> None:
     geoms = ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(2.0)])
-    assert [geom.type for geom in geoms] == [int(mujoco.mjtGeom.mjGEOM_SPHERE)]  # the plane stands still
+    assert [geom.type for geom in geoms] == [int(mujoco.mjtGeom.mjGEOM_SPHERE)]  # the plane is static
     np.testing.assert_allclose(geoms[0].pos, [2, 0, 1])
     np.testing.assert_allclose(geoms[0].rgba, [0.2, 0.4, 0.6, 0.3])
     assert geoms[0].transparent
@@ -44,7 +44,7 @@ def test_traces_get_fewer_points_before_some_are_dropped(limit: int, number: int
     traces = np.random.default_rng(0).normal(size=(number, 33, 3))
     scene = ExtraGeoms(MODEL, limit)
     geoms = scene.draw(pose(0), traces=traces, best=best)
-    assert len(geoms) <= min(limit, 160)  # most geoms are left to ghosts
+    assert len(geoms) <= min(limit, 160)  # ghosts get most geoms
     assert (len(geoms) >= 4 * number) == (limit >= 100 and number == 10)  # a trace has at least 4 lines
     assert len(scene.draw(pose(0), [ghost(i) for i in range(20)], traces, best)) <= limit
 
