@@ -155,7 +155,7 @@ def train(
         )  # fmt: skip
         callbacks: list[Callback] = []
         if leads:
-            board = shown.enter_context(TensorBoard(run.folder, run.config)) if tensorboard else None
+            board = shown.enter_context(TensorBoard(run.folder)) if tensorboard else None
             seed = evaluation_seed(env.options.seed + 1)
             videos = Videos(
                 learner, run.folder / "videos", video_every, seed, camera=camera, note=display.note,

@@ -123,6 +123,17 @@ class Placement:
     """cpu, or a CUDA device such as cuda:0."""
 
 
+@optional_flags(EnvOptions, omit=NO_FLAGS, default="")
+class EnvFlags:
+    """Where the worlds run, and the length of their episodes: by default those of the run, if there is one."""
+
+    engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
+    """mujoco (the C engine, on CPU cores), warp, or auto (the default): warp on a CUDA device and mujoco on the CPU."""
+    device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
+    """cpu (the default), or a CUDA device such as cuda:0. Without this flag a run with the engine auto is evaluated on
+    the CPU, where a few worlds step fastest."""
+
+
 @optional_flags(PhysicsOptions, default="")
 class Physics:
     """How the worlds are simulated. The defaults come from the task or its model."""

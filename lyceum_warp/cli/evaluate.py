@@ -11,7 +11,7 @@ from rich.table import Table
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, ParamWords, Trust, given, optional_flags, parameters
+from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Trust, given, parameters
 from lyceum_warp.cli.display import make_console, note, policy_video, tried
 from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.controllers.trajectory import source
@@ -25,17 +25,6 @@ from lyceum_warp.runs.task_copy import note_changes, run_env
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 from lyceum_warp.viz.long_work import LongWork
 from lyceum_warp.viz.video import check_video
-
-
-@optional_flags(EnvOptions, omit=NO_FLAGS, default="(default: the run's)")
-class OtherEnv:
-    """Options of the environment."""
-
-    engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """mujoco (the C engine, on CPU cores), warp, or auto."""
-    device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu, or a CUDA device such as cuda:0. By default a run with engine auto is evaluated on the CPU, where a few
-    worlds step fastest."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -70,7 +59,7 @@ class Eval:
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder for one file per episode, in the format of lyceum-warp plan: episode-000.npz and so on."""
     trust: Trust = False
-    env: tyro.conf.OmitArgPrefixes[OtherEnv] = dataclasses.field(default_factory=OtherEnv)
+    env: tyro.conf.OmitArgPrefixes[EnvFlags] = dataclasses.field(default_factory=EnvFlags)
 
     def run(self) -> int:
         """Run the command, and return the exit code."""

@@ -2,9 +2,7 @@
 
 import dataclasses
 import datetime
-import math
 import signal
-import time
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -30,14 +28,14 @@ from lyceum_warp.cli.arguments import (
 )
 from lyceum_warp.cli.display import PlanDisplay, make_console, report_table, states_video, tried
 from lyceum_warp.controllers.checked_controller import CheckedController
-from lyceum_warp.controllers.control_report import control_report
+from lyceum_warp.controllers.control_report import ControlReport, control_report
 from lyceum_warp.controllers.loop import control
 from lyceum_warp.controllers.real_time import control_async
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.runs.folder import Run, load_value
 from lyceum_warp.support.interrupts import Interrupted
-from lyceum_warp.support.validate import positive_number, whole_number
+from lyceum_warp.support.validate import whole_number
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 from lyceum_warp.viz.control_plot import control_plot
 
@@ -95,8 +93,6 @@ class Plan:
     task: TaskWord
     episodes: int = 1
     """Number of episodes."""
-    minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """Start no new episode after this time."""
     steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of steps in an episode; by default the task's horizon."""
     replan_every: int = 1
@@ -104,10 +100,7 @@ class Plan:
     seed: int = 0
     """Seed of the first episode's initial state and noise; it increases by one with each episode."""
     real_time: bool = False
-    """Step the world in real time while the planner runs, instead of waiting for each plan."""
-    rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
-    """Required plans per second, which set the deadline in the report; by default one plan per step, or per
-    --replan-every steps."""
+    """Step the world in real time while the planner plans, instead of waiting for each plan."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder; by default runs/plan-TASK-DATE."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
@@ -132,10 +125,6 @@ class Plan:
         whole_number("episodes", self.episodes, low=1)
         whole_number("seed", self.seed, low=0)
         whole_number("seed of the last episode", self.seed + self.episodes - 1, low=0)
-        if self.minutes is not None:
-            positive_number("minutes", self.minutes, "minutes")
-        if self.rate is not None and not 0 < self.rate < float("inf"):
-            raise ValueError(f"rate must be a positive number of plans per second, not {self.rate}")
         every = whole_number("replan_every", self.replan_every, low=1)
         if every > 1 and self.real_time:
             raise ValueError(
@@ -165,7 +154,7 @@ class Plan:
             "planner_model": self.planner_model and str(_model(self.planner_model)),
             "value": self.value and str(self.value.resolve()), **vars(self.planner),
             "engine": planner.env.engine.name, "episodes": self.episodes, "steps": self.steps,
-            "replan_every": every, "seed": self.seed, "real_time": self.real_time, "rate": self.rate,
+            "replan_every": every, "seed": self.seed, "real_time": self.real_time,
         }  # fmt: skip
         return _run(Run.create(out, config, device=self.planner.device), plant, planner, self)
 
@@ -238,12 +227,8 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
     aborted: list[Trajectory] = []
     method: Any = control_async if options.real_time else partial(control, replan_every=options.replan_every)
     shown: dict[str, Any] = dict(steps=plant.horizon, timestep=plant.timestep, real_time=options.real_time)
-    deadline = math.inf if options.minutes is None else time.monotonic() + 60 * options.minutes
     try:
         for episode in range(options.episodes):
-            if done and time.monotonic() >= deadline:
-                console.print(f"{options.minutes:g} minutes are over after {len(done)} of {options.episodes} episodes")
-                break
             with PlanDisplay(console, episode, options.episodes, **shown) as display:
                 seed = options.seed + episode
                 trajectory = method(plant, planner, seed=seed, on_step=display, on_abort=aborted.append)
@@ -259,13 +244,6 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
             console.print(message, soft_wrap=True, markup=False)
         raise
     return _report(run, plant, done, options)
-
-
-def _rate(options: Plan, episode: Trajectory) -> float | None:
-    """Required plans per second, for the deadline; None for one plan per step."""
-    if options.rate is not None or options.replan_every == 1:
-        return options.rate
-    return 1 / (options.replan_every * episode.timestep)
 
 
 def _left(run: Run, whole: int, aborted: list[Trajectory], path: Path | None) -> str:
@@ -285,13 +263,18 @@ def _file(run: Run, episode: int) -> Path:
 def _save(run: Run, done: list[Trajectory], options: Plan) -> None:
     """Write the last episode, and the report of all episodes."""
     done[-1].save(_file(run, len(done) - 1))
-    control_report(done, rate=_rate(options, done[0])).write(run.folder / "report.json")
+    _summary(done, options).write(run.folder / "report.json")
+
+
+def _summary(done: list[Trajectory], options: Plan) -> ControlReport:
+    """The report of some episodes. A plan has the time of the steps to the next one."""
+    return control_report(done, rate=1 / (options.replan_every * done[0].period))
 
 
 def _report(run: Run, plant: Env, done: list[Trajectory], options: Plan) -> int:
     """Print the report, make the plot and the video, and list the files."""
     console, camera = make_console(), parsed_camera(options.camera)
-    report = control_report(done, rate=_rate(options, done[0]))
+    report = _summary(done, options)
     console.print(report_table(report, success=plant.task.functions["success"] is not None))
     paths = [("episodes", str(run.folder / "episode-*.npz")), ("report", str(run.folder / "report.json"))]
     if options.plot:

@@ -17,13 +17,12 @@ from lyceum_warp.algos.networks import moved
 from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.cli.algorithms import Hyperparameters
 from lyceum_warp.cli.arguments import (
-    NO_FLAGS,
     CameraWords,
+    EnvFlags,
     ParamWords,
     Physics,
     Trust,
     given,
-    optional_flags,
     parameters,
 )
 from lyceum_warp.cli.display import Display, curve_table, make_console, note, policy_video, tried
@@ -52,16 +51,6 @@ _KEPT = {
     "out": "--out",
 }  # fmt: skip
 """Flags that are refused with --resume."""
-
-
-@optional_flags(EnvOptions, omit=NO_FLAGS, default="")
-class EnvFlags:
-    """Where the worlds run, and the length of their episodes."""
-
-    engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """mujoco (the C engine, on CPU cores), warp, or auto (the default): warp on a CUDA device and mujoco on the CPU."""
-    device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu (the default), or a CUDA device such as cuda:0."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -238,7 +227,7 @@ class Train:
             policy, value, iteration = saved_networks(source, self.which if self.resume is None else None)
             if self.resume is None:
                 entries["from"] = {"run": str(source.folder.resolve()), "which": self.which, "iteration": iteration}
-        says = note if team.leads else _silent
+        says = note if team.leads else lambda line: None
         learner = configuration.learner(
             team, run=source, networks=(policy, value), note=says, task=self.task, trust=self.trust
         )
@@ -283,7 +272,3 @@ class Train:
             note(f"the mean policy's return is {final:.1f}; --require-return demands more than {self.require_return:g}")
             return 1
         return 0
-
-
-def _silent(line: str) -> None:
-    """Print nothing; for all ranks except 0."""

@@ -1,14 +1,12 @@
-"""Write curves and hyperparameters of a run for TensorBoard, with the extra ``tensorboard``.
+"""Write curves of a run for TensorBoard, with the extra ``tensorboard``.
 
 ``metrics.csv`` holds the same numbers; the files written here are a copy for another viewer.
 """
 
 import importlib.util
-import json
 import math
 import os
 import time
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,36 +30,31 @@ _TAGS = {
 }  # fmt: skip
 """Names of curves that cannot be derived from the columns."""
 
-_COMPARED = ("return/mean", "mean_policy/return", "episode/eval", "episode/success")
-"""The curves whose last values are shown in the tab HPARAMS."""
-
 
 class TensorBoard:
     """Writes a run's iterations where TensorBoard reads them; the horizontal axis counts samples.
 
-    Every number of an iteration becomes a curve, whose name starts with its group: return/, episode/, mean_policy/,
-    policy/, value/, time/ metrics/ and step_metrics/. The hyperparameters appear in the tabs HPARAMS and TEXT.
+    Every number of an iteration is a curve, named by its group: return/, episode/, mean_policy/, policy/, value/, time/
+    metrics/ and step_metrics/.
 
     In a folder that already holds curves, the curves continue: what they hold from the samples of the first new
     iteration on is replaced.
 
     Example:
-        >>> with TensorBoard(Path("runs/mine"), {"gamma": 0.99}) as board:
+        >>> with TensorBoard("runs/mine") as board:
         ...     for it in NPG(env):
         ...         board(it)
 
     Args:
-        folder: The folder; it is created if it does not exist. Pass it, or a parent folder, to ``tensorboard
-            --logdir``.
-        config: The hyperparameters, which may be nested.
+        folder: The folder; it is made if it does not exist. ``tensorboard --logdir`` takes it, or one above it.
 
     Raises:
         ImportError: The package tensorboard is not installed.
     """
 
-    def __init__(self, folder: str | Path, config: Mapping[str, Any]) -> None:
+    def __init__(self, folder: str | Path) -> None:
         check_tensorboard()
-        self._folder, self._config = Path(folder), dict(config)
+        self._folder = Path(folder)
         self._folder.mkdir(parents=True, exist_ok=True)
         self._file: Any = None
 
@@ -106,9 +99,6 @@ class TensorBoard:
         self._add(Event(file_version="brain.Event:2"))
         if number:  # TensorBoard discards points of earlier files from this step on
             self._add(Event(step=replaced, session_log=SessionLog(status=SessionLog.START)))
-        else:
-            for summary in _hyperparameters(self._config):
-                self._add(Event(summary=summary))
 
     def _add(self, event: Any) -> None:
         event.wall_time = time.time()
@@ -133,23 +123,3 @@ def tag(column: str) -> str:
         if column.startswith(beginning):
             return f"{group}/{column.removeprefix(beginning)}"
     return f"policy/{column}"
-
-
-def _hyperparameters(config: Mapping[str, Any]) -> list[Any]:
-    """The summaries for the tabs HPARAMS and TEXT."""
-    from tensorboard.plugins.hparams.summary_v2 import HParam, Metric, hparams_config_pb, hparams_pb
-    from tensorboard.plugins.text.summary_v2 import text_pb
-
-    flat = dict(_flat(config))
-    names, metrics = [HParam(name) for name in flat], [Metric(name) for name in _COMPARED]
-    text = "\n".join("    " + line for line in json.dumps(config, indent=2, default=str).splitlines())
-    return [hparams_config_pb(names, metrics), hparams_pb(flat), text_pb("config", text)]
-
-
-def _flat(config: Mapping[str, Any]) -> Iterator[tuple[str, bool | float | str]]:
-    """The hyperparameters as a flat dict, as TensorBoard expects; entries whose value is None are omitted."""
-    for name, value in config.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value)
-        elif value is not None:
-            yield name, value if isinstance(value, (bool, int, float, str)) else str(value)
