@@ -1,4 +1,4 @@
-"""Define a cheetah that runs at a commanded speed; this task uses most of the task form.
+"""Define a cheetah that runs at a commanded speed, with most features of the task form.
 
 ``python examples/commanded_speed.py`` checks and steps it; ``lyceum-warp train examples/commanded_speed.py`` trains it.
 """
@@ -32,7 +32,7 @@ class World:
     qpos: Row[float]
     qvel: Row[float]
     sensordata: Row[float]
-    gravity: Row[float]  # this and the next three are model fields; startup and randomize write them in each world
+    gravity: Row[float]  # this and the next three are model fields; startup and randomize write them per world
     body_mass: Row[float]
     geom_friction: Row[wp.vec3]
     actuator_gainprm: Row[lw.vec10]
@@ -48,7 +48,7 @@ class Params:
     noise: float = 0.02
     fastest: float = 4.0  # command at level 1, m/s
     push: float = 0.5  # standard deviation, m/s
-    gait: wp.array2d[float] = GAIT  # joint angles to imitate, a row for each phase
+    gait: wp.array2d[float] = GAIT  # joint angles to imitate, one row per phase
     period: float = 0.4  # of the gait, s
     weights: wp.vec4 = wp.vec4(1.0, 0.3, -0.02, -0.5)  # of the reward's terms
     feet: wp.array[int] = lw.sensors("bfoot", "ffoot")
@@ -139,7 +139,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):  # at every reset, from
 
 
 @wp.func
-def event(s: World, p: Params, rng: Row[wp.uint32]):  # on average a new command every 2 s, a push every second
+def event(s: World, p: Params, rng: Row[wp.uint32]):  # on average a new command every 2 s and a push every second
     if lw.uniform(rng, 0.0, 2.0) < p.dt:
         s.command[0] = lw.uniform(rng, 0.0, 1.0 + s.level[0] * (p.fastest - 1.0))
     if lw.uniform(rng, 0.0, 1.0) < p.dt:

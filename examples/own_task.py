@@ -1,6 +1,7 @@
 """Define a task and its model in one file: swing up a pendulum whose motor is too weak to lift it directly.
 
-``python examples/own_task.py`` checks and steps it. docs/own_task.md shows the command line, and a model in a file.
+``python examples/own_task.py`` checks and steps it. docs/own_task.md shows the command line, and a task with its model
+in a file.
 """
 
 import mujoco
@@ -52,7 +53,7 @@ class Pendulum(lw.Task):
 
 
 if __name__ == "__main__":
-    print(check_task(Pendulum, steps=100))  # the rules that the package's own tasks keep
+    print(check_task(Pendulum, steps=100))  # the rules that the package's own tasks follow
     env = lw.make(Pendulum, nworld=4, effort_weight=0.1)
     env.action[:] = 0.5  # Nm
     env.step()

@@ -1,4 +1,4 @@
-"""Control an arm with MPPI: plan at every step, apply the plan's first action, and report how it went.
+"""Control an arm with MPPI: plan at every step, apply the plan's first action, and report the results.
 
     python examples/plan.py
     python examples/plan.py --task half_cheetah --steps 200 --samples 64
@@ -23,9 +23,9 @@ def main(
     Args:
         task: Name of a task, or a file with one.
         episodes: Number of episodes.
-        steps: Steps of an episode; by default the task's horizon.
-        samples: Samples per plan; by default the task's own setting.
-        seed: Seed of the first episode; each further episode adds 1.
+        steps: Number of steps in an episode; by default the task's horizon.
+        samples: Number of samples per plan; by default the task's setting.
+        seed: Seed of the first episode; it increases by 1 with each episode.
     """
     plant = lw.make(task, autoreset=False)  # the controlled world
     # the planner has its own worlds, one for each sample

@@ -3,7 +3,7 @@
     python examples/random_search.py
     python examples/random_search.py --task hopper --nworld 64 --iterations 300 --video-every 100
 
-The class contains no code for files: lw.train writes the run folder, with metrics, policies, checkpoints and videos.
+The class needs no code for files: lw.train writes the run folder, with metrics, policies, checkpoints and videos.
 """
 
 import dataclasses
@@ -20,13 +20,13 @@ class SearchConfig:
     """Hyperparameters."""
 
     step: float = 1.0
-    """Step size along a direction whose two returns differ by one standard deviation of all returns."""
+    """Step size along a direction if its two returns differ by one standard deviation of all returns."""
     noise: float = 0.5
     """Standard deviation of the perturbations of the weights."""
 
 
 class RandomSearch(lw.Learner):
-    """Evaluates perturbations of a linear policy's weights; each pair of worlds tries one of them with both signs."""
+    """Perturbs a linear policy's weights; each pair of worlds evaluates one perturbation with both signs."""
 
     algorithm = "random-search"
 

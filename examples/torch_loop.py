@@ -1,4 +1,4 @@
-"""Write a learner in plain torch, an actor and a critic, on the environment's own buffers.
+"""Train an actor and a critic in plain torch, on the environment's own buffers.
 
     python examples/torch_loop.py
     python examples/torch_loop.py --device cuda --nworld 4096
@@ -29,7 +29,7 @@ def main(nworld: int = 256, iterations: int = 100, steps: int = 32, device: str 
             obs = env.obs.clone()  # env.obs changes in place
             with torch.no_grad():
                 action = torch.normal(actor(obs), log_std.exp())
-            env.step(action)  # copies the action into env.action; a world that is done begins a new episode
+            env.step(action)  # copies the action into env.action; a world that is done starts a new episode
             with torch.no_grad():
                 # env.obs may already belong to a new episode; env.final_obs is the observation after this step.
                 # Bootstrap from its value unless the task terminated: a time limit only truncates the episode.

@@ -69,16 +69,16 @@ def make(task: str | type[Task], options: EnvOptions | None = None, **words: Any
 class Env:
     """One task in many worlds, with every array allocated once and shared with torch.
 
-    Write ``action``, call ``step``, and read the other buffers, which are updated in place. A world whose episode ends
-    begins a new, random one within the same step: ``obs`` is then the first observation of the new episode, and
-    ``final_obs`` the last observation of the old one.
+    Write ``action``, call ``step``, and read the other buffers, which are updated in place. When an episode ends, its
+    world starts a new random episode within the same step: ``obs`` is then the first observation of the new episode,
+    and ``final_obs`` the last observation of the old one.
 
-    A world with a fault (see ``Done``) restarts and is counted in ``fault_counts``. All other worlds stay equal to the
-    bit. The transition has reward 0 and the last good observation as ``final_obs``. In the Warp engine the worlds share
-    a pool of contacts: if it overflows, every world whose contacts did not fit has a fault.
+    A world with a fault (see ``Done``) restarts and is counted in ``fault_counts``; no bit of any other world changes.
+    The transition has reward 0 and the last valid observation as ``final_obs``. In the Warp engine all worlds share a
+    pool of contacts: if it overflows, every world whose contacts did not fit has a fault.
 
-    On a GPU, use these tensors on torch's default stream, which is synchronised with Warp's, or synchronise other
-    streams yourself.
+    On a GPU, use these tensors on torch's default stream, which is synchronised with Warp's; synchronise other streams
+    yourself.
 
     {arguments}
     """
@@ -114,7 +114,7 @@ class Env:
     done_reason: torch.Tensor
     """Bits of ``Done``, (nworld,), int32."""
     action: torch.Tensor
-    """Actions of the next step, (nworld, nact), float32. One that is not finite is a fault and is applied as zero."""
+    """Actions of the next step, (nworld, nact), float32. A non-finite action is a fault and is replaced by zero."""
     episode_step: torch.Tensor
     """Steps since the reset, (nworld,), int32."""
     time: torch.Tensor
@@ -215,7 +215,7 @@ class Env:
 
     @functools.cached_property
     def model(self) -> mujoco.MjModel:
-        """The compiled model, read-only, because the engine has a copy of its own.
+        """The compiled model, read-only, because the engine uses its own copy.
 
         To change the physics, list model fields in the task's ``World`` and write them in ``startup`` or ``randomize``,
         or pass an edited MjSpec as ``model=``. ``copy.copy(env.model)`` is an ordinary MjModel that can be edited.
@@ -234,13 +234,13 @@ class Env:
 
     @property
     def autoreset(self) -> bool:
-        """Whether finished worlds begin a new episode within the same step."""
+        """Whether finished worlds start a new episode within the same step."""
         return self.worlds.autoreset
 
     # the step
 
     def step(self, action: torch.Tensor | None = None) -> None:
-        """Advance every world by one step under ``action``, and begin new episodes in worlds whose episode ended.
+        """Advance every world by one step under ``action``, and start new episodes in worlds whose episode ended.
 
         ``Worlds.step_phases`` lists the phases in order.
 
@@ -248,7 +248,7 @@ class Env:
             action: Copied into ``env.action`` first, if given; (nworld, nact).
 
         Raises:
-            ValueError: The action has another shape or type.
+            ValueError: The action has the wrong shape or type.
         """
         if action is not None:
             check_tensor(action, "action", self.action)
@@ -259,10 +259,10 @@ class Env:
     # resets
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
-        """Put worlds into the task's fixed initial state, with zero actions.
+        """Reset worlds to the task's fixed initial state, and zero their actions.
 
         Args:
-            mask: Which worlds, (nworld,) bool; all by default.
+            mask: Worlds to change, (nworld,) bool; by default all.
         """
         worlds = self.worlds
         worlds.set_mask(mask)
@@ -271,11 +271,11 @@ class Env:
             call()
 
     def rand_reset(self, seed: int | None = None, mask: torch.Tensor | None = None) -> None:
-        """Put worlds into random initial states, with zero actions.
+        """Reset worlds to random initial states, and zero their actions.
 
         Args:
             seed: Restarts the worlds' random streams; by default each world continues its own.
-            mask: Which worlds, (nworld,) bool; all by default.
+            mask: Worlds to change, (nworld,) bool; by default all.
         """
         worlds = self.worlds
         worlds.set_mask(mask)
@@ -288,18 +288,18 @@ class Env:
     # the state
 
     def get_state(self, out: torch.Tensor | None = None, mask: torch.Tensor | None = None) -> torch.Tensor:
-        """The full state of every world, which determines its future, (nworld, state_space.size), float64.
+        """The complete state of every world, (nworld, state_space.size), float64; it determines the world's future.
 
         It holds the engine's integration state, fields left by the last substep, model fields that differ between
-        worlds, the counters of steps and episodes, the random stream, the task's memory, the sums of the metrics, and
-        the count for ``success_steps``. ``state_space.parts`` names their columns.
+        worlds, the step and episode counters, the random stream, the task's memory, the metric sums, and the count for
+        ``success_steps``. ``state_space.parts`` names their columns.
 
         Args:
             out: Where to write the states.
-            mask: Which worlds' rows of ``out`` to write, (nworld,) bool; all by default.
+            mask: Worlds whose rows of ``out`` to write, (nworld,) bool; by default all.
 
         Raises:
-            ValueError: An argument has another shape or type, or a mask comes without ``out``.
+            ValueError: An argument has the wrong shape or type, or a mask comes without ``out``.
         """
         worlds = self.worlds
         for call in worlds.programs.read_state:
@@ -319,11 +319,11 @@ class Env:
 
         Args:
             state: (nworld, state_space.size), float64.
-            mask: Which worlds, (nworld,) bool; all by default.
+            mask: Worlds to change, (nworld,) bool; by default all.
             check: Whether to refuse states that are not finite. On a GPU the check waits for the device.
 
         Raises:
-            ValueError: The state has another shape or type, or is not finite.
+            ValueError: The state has the wrong shape or type, or is not finite.
         """
         worlds = self.worlds
         check_tensor(state, "state", worlds.state_view)
@@ -346,10 +346,10 @@ class Env:
         Args:
             state: States to observe, (nworld, state_space.size).
             out: Where to write the observations.
-            group: Which group of observations.
+            group: Name of the observation group.
 
         Raises:
-            ValueError: There is no such group, or an argument has another shape or type.
+            ValueError: There is no such group, or an argument has the wrong shape or type.
         """
         check_group(group, self.obs_groups, self.task.name)
         return _copied((self if state is None else self._scratch_at(state)).obs_groups[group], out)
@@ -378,7 +378,7 @@ class Env:
             out: Where to write the rewards.
 
         Raises:
-            ValueError: Only a part of a transition is given, or an argument has the wrong shape or type.
+            ValueError: Only part of a transition is given, or an argument has the wrong shape or type.
         """
         if before is None and action is None and after is None:
             return _copied(self.reward, out)
@@ -399,7 +399,7 @@ class Env:
         """Check and set the actions of the next step. ``env.action.copy_(...)`` skips the checks.
 
         Raises:
-            ValueError: The action has another shape or type, or is not finite.
+            ValueError: The action has the wrong shape or type, or is not finite.
         """
         self._check_action(action)
         self.action.copy_(action.detach())
@@ -414,8 +414,8 @@ class Env:
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
         """A live view of a field of MjData or MjModel, by MuJoCo's name.
 
-        An environment keeps ``time``, ``ctrl`` and the fields that its task reads. Name further ones when you make it,
-        as in ``make("hopper", fields=["site_xpos", "body_mass"])``. Do not write into the view: use ``set_state`` or
+        An environment keeps ``time``, ``ctrl`` and the fields that its task reads. Request others when you make it, as
+        in ``make("hopper", fields=["site_xpos", "body_mass"])``. Do not write into the view: use ``set_state`` or
         ``set_dynamics``.
 
         Args:
@@ -442,19 +442,18 @@ class Env:
         return view[:, where.start] if one_object else view[:, where]
 
     def set_dynamics(self, mask: torch.Tensor | None = None, **fields: Any) -> None:
-        """Set model fields that the task draws or that ``dynamics=`` names; derived constants follow.
+        """Set model fields that the task randomizes or ``dynamics=`` names, and update the constants derived from them.
 
-        A reset restores the nominal values of fields that the task's ``initialize``, ``randomize`` or ``event`` writes,
-        before they are drawn again. Other fields keep the new values until ``rand_reset(seed=...)``.
+        Each reset first restores the nominal values of fields that the task's ``initialize``, ``randomize`` or
+        ``event`` writes. Other fields keep the new values until ``rand_reset(seed=...)``.
 
         Args:
-            mask: Which worlds, (nworld,) bool; all by default.
-            fields: Values by the names of model fields, as ``body_mass=masses``: a row for each world, or one row for
-                all worlds.
+            mask: Worlds to change, (nworld,) bool; by default all.
+            fields: Values by model field, as in ``body_mass=masses``: one row per world, or one row for all worlds.
 
         Raises:
-            ValueError: A field is unknown or does not differ between worlds, or a value is of the wrong size, not
-                finite, or negative where only positive ones make sense.
+            ValueError: A field is unknown or the same in all worlds, or a value has the wrong size, is not finite, or
+                is negative although the field must be positive.
         """
         state = self.get_state()
         put_rows(self.task.model, fields, self._columns_of_dynamics(state))
@@ -517,14 +516,14 @@ class Env:
 
     @property
     def given_params(self) -> dict[str, Any]:
-        """The given parameters of the task by name; all others have their defaults."""
+        """The task parameters that were given, by name; all others have their defaults."""
         return dict(self._given_params)
 
     def set_params(self, **params: Any) -> None:
         """Change parameters of the task from the next step on, in place.
 
         Raises:
-            ValueError: There is no such parameter, or the observation would change its size.
+            ValueError: There is no such parameter, or the size of the observation would change.
         """
         self.task.change_params(params)
         self._given_params = self._given_params | params
@@ -543,7 +542,7 @@ class Env:
         self._copy_shared(other)
 
     def replicate(self, *, nworld: int | None = None, **changes: Any) -> "Env":
-        """Make another environment of the same task with the same options and parameters, except for the given changes.
+        """Make another environment of the same task, with the same options and parameters except for the given changes.
 
         ``seed`` and ``first_world`` become 0 unless given. Parameters with one value per world are repeated if the
         number of worlds differs.
@@ -558,22 +557,22 @@ class Env:
         return made
 
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
-        """``replicate`` for a few worlds, such as an evaluation's: with engine="auto" they run on the C engine.
+        """``replicate`` for a few worlds, as for an evaluation: with engine="auto" they run on the C engine.
 
         On a GPU a step of a few worlds takes nearly as long as a step of thousands.
         """
         return self.replicate(nworld=nworld, **(options_for_few_worlds(self.options.engine, self.device) | changes))
 
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
-        """The values of some parameters, for a number of worlds."""
+        """The values of the named parameters, for ``nworld`` worlds."""
         known, worlds = self.task.parameters, np.arange(nworld) % self.nworld
-        # other values stay in their given form, such as an element's name, not its index
+        # other values stay as given, for instance as an element's name instead of its index
         given = {name: value for name, value in self._given_params.items() if name not in known.tables}
         values = {name: (known.values | given)[name] for name in names}
         return values | {name: known.values[name][worlds] for name in names if name in known.per_world}
 
     def _scratch_at(self, given: torch.Tensor) -> "Env":
-        """Worlds of the same task in given states; made when first needed."""
+        """Scratch worlds of the same task in the given states; made at first use."""
         if self._scratch is None:
             self._scratch = self.replicate()
         self._scratch._copy_shared(self)
@@ -588,7 +587,7 @@ class Env:
 
     @property
     def bytes_per_world(self) -> float:
-        """Estimated memory of a world in bytes, without the model, which all worlds share."""
+        """Estimated bytes of memory per world, without the model, which all worlds share."""
         physics = self.options.engine, self.task.model, self.device, self.task.fields
         engine = bytes_per_world(*physics, dynamics=self.task.dynamics, **self.options.for_engine())
         return engine + own_bytes_per_world(self.task)

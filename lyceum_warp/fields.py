@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 quat = wp.vec4
-"""A quaternion in MuJoCo's order w, x, y, z. Warp's functions that expect x, y, z, w refuse it."""
+"""A quaternion in MuJoCo's order w, x, y, z. Warp's quaternion functions, which expect x, y, z, w, do not accept it."""
 
 vec10 = wp.types.vector(length=10, dtype=wp.float32)
 
@@ -39,7 +39,7 @@ STATE_FIELDS = {
     "mocap_quat": mujoco.mjtState.mjSTATE_MOCAP_QUAT,
     "userdata": mujoco.mjtState.mjSTATE_USERDATA,
 }
-"""Fields that are part of the integration state, with their mjtState component."""
+"""Fields of the integration state, with their mjtState component."""
 
 INPUTS = ("ctrl", "xfrc_applied", "qfrc_applied", "mocap_pos", "mocap_quat", "userdata")
 """State fields that the physics reads and never changes. A task may write them before a step."""
@@ -66,7 +66,7 @@ DERIVED_FIELDS = (
     | dict.fromkeys(_VELOCITY.split(), Stage.VELOCITY)
     | dict.fromkeys(_ACCELERATION.split(), Stage.ACCELERATION)
 )
-"""Fields that a forward pass computes, with the stage that computes them."""
+"""Fields that a forward pass computes, each with its stage."""
 
 ON_DEMAND = {
     "cacc": mujoco.mjtSensor.mjSENS_FRAMELINACC,
@@ -75,10 +75,10 @@ ON_DEMAND = {
     "subtree_linvel": mujoco.mjtSensor.mjSENS_SUBTREELINVEL,
     "subtree_angmom": mujoco.mjtSensor.mjSENS_SUBTREEANGMOM,
 }
-"""Fields that MuJoCo leaves at zero unless a sensor of the model needs them, with the type of such a sensor."""
+"""Fields that MuJoCo leaves at zero unless a sensor of the model needs them, each with one such sensor type."""
 
 SENSED = {"sensordata", *ON_DEMAND}
-"""Fields for which the model's sensors must be enabled."""
+"""Fields that are computed only if the model's sensors are enabled."""
 
 _TYPES = {3: wp.vec3, 4: quat, 6: wp.spatial_vector, 9: wp.mat33, 10: vec10}
 
@@ -103,7 +103,7 @@ _KINDS = {
     "subtree_angmom".split(),
     _Kind.mjOBJ_BODY,
 ) | dict.fromkeys(("xanchor", "xaxis"), _Kind.mjOBJ_JOINT)  # fmt: skip
-"""The kind of object with one row per object in a field, by the field's name or prefix."""
+"""For fields with one row per object: the kind of object, by the field's name or prefix."""
 
 _QPOS = (_Kind.mjOBJ_JOINT, "jnt_qposadr", "nq")
 _DOFS = (_Kind.mjOBJ_JOINT, "jnt_dofadr", "nv")
@@ -127,8 +127,8 @@ _RANGES = (
     | {"sensordata": _SENSORS, "flexvert_xpos": _VERTICES}
     | dict.fromkeys(("flexedge_length", "flexedge_velocity"), _EDGES)
 )  # fmt: skip
-"""Fields in which an object has several rows, by name or prefix: the kind of object, the array of first rows, and the
-array of numbers of rows, or else the size of the field."""
+"""For fields in which an object may have several rows, by name or prefix: the kind of object, the MjModel array of its
+first row, and the array of its row counts or the total number of rows."""
 
 _COUNTS = {
     _Kind.mjOBJ_ACTUATOR: "nactuator",
@@ -149,36 +149,36 @@ _COUNTS = {
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """One field of one model, and how the engine keeps it."""
+    """One field of one model, and how the engine updates it."""
 
     name: str
     shape: tuple[int, ...]
-    """Shape of one world's value, without the axis that ``dtype`` holds."""
+    """Shape of one world's value, without the axis that is part of ``dtype``."""
     dtype: type
     """Warp type of an element: float, wp.vec3, quat (w, x, y, z), ..."""
     refresh: Stage
-    """The stage that must be computed after a step for this field to belong to the new state."""
+    """The stage to compute after a step so that the field matches the new state."""
     reset: Stage
-    """The stage that must be computed after a reset; NONE for a field that a reset clears."""
+    """The stage to compute after a reset; NONE for a field that a reset clears."""
     lagged: bool
-    """Whether the field keeps the value that ``mj_step`` leaves, one substep behind the state."""
+    """Whether the field keeps the value left by ``mj_step``, which lags one substep behind the state."""
     snapshot: bool
-    """Whether the field is saved with the integration state, because it is not a function of it."""
+    """Whether the field is saved beside the integration state, because it is not a function of it."""
     written: bool = False
-    """Whether the task writes the field, one of ``INPUTS``, before a step."""
+    """Whether the task writes the field before a step; only for ``INPUTS``."""
 
     @property
     def size(self) -> int:
-        """Numbers in one world's value."""
+        """Number of scalars in one world's value."""
         return int(np.prod(self.shape, dtype=int)) * max(1, wp.types.type_size_in_bytes(self.dtype) // 4)
 
 
 _KNOWN = (*STATE_FIELDS, *DERIVED_FIELDS, "sensordata")
-"""Names of fields of MjData that an environment keeps."""
+"""MjData fields that an environment can keep."""
 
 
 def similar_data_fields(name: str) -> list[str]:
-    """Names of fields of MjData that resemble a name, the nearest first."""
+    """Names of MjData fields similar to a name, closest first."""
     return difflib.get_close_matches(name, _KNOWN, 3)
 
 
@@ -192,17 +192,17 @@ def describe(
 ) -> Field:
     """Describe a field of a model.
 
-    Positions, velocities and functions of them belong to the current state: after a step, after a restart and after
-    an event that changed a world. Fields of the acceleration stage, such as ``qacc``, ``cfrc_ext`` or the forces of
-    actuators, come from the last substep and belong to the state before it; in a world that begins an episode, to the
-    first state. In ``sensordata`` each sensor follows its own stage.
+    Positions, velocities and functions of them match the current state after every step, restart and event. Fields of
+    the acceleration stage, such as ``qacc``, ``cfrc_ext`` or actuator forces, are computed by the last substep from the
+    state before it; at the start of an episode, from the first state. In ``sensordata`` each sensor follows its own
+    stage.
 
     Args:
         model: The compiled model.
         name: MuJoCo's name of the field, an attribute of MjData.
-        lagged: Whether to keep the value that ``mj_step`` leaves, one substep behind the state. Fields of the
+        lagged: Whether to keep the value left by ``mj_step``, which lags one substep behind the state. Fields of the
             acceleration stage always lag; fields of the integration state never do.
-        cleared: Whether the field is 0 at the start of an episode, instead of being computed for its first state.
+        cleared: Whether the field is 0 at the start of an episode instead of computed from the first state.
         written: Whether the task writes the field before a step. Controls are always written.
 
     Raises:
@@ -248,7 +248,7 @@ def describe(
 
 
 def early_sensor_columns(model: mujoco.MjModel) -> np.ndarray:
-    """The columns of ``sensordata`` with sensors of the position and velocity stages, (n,) int."""
+    """The columns of ``sensordata`` that hold sensors of the position and velocity stages, (n,) int."""
     early = np.flatnonzero(model.sensor_needstage < Stage.ACCELERATION)
     ranges = [np.arange(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i]) for i in early]
     return np.concatenate([np.zeros(0, int), *ranges])
@@ -268,7 +268,7 @@ def _sensed(model: mujoco.MjModel, name: str) -> bool:
     if name == "sensordata":
         return True
     kind = mujoco.mjtSensor
-    if ON_DEMAND[name] == kind.mjSENS_FRAMELINACC:  # one pass serves all of these
+    if ON_DEMAND[name] == kind.mjSENS_FRAMELINACC:  # one pass computes them all
         kinds = [kind.mjSENS_ACCELEROMETER, kind.mjSENS_FORCE, kind.mjSENS_TORQUE, kind.mjSENS_FRAMELINACC,
                  kind.mjSENS_FRAMEANGACC]  # fmt: skip
     else:
@@ -279,10 +279,10 @@ def _sensed(model: mujoco.MjModel, name: str) -> bool:
 def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
     """The rows of a named element of the model in a field of MjData or MjModel.
 
-    A joint has its coordinates in ``qpos`` and its degrees of freedom in ``qvel``, ``dof_damping`` and other fields of
-    that size, a sensor its numbers in ``sensordata``, an actuator its controls in ``ctrl``, its activations in ``act``
-    and its force outputs in ``actuator_force``, a flex its vertices, a mocap body its row in ``mocap_pos``. In every
-    other field each object has one row.
+    Several rows are possible for a joint (coordinates in ``qpos``; degrees of freedom in ``qvel``, ``dof_damping`` and
+    similar fields), a sensor (``sensordata``), an actuator (controls in ``ctrl``, activations in ``act``, outputs in
+    ``actuator_force``) and a flex (vertices). A mocap body has one row in ``mocap_pos``. In all other fields each
+    object has one row.
 
     Raises:
         ValueError: The model has no such element, or the element has no rows in the field.
@@ -311,7 +311,7 @@ def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
 
 
 def has_several_rows(name: str) -> bool:
-    """Whether an object may have several rows in a field, such as a joint's degrees of freedom in ``cdof``."""
+    """Whether an object may have several rows in a field, as a joint has in ``cdof``."""
     return name in _RANGES or name.partition("_")[0] in _RANGES
 
 

@@ -1,7 +1,7 @@
 """Register all tasks with Gymnasium: ``gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=64)``.
 
 Importing this module registers each task under the name of its class, as ``lyceum/HalfCheetah-v0``. A task's file is
-read when an environment is made. ``register`` adds a task of your own.
+loaded when an environment is made. ``register`` adds a task of your own.
 """
 
 from pathlib import Path
@@ -30,7 +30,7 @@ def register(task: str | Path | type[Task]) -> str:
     known = isinstance(task, str) and task in task_names()
     name = str(task) if known else task_name(find_task(task))
     id = f"lyceum/{''.join(map(str.capitalize, name.split('_')))}-v0"
-    gymnasium.registry.pop(id, None)  # Gymnasium warns of an id that is registered twice
+    gymnasium.registry.pop(id, None)  # Gymnasium warns if an id is registered twice
     gymnasium.register(
         id,
         entry_point="lyceum_warp.gym:GymnasiumEnv",

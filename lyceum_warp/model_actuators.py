@@ -8,15 +8,15 @@ from lyceum_warp.support.validate import positive_number
 def follow_velocity(actuator: mujoco.MjsActuator, speed: float) -> None:
     """Turn a position servo into one whose control is the velocity of its target.
 
-    The servo keeps its gains. The target becomes an activation of the model (``act``) and stays within the former
-    control range.
+    The gains do not change. The target becomes an activation of the model (``act``), limited to the former control
+    range.
 
     Args:
         actuator: A position servo with a control range; changed in place.
         speed: The new controls range from -speed to speed, in m/s or rad/s.
 
     Raises:
-        ValueError: The actuator is not such a servo, or the speed is not positive.
+        ValueError: The actuator is not a position servo, has no control range, or the speed is not positive.
 
     Example:
         >>> for servo in spec.actuators:
@@ -24,7 +24,7 @@ def follow_velocity(actuator: mujoco.MjsActuator, speed: float) -> None:
     """
     name, kp = f"the actuator {actuator.name!r}", actuator.gainprm[0]
     if actuator.biastype != mujoco.mjtBias.mjBIAS_AFFINE or actuator.biasprm[1] != -kp or kp <= 0.0:
-        raise ValueError(f"{name} is not a position servo: make it one, as <position kp=...> or by set_to_position")
+        raise ValueError(f"{name} is not a position servo: define it as <position kp=...>, or call set_to_position")
     if actuator.ctrlrange[0] >= actuator.ctrlrange[1]:
         raise ValueError(f"{name} has no range for its target: set its ctrlrange first")
     speed = positive_number("speed", speed, "m/s or rad/s")

@@ -1,4 +1,4 @@
-"""Describe the model fields that can differ between worlds, and the constants that follow from each."""
+"""Describe the model fields that can differ between worlds, and the constants derived from them."""
 
 import dataclasses
 import difflib
@@ -19,19 +19,19 @@ class Constants(enum.IntFlag):
 
     NONE = 0
     FIXED = 1
-    """Masses of subtrees, and bounds of geoms."""
+    """Subtree masses and geom bounds."""
     KINEMATIC = 2
-    """Lengths of tendons, anchors of equality constraints and poses of cameras in ``qpos0``."""
+    """Tendon lengths, anchors of equality constraints and camera poses at ``qpos0``."""
     INERTIAL = 4
-    """Inverse weights and unit accelerations in ``qpos0``."""
+    """Inverse weights and unit accelerations at ``qpos0``."""
     PRIVATE = 8
-    """Constants that only the C engine keeps: coinciding frames, bounding volumes of bodies, indices and flags."""
+    """Constants that only the C engine has: coinciding frames, bounding volumes of bodies, indices and flags."""
 
 
 _ALL = Constants.FIXED | Constants.KINEMATIC | Constants.INERTIAL | Constants.PRIVATE
 _POSES = Constants.KINEMATIC | Constants.INERTIAL | Constants.PRIVATE
 _WRAPPED = {"geom_pos", "geom_quat", "geom_size"}
-"""Fields of geoms that tendons may wrap around."""
+"""Geom fields that matter to a tendon wrapping around the geom."""
 
 _WRAPS = [int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER)]
 
@@ -65,7 +65,7 @@ _FIELDS = (
     | dict.fromkeys(("cam_pos", "cam_quat"), Constants.KINEMATIC | Constants.PRIVATE)
     | {"body_mass": _ALL, "geom_size": Constants.FIXED | Constants.PRIVATE}
 )
-"""The fields that can differ between worlds on every engine, and the constants that follow from each."""
+"""The fields that can differ between worlds on every engine, with the constants derived from each."""
 
 _OPTIONS = {"gravity", "magnetic", "wind", "density", "viscosity"}
 """The fields that are attributes of MjModel.opt."""
@@ -90,13 +90,13 @@ _REASONS = (
 )  # fmt: skip
 
 _POSITIVE = {"body_mass", "body_inertia", "geom_size"}
-"""Fields whose numbers must be positive if their nominal values are."""
+"""Fields whose elements must be positive if their nominal values are."""
 
 NOT_NEGATIVE = _POSITIVE | set(
     "geom_friction pair_friction jnt_stiffness dof_damping dof_armature dof_frictionloss tendon_stiffness "
     "tendon_damping tendon_armature tendon_frictionloss actuator_damping actuator_armature density viscosity".split()
 )
-"""Fields whose numbers are never negative."""
+"""Fields whose elements must not be negative."""
 
 _TYPES = {
     2: wp.vec2, 3: wp.vec3, 4: wp.vec4, 5: wp.types.vector(length=5, dtype=wp.float32), 6: wp.spatial_vector,
@@ -114,11 +114,11 @@ class ModelField:
     dtype: type
     """Warp type of an element: float, wp.vec3, wp.vec4 for quaternions (w, x, y, z), ..."""
     constants: Constants
-    """The constants that follow from the field."""
+    """The constants derived from the field."""
 
     @property
     def size(self) -> int:
-        """Floats in one world's value."""
+        """Number of floats in one world's value."""
         return int(np.prod(self.shape, dtype=int)) * wp.types.type_size_in_bytes(self.dtype) // 4
 
     @property
@@ -132,7 +132,7 @@ class ModelField:
         return self.name in _COMPUTED
 
     def problem(self, model: mujoco.MjModel, rows: np.ndarray) -> str | None:
-        """The first value that MuJoCo cannot simulate, as a message of one line; None if there is none.
+        """A one-line message about the first value that MuJoCo cannot simulate; None if all values are valid.
 
         Args:
             model: The compiled model.
@@ -160,23 +160,23 @@ class ModelField:
         )
 
     def value(self, model: mujoco.MjModel) -> np.ndarray:
-        """The field in a model, float64; for an array the model's own memory."""
+        """The field's value in a model, float64; an array is a view into the model."""
         return np.asarray(getattr(model.opt if self.option else model, self.name))
 
 
 def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[str, torch.Tensor]) -> None:
-    """Write values of model fields into the columns of states.
+    """Write values of model fields into their columns of a batch of states.
 
     Args:
         model: The compiled model.
-        values: Values by the names of the fields: a row for each world, or one row for all.
+        values: Values by field name: one row per world, or one row for all.
         columns: Columns of all model fields that differ between worlds, by name, (nworld, size) each.
 
     Raises:
-        ValueError: A field is unknown or the same in every world, or a value has another size.
+        ValueError: A field is unknown or the same in every world, or a value has the wrong size.
     """
     for name, value in values.items():
-        field = describe_model_field(model, name)  # a misspelt name has an error of its own
+        field = describe_model_field(model, name)  # raises for a misspelt name
         if name not in columns:
             raise ValueError(
                 f"the model field {name!r} is the same in every world of this environment: make it with "
@@ -194,7 +194,7 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
 
 
 def similar_model_fields(name: str) -> list[str]:
-    """Similar names of fields that can differ between worlds, the nearest first."""
+    """Similar names of fields that can differ between worlds, closest first."""
     return difflib.get_close_matches(name, _FIELDS, 3)
 
 
@@ -209,10 +209,10 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
     Args:
         model: The compiled model.
         name: MuJoCo's name of the field, an attribute of MjModel or, like "gravity", of MjModel.opt.
-        varies: Whether the field must be one that can differ between worlds.
+        varies: Whether to accept only fields that can differ between worlds.
 
     Raises:
-        ValueError: There is no such field, it does not hold real numbers, or all worlds share it.
+        ValueError: There is no such field, it does not hold real numbers, or it cannot differ between worlds.
     """
     if not varies and name not in _FIELDS:
         value: Any = getattr(model, name, None)
@@ -243,11 +243,11 @@ def _described(name: str, shape: tuple[int, ...], constants: Constants) -> Model
 
 
 MOVED_INERTIA = {"body_ipos", "body_iquat"}
-"""Fields that cannot differ for bodies compiled as "simple", whose inertial frame must equal the body's frame."""
+"""Fields that cannot differ for "simple" bodies, whose inertial frame must equal the body frame."""
 
 
 def check_simple(model: mujoco.MjModel, name: str) -> None:
-    """Refuse a field that moves the inertial frame of a body that is compiled as simple.
+    """Refuse a field that moves the inertial frame of a body compiled as simple.
 
     Raises:
         ValueError: The model has such a body.

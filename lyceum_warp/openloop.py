@@ -1,4 +1,4 @@
-"""Roll out given actions in every world, and let the task judge them."""
+"""Roll out given actions in every world, and evaluate their rewards and terminations."""
 
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -28,35 +28,36 @@ from lyceum_warp.world_arrays import memory_columns, own_parts
 
 @document_attributes
 class OpenLoop:
-    """Rolls out the worlds of an environment from one or several states under given actions, and keeps their rewards.
+    """Rolls out the worlds of an environment from one or several states under given actions, and stores their rewards.
 
     Write ``state`` and ``actions``, call ``run``, and read the other tensors, which are updated in place. Episodes do
-    not end within the horizon: the caller decides what termination means. The C engine takes the whole horizon in one
-    native call if that is exact and the task has neither ``control`` nor ``substep``, otherwise step by step. On the
-    Warp engine the rollout is one graph.
+    not end within the horizon: the caller decides what termination means. The C engine runs the whole horizon in one
+    native call if that is exact and the task has neither ``control`` nor ``substep``; otherwise it runs step by step.
+    On the Warp engine the rollout is one graph.
 
     Args:
-        env: Worlds to roll out in; do not use them for anything else.
-        horizon: Steps.
-        keys: Keys of the worlds' random streams, (nworld,) uint32 on the environment's device, read in every run. By
-            default every world uses the key in ``state``, and draws the same numbers as ``env.step`` would.
-        nominal_model: Whether model fields that differ between worlds have their nominal values instead of the values
-            in ``state``.
+        env: Worlds to roll out; do not use them for anything else.
+        horizon: Number of steps.
+        keys: Keys of the worlds' random streams, (nworld,) uint32 on the environment's device, read at every run. By
+            default each world uses the key in ``state`` and draws the same numbers as with ``env.step``.
+        nominal_model: Whether model fields that differ between worlds take their nominal values instead of those in
+            ``state``.
         models: Values of model fields that differ between worlds, by name, each (n, size) float64 on the environment's
-            device, read in every run: world w has row w % n instead of the values in ``state``.
+            device, read at every run: world w uses row w % n instead of the values in ``state``.
         states: Number of states to start from. Each has nworld / states consecutive worlds.
 
     Raises:
-        ValueError: The environment resets its worlds automatically, ``keys`` has another shape, type or device, the
+        ValueError: The environment resets its worlds automatically, ``keys`` has the wrong shape, type or device, the
             worlds cannot be divided among the states, or the buffers do not fit into memory.
     """
 
     state: torch.Tensor
-    """The start of every world, (state_space.size,) float64; with several states the same as ``states``."""
+    """The initial state of every world, (state_space.size,) float64; the same tensor as ``states`` if there are
+    several."""
     states: torch.Tensor
-    """The states to start from, (states, state_space.size) float64."""
+    """The initial states, (states, state_space.size) float64."""
     actions: torch.Tensor
-    """Actions of each step, (horizon, nworld, nact); one that is not finite is set to zero."""
+    """Actions of each step, (horizon, nworld, nact); non-finite actions are replaced by zero."""
     reward: torch.Tensor
     """Reward of each step, (horizon, nworld)."""
     terminated: torch.Tensor
@@ -68,7 +69,7 @@ class OpenLoop:
     fault: torch.Tensor
     """Bits of ``Done`` for the faults of a world, (nworld,) int32; if a bit is set, ignore that world's rewards."""
     phases: tuple[Phase, ...]
-    """The phases of ``run``, for a caller that adds its own to the same graph."""
+    """The phases of ``run``, for callers that add phases to the same graph."""
 
     def __init__(
         self, env: Env, horizon: int, *, keys: wp.array | None = None, nominal_model: bool = False,
@@ -97,7 +98,7 @@ class OpenLoop:
         with wp.ScopedDevice(env.device):
             self._state = wp.zeros((states, env.state_space.size), dtype=wp.float64)
             self._actions = wp.zeros((self.horizon, n, nact), dtype=float)
-            # step by step, controls are made when their step comes
+            # in stepwise rollouts each step computes its own controls
             self._controls = wp.zeros((self.horizon, n, 0 if stepwise else task.model.nu), dtype=float)
             self._reward = wp.zeros(rows, dtype=float)
             self._terminated = wp.zeros(rows, dtype=bool)
@@ -107,7 +108,7 @@ class OpenLoop:
             for group, space in env.obs_spaces.items():
                 setattr(self._obs, group, wp.zeros((n, space.size), dtype=float))
             self._no_memory = wp.zeros((rows + n, 0), dtype=float)
-            # the states before each step, after it, and at the end are views of one buffer per field
+            # the states before each step, after each step and at the end are views of one buffer per field
             self._fields: dict[str, wp.array] = {}
             self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
             if task.shared:
@@ -143,12 +144,12 @@ class OpenLoop:
             call()
 
     def sequence(self, phases: Iterable[Phase]) -> Calls:
-        """The calls that run some phases, such as the rollout's, in as few graphs as the engine allows."""
+        """Turn phases into calls, in as few graphs as the engine allows."""
         return self.worlds.programs.graphs.sequence(phases)
 
     @staticmethod
     def _bytes_per_world(env: Env, horizon: int) -> int:
-        """An estimate of the buffers' memory for each world."""
+        """Estimated bytes of the buffers per world."""
         fields = [field for field in env.task.fields if field.name in env.task.types]
         numbers = sum(field.size for field in fields) + sum(field.size for field in env.task.dynamics)
         numbers += sum(own_parts(env.task).values())
@@ -184,7 +185,7 @@ class OpenLoop:
         return (*phases, Phase("end", partial(self._end, worlds.after)))
 
     def _start(self) -> None:
-        """Write the start into every world's state, and map all actions to controls."""
+        """Write the initial states into the worlds' states, and map all actions to controls."""
         worlds, device = self.worlds, self.env.device
         wp.launch(planning.broadcast, worlds.state.shape, [self._state, worlds.state], device=device)
         if self._nominal_model:
@@ -209,7 +210,7 @@ class OpenLoop:
         wp.launch(planning.controls, self._actions.shape[:2], args, device=device)
 
     def _overwrite_model(self) -> None:
-        """Give the model fields in every world's state their nominal values."""
+        """Overwrite the model fields in every world's state with their nominal values."""
         columns, states = self.env.state_space.parts, self.worlds.state
         nominal: Mapping[str, wp.array] = self.env.engine.nominal
         for name, row in nominal.items():
@@ -218,7 +219,7 @@ class OpenLoop:
             wp.launch(planning.overwrite, (states.shape[0], row.shape[1]), args, device=self.env.device)
 
     def _transitions(self) -> list[Any]:
-        """The first arguments of kernels for the transitions of the whole horizon."""
+        """The first arguments of kernels that process all transitions of the horizon."""
         actions = self._actions.reshape((-1, self._actions.shape[2]))
         return [self._before, self._after, self.worlds.params, actions]
 
@@ -239,12 +240,12 @@ class OpenLoop:
                     wp.copy(buffer[t + 1], buffer[0])
 
     def _judge_rows(self) -> None:
-        """Judge all transitions of the horizon at once."""
+        """Evaluate all transitions of the horizon in one launch."""
         rows, args = self.horizon * self.env.nworld, [*self._transitions(), self._reward, self._terminated]
         launch_worlds(self.env.task.kernels.judge_rows, rows, args, self.env.device)
 
     def _end_of_horizon(self) -> None:
-        """Count the steps, collect faults, and observe the last states."""
+        """Advance the step counters, collect faults, and observe the last states."""
         wp.launch(planning.add_to, self.env.nworld, [self.horizon, self.worlds.counters.step], device=self.env.device)
         self._end(self._last)
 

@@ -1,7 +1,7 @@
 """Define the options of an environment and of its physics.
 
-``make``, ``replicate``, MPPI, the command line, the help texts and the suggestions for misspelt words all read these
-two classes. A new option is a new field here.
+``make``, ``replicate``, MPPI, the command line, the help texts and the suggestions for misspelt names are all generated
+from these two classes. To add an option, add a field here.
 """
 
 import dataclasses
@@ -86,7 +86,7 @@ class PhysicsOptions:
     nconmax: int | None = _for_engine(None)
     """Contact capacity per world, on average (Warp engine); by default twice the peak of random rollouts."""
     njmax: int | None = _for_engine(None)
-    """Constraint capacity of each world (Warp engine); by default twice the peak of random rollouts, and room for
+    """Constraint capacity of each world (Warp engine); by default twice the peak of random rollouts, plus room for
     inactive equality constraints."""
     deterministic: bool = _for_engine(False)
     """Make two runs on a CUDA device equal to the bit. Costs 5 to 18 times the time and 5 to 7 times the memory on
@@ -110,7 +110,7 @@ class PhysicsOptions:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EnvOptions:
-    """The number of worlds, where they run, and how their episodes begin and end.
+    """The number of worlds, where they run, and how their episodes start and end.
 
     Raises:
         ValueError: A value is of the wrong type or out of range.
@@ -128,13 +128,13 @@ class EnvOptions:
     seed: int = 0
     """Seed of the worlds' random streams."""
     first_world: int = 0
-    """Number of the first world, if several processes share a batch: a world's random stream depends on its number in
-    the whole batch."""
+    """Index of the first world, if several processes share a batch: a world's random stream depends on its index in the
+    whole batch."""
     autoreset: bool = True
-    """Whether a world whose episode ended begins a new one within the same step. With False finished worlds keep
-    stepping with ``done`` set until they are reset; only a world with a fault restarts at once."""
+    """Whether a world whose episode ended starts a new one within the same step. If False, finished worlds keep
+    stepping with ``done`` set until they are reset; only worlds with a fault restart at once."""
     horizon: int | None = None
-    """Steps after which an episode is truncated, 0 for never; by default the task's."""
+    """Steps after which an episode is truncated, or 0 for never; by default the task's horizon."""
     graphs: bool = True
     """Whether launches are captured as graphs and replayed. False is for debugging and changes no numbers."""
     model: ModelSource | None = None
@@ -142,7 +142,8 @@ class EnvOptions:
     fields: Collection[str] = ()
     """Additional fields to keep, for ``env.field``."""
     dynamics: Collection[str] = ()
-    """Model fields that may differ between worlds, for ``env.set_dynamics``, beside those that the task draws."""
+    """Model fields that may differ between worlds, for ``env.set_dynamics``, in addition to the fields that the task
+    randomizes."""
     physics: PhysicsOptions = PhysicsOptions()
     """How the worlds are simulated."""
 
@@ -153,7 +154,7 @@ class EnvOptions:
         check_kind("device", self.device, str | None, "as 'cpu' or 'cuda:0'")
         if not isinstance(self.engine, str) and not callable(self.engine):
             raise ValueError(f"engine must be 'auto', 'mujoco', 'warp' or a callable, not {described(self.engine)}")
-        if self.model is not None and not isinstance(self.model, mujoco.MjModel):  # which has an error of its own
+        if self.model is not None and not isinstance(self.model, mujoco.MjModel):  # MjModel raises its own error
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         check_kind("physics", self.physics, PhysicsOptions, _PHYSICS_EXAMPLE)
         _flags(self, "autoreset", "graphs")
@@ -165,18 +166,18 @@ class EnvOptions:
 
     @classmethod
     def split(cls, words: Mapping[str, Any], base: "EnvOptions | None" = None) -> tuple["EnvOptions", dict[str, Any]]:
-        """Sort the keyword arguments of a flat call into options and everything else, the task's parameters.
+        """Split keyword arguments into options and task parameters.
 
         Args:
             words: The keyword arguments.
-            base: The options that they change; by default the defaults.
+            base: The options to start from; by default ``EnvOptions()``.
         """
         rest = {name: value for name, value in words.items() if name not in OPTIONS}
         options = {name: value for name, value in words.items() if name in OPTIONS}
         return (base or cls()).changed(options), rest
 
     def changed(self, words: Mapping[str, Any]) -> "EnvOptions":
-        """A copy with some options changed, by name; physics options may be among them."""
+        """A copy with some options changed, by name, including physics options."""
         physics = {name: value for name, value in words.items() if name in _PHYSICS}
         others = {name: value for name, value in words.items() if name not in _PHYSICS}
         if physics:
@@ -186,7 +187,7 @@ class EnvOptions:
         return dataclasses.replace(self, **others)
 
     def for_engine(self) -> dict[str, Any]:
-        """The options that the engine's constructor takes, by name."""
+        """The options of the engine's constructor, by name."""
         both = [(options, field) for options in (self, self.physics) for field in dataclasses.fields(options)]
         return {field.name: getattr(options, field.name) for options, field in both if field.metadata.get("engine")}
 
@@ -210,15 +211,15 @@ _OTHER_WORDS = {
     "iterations": "solver={'iterations': ...}", "ls_iterations": "solver={'ls_iterations': ...}",
     "noslip_iterations": "solver={'noslip_iterations': ...}",
 }  # fmt: skip
-"""Names of options in other packages and in earlier releases."""
+"""Names of options in other packages and in earlier releases, with their names here."""
 
 
 def suggestion(word: str, others: Iterable[str] = ()) -> str:
-    """Suggest known words for an unknown one, as "did you mean ...?"; empty if none is similar.
+    """A hint "did you mean ...?" for an unknown name; empty if no known name is similar.
 
     Args:
-        word: The unknown word.
-        others: Known names beside the options.
+        word: The unknown name.
+        others: Known names in addition to the options.
     """
     close = [_OTHER_WORDS[word]] if word in _OTHER_WORDS else difflib.get_close_matches(word, [*others, *OPTIONS], 3)
     return f"did you mean {' or '.join(close)}?" if close else ""

@@ -13,18 +13,18 @@ from lyceum_warp.model_fields import ModelField
 
 @dataclasses.dataclass(frozen=True)
 class Space:
-    """The vector of one world: its parts by name, its type and its bounds, if any.
+    """One world's vector: its named parts, dtype and optional bounds.
 
-    A scalar has no axis. Arrays of an environment have an additional leading axis over worlds.
+    A scalar has no axis. An environment's arrays have an additional leading axis over worlds.
     """
 
     parts: Mapping[str, slice] = dataclasses.field(default_factory=dict)
     """The columns of each named part, in order."""
     dtype: torch.dtype = torch.float32
     low: np.ndarray | None = None
-    """Lower bounds, of the shape ``shape``; None without bounds."""
+    """Lower bounds, of shape ``shape``; None without bounds."""
     high: np.ndarray | None = None
-    """Upper bounds, of the shape ``shape``; None without bounds."""
+    """Upper bounds, of shape ``shape``; None without bounds."""
 
     @classmethod
     def of(cls, sizes: Mapping[str, int], **rest: object) -> "Space":
@@ -37,7 +37,7 @@ class Space:
 
     @property
     def size(self) -> int:
-        """Numbers in the vector; 1 for a scalar."""
+        """Length of the vector; 1 for a scalar."""
         return max((part.stop for part in self.parts.values()), default=1)
 
     @property
@@ -47,7 +47,7 @@ class Space:
 
     @property
     def columns(self) -> list[str]:
-        """Names of the numbers: the part's name, or ``name[i]`` in a part of several numbers."""
+        """Name of each column: the part's name, or ``name[i]`` if the part has several columns."""
         return [
             name if part.stop - part.start == 1 else f"{name}[{i}]"
             for name, part in self.parts.items()
@@ -64,7 +64,7 @@ class Space:
 
 
 COUNTERS = ("step", "key", "episode", "done_reason")
-"""Counters in a state: steps since the reset, key of the random streams, number of the episode, bits of ``Done``."""
+"""Counters in a state: steps since the reset, key of the random stream, episode number, bits of ``Done``."""
 
 OWN_PARTS = (*COUNTERS, "metrics", "success_steps")
 """Parts of a state that an environment adds to MuJoCo's and to the task's memory."""
@@ -75,8 +75,8 @@ def action_space(
 ) -> Space:
     """The space of actions: each actuator's controls, bounded by ``action_range`` or the control ranges.
 
-    An actuator may have several controls or none. Without a name it is named by its index. A task's own ``actions``
-    have bounds only with an ``action_range``.
+    An actuator may have several controls or none. An unnamed actuator is named by its index. A task's own ``actions``
+    have bounds only if there is an ``action_range``.
     """
     if actions is not None:
         space = Space.of(actions)
@@ -88,7 +88,7 @@ def action_space(
 
 
 def _controls(model: mujoco.MjModel) -> dict[str, int]:
-    """The actuators' names and their numbers of controls, in the order of the controls."""
+    """The number of controls by actuator name, in the order of the controls."""
     given = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nactuator)]
     sizes: dict[str, int] = {}
     for i in np.argsort(model.actuator_ctrladr, kind="stable").tolist():
@@ -104,7 +104,7 @@ def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | Non
     """The scale and the offset that map actions to controls, (nu, 2).
 
     Raises:
-        ValueError: There is an ``action_range``, but a control without a range.
+        ValueError: There is an ``action_range``, but a control has no range.
     """
     if action_range is None:
         return np.tile((1.0, 0.0), (model.nu, 1))
@@ -113,7 +113,7 @@ def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | Non
         unlimited = np.flatnonzero(~np.isfinite(ranges).all(axis=1)).tolist()
         raise ValueError(
             f"action_range maps actions to the controls' ranges, but the model gives none to the controls {unlimited}: "
-            "set their ctrlrange, or leave action_range out"
+            "set their ctrlrange, or omit action_range"
         )
     low, high = action_range
     gain = (ranges[:, 1] - ranges[:, 0]) / (high - low)
@@ -128,13 +128,13 @@ def control_ranges(model: mujoco.MjModel) -> np.ndarray:
 def state_space(
     model: mujoco.MjModel, snapshots: Iterable[Field], dynamics: Iterable[ModelField], own: Mapping[str, int]
 ) -> Space:
-    """The space of states: integration state in MuJoCo's order, snapshots, model fields, counters, further parts.
+    """The space of states: integration state in MuJoCo's order, snapshots, model fields, counters, additional parts.
 
     Args:
         model: The compiled model.
-        snapshots: Fields that are saved with the integration state.
+        snapshots: Fields that are saved beside the integration state.
         dynamics: Model fields that differ between worlds.
-        own: Further parts and their sizes, such as the task's memory.
+        own: Additional parts and their sizes, such as the task's memory.
     """
     sizes = {}
     names = {component.value: name for name, component in STATE_FIELDS.items()}

@@ -1,4 +1,4 @@
-"""Train a learner and write its run, for the command line and for ``lw.train``."""
+"""Train a learner and write its run folder, for the command line and for ``lw.train``."""
 
 import contextlib
 import json
@@ -29,22 +29,22 @@ from lyceum_warp.viz.video import check_video
 log = logging.getLogger(__name__)
 
 Callback = Callable[[Any], Any]
-"""Called with the statistics of each iteration, of the algorithm's class."""
+"""Called with each iteration's statistics; their class depends on the algorithm."""
 
 
 class Display:
-    """Show the progress of a training; this base class only logs messages."""
+    """Shows the progress of training; this base class only logs messages."""
 
     @contextlib.contextmanager
     def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
-        """Context of a training that lasts until a number of iterations."""
+        """Context that surrounds training, up to a total number of iterations."""
         yield
 
     def __call__(self, iteration: Iteration) -> None:
         """Show a complete iteration."""
 
     def work(self, text: str, unit: str, done: int, total: int) -> None:
-        """Show progress of work between two iterations, such as a video."""
+        """Show the progress of work between two iterations, such as rendering a video."""
 
     def note(self, line: str) -> None:
         """Show a message."""
@@ -69,25 +69,25 @@ def train(
     entries: Mapping[str, Any] | None = None,
     display: Display | None = None,
 ) -> Run:
-    """Train, and write the folder of a run, as ``lyceum-warp train`` does: metrics, policies and checkpoints.
+    """Train, and write metrics, policies and checkpoints into a run folder, as ``lyceum-warp train`` does.
 
     ``lw.load(folder)`` returns the last policy, and ``lw.load(folder, which="best")`` the policy with the best return.
-    The return is ``mean_return`` if the learner evaluates the mean policy. Otherwise it is ``return_mean``, over the
-    episodes that the policy before an iteration sampled.
+    The return is ``mean_return`` if the learner evaluates the mean policy. Otherwise it is ``return_mean`` over the
+    iteration's sampled episodes, which the policy before the update generated.
 
-    The policy and the complete state are saved at the start, at the end, and every 30 s, or more often while saving
-    takes at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run resumes from the last save with the
-    same numbers. Ctrl-C, SIGTERM and SIGHUP save and end the run after the current iteration; a second signal ends it
-    at once.
+    The policy and the complete state are saved at the start, at the end, and every 30 s, or more often if saving takes
+    at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run resumes from the last save and produces the
+    same numbers. On Ctrl-C, SIGTERM or SIGHUP the run is saved and ends after the current iteration; a second signal
+    ends it at once.
 
     Args:
         learner: The algorithm: ``NPG(env)``, or another ``lyceum_warp.algos.learner.Learner``.
         folder: The run's folder, new or empty.
-        iterations: Total number of iterations, including iterations before ``resume``.
-        callback: Called with each iteration after its row was written. Training ends if it returns True. If it raises
-            an error, the run is saved, and the error is raised again.
-        target_return: Training ends once the return that selects the best policy reaches this number.
-        minutes: Training ends after the iteration in which this time is over; None for no limit.
+        iterations: Total number of iterations, including those before ``resume``.
+        callback: Called with each iteration after its row was written. If it returns True, training ends. If it raises
+            an error, the run is saved and the error is raised again.
+        target_return: Training ends once the return, as defined above, reaches this number.
+        minutes: Time limit; training ends after the iteration that exceeds it. None for no limit.
         keep_every: Iterations between two numbered policies; 0 for none.
         save_every: Iterations between two saves; 0 to save by time.
         tensorboard: Whether to also write the metrics for TensorBoard.
@@ -96,10 +96,10 @@ def train(
         camera: Camera of the videos: a camera of the model by name or index, a ``viz.cameras.FreeCamera``, or "free"
             for MuJoCo's default free camera.
         resume: Whether to continue the run in the folder. ``learner`` must be made with the same arguments.
-        take_over: Whether to continue a run that another process has locked, on this or another host. That process
+        take_over: Whether to continue a run that another process has locked, on this or another host. The other process
             then ends at its next write.
-        entries: Further entries of config.json, of JSON values.
-        display: Shows the progress; by default messages are logged.
+        entries: Additional JSON entries for config.json.
+        display: Shows the progress; by default only messages are logged.
 
     Returns:
         The run. ``run.rows()`` returns the metrics.
@@ -107,10 +107,10 @@ def train(
     Raises:
         ValueError: The folder is not empty, an argument is out of range, the run does not fit ``learner``, or another
             process has locked it or taken it over.
-        ImportError: ``tensorboard`` is given, but the extra of that name is not installed.
+        ImportError: ``tensorboard`` is True, but the extra ``tensorboard`` is not installed.
         NoVideoError: ``video_every`` is given, but the extra ``viz`` is not installed.
-        OSError: The folder cannot be written. ``resume=True`` continues from the last save.
-        FloatingPointError: The learner's updates are no longer finite.
+        OSError: The folder cannot be written; ``resume=True`` later continues from the last save.
+        FloatingPointError: An update of the learner is not finite.
         Interrupted: One of several ranks received a signal.
     """
     check_kind("learner", learner, Learner, "as lw.NPG(env)")
@@ -155,7 +155,7 @@ def train(
         )  # fmt: skip
         callbacks: list[Callback] = []
         if leads:
-            board = shown.enter_context(TensorBoard(run.folder, run.config)) if tensorboard else None
+            board = shown.enter_context(TensorBoard(run.folder)) if tensorboard else None
             seed = evaluation_seed(env.options.seed + 1)
             videos = Videos(
                 learner, run.folder / "videos", video_every, seed, camera=camera, note=display.note,
@@ -176,7 +176,7 @@ def _learn(
     learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None,
     limit: float,
 ) -> None:  # fmt: skip
-    """Iterate for at most ``limit`` seconds. All ranks agree on when the run is saved and when it ends."""
+    """Iterate for about ``limit`` seconds at most. All ranks agree on when the run is saved and when it ends."""
     team, run, deadline = learner.team, saver.run, time.monotonic() + limit
     ended = False
     with ending(), postponed(insist=team.size == 1) as noted:
@@ -210,7 +210,7 @@ def _learn(
 
 
 def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note: Callable[[str], None]) -> None:
-    """Load a run's checkpoint into the learner, and prepare its files for further iterations."""
+    """Load a run's checkpoint into the learner, and prepare the run's files for more iterations."""
     folder, content = run.folder, run.read(learner.env.obs.device, note=note)
     reached, target, done = run.config.get("reached"), settings["target_return"], content["iteration"]
     if reached is not None and target is not None and reached["return"] >= target:
@@ -231,7 +231,7 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
         text = " ".join(str(error).split())
         raise ValueError(f"{run.checkpoint} does not fit the configuration beside it: {text}") from error
     if learner.team.leads:
-        cut_rows(run.metrics, done)  # a killed run may have rows of unsaved iterations
+        cut_rows(run.metrics, done)  # a killed run may have rows for unsaved iterations
         if changed := run.changed(versions(run.config["device"])):
             text = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
             note(f"versions have changed, so numbers may differ from an uninterrupted run's: {text}")
@@ -244,7 +244,7 @@ def _check_equal(run: Run, learner: Learner) -> None:
     old, new, algorithm = then.options, env.options, run.config["algorithm"]
     now["engine"] = engine_name(now["engine"], now["device"])
     own = {"engine": engine_name(old.engine, old.device), "algorithm": algorithm, "nworld": old.nworld}
-    # options that do not change the numbers are left out; note_changes compares the model
+    # options that do not affect the results are omitted; note_changes compares the model
     options = {"horizon": old.horizon, "fields": old.fields, "dynamics": old.dynamics}
     params = dict.fromkeys(now["params"]) | run_params(run, then.params)
     # a run of an earlier release lacks the newest hyperparameters
@@ -258,5 +258,5 @@ def _check_equal(run: Run, learner: Learner) -> None:
             if value != after.get(name):
                 raise ValueError(
                     f"the run in {run.folder} has {name} {value}, not {after.get(name)}, and a run keeps its settings: "
-                    "leave that out, or begin a new run in another folder"
+                    "omit it, or start a new run in another folder"
                 )

@@ -1,4 +1,4 @@
-"""Allocate the arrays of an environment's worlds, and convert between them and rows of states."""
+"""Allocate the arrays of an environment's worlds, and convert between these arrays and state vectors."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -19,7 +19,7 @@ from lyceum_warp.task import MEMORIES
 
 
 def own_bytes_per_world(task: BoundTask) -> int:
-    """Estimate the bytes that ``Worlds`` takes for each world, without the engine."""
+    """Estimated bytes per world of ``WorldArrays``, without the engine's arrays."""
     snapshots = [field for field in task.fields if field.snapshot]
     state_size = state_space(task.model, snapshots, task.dynamics, own_parts(task)).size
     copies = sum(field.size for field in task.fields)
@@ -47,7 +47,7 @@ class WorldArrays:
 
     Args:
         task: The task, bound to its model and parameters.
-        engine: Its physics, which keeps the task's fields.
+        engine: The physics; it has the task's fields.
     """
 
     def __init__(self, task: BoundTask, engine: Engine) -> None:
@@ -62,7 +62,7 @@ class WorldArrays:
         self.state_view = torch_view(self.state)
 
     def _allocate_fields(self) -> None:
-        """The fields of the states after and before a step, and the task's memory."""
+        """Allocate the fields after and before a step, and the task's memory."""
         n, model, task, kernels = self.nworld, self.task.model, self.task.task, self.task.kernels
         self.memory, self.lasting_memory, self._lasting_before = (
             wp.zeros((n, sum(sizes(self.task.memory[name]).values())), dtype=float)
@@ -71,7 +71,7 @@ class WorldArrays:
         self.metric_sums = wp.zeros((n, len(task.metrics)), dtype=float)
         """Sums of the metrics over the episode so far."""
         self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
-        """Successful steps in a row, up to ``success_steps``; without a column if one step is enough."""
+        """Successful steps in a row, up to ``success_steps``; has no columns if one step is enough."""
         own = ("memory", "lasting_memory", "metric_sums", "success_counts")
         self._clearable = {name: getattr(self, name) for name in own}
         self._clearable |= {name: flat(self.engine.arrays[name]) for name in task.cleared}
@@ -111,7 +111,7 @@ class WorldArrays:
                 batch.shared = self.shared
 
     def _allocate_outcome(self) -> None:
-        """Rewards, ends, metrics and observations."""
+        """Allocate rewards, terminations, metrics and observations."""
         n, task, kernels = self.nworld, self.task.task, self.task.kernels
         self.outcome = steps.Outcome()
         self.buffers: dict[str, torch.Tensor] = {}
@@ -121,7 +121,7 @@ class WorldArrays:
         self.metrics: wp.array = wp.zeros((n, len(task.metrics)), dtype=float)
         """The metrics of the last step, (nworld, number of metrics)."""
         self.episode_metrics: wp.array = wp.zeros_like(self.metrics)
-        """The sums of the metrics over the episode of that step."""
+        """The sums of the metrics over the last step's episode."""
         self.outcome.metrics = self.metrics  # type: ignore[assignment]
         self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
         parts = int(steps.OBSERVE_FIRST) + len(self.obs_spaces)
@@ -148,7 +148,7 @@ class WorldArrays:
         self.scale: wp.array = wp.array(scale, dtype=float)
 
     def _allocate_counters(self) -> None:
-        """Counters, random streams and faults."""
+        """Allocate counters, random streams and faults."""
         n = self.nworld
         self.counters = steps.Counters()
         self.counters.step, self.counters.episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
@@ -159,23 +159,23 @@ class WorldArrays:
         self.fault_count = wp.zeros((n, int(FAULTS).bit_length()), dtype=int)
 
     def _allocate_masks(self) -> None:
-        """Masks of worlds, (nworld,) bool each."""
+        """Allocate masks of worlds, (nworld,) bool each."""
         n = self.nworld
         self.everyone = wp.full(n, True, dtype=bool)
         self.mask = wp.zeros(n, dtype=bool)
-        """Worlds of the next reset or restored state; see ``set_mask``."""
+        """Worlds to reset or restore next; see ``set_mask``."""
         self.restarting = wp.zeros(n, dtype=bool)
-        """Worlds whose episodes ended with this step."""
+        """Worlds whose episode ended in this step."""
         self._rejected = wp.zeros(n, dtype=bool)
-        """Worlds whose initial states the task rejects, to be drawn again."""
+        """Worlds whose initial state the task rejects, so it is drawn again."""
         self._continuing = wp.zeros(n, dtype=bool)
-        """Worlds that do not restart, and had events."""
+        """Worlds that do not restart and ran their events."""
         self._physics_changed = wp.zeros(n, dtype=bool)
         """Worlds whose physics an event of this step changed."""
         self._changed = wp.zeros(n, dtype=bool)
         """Worlds whose physics or task memory an event of this step changed."""
         self._outdated = wp.zeros(n, dtype=bool)
-        """Worlds that restarted or were changed by events since they were observed."""
+        """Worlds that restarted or were changed by events since their last observation."""
         self.mask_view, self.changed_view = torch_view(self.mask), torch_view(self._changed)
         self.terminated_view = torch_view(self._found.terminated)
 
@@ -185,7 +185,7 @@ class WorldArrays:
         return {group: torch_view(getattr(into, group)) for group in self.obs_spaces}
 
     def set_mask(self, mask: torch.Tensor | None) -> None:
-        """Choose the worlds of the next reset or restored state; None for all."""
+        """Choose the worlds to reset or restore next; None for all."""
         if mask is None:
             self.mask_view.fill_(True)
         else:
@@ -193,7 +193,7 @@ class WorldArrays:
             self.mask_view.copy_(mask)
 
     def pack_state(self, ended: wp.array) -> None:
-        """Write every world's state into ``state``; ``ended`` is its ``done_reason`` part, (nworld,)."""
+        """Write every world's state vector into ``state``; ``ended`` fills the part ``done_reason``, (nworld,)."""
         size = self.engine.state_size
         self.engine.get_state(self.state[:, :size])
         own = self.counters
@@ -217,7 +217,7 @@ class WorldArrays:
             yield arrays[name] if name in arrays else getattr(self, name), self.state[:, place]
 
     def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
-        """Set the masked worlds' counters from columns of states."""
+        """Set the masked worlds' counters from the columns after the engine's state."""
         own = self.counters
         counters = [mask, columns, own.step, own.key, own.episode, self.outcome.done_reason]
         wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)

@@ -1,4 +1,4 @@
-"""Run the phases of a step, a reset, and of reading or restoring states; ``Worlds.step_phases`` orders a step."""
+"""Run the phases of a step, of a reset, and of reading and restoring states; ``Worlds.step_phases`` lists a step."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -28,7 +28,7 @@ from lyceum_warp.world_arrays import WorldArrays
 
 @dataclasses.dataclass(frozen=True)
 class Programs:
-    """The phases of an environment as calls, for one combination of horizon, autoreset and graphs."""
+    """An environment's phases as callables, for one combination of horizon, autoreset and graphs."""
 
     graphs: Graphs
     step: Calls
@@ -39,13 +39,13 @@ class Programs:
 
 
 class Worlds(WorldArrays):
-    """Many worlds of one task on one engine: arrays of fixed address, and the phases that work on them.
+    """Many worlds of one task on one engine: arrays at fixed addresses, and the phases that process them.
 
-    Every method that is run as a phase launches the same kernels on the same arrays each time.
+    Every phase must launch the same kernels on the same arrays each time, because graphs replay it.
 
     Args:
         task: The task, bound to its model and parameters.
-        engine: Its physics, which keeps the task's fields.
+        engine: The physics engine, with the task's fields.
         options: Options of the environment.
     """
 
@@ -58,9 +58,9 @@ class Worlds(WorldArrays):
         self.configure(horizon=horizon, autoreset=options.autoreset, graphs=options.graphs)
 
     def configure(self, *, horizon: int, autoreset: bool, graphs: bool) -> None:
-        """Choose the horizon, whether episodes restart automatically, and whether launches become graphs.
+        """Set the horizon, whether episodes restart automatically, and whether launches are captured as graphs.
 
-        The first two are baked into captured graphs, so each combination has graphs of its own.
+        The first two are baked into captured graphs, so each combination has its own graphs.
         """
         self.horizon, self.autoreset = horizon, autoreset
         key = (horizon, autoreset, graphs)
@@ -83,7 +83,7 @@ class Worlds(WorldArrays):
         del self.programs, self.step
 
     def _make_workers(self) -> Workers | None:
-        """Threads for the launches around the engine's calls; None if only the caller's thread launches."""
+        """Worker threads for launches around the engine's calls; None if only the caller's thread launches."""
         # Warp's kernels in debug mode are not thread-safe
         if not self.device.is_cpu or self.engine.capturable or wp.config.mode == "debug":
             return None
@@ -93,7 +93,7 @@ class Worlds(WorldArrays):
     # phases
 
     def step_phases(self) -> list[Phase]:
-        """One step, in order."""
+        """The phases of one step, in order."""
         return [
             *self._transition_phases(),
             *self._restart_phases(self.restarting, randomly=True),
@@ -122,7 +122,7 @@ class Worlds(WorldArrays):
         ]
 
     def _only_for(self, mask: wp.array, *phases: list[Phase]) -> Phase:
-        """Merge phases into one that is skipped if the mask holds no world."""
+        """Merge phases into one phase that is skipped if the mask is empty."""
         every = [phase for part in phases for phase in part]
 
         def run() -> None:
@@ -154,7 +154,7 @@ class Worlds(WorldArrays):
         return substep * skip
 
     def reset_phases(self, *, randomly: bool) -> list[Phase]:
-        """Begin episodes in the worlds of ``mask``, in order."""
+        """The phases that start episodes in the worlds of ``mask``, in order."""
         return [
             *self._restart_phases(self.mask, randomly=randomly),
             *self._refresh_phases(self.mask),
@@ -203,7 +203,7 @@ class Worlds(WorldArrays):
         return [Phase("read state", self._read_state)]
 
     def restore_phases(self) -> list[Phase]:
-        """Put the worlds of ``mask`` into the states of ``state``, in order; every getter reflects them afterwards."""
+        """The phases that put the worlds of ``mask`` into the states in ``state``, for all getters too."""
         engine_columns = self.state[:, : self.engine.state_size]
         return [
             Phase("restore engine", partial(self.engine.set_state, engine_columns, self.mask), engine=True),
@@ -212,7 +212,7 @@ class Worlds(WorldArrays):
         ]
 
     def rehearsal(self) -> None:
-        """Run every phase that is made of launches once, for ``compile_ahead``, which notes the kernels."""
+        """Run every phase that consists of launches once, so that ``compile_ahead`` can list the kernels."""
         self.seed_streams(0)
         phases = (*self.reset_phases(randomly=True), *self.step_phases(), *self.read_phases(), *self.restore_phases())
         for phase in phases:
@@ -225,7 +225,7 @@ class Worlds(WorldArrays):
             launch_lanes(kernel, self.nworld, [self.after, self.before], self.device)
 
     def act(self) -> None:
-        """Keep the state before the step, and turn actions into controls."""
+        """Copy the state before the step, and turn actions into controls."""
         self.keep_before()
         launch_worlds(self.task.kernels.act, self.nworld, [
             self.after, self.params, self.action, self.ranges, self.scale, self.counters, self.safe_action,
@@ -259,7 +259,7 @@ class Worlds(WorldArrays):
     def _judge(
         self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool, keep_reason: bool = False
     ) -> None:
-        """Reward, metrics, evaluation, ends and observations of the masked worlds; see ``kernels.steps``."""
+        """Compute the masked worlds' rewards, metrics, evaluations, ends and observations; see ``kernels.steps``."""
         kernels = self.task.kernels
         if kernels.check_memory is not None:
             launch_lanes(kernels.check_memory, self.nworld, [mask, self.before, self.after, fault], self.device)
@@ -281,7 +281,7 @@ class Worlds(WorldArrays):
             launch_worlds(steps.hold_success, self.nworld, args, self.device)
 
     def _restart(self, mask: wp.array, *, randomly: bool, again: bool = False) -> None:
-        """Put the masked worlds into an initial state of the task."""
+        """Put the masked worlds into the task's initial state, fixed or random."""
         self.engine.reset(mask)
         self._clear(mask, "memory", *self.task.task.cleared, *([] if again else ["metric_sums", "success_counts"]))
         if self.task.kernels.reject_worlds is not None:  # a rejected draw must not change lasting memory
@@ -298,15 +298,15 @@ class Worlds(WorldArrays):
                 launch_rows(state.fill_rows, mask, self._zeros[: array.shape[1]], array)
 
     def _make_nominal(self, mask: wp.array, names: Iterable[str]) -> None:
-        """Give model fields of the masked worlds their nominal values."""
+        """Set model fields of the masked worlds to their nominal values."""
         for name in names:
             launch_rows(state.fill_rows, mask, flat(self.engine.nominal[name])[0], flat(self.engine.arrays[name]))
 
     def _redraw(self, kernel: wp.Kernel, mask: wp.array) -> None:
-        """Draw initial states of the masked worlds again while the task rejects them."""
+        """Redraw the masked worlds' initial states while the task rejects them."""
         wp.copy(self._rejected, mask)
         for _ in range(self.task.task.draws - 1):
-            # reading the mask would wait for a GPU, where the remaining launches run with an empty mask instead
+            # reading the mask would wait for the GPU, so there the remaining launches run even with an empty mask
             if not self.engine.capturable and not self._rejected.numpy().any():
                 return
             self.engine.refresh(self._rejected)
@@ -334,13 +334,13 @@ class Worlds(WorldArrays):
         self.engine.commit(self._physics_changed, state_fields)
 
     def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
-        """Mark continuing worlds in which a field changed, which belongs to the physics or to the task's memory."""
+        """Mark continuing worlds in which a field changed; ``physics`` is False for the task's memory."""
         found = [self._physics_changed, self._changed, self._outdated]
         args = [self._continuing, flat(before), flat(after), physics, *found]
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
 
     def _observe(self, mask: wp.array) -> None:
-        """Observe the masked worlds; the others were observed when they were judged."""
+        """Observe the masked worlds; all others were already observed while they were judged."""
         kernels, finite, parts = self.task.kernels, self._finite_obs, self._observing
         args = [mask, self.after, self.params, self.counters, self.final_obs, finite, self.obs, parts]
         launch_parts(kernels.observe_worlds, parts, self.nworld, args, self.device)
@@ -350,19 +350,19 @@ class Worlds(WorldArrays):
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         """Observe and judge the states of the masked worlds, without a transition."""
-        # a state that was set unchecked may be a fault; its world keeps the last good observation
+        # a state that was set unchecked may be a fault; its world keeps the last valid observation
         self.engine.find_faults(self.mask)
         keep_reason = keep_reason and not self.autoreset
         self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)
 
     def _read_state(self) -> None:
-        # with automatic resets done_reason belongs to one step only; without them it is part of the state
+        # with automatic resets done_reason lasts for one step only; without them it is part of the state
         self.pack_state(self._no_fault if self.autoreset else self.outcome.done_reason)
 
     # for environments and open-loop rollouts
 
     def judge_transition(self, action: torch.Tensor) -> None:
-        """Judge the transition from ``before`` to the current state under actions, without the engine's faults."""
+        """Judge the transition from ``before`` to the current state under given actions; ignore engine faults."""
         torch_view(self.safe_action).copy_(action)
         self._judged.zero_()  # receives the faults of this transition
         self._judge(self.everyone, self._judged, self._no_fault, transition=True)

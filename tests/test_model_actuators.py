@@ -41,7 +41,7 @@ def test_a_servo_follows_a_velocity_up_to_its_former_range() -> None:
 @pytest.mark.parametrize(
     ("name", "speed", "message"),
     [
-        ("motor", 1.0, "the actuator 'motor' is not a position servo: make it one, as <position kp="),
+        ("motor", 1.0, "the actuator 'motor' is not a position servo: define it as <position kp="),
         ("free", 1.0, "the actuator 'free' has no range for its target: set its ctrlrange first"),
         ("servo", -1.0, "speed must be a positive number of m/s or rad/s, not -1.0"),
     ],

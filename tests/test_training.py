@@ -290,8 +290,8 @@ def test_a_command_begins_with_the_policy_of_a_run(
     capsys.readouterr()
     for options, words in [
         (["hopper"], ["takes 6 observations", "'hopper' has 11"]),
-        (["--hidden", "9"], ["have hidden (8,), not (9,)", "leave out --hidden"]),
-        (["--value-group", "critic"], ["have value_group policy, not critic", "leave out --value-group"]),
+        (["--hidden", "9"], ["have hidden (8,), not (9,)", "omit --hidden"]),
+        (["--value-group", "critic"], ["have value_group policy, not critic", "omit --value-group"]),
         (["--which", "5"], ["has no policy '5': it has 'last', 'best', 2, 4, 6"]),
         (["--resume", str(six)], ["--from has no effect with --resume"]),
     ]:
@@ -316,7 +316,7 @@ def test_flags_with_the_defaults_of_new_runs_replace_the_settings_of_the_other_r
     assert config["physics"] == {}
     capsys.readouterr()
     assert cli.main([*command, "--out", str(tmp_path / "no"), "--hidden", "64", "64"]) == 2
-    refused(capsys, "have hidden (8,), not (64, 64)", "leave out --hidden")
+    refused(capsys, "have hidden (8,), not (64, 64)", "omit --hidden")
     assert cli.main(["train", "--resume", str(old), "--iterations", "9", "--gamma", "0.995"]) == 2
     refused(capsys, "has gamma 0.9, not 0.995")
 

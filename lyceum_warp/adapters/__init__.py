@@ -1,1 +1,1 @@
-"""Environments in the form that other libraries of reinforcement learning expect: one file a library, each an extra."""
+"""Adapt environments to other reinforcement learning libraries; each library is an extra."""

@@ -1,4 +1,4 @@
-"""Make and check the environment behind an adapter: its arguments, seeds and pictures."""
+"""Make and check the environment behind an adapter, its seeds and its pictures."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -12,19 +12,19 @@ from lyceum_warp.viz.cameras import CameraChoice
 from lyceum_warp.viz.pictures import WorldPictures
 
 _SEEDS = 2**31
-"""Seeds of an environment are below this number."""
+"""Upper bound (exclusive) of an environment's seeds."""
 
 _OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode, where there is one,"}
-"""Options of an environment that an adapter sets, and the argument that decides instead."""
+"""Options that an adapter sets itself, with the argument to use instead."""
 
 
 def environment_of(
     task: str | type[Task] | Env, num_envs: int | None, words: Mapping[str, Any], *, autoreset: bool
 ) -> Env:
-    """Make the environment behind an adapter, or check one that was given.
+    """Make the environment behind an adapter, or check a given one.
 
     Args:
-        task: A task as ``lw.make`` takes it, or an environment.
+        task: A task, as in ``lw.make``, or an environment.
         num_envs: Number of worlds; by default one, or the number in the given environment.
         words: Options and parameters, for ``lw.make``.
         autoreset: Whether the environment resets worlds within a step.
@@ -40,7 +40,7 @@ def environment_of(
     if words:
         raise ValueError(f"an environment has its options already: give {', '.join(words)} to lw.make")
     if num_envs not in (None, task.nworld):
-        raise ValueError(f"the environment has {task.nworld} worlds, not num_envs={num_envs}: leave num_envs out")
+        raise ValueError(f"the environment has {task.nworld} worlds, not num_envs={num_envs}: omit num_envs")
     if task.autoreset is not autoreset:
         raise ValueError(f"the environment has autoreset={task.autoreset}: make it with autoreset={autoreset}")
     return task
@@ -49,7 +49,7 @@ def environment_of(
 def pictures_of(
     env: Env, render_mode: str | None, camera: CameraChoice, size: tuple[int, int]
 ) -> tuple[WorldPictures, dict[str, Any]]:
-    """The pictures of an environment's worlds, and the entries of a library's ``metadata`` that describe them.
+    """The renderer of an environment's worlds, and the entries of a library's ``metadata`` that describe it.
 
     Raises:
         ValueError: There is no such render mode or camera, or the size is odd.
@@ -61,7 +61,7 @@ def pictures_of(
 
 
 class ResetSeeds:
-    """Choose the seed of each reset. The first reset without a seed draws one, as libraries expect.
+    """Chooses the seed of each reset. If the first reset has no seed, one is drawn at random, as libraries expect.
 
     Args:
         seeded: Whether the user has seeded the environment.
@@ -74,8 +74,8 @@ class ResetSeeds:
         """The seed of this reset; None continues the random streams.
 
         Args:
-            given: The seed of any size that the reset was given, or None.
-            drawn: Returns a random seed, for worlds that never had one.
+            given: The seed passed to reset, of any size, or None.
+            drawn: Returns a random seed, for worlds that were never seeded.
         """
         if given is None and self._seeded:
             return None
@@ -84,7 +84,7 @@ class ResetSeeds:
 
 
 def per_world(value: Any, nworld: int) -> list[Any]:
-    """A value for each world: the rows of a tensor with one row for each world, otherwise the same value."""
+    """A list with one value per world: the tensor's rows if there is one per world, else the value repeated."""
     if isinstance(value, torch.Tensor) and value.ndim and len(value) == nworld:
         return list(value)
     return [value] * nworld

@@ -16,16 +16,16 @@ from lyceum_warp.viz.cameras import CameraChoice
 class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
     """One world as a ``gymnasium.Env``, for evaluation, debugging and tools without support for vector environments.
 
-    ``info`` holds ``eval`` and ``done_reason``, and if the task has them ``success``, ``metrics`` and
+    ``info`` holds ``eval``, ``done_reason`` and, if the task has them, ``success``, ``metrics`` and
     ``episode_metrics``. ``GymnasiumVectorEnv`` steps many worlds much faster.
 
     Args:
-        task: A task as ``lw.make`` takes it, or an environment of one world, made with ``autoreset=False``.
-        dict_obs: Whether an observation is a dict of the task's groups, by default if it has several; otherwise it is
-            the group ``policy``.
+        task: A task, as in ``lw.make``, or an environment of one world, made with ``autoreset=False``.
+        dict_obs: Whether observations are dicts of all observation groups; otherwise they are the group ``policy``. The
+            default is True if the task has several groups.
         render_mode: "rgb_array" for pictures, or None.
-        camera: The camera of pictures, as in ``lyceum_warp.viz.video.write_video``.
-        render_size: Their width and height in pixels, even numbers.
+        camera: The camera for pictures, as in ``lyceum_warp.viz.video.write_video``.
+        render_size: Width and height of pictures in pixels, even numbers.
         **words: Options and parameters for ``lw.make``.
 
     Raises:
@@ -57,7 +57,7 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         self._reset_once = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin a new, random episode.
+        """Start a new random episode.
 
         Args:
             seed: Seed of the random stream; None continues it.
@@ -67,7 +67,7 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
             ValueError: The seed is not a whole number, or there is an option.
         """
         if options:
-            raise ValueError(f"reset has no option {next(iter(options))!r}: leave options out")
+            raise ValueError(f"reset has no option {next(iter(options))!r}: omit options")
         own_seed = self._seeds(seed, lambda: self.np_random_seed)
         super().reset(seed=seed)
         self.env.rand_reset(own_seed)
@@ -82,8 +82,8 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
             action: (nact,), float32.
 
         Raises:
-            ResetNeeded: There was no reset yet.
-            ValueError: The action has another shape or type.
+            ResetNeeded: ``reset`` was not called yet.
+            ValueError: The action has the wrong shape or type.
         """
         if not self._reset_once:
             raise gymnasium.error.ResetNeeded("there was no reset before this step: call reset() first")
@@ -93,22 +93,22 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         return obs, float(reward), bool(terminated), bool(truncated), _numbers(info)
 
     def render(self) -> Any:
-        """A picture of the world, (height, width, 3) uint8; None without a ``render_mode``.
+        """Render a picture of the world, (height, width, 3) uint8; None without a ``render_mode``.
 
         Raises:
-            NoVideoError: The machine cannot draw.
+            NoVideoError: This machine cannot render.
         """
         return None if self.render_mode is None else self._pictures()[0]
 
     def close(self) -> None:
-        """End the process that draws pictures."""
+        """End the rendering subprocess."""
         self._pictures.close()
 
     def _rows(self, *buffers: torch.Tensor) -> list[Any]:
-        """The row of the only world in each buffer."""
+        """The row of the single world in each buffer."""
         return [array[0] for array in self._host.of(*buffers)]
 
 
 def _numbers(info: dict[str, Any]) -> dict[str, Any]:
-    """Convert infos of one world to Python numbers."""
+    """Convert one world's infos to Python numbers."""
     return {name: _numbers(value) if isinstance(value, dict) else value.item() for name, value in info.items()}

@@ -1,4 +1,4 @@
-"""Convert an environment's spaces to Gymnasium's, and check Gymnasium's release before it is imported."""
+"""Convert an environment's spaces to Gymnasium's, after checking the installed Gymnasium release."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ __all__ = ["box", "gymnasium", "observation_space"]
 
 
 def box(space: Space) -> gymnasium.spaces.Box:
-    """The space of one world's vector; infinite without bounds."""
+    """A box for one world's vector; infinite if the space has no bounds."""
     low, high = (-np.inf if space.low is None else space.low), (np.inf if space.high is None else space.high)
     return gymnasium.spaces.Box(low, high, shape=space.shape, dtype=np.float32)
 

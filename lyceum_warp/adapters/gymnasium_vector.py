@@ -19,37 +19,39 @@ AutoresetMode = gymnasium.vector.AutoresetMode
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     """Many worlds as a ``gymnasium.vector.VectorEnv``.
 
-    ``infos`` holds ``eval`` and ``done_reason``, and if the task has them ``success``, ``metrics`` and
-    ``episode_metrics``: arrays with a value for each world.
+    ``infos`` holds ``eval``, ``done_reason`` and, if the task has them, ``success``, ``metrics`` and
+    ``episode_metrics``: arrays with one value per world.
 
-    ``autoreset_mode`` says when an ended world is reset:
+    ``autoreset_mode`` determines when a world is reset after its episode ends:
 
-    - SAME_STEP: within the step. The world returns the first observation of its next episode;
-      ``infos["final_obs"]`` and ``infos["final_info"]`` hold the last observations and infos of ended episodes, and
-      the masks ``_final_obs`` and ``_final_info`` select their worlds. With NumPy these entries exist if an episode
+    - SAME_STEP: within the same step. The world returns the first observation of its next episode;
+      ``infos["final_obs"]`` and ``infos["final_info"]`` hold the last observations and infos of ended episodes, and the
+      masks ``_final_obs`` and ``_final_info`` select their worlds. With NumPy these entries exist only if an episode
       ended, and ``final_obs`` is an object array with None for the other worlds, as Gymnasium's wrappers expect. With
-      ``torch=True`` they always exist, as tensors of all worlds, because the step does not wait for the device.
-    - DISABLED: by ``reset(options={"reset_mask": mask})``. Until then the world keeps stepping and its end stays set. A
-      world with a fault is reset at once, but returns its last good observation.
-    - NEXT_STEP: in the next step, which ignores the world's action. Every step then runs a second reset phase. Some
+      ``torch=True`` they always exist, as tensors over all worlds, because the step does not wait for the device.
+    - DISABLED: only by ``reset(options={"reset_mask": mask})``. Until then the world keeps stepping, and its
+      termination or truncation stays set. A world with a fault is reset at once, but returns its last valid
+      observation.
+    - NEXT_STEP: in the next step, which ignores the world's action. Every step then has a second reset phase. Some
       wrappers, such as ``NormalizeObservation``, require this mode.
 
-    As in Gymnasium's own environments, the first reset without a seed draws one, unless ``seed=`` is given here. Worlds
-    with one seed differ from each other, and are the same in every run.
+    As in Gymnasium's own environments, a first reset without a seed draws one at random, unless ``seed=`` is given
+    here. With a given seed, the worlds differ from each other, but are the same in every run.
 
     Args:
-        task: A task as ``lw.make`` takes it, or an environment.
+        task: A task, as in ``lw.make``, or an environment.
         num_envs: Number of worlds.
-        autoreset_mode: SAME_STEP, DISABLED or NEXT_STEP of ``gymnasium.vector.AutoresetMode``, or its value; by default
-            SAME_STEP, or DISABLED for an environment with ``autoreset=False``.
-        torch: Whether actions and results are tensors on the environment's device. A step then never waits for it.
-        copy: Whether results are copies. Otherwise most tensors, and most arrays on the CPU, are live buffers that the
+        autoreset_mode: A ``gymnasium.vector.AutoresetMode`` or its value; by default SAME_STEP, or DISABLED for an
+            environment with ``autoreset=False``.
+        torch: Whether actions and results are tensors on the environment's device. A step then never waits for the
+            device.
+        copy: Whether results are copied. Otherwise most tensors, and most arrays on the CPU, are live buffers that the
             next step overwrites.
-        dict_obs: Whether an observation is a dict of the task's groups, by default if it has several; otherwise it is
-            the group ``policy``.
+        dict_obs: Whether observations are dicts of all observation groups; otherwise they are the group ``policy``. The
+            default is True if the task has several groups.
         render_mode: "rgb_array" for pictures, or None.
-        camera: The camera of pictures, as in ``lyceum_warp.viz.video.write_video``.
-        render_size: Their width and height in pixels, even numbers.
+        camera: The camera for pictures, as in ``lyceum_warp.viz.video.write_video``.
+        render_size: Width and height of pictures in pixels, even numbers.
         max_episode_steps: Steps after which an episode is truncated; by default the task's horizon.
         **words: Options and parameters for ``lw.make``, such as ``device="cuda"`` or ``ctrl_cost_weight=1e-2``.
 
@@ -107,7 +109,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return self.env.obs.device
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin new, random episodes.
+        """Start new random episodes.
 
         Args:
             seed: Seed of the worlds' random streams; None continues them.
@@ -117,8 +119,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             The observations and infos of all worlds.
 
         Raises:
-            ResetNeeded: A reset of some worlds came before a reset of all.
-            ValueError: The seed is not a whole number, or an option is unknown or has another shape or type.
+            ResetNeeded: A partial reset came before the first full reset.
+            ValueError: The seed is not a whole number, or an option is unknown or has the wrong shape or type.
         """
         mask = self._mask(options)
         own_seed = self._seeds(seed, lambda: self.np_random_seed)
@@ -139,8 +141,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             Observations, rewards, terminations, truncations and infos.
 
         Raises:
-            ResetNeeded: There was no reset yet.
-            ValueError: The actions have another shape or type, or lie on another device.
+            ResetNeeded: ``reset`` was not called yet.
+            ValueError: The actions have the wrong shape, type or device.
         """
         if not self._reset_once:
             raise gymnasium.error.ResetNeeded("there was no reset before this step: call reset() first")
@@ -161,17 +163,17 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return obs, rewards, terminations, truncations, infos
 
     def render(self) -> tuple[Any, ...] | None:
-        """A picture of each world, (height, width, 3) uint8; None without a ``render_mode``.
+        """Render a picture of each world, (height, width, 3) uint8; None without a ``render_mode``.
 
         Raises:
-            NoVideoError: The machine cannot draw.
+            NoVideoError: This machine cannot render.
         """
         return None if self.render_mode is None else tuple(self._pictures())
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call a method, or read an attribute, of this adapter or of its ``Env``, and return a value for each world.
+        """Call a method or read an attribute of this adapter or its ``Env``, and return one value per world.
 
-        A tensor with a row for each world returns its rows; any other value is repeated.
+        A tensor with one row per world is split into rows; any other value is repeated.
         """
         value = getattr(self if hasattr(self, name) else self.env, name)
         value = value(*args, **kwargs) if callable(value) else value
@@ -184,7 +186,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return self.call(name)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """End the process that draws pictures."""
+        """End the rendering subprocess."""
         if hasattr(self, "_pictures"):  # Gymnasium also closes an environment whose constructor failed
             self._pictures.close()
 

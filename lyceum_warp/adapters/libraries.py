@@ -1,4 +1,4 @@
-"""Check that a library which an adapter needs is installed, in a release that the adapter supports."""
+"""Check that a supported release of an adapter's library is installed."""
 
 import importlib.metadata
 import re
@@ -8,9 +8,9 @@ def check_library(package: str, *, low: str, below: str, install: str) -> None:
     """Check the installed release of a library.
 
     Args:
-        package: The package as pip names it.
+        package: The package's name for pip.
         low: The lowest supported version, such as "2.9".
-        below: The first version that is too new, such as "3".
+        below: The first unsupported newer version, such as "3".
         install: The argument of ``pip install`` that installs a supported release.
 
     Raises:
@@ -28,5 +28,5 @@ def check_library(package: str, *, low: str, below: str, install: str) -> None:
 
 
 def _release(version: str) -> tuple[int, ...]:
-    """The release of a version: (2, 10) for "2.10rc1"."""
+    """The release segment of a version: (2, 10) for "2.10rc1"."""
     return tuple(map(int, re.findall(r"\d+", re.match(r"[\d.]*", version).group())))  # type: ignore[union-attr]

@@ -1,4 +1,4 @@
-"""Convert a configuration of PPO into the dict that rsl_rl's runner takes."""
+"""Convert a PPO configuration to rsl_rl's runner configuration."""
 
 import math
 from typing import Any
@@ -8,7 +8,7 @@ from lyceum_warp.algos.value import value_group
 from lyceum_warp.env import Env
 
 _ACTIVATIONS = {"leaky_relu": "lrelu", "silu": "swish"}
-"""Names of activations here and in rsl_rl, if they differ."""
+"""Activations whose names differ: the name here and in rsl_rl."""
 
 _PPO = {
     "epochs": "num_learning_epochs", "minibatches": "num_mini_batches", "clip": "clip_param", "gamma": "gamma",
@@ -25,14 +25,15 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
     Example:
         >>> runner = OnPolicyRunner(RslRlVecEnv(env), runner_config(env))
 
-    rsl_rl's PPO has no counterpart of ``final_entropy_coef``, ``stagger``, ``tf32`` and evaluations of the mean policy.
+    rsl_rl's PPO has no equivalent of ``final_entropy_coef``, ``stagger``, ``tf32`` and the evaluation of the mean
+    policy.
 
     Args:
         env: The environment; its observation groups are the inputs of the networks.
         config: Hyperparameters; by default ``PPOConfig()``.
 
     Returns:
-        A new dict, which rsl_rl modifies.
+        A new dict; rsl_rl modifies it.
 
     Raises:
         ValueError: The task has no observation group for the value function.
@@ -46,7 +47,7 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
     return {
         "num_steps_per_env": config.num_steps,
         "save_interval": 50,
-        "check_for_nan": False,  # it waits for the device, and the environment reports non-finite values as faults
+        "check_for_nan": False,  # this check waits for the device, and non-finite values are faults
         "obs_groups": {"actor": ["policy"], "critic": [value_group(env, config.value_group)]},
         "actor": network | _layers(config.hidden, config.activation) | {"distribution_cfg": distribution},
         "critic": network | _layers(config.value_hidden, config.value_activation),

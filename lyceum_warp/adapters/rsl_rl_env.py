@@ -17,35 +17,35 @@ from rsl_rl.env import VecEnv  # noqa: E402 (after the check)
 from tensordict import TensorDict  # noqa: E402
 
 RECENT = 100
-"""Number of recent episodes over which the logged means are taken."""
+"""Logged means cover about this number of recent episodes."""
 
 
 class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     """An environment for rsl_rl's runners: ``OnPolicyRunner(RslRlVecEnv("hopper", 4096, device="cuda"), config)``.
 
     ``step`` never waits for the device. It returns copies of the observations, because rsl_rl stores observations only
-    after the next step. The other results are buffers that the next step overwrites; rsl_rl copies them first.
+    after the next step. All other results are buffers that the next step overwrites; rsl_rl copies them before.
 
     Args:
-        task: A task as ``lw.make`` takes it, or an environment with automatic resets.
+        task: A task, as in ``lw.make``, or an environment with automatic resets.
         num_envs: Number of worlds; by default one, or the number in the given environment.
         words: Options and parameters, as for ``lw.make``.
 
     Raises:
         ValueError: An argument does not fit; the message names it.
-        ImportError: When this module is imported: rsl_rl is missing, or its release is not supported.
+        ImportError: rsl_rl is missing or its release is not supported; raised when this module is imported.
     """
 
     num_envs: int
     """Number of worlds."""
     num_actions: int
-    """Numbers in an action."""
+    """Length of an action."""
     max_episode_length: int
     """Steps after which an episode is truncated; 2147483647 without a horizon."""
     device: torch.device
     """Device of all tensors."""
     cfg: dict[str, Any]
-    """The task, its parameters, the engine and the number of worlds, for rsl_rl's writers."""
+    """The task, its parameters, the engine and the number of worlds, for rsl_rl's log writers."""
 
     def __init__(self, task: str | type[Task] | Env, num_envs: int | None = None, **words: Any) -> None:
         self.env = env = environment_of(task, num_envs, words, autoreset=True)
@@ -61,7 +61,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             for groups in (env.obs_groups, env.final_obs_groups)
         )
         self._metrics = torch.zeros(len(env.metrics), device=self.device)
-        self._episodes = torch.zeros((), device=self.device)  # in the means
+        self._episodes = torch.zeros((), device=self.device)  # episodes in the means
 
     @property
     def unwrapped(self) -> Env:
@@ -70,9 +70,9 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Steps since the reset, (nworld,) int32, a live view. Assign it to move the worlds to other steps.
+        """Steps since the reset, (nworld,) int32, a live view. Assign to it to change the worlds' step counters.
 
-        Time limits follow: the next step truncates a world at step ``max_episode_length - 1``.
+        This also moves the time limits: the next step truncates a world at step ``max_episode_length - 1``.
         """
         return self.env.episode_step
 
@@ -101,18 +101,18 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         return self._obs.clone()
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advance every world by one step; worlds whose episode ends begin a new one.
+        """Advance every world by one step; worlds whose episode ends start a new one.
 
         Args:
             actions: (nworld, nact), float32.
 
         Returns:
-            Observations, after a reset the first of the new episode; rewards, (nworld,); dones, (nworld,) bool; and a
-            dict:
+            Observations (after a reset, the first observation of the new episode); rewards, (nworld,); dones, (nworld,)
+            bool; and a dict:
 
             ============= =========================================================================================
             ``time_outs`` whether the time limit or a fault truncated the episode, (nworld,) bool. A transition with
-                          a fault has reward 0 and the last good observation as its final one
+                          a fault has reward 0 and the last valid observation as its final one
             ``final_obs`` a dict of observation groups after the step, before any reset
             ``log``       means of the task's metrics over about the last 100 episodes that ended (all of this step's),
                           ``metrics/NAME``, which are 0 before the first end; and ``faults/worlds``, worlds with a
@@ -120,7 +120,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             ============= =========================================================================================
 
         Raises:
-            ValueError: The actions have another shape, type or device.
+            ValueError: The actions have the wrong shape, type or device.
         """
         env = self.env
         env.step(actions)
@@ -134,8 +134,8 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     def _log(self) -> dict[str, torch.Tensor]:
         """Means of the metrics over recent episodes, computed on the device.
 
-        rsl_rl averages the log over the steps of an iteration. Means over only the last step would give a step with
-        one ended episode the weight of a step with a thousand.
+        rsl_rl averages the log over the steps of an iteration. With means over only the last step, a step in which one
+        episode ended would weigh as much as a step in which a thousand ended.
         """
         env = self.env
         if not env.metrics:

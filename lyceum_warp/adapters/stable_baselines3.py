@@ -1,4 +1,4 @@
-"""Adapt many worlds to Stable-Baselines3's VecEnv, with the extra ``stable-baselines3``."""
+"""Adapt many worlds to Stable-Baselines3's VecEnv."""
 
 import time
 from collections.abc import Sequence
@@ -24,20 +24,20 @@ from stable_baselines3.common.vec_env import VecEnv  # noqa: E402
 class StableBaselines3VecEnv(VecEnv):
     """Many worlds as a ``stable_baselines3.common.vec_env.VecEnv``.
 
-    The info dict of a world whose episode ends has ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (as
+    When a world's episode ends, its info dict has ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (as
     from Stable-Baselines3's Monitor: return ``r``, length ``l``, seconds since the start ``t``), ``eval``,
     ``done_reason``, ``is_success`` if the task has a goal, and ``episode_metrics`` if it has metrics. The info dicts of
-    the other worlds are empty, and the same objects in every step.
+    all other worlds are empty, and are the same objects in every step.
 
-    By default observations are the group ``policy``, because Stable-Baselines3 feeds all groups to the policy.
+    By default observations are only the group ``policy``, because Stable-Baselines3 feeds all groups to the policy.
 
     Args:
-        task: A task as ``lw.make`` takes it, or an environment.
+        task: A task, as in ``lw.make``, or an environment.
         num_envs: Number of worlds.
-        dict_obs: Whether an observation is a dict of all groups.
+        dict_obs: Whether observations are dicts of all observation groups.
         render_mode: "rgb_array" for pictures, or None.
-        camera: The camera of pictures, as in ``lyceum_warp.viz.video.write_video``.
-        render_size: Their width and height in pixels, even numbers.
+        camera: The camera for pictures, as in ``lyceum_warp.viz.video.write_video``.
+        render_size: Width and height of pictures in pixels, even numbers.
         **words: Options and parameters for ``lw.make``.
 
     Raises:
@@ -70,13 +70,13 @@ class StableBaselines3VecEnv(VecEnv):
         self._reset_once = False
 
     def reset(self) -> Any:
-        """Begin new, random episodes in all worlds, and return their first observations.
+        """Start new random episodes in all worlds, and return their first observations.
 
         Raises:
-            ValueError: ``set_options`` set an option, but a reset has no options.
+            ValueError: ``set_options`` set an option, but ``reset`` has none.
         """
         if options := next(filter(None, self._options), None):
-            raise ValueError(f"reset has no option {next(iter(options))!r}: leave set_options out")
+            raise ValueError(f"reset has no option {next(iter(options))!r}: omit set_options")
         seed = self._own_seeds(self._seeds[0], lambda: int(np.random.randint(2**31 - 1)))
         self.env.rand_reset(seed)
         self._reset_seeds()
@@ -85,11 +85,11 @@ class StableBaselines3VecEnv(VecEnv):
         return self._observations.formed(list(self._host.of(*self._observations.current)))
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions of the next step, (num_envs, nact), float32.
+        """Set the actions of the next step, (num_envs, nact), float32.
 
         Raises:
-            RuntimeError: There was no reset yet.
-            ValueError: The actions have another shape or type.
+            RuntimeError: ``reset`` was not called yet.
+            ValueError: The actions have the wrong shape or type.
         """
         if not self._reset_once:
             raise RuntimeError("there was no reset before this step: call reset() first")
@@ -112,21 +112,21 @@ class StableBaselines3VecEnv(VecEnv):
         return self._observations.formed(values[:count]), reward, done, infos
 
     def close(self) -> None:
-        """End the process that draws pictures."""
+        """End the rendering subprocess."""
         self._pictures.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """A picture of each world, (height, width, 3) uint8; None for each without a ``render_mode``.
+        """Render a picture of each world, (height, width, 3) uint8; None per world without a ``render_mode``.
 
         Raises:
-            NoVideoError: The machine cannot draw.
+            NoVideoError: This machine cannot render.
         """
         return [None] * self.num_envs if self.render_mode is None else self._pictures()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Read an attribute of the ``Env`` or of this adapter, or a parameter of the task, for each world.
+        """Read a parameter of the task, or an attribute of the ``Env`` or of this adapter, for each world.
 
-        A tensor with a row for each world returns its rows; any other value is repeated.
+        A tensor with one row per world is split into rows; any other value is repeated.
         """
         parameters = self.env.task.parameters
         if attr_name in parameters.values:
@@ -139,17 +139,17 @@ class StableBaselines3VecEnv(VecEnv):
         """Set a parameter of the task in all worlds, or an attribute of this adapter.
 
         Raises:
-            ValueError: There is no such parameter or attribute, or ``indices`` leaves worlds out.
+            ValueError: There is no such parameter or attribute, or ``indices`` does not include all worlds.
         """
         if len(set(self._get_indices(indices))) != self.num_envs:
-            raise ValueError(f"{attr_name!r} belongs to all worlds together: leave indices out")
+            raise ValueError(f"{attr_name!r} belongs to all worlds together: omit indices")
         if attr_name not in self.env.task.parameters.values and hasattr(self, attr_name):
             setattr(self, attr_name, value)
         else:  # its error suggests the closest names
             self.env.set_params(**{attr_name: value})
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method of the ``Env`` once, and return its result for each world, as ``get_attr`` does."""
+        """Call a method of the ``Env`` once, and return its result per world, as ``get_attr`` does."""
         return self._chosen(getattr(self.env, method_name)(*method_args, **method_kwargs), indices)
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
@@ -161,7 +161,7 @@ class StableBaselines3VecEnv(VecEnv):
         return [rows[i] for i in self._get_indices(indices)]
 
     def _add_ends(self, infos: list[dict[str, Any]], worlds: np.ndarray) -> None:
-        """Fill in the infos of ended episodes, and reset the sums of their worlds."""
+        """Fill in the infos of ended episodes, and reset their worlds' sums."""
         env, count = self.env, self._observations.count
         index = torch.from_numpy(worlds).to(env.obs.device)
         buffers = [*self._observations.final, env.terminated, *self._infos.tensors]
@@ -181,7 +181,7 @@ class StableBaselines3VecEnv(VecEnv):
 
 
 def _of_world(infos: dict[str, Any], i: int) -> dict[str, Any]:
-    """The infos of one world, with Stable-Baselines3's names."""
+    """The infos of one world, under Stable-Baselines3's names."""
     return {
         "is_success" if name == "success" else name: _of_world(value, i) if isinstance(value, dict) else value[i].item()
         for name, value in infos.items()

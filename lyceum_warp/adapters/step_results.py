@@ -27,11 +27,11 @@ class Observations:
 
     @property
     def current(self) -> list[torch.Tensor]:
-        """The observations of each group, (nworld, size); without automatic resets the last ones of ended worlds."""
+        """The current observations by group, (nworld, size); without automatic resets, ended worlds keep their last."""
         env = self._env
         if env.autoreset:
             return [env.obs_groups[group] for group in self._groups]
-        # a world with a fault is reset in any case, so that its buffer holds the next episode's observation
+        # a world with a fault is always reset, so its buffer already holds the next episode's observation
         done = env.done[:, None]
         return [torch.where(done, env.final_obs_groups[group], env.obs_groups[group]) for group in self._groups]
 
@@ -46,11 +46,11 @@ class Observations:
         return len(self._groups)
 
     def formed(self, values: list[Any]) -> Any:
-        """Form one array, or a dict of arrays, from the values of the groups."""
+        """Combine the groups' values into one observation: a single array, or a dict of arrays."""
         return dict(zip(self._groups, values, strict=True)) if self.dict_obs else values[0]
 
     def rows(self, values: list[np.ndarray]) -> list[Any]:
-        """Split arrays of the groups, (worlds, size of the group), into one observation for each world."""
+        """Split the groups' arrays, (worlds, group size), into one observation per world."""
         return [self.formed(list(row)) for row in zip(*values, strict=True)]
 
 
@@ -59,14 +59,14 @@ class HostArrays:
 
     Args:
         env: The environment.
-        copy: Whether results are copies. Otherwise results of an environment on the CPU are its live buffers, which the
+        copy: Whether results are copied. Otherwise, on the CPU, results are the environment's live buffers, which the
             next step overwrites.
-        one_world: Whether actions lack the axis of worlds, because there is one world.
+        one_world: Whether actions have no axis for worlds, because there is only one.
     """
 
     def __init__(self, env: Env, *, copy: bool = True, one_world: bool = False) -> None:
         self._env, self._copy = env, copy
-        # on the CPU the array shares the buffer's memory; copies to a GPU start from pinned memory
+        # on the CPU the array shares the buffer's memory; for a GPU, actions are staged in pinned memory
         pinned = torch.empty(env.action.shape, pin_memory=True) if env.action.is_cuda else None
         self._pinned = pinned
         actions = (env.action if pinned is None else pinned).numpy()
@@ -76,7 +76,7 @@ class HostArrays:
         """Copy actions into the environment, (nworld, nact) or (nact,), float32 or float64.
 
         Raises:
-            ValueError: They are not a NumPy array, or have another shape or type.
+            ValueError: They are not a NumPy array, or have the wrong shape or type.
         """
         if not isinstance(action, np.ndarray) or action.shape != self._action.shape or action.dtype.kind != "f":
             numpy = isinstance(action, np.ndarray)
@@ -120,7 +120,7 @@ class Infos:
         return [*self._plain.values(), *self._metrics.values()]
 
     def named(self, values: list[Any]) -> dict[str, Any]:
-        """Name the values of the buffers, which are tensors or arrays in the same order."""
+        """Convert values, tensors or arrays in the order of ``tensors``, to a dict."""
         infos = dict(zip(self._plain, values, strict=False))
         for name, table in zip(self._metrics, values[len(self._plain) :], strict=True):
             infos[name] = dict(zip(self._names, table.T, strict=True))
@@ -128,19 +128,19 @@ class Infos:
 
 
 class StepResults:
-    """The results of a step as Gymnasium returns them.
+    """The results of a step in Gymnasium's format.
 
     Args:
         env: The environment.
-        observations: Its observations.
-        given: Converts buffers for the caller, all of them in one call.
+        observations: The observations to return.
+        given: Converts all buffers for the caller in one call.
     """
 
     def __init__(self, env: Env, observations: Observations, given: Callable[..., list[Any]]) -> None:
         self._env, self._observations, self._infos, self._given = env, observations, Infos(env), given
 
     def __call__(self) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Observations, rewards, terminations, truncations and infos."""
+        """Return observations, rewards, terminations, truncations and infos."""
         shown = self._observations.current
         env = self._env
         values = iter(self._given(*shown, env.reward, env.terminated, env.truncated, *self._infos.tensors))

@@ -1,1 +1,1 @@
-"""Learn and plan: NPG, PPO and sampling-based planners, one file each, beside the parts that they share."""
+"""Learn and plan: NPG, PPO and sampling-based planners, one file each, and the parts that they share."""

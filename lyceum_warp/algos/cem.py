@@ -1,14 +1,14 @@
 """Update plans by the cross-entropy method (CEM): fit a normal distribution to the best samples.
 
-The noise of the planner (``planner.py``) then has a standard deviation s_t for each number of the plan. The n best
-samples (the elites) u_t^1, ..., u_t^n give the next plan and its noise:
+The planner's noise (``planner.py``) then has a standard deviation s_t for each element of the plan. The n best samples
+(the elites) u_t^1, ..., u_t^n determine the next plan and its noise:
 
     u_t = 1/n sum_k u_t^k,    s_t = max(sqrt(1/n sum_k (u_t^k - u_t)^2), min_noise)
 
 This is the method of Rubinstein (1999, "The cross-entropy method for combinatorial and continuous optimization") with a
 diagonal covariance, as in hydrax, judo and MuJoCo MPC. The standard deviations are shifted in time with the plan, and
-the end is filled with the initial ones. If noise is smoothed over time, s_t refers to the noise before smoothing: the
-spread of the elites is divided by the standard deviation of smoothed standard normal noise.
+the end is filled with their initial values. If noise is smoothed over time, s_t refers to the noise before smoothing:
+the elites' standard deviation is divided by that of smoothed standard normal noise.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ class EliteWeights(PlanUpdate):
     """Equal weights for the best samples, zero for the others.
 
     Args:
-        elites: Number of samples with a weight.
+        elites: Number of samples with non-zero weight.
     """
 
     capturable = True
@@ -38,7 +38,7 @@ class EliteWeights(PlanUpdate):
         self._rank = torch.zeros_like(samples.returns, dtype=torch.int32)
 
     def weigh(self, samples: PlanSamples) -> None:
-        """Weigh the best samples that did not fail."""
+        """Weight the best samples that did not fail."""
         returns, weights, rank = (by_sample(rows) for rows in (samples.returns, samples.weights, self._rank))
         plants, count = samples.returns.shape
         wp.launch(planning.rank, plants * count, [returns, count, rank], device=returns.device)
@@ -50,8 +50,8 @@ class CrossEntropy(EliteWeights):
     """The update of CEM.
 
     Args:
-        elites: Number of samples to fit to.
-        min_noise: The smallest standard deviation, one number or one for each action.
+        elites: Number of samples in the fit.
+        min_noise: Lower limit of the standard deviations, one number or one for each action.
         smoothing: Weights (b0, b1, b2) that smooth the noise over time.
     """
 
@@ -62,10 +62,10 @@ class CrossEntropy(EliteWeights):
         self.min_noise, self.smoothing = min_noise, smoothing
 
     def prepare(self, samples: PlanSamples) -> None:
-        """Allocate the ranks, the smallest deviations and the deviations of smoothed noise.
+        """Allocate the ranks, the lower limits and the standard deviations of smoothed noise.
 
         Raises:
-            ValueError: ``min_noise`` has another number of values than the task has actions.
+            ValueError: The number of values in ``min_noise`` differs from the number of actions.
         """
         super().prepare(samples)
         count, _, nact = samples.plan.shape

@@ -1,7 +1,7 @@
-"""Compute small fully connected networks and their derivatives on the CPU without autograd.
+"""Evaluate and differentiate small fully connected networks on the CPU without autograd.
 
-With a hundred units in a layer, the overhead of modules and autograd exceeds the arithmetic. Here a pass is one matrix
-product for each layer, into preallocated buffers. Other networks and devices use torch's modules and autograd.
+With a hundred units per layer, the overhead of modules and autograd exceeds the arithmetic. Here a pass is one matrix
+product per layer, into preallocated buffers. Other networks and devices use torch's modules and autograd.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -32,18 +32,18 @@ _ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[[tor
     nn.ReLU: (lambda x: np.maximum(x, 0.0, out=x), lambda d, y: _relu_slope(d, y, 0.0, grad_input=d)),
     nn.ELU: (_elu_, lambda d, y: _elu_slope(d, 1.0, 1.0, 1.0, True, y, grad_input=d)),
 }
-"""For each supported activation: the activation in place, and the in-place product with its slope, which is computed
-from the activation's result."""
+"""For each supported activation: a function that applies it in place, and a function that multiplies by its slope in
+place. The slope is computed from the activation's output."""
 
 _FEW = 2**18
-"""Number of rows times weights of the largest layer up to which NumPy computes the results. With cold caches, as
-between two steps of the worlds, a call of NumPy has less overhead; larger products run faster in torch."""
+"""NumPy computes products of up to this size (rows times weights of the largest layer). With cold caches, as between
+two steps of the worlds, a NumPy call has less overhead; larger products run faster in torch."""
 
 
 class DensePasses:
     """Forward passes y = f(x), and products with the Jacobian J = dy / dparameters.
 
-    Results are buffers, which the next call overwrites.
+    Results are buffers that the next call overwrites.
 
     Args:
         parameters: Weight and bias of each layer, in the order of the layers.
@@ -62,7 +62,7 @@ class DensePasses:
 
     @staticmethod
     def of(network: nn.Module) -> "DensePasses | None":
-        """Wrap a network of ``mlp`` on the CPU; None for any other network."""
+        """Wrap a CPU network made by ``mlp``; None for any other network."""
         if type(network) is not nn.Sequential or len(network) % 2 == 0:
             return None
         layers: list[Any] = list(network)[::2]
@@ -70,7 +70,7 @@ class DensePasses:
         kind = type(activations[0]) if activations else nn.Tanh
         linear = all(type(layer) is nn.Linear and layer.bias is not None for layer in layers)
         parameters = [p for layer in layers for p in (layer.weight, layer.bias)] if linear else []
-        # refuse shared layers, and weights that are computed from other parameters
+        # reject shared layers and reparametrised weights
         if [id(p) for p in network.parameters()] != [id(p) for p in parameters] or kind not in _ACTIVATIONS:
             return None
         if (
@@ -95,7 +95,7 @@ class DensePasses:
         self._arrays = [result.numpy() for result in self.results]
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
-        """Compute outputs, (rows, outputs), from inputs, (rows, inputs); later products read the inputs again."""
+        """Compute outputs, (rows, outputs), from inputs, (rows, inputs), which ``push`` and ``pull`` read again."""
         if len(x) != self._rows:
             self._resize(len(x))
         self._inputs = [x, *self.results[:-1]]
@@ -127,7 +127,7 @@ class DensePasses:
         """Compute J^T u at the last inputs, from u, (rows, outputs), into tensors of the parameters' shapes."""
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
-            if x.shape[1] < u.shape[1]:  # the product with the longer rows is faster
+            if x.shape[1] < u.shape[1]:  # the product with longer rows is faster
                 out[2 * i].copy_((x.t() @ u).t())
             else:
                 torch.mm(u.t(), x, out=out[2 * i])
@@ -148,7 +148,7 @@ class DensePolicy:
 
     @staticmethod
     def of(policy: GaussianPolicy) -> "DensePolicy | None":
-        """Wrap a policy; None if its network is not supported, is partly frozen, or if the policy is a subclass."""
+        """Wrap a policy; None if its network is unsupported or partly frozen, or if the policy is a subclass."""
         plain = type(policy) is GaussianPolicy and type(policy.normalizer) in (Normalizer, nn.Identity)
         if not plain or _hooked(policy) or _hooked(policy.normalizer):
             return None
@@ -196,7 +196,7 @@ class DenseValue:
 
     @staticmethod
     def of(value: ValueFunction) -> "DenseValue | None":
-        """Wrap a value function; None if its network is not supported, or if it is of a subclass."""
+        """Wrap a value function; None if its network is not supported, or if the value function is a subclass."""
         if type(value) is not ValueFunction or _hooked(value):
             return None
         passes = DensePasses.of(value.network)

@@ -1,8 +1,8 @@
-"""Distribute learning over processes: each steps its share of the worlds, and all make the same update.
+"""Distribute learning over processes: each steps its share of the worlds, and all apply the same update.
 
 Sums over worlds are computed in each process and then reduced over the processes. Every process draws the random
-numbers of all worlds from the same stream and uses its own part. The number of processes therefore changes only the
-rounding of sums.
+numbers of all worlds from the same stream and uses its own part. So the number of processes affects only how sums are
+rounded.
 """
 
 import contextlib
@@ -43,7 +43,7 @@ class Team:
         return self.size == 1 or distributed.get_backend() == "nccl"
 
     def capture(self, function: Callable[[], object]) -> torch.cuda.CUDAGraph:
-        """Capture torch operations and communication in a CUDA graph, which is registered for ``release``."""
+        """Capture torch operations and communication in a CUDA graph, and register it for ``release``."""
         graph = torch.cuda.CUDAGraph()
         # other threads, such as NCCL's, call CUDA during the capture
         with capturing(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
@@ -56,12 +56,12 @@ class Team:
         self._graphs.add(graph)
 
     def release(self) -> None:
-        """Reset all registered graphs: NCCL does not shut down while one exists."""
+        """Reset all registered graphs, because NCCL does not shut down while one exists."""
         for graph in list(self._graphs):
             graph.reset()
 
     def share(self, nworld: int) -> int:
-        """Divide ``nworld`` worlds among the processes; returns the number for each process.
+        """Divide ``nworld`` worlds among the processes, and return the number per process.
 
         Raises:
             ValueError: ``nworld`` is not a multiple of the number of processes.
@@ -80,7 +80,7 @@ class Team:
             nworld: Number of this process's worlds.
 
         Returns:
-            Indices into the flattened (steps, nworld), 0 for samples of other processes; and a mask of this process's
+            Indices into the flattened (steps, nworld), 0 for samples of other processes, and a mask of this process's
             samples.
         """
         step, world = index // (nworld * self.size), index % (nworld * self.size) - self.rank * nworld
@@ -125,7 +125,7 @@ class Team:
 
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
-        """End all processes if the block fails in one; only that process reports the error.
+        """End all processes if the block fails in one of them; only that process reports the error.
 
         The block must not communicate, because a failed process would not take part.
 
@@ -138,7 +138,7 @@ class Team:
         failed = torch.zeros(1, device=self.device)
         try:
             yield
-        except BaseException:  # signals, too
+        except BaseException:  # including signals
             self.sum(failed.fill_(1.0))
             raise
         if self.sum(failed).item() > 0:
@@ -147,7 +147,7 @@ class Team:
 
 @contextlib.contextmanager
 def side_stream() -> Iterator[None]:
-    """Run a block on another CUDA stream than the default one, as torch requires before a capture."""
+    """Run a block on a non-default CUDA stream, as torch requires before a capture."""
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):

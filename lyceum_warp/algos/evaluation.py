@@ -1,4 +1,4 @@
-"""Evaluate policies in whole episodes under the mean action."""
+"""Evaluate policies in whole episodes, without exploration noise."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ MEAN_SEED = 2**31 - 1
 
 
 def evaluation_seed(seed: int) -> int:
-    """Derive an evaluation's seed, one-to-one, so that training with the same seed draws other initial states."""
+    """Derive an evaluation's seed, one-to-one, so that training with the same seed draws different initial states."""
     return whole_number("seed", seed, low=0) ^ 0x5A17C3E9
 
 
@@ -33,11 +33,11 @@ class Episodes:
     lengths: torch.Tensor
     """Numbers of steps."""
     rewards: torch.Tensor
-    """Rewards of the last step."""
+    """Reward of each episode's last step."""
     evals: torch.Tensor
     """The evaluation metric at the end of each episode."""
     success: torch.Tensor
-    """Whether the goal was met at the end of each episode, 1 or 0."""
+    """Whether the goal was met at the end of each episode: 1.0 or 0.0."""
     metrics: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
     """Sums of the task's metrics, by name."""
 
@@ -59,21 +59,21 @@ def evaluate(
 ) -> Episodes:
     """Run a policy without noise for whole episodes from random initial states.
 
-    Every world contributes the same number of episodes. Counting all episodes that end would bias the statistics
-    towards short ones.
+    Every world contributes the same number of episodes; counting all episodes that end would bias the statistics
+    towards short episodes.
 
     Args:
         env: The environment; its worlds are reset.
         policy: A module with a method ``act``, or a function; maps observations (nworld, nobs) to actions
             (nworld, nact).
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
-        seed: Seed of the initial states; they differ from the initial states of an environment made with this seed. By
-            default the worlds continue their random streams.
+        seed: Seed of the initial states, which differ from those of an environment made with this seed. By default the
+            worlds continue their random streams.
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:
-        ValueError: The task has no horizon, the environment was made with ``autoreset=False``, or its observations and
-            actions have other sizes than the policy's.
+        ValueError: The task has no horizon, the environment was made with ``autoreset=False``, or the policy does not
+            fit its observations and actions.
     """
     check_kind("env of evaluate", env, Env, "as lw.make(...) makes it")
     if not callable(policy):
@@ -113,7 +113,7 @@ def evaluate(
 
 
 def _first_actions(act: Callable[[torch.Tensor], torch.Tensor], env: Env) -> torch.Tensor:
-    """Actions of a policy, checked, because later ones are only copied."""
+    """Get a policy's first actions and check them; later actions are only copied."""
     try:
         action = act(env.obs)
     except RuntimeError as error:
@@ -129,12 +129,12 @@ ENDLESS_STEPS = 1000
 
 
 def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
-    """Make a few worlds of the same task for whole episodes; without a horizon, episodes are truncated at 1,000 steps.
+    """Make a few worlds of the same task for whole episodes. Tasks without a horizon get one of 1,000 steps.
 
     Args:
         env: The environment.
         nworld: Number of worlds.
-        changes: Options that differ; see ``Env.replicate``.
+        changes: Options to change; see ``Env.replicate``.
     """
     endless = {} if env.horizon else {"horizon": ENDLESS_STEPS}
     return env.replicate_few(nworld, **(endless | changes))
@@ -143,11 +143,11 @@ def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
 class MeanPolicyEvaluation:
     """Evaluates the mean policy during training in a separate environment with few worlds.
 
-    The initial states are the same each time and are not trained on, so that only the policy differs between two
-    evaluations. Rank 0 evaluates; all processes get its numbers.
+    The initial states are the same each time and are not used for training, so that evaluations differ only in the
+    policy. Rank 0 evaluates; all processes get its results.
 
     Args:
-        env: The environment of the training; each evaluation uses its current parameters.
+        env: The training environment; each evaluation uses its current parameters.
         episodes: Number of episodes.
         team: The processes.
     """
@@ -157,7 +157,7 @@ class MeanPolicyEvaluation:
         self._few: Env | None = None
 
     def __call__(self, policy: torch.nn.Module) -> dict[str, float]:
-        """Run the evaluation; returns means over the episodes, by their names in ``Iteration``."""
+        """Run the evaluation, and return means over the episodes by their names in ``Iteration``."""
         means = torch.zeros(len(MEAN_STATISTICS), dtype=torch.float64, device=self.env.obs.device)
         if self.team.leads:
             if self._few is None:

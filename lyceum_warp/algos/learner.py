@@ -1,4 +1,4 @@
-"""Define the interface of a learning algorithm, which training, run folders and export share."""
+"""Define the interface of learning algorithms, for training, run folders and export."""
 
 import abc
 import copy
@@ -14,10 +14,10 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
 
 METRIC_COLUMN, STEP_METRIC_COLUMN = "metrics/", "step_metrics/"
-"""Prefixes of the columns of a task's own metrics: sums over an episode, and means per step."""
+"""Prefixes of the columns of task metrics: sums over an episode, and means per step."""
 
 NESTED = ("metrics", "step_metrics", "numbers")
-"""Fields of ``Iteration`` with several numbers each."""
+"""Fields of ``Iteration`` that are dicts."""
 
 
 @document_attributes
@@ -35,7 +35,7 @@ class Iteration:
     reward_mean: float | None = None
     """Mean reward of a step, over all samples."""
     return_mean: float | None = None
-    """Mean return (sum of rewards) of the episodes that ended during sampling; nan if none ended."""
+    """Mean return (sum of rewards) of the episodes that ended during sampling; NaN if no episode ended."""
     return_std: float | None = None
     """Standard deviation of these returns."""
     return_min: float | None = None
@@ -49,9 +49,9 @@ class Iteration:
     eval_mean: float | None = None
     """Mean evaluation metric at the end of an episode."""
     success: float | None = None
-    """Share of the episodes that ended with the goal met; nan for tasks without ``success``."""
+    """Fraction of episodes that ended with the goal met; NaN for tasks without ``success``."""
     mean_return: float | None = None
-    """Mean return of the policy without noise, evaluated after the iteration; None in iterations without evaluation."""
+    """Mean return of the policy without noise, evaluated after the iteration; None if it was not evaluated."""
     mean_length: float | None = None
     """Mean length of the evaluated episodes, steps."""
     mean_terminal_reward: float | None = None
@@ -59,13 +59,13 @@ class Iteration:
     mean_eval: float | None = None
     """Mean evaluation metric at the end of the evaluated episodes."""
     mean_success: float | None = None
-    """Share of the evaluated episodes that ended with the goal met; None for tasks without ``success``."""
+    """Fraction of the evaluated episodes that ended with the goal met; None for tasks without ``success``."""
     metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Means over episodes of the task's metrics, each summed over an episode, by name."""
+    """The task's metrics by name, summed over each episode and averaged over episodes."""
     step_metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Means of the task's metrics per step, over all samples, by name. They do not depend on the length of episodes."""
+    """The task's metrics by name, averaged over all samples; independent of episode length."""
     numbers: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Additional numbers of the algorithm, by the names of their columns."""
+    """Additional numbers of the algorithm, by column name."""
 
     def row(self) -> dict[str, Any]:
         """Convert to a row of metrics.csv: numbers by column, without None.
@@ -83,7 +83,7 @@ class Learner(abc.ABC):
     """Base class of learning algorithms: an infinite iterator of ``Iteration``, which ``lw.train`` runs.
 
     A subclass sets ``algorithm``, ``policy`` and ``config``, and implements ``__next__``, which counts ``iteration``
-    and ``samples``. It extends ``state_dict`` and ``load_state_dict`` by any other state of the algorithm.
+    and ``samples``. It extends ``state_dict`` and ``load_state_dict`` by any additional state of the algorithm.
     docs/learners.md has an example.
 
     Args:
@@ -92,17 +92,17 @@ class Learner(abc.ABC):
         team: The processes that learn together, each with its share of the worlds; by default only this process.
 
     Raises:
-        ValueError: The environment does not reset automatically, its worlds are not this process's share, or the seed
-            is not a whole number.
+        ValueError: The environment does not reset automatically, ``first_world`` does not match this process's rank, or
+            the seed is not a whole number.
     """
 
     algorithm: str
-    """The name of the algorithm, under which a run's config.json holds the hyperparameters."""
+    """The name of the algorithm; the key of the hyperparameters in a run's config.json."""
     env: Env
     """The environment that provides the samples."""
     policy: torch.nn.Module
     """The policy after the last iteration. Its method ``act`` maps observations, (..., nobs), to actions without noise,
-    (..., nact), and includes the normaliser of observations. It has the attributes ``nobs`` and ``nact``."""
+    (..., nact), and normalises observations itself. It has the attributes ``nobs`` and ``nact``."""
     value: torch.nn.Module | None = None
     """The value function after the last iteration; None for algorithms without one."""
     config: Any
@@ -142,14 +142,14 @@ class Learner(abc.ABC):
         """Run one iteration: sample, update the policy, and evaluate it if due.
 
         Raises:
-            FloatingPointError: An update is not finite, so that learning cannot continue.
+            FloatingPointError: An update is not finite, so learning cannot continue.
         """
 
     @property
     def best_by(self) -> str:
-        """The return that selects a run's best policy and ends the run: "mean_return" or "return_mean".
+        """Which return selects the best policy and is compared with the target: "mean_return" or "return_mean".
 
-        "mean_return" belongs to the policy after the iteration, "return_mean" to the policy before it. The default is
+        "mean_return" describes the policy after the iteration, "return_mean" the policy before it. The default is
         "mean_return", or "return_mean" if the configuration has ``mean_every=0``.
         """
         return "return_mean" if getattr(self.config, "mean_every", None) == 0 else "mean_return"
@@ -175,13 +175,13 @@ class Learner(abc.ABC):
             state["value"] = self.value.state_dict()
         if self.generator is not None:
             state["generator"] = self.generator.get_state()
-        return copy.deepcopy(state)  # a module's own state_dict shares memory with its parameters
+        return copy.deepcopy(state)  # a module's state_dict shares memory with its parameters
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from a state of ``state_dict``; further iterations are equal to the bit.
+        """Resume from a state of ``state_dict``; the following iterations are identical bit for bit.
 
         Raises:
-            ValueError: The state has another number of worlds, or its counters are no numbers.
+            ValueError: The state has a different number of worlds, or its counters are not whole numbers.
         """
         nworld = self.env.nworld * self.team.size
         if len(state["env"]) != nworld:

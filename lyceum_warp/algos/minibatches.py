@@ -9,26 +9,26 @@ import torch
 from lyceum_warp.algos.distributed import Team, side_stream
 
 Samples = Mapping[str, torch.Tensor]
-"""Tensors by name, each with a row for each sample."""
+"""Tensors by name, each with one row per sample."""
 
 _SURE = 6.0
-"""Room for a process's samples in a mini-batch, in standard deviations above their mean number."""
+"""Capacity for a process's samples in a mini-batch, in standard deviations above their mean number."""
 
 
 class Minibatches:
-    """Shuffles the samples of a rollout once, and learns from the same mini-batches in every epoch.
+    """Shuffles a rollout's samples once, and learns from the same mini-batches in every epoch.
 
     The mini-batches do not depend on the number of processes: each process uses the samples of its own worlds, in a
     tensor of fixed size that is padded with rows of weight 0. The size is six standard deviations above the mean number
     of samples; excess samples are dropped.
 
     On a GPU the first epoch runs directly, which allocates Adam's moments. The second epoch is captured and then
-    replayed. Graphs hold addresses, so ``learn`` must update tensors in place.
+    replayed. Graphs store addresses, so ``learn`` must update tensors in place.
 
     Args:
         learn: Called with the process's samples of a mini-batch and their weights, (samples,), which sum to 1 over all
             processes.
-        steps: Steps of every world.
+        steps: Number of steps of every world.
         nworld: Worlds of this process.
         count: Number of mini-batches.
         team: The processes.
@@ -51,7 +51,7 @@ class Minibatches:
         self.forget()
 
     def forget(self) -> None:
-        """Drop the graph, because its tensors were replaced."""
+        """Discard the graph because its tensors were replaced."""
         self._warm = False
         self._graph: torch.cuda.CUDAGraph | None = None
 
@@ -106,7 +106,7 @@ class Minibatches:
 
 @contextlib.contextmanager
 def precision(*, tf32: bool) -> Iterator[None]:
-    """Run a block in which matrix products on a GPU may use TensorFloat-32."""
+    """Context in which matrix products on a GPU may use TensorFloat-32."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if tf32 else before)
     try:

@@ -1,6 +1,6 @@
-"""Update plans by model predictive path integral control (MPPI): weigh samples by the exponential of their returns.
+"""Update plans by model predictive path integral control (MPPI): weight samples by the exponential of their returns.
 
-Sample k of the planner (``planner.py``), with the return R_k, has the weight
+The planner's sample k (``planner.py``), with return R_k, has the weight
 
     w_k = exp((R_k - max R) / temperature) / sum_j exp((R_j - max R) / temperature),
 
@@ -18,7 +18,7 @@ class ExponentialWeights(PlanUpdate):
     """The update of MPPI.
 
     Args:
-        temperature: In units of reward.
+        temperature: Temperature of the weights, in units of reward.
     """
 
     capturable = True
@@ -27,7 +27,7 @@ class ExponentialWeights(PlanUpdate):
         self.temperature = temperature
 
     def weigh(self, samples: PlanSamples) -> None:
-        """Weigh by exp(return / temperature)."""
+        """Weight samples by exp(return / temperature)."""
         returns, weights = by_sample(samples.returns), by_sample(samples.weights)
         args = [returns, self.temperature, weights, wp.from_torch(samples.summary)]
         launch_blocks(planning.weigh, len(samples.returns), args)

@@ -1,4 +1,4 @@
-"""Sort the arguments of a planner into settings, options and parameters, and complete them from the task's planning."""
+"""Sort a planner's arguments into settings, options and parameters, with defaults from the task's ``planning``."""
 
 import contextlib
 import dataclasses
@@ -49,15 +49,15 @@ def planner_arguments(
     value: object,
     plants: int = 1,
 ) -> tuple[MPPIConfig, EnvOptions, dict[str, Any]]:
-    """Sort the arguments of a planner, and complete them from the task's ``planning``.
+    """Sort a planner's arguments, with defaults from the task's ``planning``.
 
     Args:
         task: The task.
         config: Settings that replace the task's.
-        words: The flat keyword arguments: single settings, options of the worlds, parameters of the task. A setting
+        words: The flat keyword arguments: individual settings, options of the worlds, parameters of the task. A setting
             of None is ignored.
         params: Parameters of the task.
-        value: The value function. With a value function, the parameters in ``planning`` are ignored.
+        value: The value function. If there is one, the parameters in ``planning`` are ignored.
         plants: Number of plants to plan for.
 
     Returns:
@@ -65,7 +65,7 @@ def planner_arguments(
         the parameters of the planner's worlds.
 
     Raises:
-        ValueError: A word is unknown or ambiguous, or a value is not valid.
+        ValueError: A keyword is unknown or ambiguous, or a value is not valid.
     """
     check_kind("config", config, MPPIConfig | None, "as lw.MPPIConfig(horizon=16)")
     check_kind("params", params, Mapping | None, "a dict of parameters of the task")
@@ -94,10 +94,10 @@ def planner_arguments(
 
 
 def plant_seeds(seed: int | Sequence[int], plants: int) -> Sequence[int]:
-    """Make a seed for each plant from the first plant's seed, or check a list of seeds.
+    """Derive each plant's seed from the first plant's seed, or check a list of seeds.
 
     Raises:
-        ValueError: A seed is not a whole number from 0, or there are too few or too many.
+        ValueError: A seed is not a non-negative whole number, or there are too few or too many.
     """
     given: Any = seed
     if isinstance(given, (np.ndarray, torch.Tensor)):
@@ -112,10 +112,10 @@ def plant_seeds(seed: int | Sequence[int], plants: int) -> Sequence[int]:
 
 @contextlib.contextmanager
 def explained_worlds(config: MPPIConfig, plants: int) -> Iterator[None]:
-    """Name the settings that determine the number of worlds, if the worlds made in this block do not fit into memory.
+    """If the worlds made in this block do not fit into memory, name the settings that determine their number.
 
     Raises:
-        NotEnoughMemoryError: They do not fit.
+        NotEnoughMemoryError: The worlds do not fit.
     """
     try:
         yield
@@ -125,7 +125,7 @@ def explained_worlds(config: MPPIConfig, plants: int) -> Iterator[None]:
 
 
 def plain(value: Any) -> Any:
-    """Convert a setting, an option or a parameter to what JSON can hold."""
+    """Convert a setting, an option or a parameter to a JSON value."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, Mapping):
@@ -148,7 +148,7 @@ _OWN_OPTIONS = {
     "seed": "every sample starts from the state to plan from",
     "first_world": "its worlds are all the samples that there are",
 }
-"""Options that the planner sets in its worlds, each with the reason."""
+"""Options that the planner sets itself, each with the reason."""
 
 
 def _check_options(options: Mapping[str, Any]) -> None:

@@ -32,54 +32,55 @@ class MPPIConfig:
     horizon: int = 32
     """Number of steps in a plan."""
     samples: int = 64
-    """Number of samples for each improvement of the plan; each is rolled out in one world for each model."""
+    """Number of samples per improvement of the plan. Each sample is rolled out in one world per model."""
     update: Literal["mppi", "cem", "predictive_sampling"] | PlanUpdate = "mppi"
-    """How samples become the new plan: by their mean with weights exp(return / temperature) ("mppi"), the mean of the
+    """How samples determine the new plan: their mean with weights exp(return / temperature) ("mppi"), the mean of the
     best samples ("cem", the cross-entropy method), the best sample ("predictive_sampling"), or a ``PlanUpdate``."""
     temperature: float = 0.1
-    """Temperature of MPPI's weights, in units of reward. Low temperatures follow the best sample, high temperatures
+    """Temperature of MPPI's weights, in units of reward. Low temperatures follow the best sample; high temperatures
     average all samples."""
     elites: int | None = None
-    """Number of samples that CEM fits to. None means a tenth of the samples, but at least two."""
+    """Number of best samples that CEM fits. None means a tenth of the samples, but at least two."""
     noise: Numbers = 0.5
     """Noise that is added to the plan, in units of the action: a standard deviation, one for each action, or a
-    covariance, (nact, nact). CEM starts with these standard deviations and adapts them."""
+    covariance, (nact, nact). CEM starts from these standard deviations and adapts them."""
     min_noise: float | Sequence[float] | None = None
     """Lower limit of CEM's adapted standard deviations, one number or one for each action. None means a tenth of
     ``noise``."""
     include_plan: bool | None = None
-    """Whether the first sample is the plan itself, without noise. None means True if there are several samples and the
-    update does not adapt the noise, as CEM does."""
+    """Whether the first sample is the plan itself, without noise. None means True, except with a single sample or an
+    update that adapts the noise, as CEM does."""
     smoothing: tuple[float, float, float] = (0.25, 0.8, 0.0)
     """Weights (b0, b1, b2) that smooth the noise n over time: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) from the third
-    step on. (1, 0, 0) is white noise. Noise of knots is not smoothed."""
+    step on. (1, 0, 0) is white noise. The noise of knots is not smoothed."""
     knots: int | None = None
-    """Number of knots over the horizon if the plan is a spline: noise is added to the knots, and the actions of all
-    steps are interpolated. None means that the plan has separate actions for each step."""
+    """Number of spline knots over the horizon: noise is added to the knots, and the actions are interpolated between
+    them. None means a separate action for each step."""
     spline: Literal["zero", "linear", "cubic"] = "cubic"
-    """Interpolation between knots: piecewise constant ("zero"), piecewise linear ("linear"), or a cubic Hermite spline
+    """Interpolation between knots: piecewise constant ("zero"), piecewise linear ("linear"), or cubic Hermite
     ("cubic")."""
     discount: float | None = None
-    """Discount factor of rewards and of the terminal value. None means the value function's discount, or else 1."""
+    """Discount factor of rewards and of the terminal value. None means the value function's discount, or 1 without
+    one."""
     iterations: int = 1
     """Number of improvements of the plan in each call."""
     fill: str | Numbers = "zero"
-    """Actions at the end of a plan that is shifted: "zero" (the action nearest to zero), "repeat" (the last action), or
-    an action, given as one number or one for each element."""
+    """Actions that fill the end of a shifted plan: "zero" (the action nearest to zero), "repeat" (the last action), or
+    a given action, as one number or one per element."""
     termination: Literal["stop", "ignore"] = "stop"
     """Whether a sample's return ends with its episode ("stop"), or continues to the horizon ("ignore", as in Lyceum and
     trajopt)."""
     nominal_model: bool = False
-    """Whether samples use the nominal values of per-world model fields; by default they use the values in the state to
-    plan from."""
+    """Whether samples use the nominal values of per-world model fields; by default they use the values in the given
+    state."""
     models: int = 1
-    """Number of models in which each sample is rolled out. With several models, the planner draws their model fields
-    with the task's ``startup``, ``initialize`` and ``randomize``, and ignores the values in the state."""
+    """Number of models in which each sample is rolled out. With several models, the planner randomizes their model
+    fields with the task's ``startup``, ``initialize`` and ``randomize``, and ignores the values in the state."""
     risk: Literal["mean", "worst"] = "mean"
-    """The return of a sample in several models: the mean or the smallest of its returns."""
+    """How the returns of a sample in several models are combined: their mean or the smallest."""
 
     def __post_init__(self) -> None:
-        """Check what does not depend on the task."""
+        """Check the settings independently of a task."""
         checked: dict[str, Any] = {
             name: whole_number(name, getattr(self, name), low=1) for name in ("horizon", "samples", "models")
         }
@@ -112,13 +113,13 @@ class MPPIConfig:
             raise ValueError(f"risk={self.risk!r} compares models: give their number, as models=4")
         if checked["models"] > 1 and self.nominal_model:
             raise ValueError(
-                f"models={checked['models']} draws model fields, and nominal_model=True does not: leave out one of them"
+                f"models={checked['models']} draws model fields, and nominal_model=True does not: omit one of them"
             )
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 
     def changed(self, settings: Mapping[str, Any]) -> "MPPIConfig":
-        """Copy with changed settings. A change of the update resets the settings of the old update to their defaults.
+        """Copy with changed settings. Changing the update resets settings specific to the old update to their defaults.
 
         Raises:
             ValueError: A value is of the wrong type or out of range.
@@ -128,7 +129,7 @@ class MPPIConfig:
         return dataclasses.replace(self, **words)
 
     def completed(self, value: object = None) -> "MPPIConfig":
-        """Copy with defaults for the settings that are None, except ``knots`` and settings that the update ignores.
+        """Copy with None replaced by defaults, except in ``knots`` and in settings that the update ignores.
 
         Args:
             value: The planner's value function; its ``discount``, if it has one, is the default.
@@ -161,7 +162,7 @@ class MPPIConfig:
         """Lower Cholesky factor of the noise's covariance, (nact, nact).
 
         Raises:
-            ValueError: ``noise`` has another number of actions.
+            ValueError: The size of ``noise`` does not match.
         """
         noise = np.asarray(self.noise)
         if noise.shape in ((), (nact,)):
@@ -182,7 +183,7 @@ class MPPIConfig:
         """The action that fills the end of a plan and the whole initial plan, clipped to the bounds, (nact,).
 
         Raises:
-            ValueError: ``fill`` has another number of actions.
+            ValueError: The size of ``fill`` does not match.
         """
         fill = np.asarray(0.0 if isinstance(self.fill, str) else self.fill)
         if fill.shape not in ((), (space.size,)):
@@ -208,7 +209,7 @@ def _array(value: Any) -> np.ndarray | None:
 
 
 def _tuples(array: np.ndarray) -> Any:
-    """Convert an array to a float or to tuples, which a frozen dataclass can compare and hash."""
+    """Convert an array to a float or to tuples, which can be compared and hashed."""
     return array.item() if array.ndim == 0 else tuple(map(_tuples, array))
 
 
@@ -240,7 +241,7 @@ def _smoothing(smoothing: Any) -> Any:
     if array is None or array.shape != (3,):
         raise ValueError(f"smoothing must be 3 finite numbers, not {smoothing!r}")
     b0, b1, b2 = array.tolist()
-    # stability triangle of a second-order filter, whose poles are the roots of z^2 - b1 z - b2
+    # the stability triangle of a second-order filter; its poles are the roots of z^2 - b1 z - b2
     if not (abs(b2) < 1 and abs(b1) < 1 - b2):
         raise ValueError(
             f"smoothing {(b0, b1, b2)} is unstable: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) must have its poles inside "

@@ -1,4 +1,4 @@
-"""Compute the vanilla gradient, products with the Fisher information, and conjugate gradient."""
+"""Compute the vanilla policy gradient, products with the Fisher information matrix, and conjugate gradient."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -17,7 +17,7 @@ def score_gradient(
     *,
     dense: DensePolicy | None = None,
 ) -> torch.Tensor:
-    """Gradient of sum(weight * log pi(action | obs)) with respect to the policy's trainable parameters, (parameters,).
+    """Gradient of sum(weight * log pi(action | obs)) with respect to the trainable parameters, (parameters,).
 
     Args:
         policy: The policy.
@@ -82,7 +82,7 @@ class FisherProduct:
         ]
         log_std_part = vector if self.log_std_at is None else parts.pop(self.log_std_at)
         pulled = self.jacobian.pull(self.jacobian.push(parts) * self.precision)
-        if self.log_std_at is not None:  # not a sum over samples: each process contributes an equal part
+        if self.log_std_at is not None:  # not a sum over samples, so each process contributes an equal part
             pulled.insert(self.log_std_at, 2.0 / self.team.size * log_std_part)
         return self.team.sum(flatten(pulled)) + self.damping * vector
 
@@ -90,7 +90,7 @@ class FisherProduct:
 class AutogradJacobian:
     """Products with the Jacobian J = d mean / d parameters of any network, by autograd.
 
-    J v is the derivative of the linear map u -> J^T u, so both products are backward passes through graphs that are
+    J v is the derivative of u^T J v with respect to u, so both products are backward passes through graphs that are
     built once.
 
     Args:
@@ -117,8 +117,8 @@ def conjugate_gradient(
 ) -> torch.Tensor:
     """Solve product(x) = target for a symmetric positive definite product, from x = 0.
 
-    The number of iterations is fixed and nothing branches on values, so nothing waits for the device. Steps are zero
-    once the residual vanishes.
+    The number of iterations is fixed and no branch depends on values, so the host never waits for the device. Steps are
+    zero once the residual vanishes.
     """
     x = torch.zeros_like(target)
     residual = target.clone()

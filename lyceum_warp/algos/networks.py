@@ -27,14 +27,14 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {
 
 
 def check_memory(sizes: Sequence[int], **arguments: Any) -> None:
-    """Check that the weights of a fully connected network fit into the machine's memory.
+    """Check that the weights of a fully connected network fit into memory.
 
     Args:
         sizes: Widths of all layers, including input and output.
-        arguments: The arguments that they follow from, for the message.
+        arguments: The arguments that determine the sizes, for the message.
 
     Raises:
-        ValueError: They do not fit.
+        ValueError: The weights do not fit.
     """
     needed, free = 4 * sum(n * m + m for n, m in itertools.pairwise(sizes)), free_memory(wp.get_device("cpu"))
     if free is not None and needed > free:
@@ -54,7 +54,7 @@ def mlp(
     Args:
         sizes: Widths of all layers, including input and output.
         activation: Activation after each layer except the last.
-        last_scale: Factor of the last layer's initial weights.
+        last_scale: Factor on the last layer's initial weights.
         generator: Draws the initial weights.
 
     Raises:
@@ -96,8 +96,8 @@ class Normalizer(nn.Module):
     """Normalises observations by their running mean and variance; the identity before the first update.
 
     Args:
-        size: Numbers in an observation.
-        limit: Normalised values are clipped to plus and minus this; inf for no limit.
+        size: Length of an observation.
+        limit: Normalised values are clipped to [-limit, limit]; inf for no limit.
     """
 
     count: torch.Tensor
@@ -138,7 +138,7 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def interpolate(self, before: _Applied, after: _Applied, part: torch.Tensor) -> None:
-        """Apply a fraction of an update to ``shift`` and ``scale``; mean and variance keep the whole update.
+        """Apply a fraction of an update to ``shift`` and ``scale``; mean and variance include the whole update.
 
         Args:
             before: ``shift`` and ``scale`` before the update.
@@ -167,7 +167,7 @@ class Normalized(nn.Module):
         self.normalizer = Normalizer(nobs, limit) if normalize else nn.Identity()
 
     def observe(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
-        """Update the normaliser, if there is one; this changes the outputs.
+        """Update the normaliser, if there is one; this changes the module's outputs.
 
         Args:
             obs: Observations, (..., nobs).

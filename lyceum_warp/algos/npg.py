@@ -1,8 +1,8 @@
 """Learn policies by natural policy gradient (NPG).
 
-The algorithm of Kakade (2002), in the form of Rajeswaran et al. (2017, "Towards Generalization and Simplicity in
-Continuous Control"): generalised advantages, the vanilla gradient, conjugate gradient on the Fisher information, and a
-step of fixed length in the Fisher metric.
+The algorithm of Kakade (2002), as in Rajeswaran et al. (2017, "Towards Generalization and Simplicity in Continuous
+Control"): generalised advantages, the vanilla policy gradient, conjugate gradient on the Fisher information, and a step
+of fixed length in the Fisher metric.
 """
 
 import copy
@@ -40,13 +40,13 @@ _SHORTER = 4
 """Maximum number of times that a step, or a change of the normaliser, is shortened."""
 
 _LARGEST = 1e30
-"""Bound of rewards, so that float32 can represent the sum of an episode's rewards."""
+"""Bound on rewards, so that float32 can represent the sum of an episode's rewards."""
 
 _PATIENCE = 10
-"""Number of consecutive iterations with a non-finite update after which learning ends."""
+"""Learning ends after this number of consecutive iterations with a non-finite update."""
 
 _DRIFT = 0.2
-"""Largest share of the wanted KL divergence that an update of the normaliser may cause."""
+"""Maximum KL divergence caused by an update of the normaliser, as a fraction of the desired KL divergence."""
 
 
 @document_attributes
@@ -69,7 +69,7 @@ class NPG(OnPolicyLearner):
     Raises:
         ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy
             cannot be learned (``lyceum_warp.algos.policy_check``).
-        FloatingPointError: In 10 consecutive iterations, the policy's step or the value function's fit was not finite.
+        FloatingPointError: The policy's step or the value function's fit was not finite in 10 consecutive iterations.
             Such updates are skipped and counted in ``NPGIteration.skipped_updates``.
     """
 
@@ -79,7 +79,7 @@ class NPG(OnPolicyLearner):
     config: NPGConfig
     """Hyperparameters."""
     segments: bool
-    """Whether iterations continue the episodes of the last iteration, instead of starting new ones."""
+    """Whether iterations continue the last iteration's episodes instead of starting new ones."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class NPG(OnPolicyLearner):
         scale = 1.0 / max(1.0 - config.gamma, 1e-3)
         self._make_networks(policy, value, scale=scale, time_orders=config.time_orders)
 
-        # on the CPU, in one process, branching on a tensor needs no synchronisation
+        # on the CPU with one process, branching on a tensor needs no synchronisation
         self._reads_numbers = device.type == "cpu" and team.size == 1
 
         # samples
@@ -142,19 +142,19 @@ class NPG(OnPolicyLearner):
         obs, value_obs = rollout.obs.flatten(0, 1), rollout.obs_groups[self.value.group].flatten(0, 1)
         old_mean = self.observe(obs)
 
-        # 3. Advantages, from the value function before its fit to these samples.
+        # 3. Compute advantages with the value function before it is fitted to these samples.
         advantage, target, prediction, outliers = self.advantages()
 
-        # 4. Vanilla gradient of E[log pi(a|s) A(s, a)].
+        # 4. Compute the vanilla gradient of E[log pi(a|s) A(s, a)].
         action = rollout.action.flatten(0, 1)
         weight = advantage.flatten() / self.count
         gradient = team.sum(score_gradient(self.policy, obs, action, weight, dense=self._dense))
         timer.mark()
 
-        # 5. Natural gradient x = F^-1 g, and the step x sqrt(delta / (g.x)), so that step.F.step = delta.
+        # 5. Compute the natural gradient x = F^-1 g, and the step x sqrt(delta / (g.x)), so that step.F.step = delta.
         fisher = self.fisher(obs)
 
-        # 6. Fit the value function to the returns of these samples, on two CPU threads in parallel with 5. Its
+        # 6. Fit the value function to the returns of these samples; with two CPU threads, in parallel with 5. Its
         # normaliser is updated just before, so that the fit corrects the effect on its predictions.
         self.value.observe(value_obs, team)
         fit = functools.partial(self.fit, value_obs, rollout.step.flatten(), target.flatten(), self.generator)
@@ -196,7 +196,7 @@ class NPG(OnPolicyLearner):
         )
 
     def _check_updates(self, update: UpdateNumbers) -> None:
-        """End learning after too many consecutive iterations with a non-finite update."""
+        """Raise an error after too many consecutive iterations with a non-finite update."""
         parts = {"the step of the policy": update.finite, "the fit of the value function": update.fitted}
         skipped = [part for part, finite in parts.items() if not finite]
         self._skipping = self._skipping + 1 if skipped else 0
@@ -204,7 +204,7 @@ class NPG(OnPolicyLearner):
             last, self._skipping = self.iteration + 1, 0
             raise FloatingPointError(
                 f"{' and '.join(skipped)} in iteration {last} {'are' if len(skipped) > 1 else 'is'} not finite, as in "
-                f"the {_PATIENCE - 1} iterations before it, whose updates were left out. "
+                f"the {_PATIENCE - 1} iterations before it, whose updates were skipped. "
                 f"{self.rollout.explain_not_finite()}"
             )
 
@@ -220,14 +220,14 @@ class NPG(OnPolicyLearner):
     def advantages(self) -> tuple[torch.Tensor, torch.Tensor, ValueSums, torch.Tensor]:
         """Compute generalised advantages and discounted returns of the rollout.
 
-        Returns bootstrap from the value function at time limits and at the end of the rollout. The value of a terminal
-        state is 0 (as in mjrl; Lyceum bootstraps there, too). The returns set the value function's scale, and
+        Returns bootstrap from the value function at time limits and at the end of the rollout. Terminal states have
+        value 0 (as in mjrl; Lyceum also bootstraps there). The returns determine the value function's scale, and
         advantages are clipped to ten times this scale, so that a single extreme reward dominates neither the gradient
         nor the fit.
 
         Returns:
             Advantages, (steps, nworld), divided by a power of two close to the value function's scale; returns, (steps,
-            nworld); the error of the predicted returns; and the number of clipped advantages.
+            nworld); error statistics of the predicted returns; and the number of clipped advantages.
         """
         rollout, config, team = self.rollout, self.config, self.team
         value = self.predict(rollout.obs_groups[self.value.group], rollout.step)
@@ -249,7 +249,7 @@ class NPG(OnPolicyLearner):
         return advantage, target, prediction, outliers
 
     def predict(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Predict returns, (...,); the mean of the last returns replaces a non-finite prediction.
+        """Predict returns, (...,); non-finite predictions are replaced by the mean of the last returns.
 
         Args:
             obs: Observations, (..., nobs).
@@ -260,10 +260,10 @@ class NPG(OnPolicyLearner):
 
     @torch.no_grad()
     def observe(self, obs: torch.Tensor) -> torch.Tensor:
-        """Update the normaliser of the policy's observations, with a bounded effect on the policy.
+        """Update the normaliser of the policy's observations, but limit the change of the policy.
 
-        An update that would change the policy by more than a fifth of the wanted KL divergence is applied in part;
-        later iterations apply the rest. The KL divergence of the iteration includes this change.
+        An update that would change the policy by more than a fifth of the desired KL divergence is applied in part;
+        later iterations apply the rest. The iteration's KL divergence includes this change.
 
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
@@ -283,7 +283,7 @@ class NPG(OnPolicyLearner):
                 square = (old_mean - mean(obs)).square()
                 kl = 0.5 * (square * torch.exp(-2 * self.policy.log_std)).sum(-1).mean()
                 kl = self.team.sum(kl) / self.team.size
-                if self._reads_numbers and kl <= limit:  # further rounds would not change it
+                if self._reads_numbers and kl <= limit:  # more rounds would change nothing
                     break
                 part = torch.where(kl <= limit, part, part * (limit / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5))
             normalizer.interpolate(before, after, part)
@@ -300,7 +300,7 @@ class NPG(OnPolicyLearner):
             subset = torch.randperm(self.count, generator=self.generator, device=obs.device)[: self._fisher_count]
             if self.team.size == 1:
                 obs = obs[subset]
-            else:  # selecting own samples would synchronise with the device, so others get the weight 0
+            else:  # selecting own samples would synchronise with the device, so other samples get weight 0
                 places, own = self.team.locate(subset, self.env.nworld)
                 obs, weight = obs[places], own.float()
         return FisherProduct(
@@ -312,12 +312,12 @@ class NPG(OnPolicyLearner):
     def move(
         self, step: torch.Tensor, obs: torch.Tensor, old_mean: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Add a step, or a fraction of it, to the policy's parameters.
+        """Add a step, or a fraction of it, to the policy's parameters, within the limit of the KL divergence.
 
-        The Fisher information approximates the KL divergence to second order, on a subset of the samples. If the
-        measured divergence exceeds its limit, the step is shortened by the second-order estimate and at least by half,
-        up to four times. The policy is left unchanged if that is not enough, or if the step is not finite. Nothing
-        waits for the device.
+        The Fisher information approximates the KL divergence only to second order and on a subset of the samples. If
+        the measured divergence exceeds its limit, the step is shortened by the second-order estimate, at least by half,
+        up to four times. If that is not enough, or if the step is not finite, the policy does not change. The host does
+        not wait for the device.
 
         Args:
             step: The step, (parameters,).
@@ -325,8 +325,8 @@ class NPG(OnPolicyLearner):
             old_mean: The mean actions of the policy that sampled, (samples, nact).
 
         Returns:
-            Whether the step and the divergence are finite; the fraction of the step that was made; and the KL
-            divergence from the old policy to the new one, averaged over the samples of all processes.
+            Whether the step and the divergence are finite; the fraction of the step that was applied; and the KL
+            divergence from the old to the new policy, averaged over the samples of all processes.
         """
         wanted = 0.5 * self.config.delta
         limit = self.config.kl_limit * wanted + 1e-6  # margin for rounding
@@ -350,7 +350,7 @@ class NPG(OnPolicyLearner):
         fraction = finite.float()
         for _ in range(_SHORTER):
             kl = measured(fraction)
-            if self._reads_numbers and kl <= limit:  # further rounds would not change it
+            if self._reads_numbers and kl <= limit:  # more rounds would change nothing
                 break
             factor = (wanted / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5)
             fraction = torch.where(kl <= limit, fraction, fraction * factor)

@@ -15,8 +15,9 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 _LONG_EPISODE = 20
-"""Number of iterations in an episode above which restarts are on by default. On some seeds of hopper, NPG's return
-stayed low for long with 63 and 31 iterations, but not with 16 (bench/README.md, "NPG's learning curves")."""
+"""Restarts are on by default if an episode spans more iterations than this. On hopper with some seeds, NPG's return
+stayed low for a long time with 63 and 31 iterations per episode, but not with 16 (bench/README.md, "NPG's learning
+curves")."""
 
 
 @document_attributes
@@ -29,35 +30,35 @@ class NPGConfig:
     """
 
     samples: int | None = None
-    """Samples in an iteration, rounded up to whole steps of all worlds. The default is the paper's 10,000, or 16 steps
-    of every world if that is more."""
+    """Samples per iteration, rounded up to whole steps of all worlds. The default is the paper's 10,000, or 16 steps of
+    every world if that is more."""
     rollout: Literal["auto", "episodes", "segments"] = "auto"
-    """"episodes" starts new episodes in every iteration, as in the paper; "segments" continues the episodes of the last
-    iteration, for many worlds with few steps each; "auto" selects "episodes" if samples / worlds >= horizon."""
+    """"episodes" starts new episodes in every iteration, as in the paper; "segments" continues the last iteration's
+    episodes, for many worlds with few steps each; "auto" selects "episodes" if samples / worlds >= horizon."""
     min_restarts: float | None = None
-    """With segments and a time limit, the minimum number of worlds that start an episode in each iteration, as a
-    multiple of samples / horizon, the average without early ends. If fewer worlds started an episode in the last
-    iteration, random worlds are restarted. Otherwise worlds that started together reach the time limit together, and
-    few samples in between show how episodes begin. Interrupted episodes are not counted in the statistics, so that
-    values well above 1 bias ``return_mean`` towards short episodes. 0 turns restarts off. The default is 0.5 if an
-    episode lasts longer than 20 iterations (as with 205 or more worlds, 1,000 steps and the default samples), and 0
-    otherwise."""
+    """With segments and a time limit: the minimum number of worlds that start an episode in each iteration, as a
+    multiple of samples / horizon, which is the average number if no episode ends early. If fewer worlds started an
+    episode in the last iteration, random worlds are restarted. Without restarts, worlds that started together reach the
+    time limit together, and in between few samples come from the start of an episode. Interrupted episodes are not
+    counted in the statistics, so values well above 1 bias ``return_mean`` towards short episodes. 0 turns restarts off.
+    The default is 0.5 if an episode lasts longer than 20 iterations (as with 205 or more worlds, 1,000 steps and the
+    default samples), and 0 otherwise."""
     gamma: float = 0.995
     """Discount factor."""
     lam: float = 0.97
     """Lambda of the generalised advantage estimate."""
     delta: float = 0.1
-    """Squared length of a step in the Fisher metric: twice the KL divergence between the old and the new policy."""
+    """Squared step length in the Fisher metric: twice the KL divergence between the old and the new policy."""
     whiten: bool = True
     """Whether to normalise advantages to mean 0 and standard deviation 1 (as in mjrl, unlike Lyceum)."""
     cg_iterations: int = 10
-    """Iterations of conjugate gradient."""
+    """Number of conjugate gradient iterations."""
     damping: float = 1e-4
     """Damping, added to the diagonal of the Fisher information (as in mjrl, unlike Lyceum)."""
     fisher_fraction: float = 1.0
-    """Fraction of the samples for the Fisher information, drawn at random in each iteration."""
+    """Fraction of the samples used for the Fisher information, drawn at random in each iteration."""
     kl_limit: float = 1.5
-    """Largest KL divergence of a step, as a multiple of its second-order value delta / 2. Longer steps are
+    """Maximum KL divergence of a step, as a multiple of its second-order value delta / 2. Larger steps are
     shortened."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the policy's hidden layers."""
@@ -76,8 +77,8 @@ class NPGConfig:
     value_epochs: int = 2
     """Epochs of the value function's fit."""
     value_batch: int | None = None
-    """Mini-batch size of the value function's fit; by default 1/256 of all samples, but at least the paper's 64, so
-    that the number of steps is bounded."""
+    """Mini-batch size of the value function's fit; by default 1/256 of all samples, which bounds the number of steps,
+    but at least the paper's 64."""
     value_rate: float = 1e-3
     """Learning rate of the value function's fit (Adam)."""
     time_orders: int = 0
@@ -99,12 +100,12 @@ class NPGConfig:
 
 
 def enough_samples(config: NPGConfig, nworld: int) -> int:
-    """Samples in an iteration, given the worlds of all processes."""
+    """Samples per iteration; ``nworld`` counts the worlds of all processes."""
     return max(10_000, 16 * nworld) if config.samples is None else config.samples
 
 
 def least_restarts(config: NPGConfig, nworld: int, steps: int, horizon: int) -> int:
-    """Minimum number of worlds that start an episode in an iteration, of all processes.
+    """Minimum number of worlds, over all processes, that start an episode in an iteration.
 
     Args:
         config: The hyperparameters.

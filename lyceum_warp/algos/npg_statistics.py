@@ -24,13 +24,14 @@ from lyceum_warp.support.docstrings import document_attributes
 class NPGIteration(OnPolicyIteration):
     """Statistics of one iteration of NPG.
 
-    Numbers about episodes cover the episodes that ended in the iteration; they are nan if none ended.
+    Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended.
     """
 
     step_norm: float
     """Euclidean norm of the full step in the policy's parameters."""
     step_fraction: float
-    """Fraction of the full step that was made; less than 1 if the full step exceeded the limit of the KL divergence."""
+    """Fraction of the full step that was applied; less than 1 if the full step exceeded the limit of the KL
+    divergence."""
     gradient_norm: float
     """Euclidean norm of the vanilla policy gradient."""
     value_error: float
@@ -40,17 +41,17 @@ class NPGIteration(OnPolicyIteration):
     outliers: int
     """Number of samples whose advantage was clipped to ten standard deviations of the returns."""
     skipped_updates: int
-    """Number of non-finite updates that were skipped: the policy's step, the value function's fit."""
+    """Number of updates that were skipped because they were not finite (policy step, value function fit), 0 to 2."""
     time_gradient: float
     """Seconds for advantages and the vanilla gradient."""
     time_solve: float
     """Seconds for conjugate gradient and the step."""
     time_value: float
-    """Seconds for the value function's fit; on two CPU threads, without the part that overlaps ``time_solve``."""
+    """Seconds for the value function's fit; with two CPU threads, without the time that overlaps ``time_solve``."""
 
 
 class UpdateNumbers(NamedTuple):
-    """The policy's update, under the names of ``NPGIteration``."""
+    """Numbers about the update, named as in ``NPGIteration``."""
 
     # equal in all processes
     finite: Scalar  # whether the step is finite
@@ -59,7 +60,7 @@ class UpdateNumbers(NamedTuple):
     step_fraction: Scalar
     gradient_norm: Scalar
     std_mean: Scalar
-    # of the process's own samples
+    # over the process's own samples
     reward: Scalar
     faults: Scalar
     outliers: Scalar
@@ -83,15 +84,15 @@ class ProcessNumbers(NamedTuple):
     values: ValueSums
     episodes: EpisodeSums
     metrics: tuple[Scalar, ...] = ()
-    """The numbers of ``metric_sums``."""
+    """The result of ``metric_sums``."""
 
     def pack(self) -> torch.Tensor:
-        """Pack all numbers into one float64 tensor, for a single transfer to other processes and to the host."""
+        """Pack all numbers into one float64 tensor, to transfer them in one copy to other processes and to the host."""
         return torch.stack([number.double() for part in self for number in part])
 
     @classmethod
     def unpack(cls, numbers: Iterable[float]) -> "ProcessNumbers":
-        """Unpack the numbers of ``pack``, as floats on the host."""
+        """Unpack the result of ``pack``, as floats on the host."""
         rest = iter(numbers)
         return cls(
             update=UpdateNumbers(*itertools.islice(rest, len(UpdateNumbers._fields))),
@@ -102,7 +103,7 @@ class ProcessNumbers(NamedTuple):
 
 
 def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> ValueSums:
-    """Compute the moments of returns and of prediction errors, scalar tensors on their device."""
+    """Compute the moments of returns and of prediction errors, as scalar tensors on the device."""
     target, error = returns.double(), (returns - predicted).double()
     return ValueSums(
         return_mean=(return_mean := target.mean()),
@@ -116,7 +117,7 @@ def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence
     """Summarise the numbers of all processes, by their names in ``NPGIteration``.
 
     Args:
-        processes: The numbers of each process, as floats.
+        processes: Each process's numbers, as floats.
         samples: Samples of each process.
         metrics: Names of the task's metrics.
     """
@@ -140,7 +141,7 @@ def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence
 
 
 def value_statistics(sums: Sequence[ValueSums], samples: int) -> dict[str, float]:
-    """Compute ``value_error`` and ``explained_variance`` from the sums of all processes with ``samples`` each."""
+    """Compute ``value_error`` and ``explained_variance`` from the sums of all processes of ``samples`` samples each."""
     n, mean, square = pooled([Moments(samples, part.return_mean, part.return_square) for part in sums])
     _, error_mean, error_square = pooled([Moments(samples, part.error_mean, part.error_square) for part in sums])
     error, size = error_square + n * error_mean**2, square + n * mean**2

@@ -1,4 +1,4 @@
-"""Share networks, rollouts, advantages, evaluation and checkpoints between NPG and PPO."""
+"""Implement what NPG and PPO share: networks, rollouts, advantages, evaluation and checkpoints."""
 
 import dataclasses
 import math
@@ -33,17 +33,17 @@ class OnPolicyLearner(Learner):
     config_type: ClassVar[type]
     """The class of the hyperparameters."""
     twice: ClassVar[bool]
-    """Whether the policy must be differentiable twice."""
+    """Whether the policy must be twice differentiable."""
     policy: GaussianPolicy
     """The policy that is learned."""
     value: ValueFunction
     """The value function."""
     generator: torch.Generator
-    """The random generator of the noise and of the order of samples."""
+    """The random generator for the noise and the order of samples."""
     rollout: Rollout
     """The samples of the last iteration."""
     count: int
-    """Samples in an iteration, of all processes."""
+    """Samples per iteration, over all processes."""
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class OnPolicyLearner(Learner):
         limit: float = LIMIT,
         as_torch: bool = False,
     ) -> None:
-        """Take the given networks or make new ones, and make the generator."""
+        """Set the networks, given or new, and the generator."""
         env, config, device = self.env, self.config, self.env.obs.device
         nobs, nact = env.obs_space.size, env.action_space.size
         group = value_group(env, config.value_group) if value is None else value.group
@@ -117,7 +117,7 @@ class OnPolicyLearner(Learner):
         return self._advantage, self._return
 
     def _with_mean_policy(self, statistics: dict[str, Any]) -> dict[str, Any]:
-        """Add statistics of the mean policy, evaluated every ``mean_every`` iterations, to those of the samples."""
+        """Add statistics of the mean policy, which is evaluated every ``mean_every`` iterations."""
         every = self.config.mean_every
         mean: dict[str, Any] = dict.fromkeys(MEAN_STATISTICS)
         if every and self.iteration % every == 0:

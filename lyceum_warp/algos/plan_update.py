@@ -1,7 +1,7 @@
-"""Define the contract of a plan's update: it weighs the samples, and may fit parameters to them.
+"""Define the interface of plan updates, which weight the samples and may fit parameters to them.
 
-The planner (``planner.py``) rolls the samples out and averages them by the weights. ``mppi.py``, ``cem.py`` and
-``predictive_sampling.py`` are three updates.
+The planner (``planner.py``) rolls out the samples and computes their weighted mean. ``mppi.py``, ``cem.py`` and
+``predictive_sampling.py`` implement three updates.
 """
 
 import abc
@@ -20,14 +20,14 @@ from lyceum_warp.support.docstrings import document_attributes
 class PlanSamples:
     """The samples of one improvement of the plans, which an update reads and writes.
 
-    Plans and samples have a row for each step of the horizon or, with knots, for each knot. All tensors are float32 on
-    the device of the planner's worlds, with fixed addresses: write into them.
+    Plans and samples have one row per step of the horizon or, with knots, per knot. All tensors are float32 on the
+    device of the planner's worlds, with fixed addresses: write into them.
     """
 
     returns: torch.Tensor
     """The samples' returns, (plants, samples); minus infinity for failed samples."""
     weights: torch.Tensor
-    """The samples' weights, (plants, samples), written by ``weigh``; they add up to 1 for each plant."""
+    """The samples' weights, (plants, samples), written by ``weigh``; they sum to 1 for each plant."""
     actions: torch.Tensor
     """The samples, (rows, plants, samples, nact)."""
     nominal: torch.Tensor
@@ -41,7 +41,7 @@ class PlanSamples:
     """Standard deviations for the next improvement, written by ``fit``."""
     summary: torch.Tensor
     """Best return, mean return, effective number of samples and number of failed samples, (plants, 4). A capturable
-    update writes it in ``weigh``. If the best return is minus infinity, the plan is kept."""
+    update writes it in ``weigh``. If the best return is minus infinity, the plan does not change."""
 
 
 @document_attributes
@@ -49,16 +49,16 @@ class PlanUpdate(abc.ABC):
     """Base class of updates, which turn samples into the next plan: ``lw.Planner(task, update=MyUpdate(...))``.
 
     A subclass implements ``weigh``; the new plan is the weighted mean of the samples. It may also implement ``fit``,
-    for example to adapt the noise. Each planner uses a shallow copy of the given object, so that ``prepare`` may store
+    for example to adapt the noise. Each planner uses a shallow copy of the given object, so ``prepare`` may store
     buffers as attributes.
     """
 
     capturable: ClassVar[bool] = False
-    """Whether ``weigh`` and ``fit`` consist of Warp launches on arrays of fixed address, so that they become part of
-    the planner's graph. Otherwise they may use torch, and run between two graphs."""
+    """Whether ``weigh`` and ``fit`` consist of Warp launches on arrays at fixed addresses, so that they can be part of
+    the planner's graph. Otherwise they may use torch and run between two graphs."""
     adapts_noise: ClassVar[bool] = False
-    """Whether the noise has a standard deviation for each number of a plan. These are shifted in time with the plan,
-    and ``fit`` adapts them. Otherwise the planner's setting ``noise`` applies."""
+    """Whether the noise has a standard deviation for each element of a plan, which is shifted in time with the plan and
+    adapted by ``fit``. Otherwise the planner's setting ``noise`` applies."""
 
     def prepare(self, samples: PlanSamples) -> None:
         """Check sizes and allocate buffers; called once, when the planner is made."""
@@ -82,7 +82,7 @@ class PlanUpdate(abc.ABC):
 
 
 def by_sample(tensor: torch.Tensor) -> Any:
-    """Convert a tensor of ``PlanSamples`` to a Warp array in which one axis counts the samples of all plants."""
+    """Convert a tensor of ``PlanSamples`` to a Warp array, merging the axes of plants and samples."""
     plants = 0 if tensor.ndim == 2 else 1
     return wp.from_torch(tensor.flatten(plants, plants + 1))
 

@@ -1,27 +1,26 @@
-"""Plan by random rollouts: model predictive path integral control (MPPI), and two other updates of its plan.
+"""Plan by sampling rollouts: MPPI, CEM and predictive sampling.
 
-Each call improves a plan, a sequence of actions u_t, from the state that it is given:
+Each call improves a plan, a sequence of actions u_t, from a given state:
 
-1. shift: the plan of the last call moves forward in time, and its end is filled;
-2. perturb: sample k adds smoothed noise e_t^k to the plan and is clipped to the actions' bounds; it gets a random
-   stream of its own, for what the task draws in it;
-3. roll out: each sample earns the return R_k, its discounted rewards and the value of the state where it ends; in
+1. shift: move the last call's plan forward in time, and fill its end;
+2. perturb: sample k is the plan plus smoothed noise e_t^k, clipped to the actions' bounds. Each sample has its own
+   random stream, from which the task's functions draw;
+3. roll out: the return R_k of sample k is the sum of its discounted rewards plus the value of its final state; in
    several models, the mean or the smallest of its returns;
-4. weigh: w_k = exp((R_k - max R) / temperature), divided by their sum;
+4. weight: w_k = exp((R_k - max R) / temperature), normalised to sum to 1;
 5. average: the new plan is u_t = sum_k w_k u_t^k.
 
-The formulation is that of Williams et al. (2017, "Information theoretic MPC for model-based reinforcement learning")
-without a cost on the controls, as in Lyceum (Summers et al. 2020) and in trajopt, which also is the source of the
+This is the formulation of Williams et al. (2017, "Information theoretic MPC for model-based reinforcement learning")
+without a cost on the controls, as in Lyceum (Summers et al. 2020) and in trajopt, which is also the source of the
 smoothing. Returns are divided by the temperature. Summers et al. give inverse temperatures: their 5 is 0.2 here.
 
-With several plants every plant has a plan, and the samples of all plans are rolled out together: a plan of few samples
-leaves most of a GPU, or most threads, without work.
+With several plants, each plant has its own plan, and the samples of all plans are rolled out together: the samples of a
+single plan may leave most of a GPU, or most threads, idle.
 
-``update`` chooses other weights in step 4; the weights above are those of MPPI (``mppi.py``). CEM (``cem.py``) weighs
-the best samples equally, and fits the noise to them afterwards. Predictive sampling (``predictive_sampling.py``) takes
-the best sample. An update of a user's own does the same two things (``plan_update.py``): it weighs, and it fits. With
-knots all of this happens to the knots of a spline, from which the actions of steps 3 and 5 are interpolated
-(``kernels/knots.py``).
+``update`` selects the weights of step 4; the formula above is MPPI's (``mppi.py``). CEM (``cem.py``) weights the best
+samples equally and then fits the noise to them. Predictive sampling (``predictive_sampling.py``) takes the best sample.
+A custom update (``plan_update.py``) also weights the samples and may fit. With knots, all steps apply to the knots of a
+spline, from which the actions of steps 3 and 5 are interpolated (``kernels/knots.py``).
 """
 
 import copy
@@ -59,82 +58,82 @@ _BUFFERS = (
     "actions", "nominal", "knot_actions", "standard_noise", "adapted_noise", "sampled", "model_returns", "returns",
     "weights", "model_fields",
 )  # fmt: skip
-_MODELS = 0x6D6F64656C73  # "models": makes other seeds of the planner's
+_MODELS = 0x6D6F64656C73  # "models" in ASCII: derives different seeds from the planner's
 _DRAWING = ("startup", "initialize", "randomize")
-"""The functions of a task that can draw model fields for a planner."""
+"""The task functions that can randomize a planner's model fields."""
 
 Value: TypeAlias = ValueFunction | wp.Function | Callable[[torch.Tensor], torch.Tensor]
 
 
 @document_attributes
 class Planner:
-    """A controller that plans again at every step: ``action = plan(state)``.
+    """A controller that replans at every step: ``action = plan(state)``.
 
-    The planner simulates in worlds of its own, one for each sample. It controls a plant: an environment, with
+    The planner simulates in its own worlds, one per sample. It controls a plant: an environment, with
     ``plan(env.get_state()[0])``, or a robot, with ``plan(plan.state_of(qpos=..., qvel=..., time=...))``. The plant's
-    model, time step and parameters may differ from the planner's. Randomness is counted: a plan depends on the seed,
-    on the number of plans before it, and on the plan to start from. A task's functions draw from streams of each
-    sample's own, seeded by the planner: a plan cannot know what the plant will draw.
+    model, time step and parameters may differ from the planner's. Random streams are counter-based: a plan depends on
+    the seed, on the number of plans before it, and on the plan it starts from. In each sample, the task's functions
+    draw from a separate stream seeded by the planner, so a plan cannot anticipate the plant's random numbers.
 
-    ``plants=n`` plans for n plants at a time, as ``env.step(plan(env.get_state()))`` in an environment with n worlds.
-    Plant i has the noise of the seed ``seed + i``, and so the plan that a planner with this seed makes on the same
-    engine; with ``models``, all plants have the models of the first seed. The buffers, except ``model_fields``,
-    then have an axis for the plants: the second one if the first counts steps or knots, otherwise the first.
+    ``plants=n`` plans for n plants at a time, as in ``env.step(plan(env.get_state()))`` with n worlds. Plant i uses the
+    seed ``seed + i`` for its noise, so its plan equals that of a single-plant planner with this seed on the same
+    engine. With ``models``, all plants use the models of the first seed. All buffers except ``model_fields`` then have
+    an axis for the plants: the second axis if the first is steps or knots, otherwise the first.
 
-    A task's ``planning`` (see ``lw.Planning``) gives settings of the planner, and options and parameters of its
-    worlds. Arguments replace the values of the task.
+    A task's ``planning`` (see ``lw.Planning``) provides default settings of the planner, and options and parameters of
+    its worlds. Arguments override them.
 
     Args:
         task: Name of a task, a file with one, or its class.
-        config: Settings in place of the task's.
-        value: Adds the value of the state where a sample ends to its return: a ``ValueFunction``, or a function from
-            (nworld, nobs) observations to (nworld,) values, or a Warp function of one observation,
-            ``value(obs: Row[float]) -> float``, which becomes part of the graph on the Warp engine. With a value the
-            parameters in ``planning`` do not apply, because the value function was fitted to the task's own rewards.
-        seed: Seed of the noise. With several plants, the seed of the first plant, or a list with a seed for each.
+        config: Settings that replace the task's.
+        value: Terminal value, added to each sample's return: a ``ValueFunction``, a function from (nworld, nobs)
+            observations to (nworld,) values, or a Warp function of one observation, ``value(obs: Row[float]) ->
+            float``, which becomes part of the graph on the Warp engine. If a value is given, the parameters in
+            ``planning`` do not apply, because the value function was fitted to the task's own rewards.
+        seed: Seed of the noise. With several plants, the seed of the first plant, or a list with one seed per plant.
         plants: Number of plants to plan for.
-        params: Parameters of the task, for names that are also settings.
-        words: Single settings, by the names of ``lw.MPPIConfig`` (None leaves one as it is), and ``update`` may be an
-            object of your own, see ``lw.PlanUpdate``; options of the planner's worlds, as for ``lw.make``; and
-            parameters of the task. (One value for each world: the worlds of a sample, one for each model, follow one
-            another, and so do the samples of a plant.) With a CUDA device and engine="auto", the C engine on the CPU
-            rolls out few samples, because it is faster there; plans then lie on the CPU.
+        params: Parameters of the task; required for names that are also settings.
+        words: Individual settings by their names in ``lw.MPPIConfig`` (None keeps the default; ``update`` may be a
+            custom ``lw.PlanUpdate``), options of the planner's worlds as for ``lw.make``, and parameters of the task.
+            (Order of per-world parameters: plants, then samples, then models, with models varying fastest.) With a CUDA
+            device, engine="auto" and few samples, the C engine rolls them out on the CPU, where it is faster; plans are
+            then on the CPU.
 
     Raises:
-        ValueError: An argument is unknown, ambiguous or not valid, or the samples do not fit into memory.
+        ValueError: An argument is unknown, ambiguous or invalid, or the samples do not fit into memory.
         FileNotFoundError: A model or task file is missing.
     """
 
     config: MPPIConfig
-    """The settings in force."""
+    """The complete settings."""
     plants: int
     """Number of plants."""
     settings: dict[str, Any]
-    """The same settings with the options and parameters of the planner's worlds, as JSON can hold them."""
+    """The settings, and the options and parameters of the planner's worlds, as JSON values."""
     actions: torch.Tensor
-    """The plan, (horizon, nact); the first row is the action that the last call returned. To start from another
-    plan, write into it; with knots, into ``knot_actions``."""
+    """The plan, (horizon, nact); the first row is the action returned by the last call. To start from a different plan,
+    write into this buffer, or with knots into ``knot_actions``."""
     nominal: torch.Tensor
-    """The plan that the last improvement started from, (horizon, nact)."""
+    """The plan from which the last improvement started, (horizon, nact)."""
     knot_actions: torch.Tensor
-    """The plan's knots, (nknot, nact), some of which lie beyond the horizon; without knots, ``actions``."""
+    """The plan's knots, (nknot, nact), some of which lie beyond the horizon; the same as ``actions`` without knots."""
     standard_noise: torch.Tensor
-    """The last improvement's standard normal numbers, (horizon, samples, nact), or (nknot, samples, nact)."""
+    """The last improvement's standard normal noise, (horizon, samples, nact) or (nknot, samples, nact)."""
     adapted_noise: torch.Tensor | None
-    """The standard deviations that CEM adapted for the next improvement, (horizon, nact) or (nknot, nact), before
-    smoothing. None for updates that adapt none."""
+    """The adapted standard deviations for the next improvement, before smoothing, (horizon, nact) or (nknot, nact);
+    None for updates that do not adapt noise."""
     sampled: torch.Tensor
     """The last improvement's actions, (horizon, samples, nact)."""
     model_fields: dict[str, torch.Tensor]
-    """The model fields of each model, (models, size) float64; empty with one model. A call reads them."""
+    """The model fields of each model, (models, size) float64, read by each call; empty with one model."""
     model_returns: torch.Tensor
-    """The samples' returns in each model, (samples, models); minus infinity for those that failed."""
+    """The samples' returns in each model, (samples, models); minus infinity for failed samples."""
     returns: torch.Tensor
-    """The samples' returns, (samples,); minus infinity for those that failed."""
+    """The samples' returns, (samples,); minus infinity for failed samples."""
     weights: torch.Tensor
     """The samples' weights, (samples,)."""
 
-    _only_update: str | None = None  # of a subclass: the only update that it has
+    _only_update: str | None = None  # in a subclass: its only update
 
     def __init__(
         self,
@@ -164,7 +163,7 @@ class Planner:
         self.env.reset()
         self.timestep = self.env.timestep
         self._initial = self.env.get_state()[0]
-        for name, row in self.env.engine.nominal.items():  # a robot has the nominal model, not one that startup drew
+        for name, row in self.env.engine.nominal.items():  # a robot has the nominal model, not one drawn by startup
             self._initial[self.env.state_space.parts[name]] = torch_view(flat(row))[0].double()
         if "lasting_memory" in self.env.task.writes.get("startup", ()):
             self._initial[memory_columns(self.env.task, self.env.state_space)["lasting_memory"]] = 0.0
@@ -203,7 +202,7 @@ class Planner:
         return drawn
 
     def _take_value(self, value: Value | None) -> None:
-        """Take the value function, and check that it fits the task's observations."""
+        """Set the value function, and check that it fits the task's observations."""
         self.value, group = value, "policy"
         self._value_kernel, self._value_in_torch = None, False
         if isinstance(value, ValueFunction):
@@ -216,7 +215,7 @@ class Planner:
             self._value_in_torch = True
             try:
                 self._torch_values()
-            except RuntimeError as error:  # its weights lie elsewhere, or it takes other observations
+            except RuntimeError as error:  # its weights are on another device, or its input has another size
                 observations = described(self._value_obs)
                 raise ValueError(f"value cannot take observations {observations}: {error}") from error
 
@@ -251,7 +250,7 @@ class Planner:
             shape = (self.horizon, plants, nact)
             self._actions, self._nominal_actions = (wp.zeros(shape, dtype=float) for _ in range(2))
             self._world_actions: Any = wp.from_torch(loop.actions)
-            # the rows of plans and samples: knots, or without them the actions themselves
+            # rows of plans and samples are knots or, without knots, actions
             if config.knots:
                 self._spline = config.knots, knots.ORDERS[config.spline]
                 rows = knots.knot_count(self.horizon, config.knots, config.spline)
@@ -292,24 +291,24 @@ class Planner:
         self._terminal_view, self._shift_view = torch_view(self._terminal), torch_view(self._shift)
 
     def _by_plant(self, rows: torch.Tensor, axis: int) -> torch.Tensor:
-        """A buffer with an axis for the plants, which it has only if there are several."""
+        """Remove a buffer's axis for the plants if there is only one."""
         return rows.squeeze(axis) if self.plants == 1 else rows
 
     @torch.no_grad()
     def __call__(self, state: torch.Tensor, obs: torch.Tensor | None = None, *, shift: int = 1) -> torch.Tensor:
-        """Improve the plan from a state, or the plans from one state each.
+        """Improve the plan from a state, or with several plants each plan from its own state.
 
         Args:
-            state: (state_space.size,) float64, or one row of states: from ``get_state`` of an environment of the same
-                task, on either engine, or from ``state_of``. With several plants (plants, state_space.size).
-            obs: Not used; every controller is called with observations.
-            shift: Steps since the last call's states.
+            state: A state from ``state_of`` or from ``get_state`` of an environment of the same task, on either engine:
+                (state_space.size,) or (1, state_space.size) float64; with several plants (plants, state_space.size).
+            obs: Not used; present because controllers are called with observations.
+            shift: Number of steps since the last call.
 
         Returns:
-            The action to take now, (nu,), or with several plants (plants, nu), on the states' device.
+            The action to apply now, (nu,), or with several plants (plants, nu), on the state's device.
 
         Raises:
-            ValueError: The state has another shape or type, or is not finite.
+            ValueError: The state has the wrong shape or type, or is not finite.
         """
         self.env.check_process()
         self._loop.state.copy_(checked_state(self.env, state, self._loop.state))
@@ -319,7 +318,7 @@ class Planner:
         return self._action.to(state.device, copy=True)
 
     def _program(self, *, first: bool) -> Calls:
-        """The calls of one improvement, of which ``first`` moves the plan forward in time."""
+        """The calls of one improvement; the first improvement also shifts the plan in time."""
         parts: list[Phase | Callable[[], None]] = [Phase("perturb", partial(self._perturb, first)), *self._loop.phases]
         if self._value_in_torch:
             parts.append(self._evaluate)
@@ -333,7 +332,7 @@ class Planner:
         return self._sequence(parts)
 
     def _sequence(self, parts: Iterable[Phase | Callable[[], None]]) -> Calls:
-        """The calls that run some phases, in as few graphs as possible, and functions of torch between them."""
+        """Turn phases into calls, in as few graphs as possible, with torch functions between them."""
         calls: list[Any] = []
         for is_phase, group in itertools.groupby(parts, lambda part: isinstance(part, Phase)):
             some: Any = list(group)
@@ -341,7 +340,7 @@ class Planner:
         return tuple(calls)
 
     def _perturb(self, first: bool) -> None:
-        """The plans to start from, and the samples around them."""
+        """Compute the plans to start from, and the samples around them."""
         device = self.env.device
         if first and self._passed is not self._shift:
             passed = [self._shift, self.horizon, self._spline[0], self._phase, self._passed]
@@ -363,7 +362,7 @@ class Planner:
         self._interpolate(self._samples, self._world_actions)
 
     def _shifted(self, first: bool, rows: wp.array, fill: wp.array, repeat: bool, target: wp.array) -> None:
-        """Rows of a plan, moved forward in time by the first improvement."""
+        """Copy the rows of a plan; the first improvement also shifts them in time."""
         if first:
             shifted = [rows, self._passed, fill, repeat, target]
             wp.launch(planning.shift_plan, rows.shape, shifted, device=self.env.device)
@@ -371,13 +370,13 @@ class Planner:
             wp.copy(target, rows)
 
     def _interpolate(self, rows: wp.array, actions: wp.array) -> None:
-        """The actions of plans or samples, unless both are one array."""
+        """Compute actions from the rows of plans or samples, unless both are the same array."""
         if rows is not actions:
             args = [rows, self._phase, *self._spline, self._low, self._high, actions]
             wp.launch(knots.interpolate, actions.shape, args, device=self.env.device)
 
     def _add_up(self) -> None:
-        """Returns of the samples that were rolled out."""
+        """Compute the samples' returns."""
         config, device = self.config, self.env.device
         if self._value_kernel is not None:
             values = [wp.from_torch(self._value_obs), self._terminal]
@@ -389,23 +388,23 @@ class Planner:
             wp.launch(planning.combine_models, self._nsample, combined, device=device)
 
     def _weigh(self) -> None:
-        """Returns of the samples that were rolled out, and their weights."""
+        """Compute the samples' returns and weights."""
         self._add_up()
         self._update.weigh(self._arrays)
 
     def _average_samples(self) -> None:
-        """The new plan, the weighted mean of the samples."""
+        """Compute the new plan, the weighted mean of the samples."""
         plan = [self._weight, self._samples, self._nominal, self._summary, self._plan]
         launch_blocks(planning.average, self._plan.size, plan)
 
     def _average(self) -> None:
-        """The new plan, and what the update fits to the samples."""
+        """Compute the new plan, and let the update fit."""
         self._average_samples()
         self._update.fit(self._arrays)
         self._interpolate(self._plan, self._actions)
 
     def _weigh_in_torch(self) -> None:
-        """The weights of an update that is not capturable, and the summary."""
+        """Compute weights with an update that is not capturable, and the summary."""
         arrays = self._arrays
         if (returned := self._update.weigh(arrays)) is not None:
             raise ValueError(
@@ -426,7 +425,7 @@ class Planner:
         self._terminal_view.copy_(self._torch_values())
 
     def _torch_values(self) -> torch.Tensor:
-        """Values of the states where the samples end, (nworld,)."""
+        """Values of the samples' final states, (nworld,)."""
         obs, nworld = self._value_obs, self.env.nworld
         if isinstance(self.value, ValueFunction):
             steps = self._loop.states[:, self.env.state_space.parts["step"]] + self.horizon
@@ -440,16 +439,16 @@ class Planner:
         return values.view(nworld)
 
     def reset(self, seed: int | Sequence[int] | None = None, *, where: torch.Tensor | None = None) -> None:
-        """Forget the plan and the adapted noise, and start the noise again.
+        """Reset the plan and the adapted noise, and restart the noise stream.
 
         Args:
-            seed: Another seed, also of the models that the planner draws. With several plants, plant i gets the seed
-                ``seed + i``; a list has a seed for each. Models are drawn with the first seed.
-            where: The plants whose plans to forget, (plants,) bool; by default all. The others keep their seeds, and
-                the planner its models.
+            seed: A new seed. With several plants, plant i gets the seed ``seed + i``, or pass a list with one seed per
+                plant. The planner's models are redrawn with the first seed.
+            where: Mask of the plants to reset, (plants,) bool; by default all. With a mask, the other plants keep their
+                seeds, and the planner keeps its models.
 
         Raises:
-            ValueError: A seed is not a whole number from 0, or ``where`` has another shape or type.
+            ValueError: A seed is not a non-negative whole number, or ``where`` has the wrong shape or type.
         """
         if where is not None:
             if not isinstance(where, torch.Tensor) or (where.shape, where.dtype) != ((self.plants,), torch.bool):
@@ -474,19 +473,19 @@ class Planner:
         return [int(seed) for seed in self._seed.numpy()]
 
     def _draw_models(self, seed: int) -> None:
-        """Draw the planner's models with the task's functions, from streams that no plant of this seed has."""
+        """Draw the planner's models with the task's functions, from streams that no plant with this seed uses."""
         self.env.rand_reset(int(np.random.SeedSequence([seed, _MODELS]).generate_state(1)[0]) >> 1)
         states = self.env.get_state()[: self.config.models]
         for name, rows in self.model_fields.items():
             rows.copy_(states[:, self.env.state_space.parts[name]])
 
     def state_of(self, **parts: Any) -> torch.Tensor:
-        """A state from its parts, as a robot knows them; the rest is as the task's fixed reset leaves it.
+        """Make a state from some of its parts, as measured on a robot; the rest is as after the task's fixed reset.
 
         Model fields have their nominal values unless they are given, as ``body_mass=...``.
 
-        The rest includes fields that a task reads as the last substep left them: they affect only the first transition
-        of a plan. A ``time`` sets the step counter, too, unless ``step`` is given.
+        The rest includes fields left by the last substep: they affect only the first transition of a plan. ``time``
+        also sets the step counter, unless ``step`` is given.
 
         Args:
             parts: Values for parts of ``env.state_space``: qpos, qvel, time, mocap_pos, ...
@@ -495,15 +494,15 @@ class Planner:
             (state_space.size,) float64.
 
         Raises:
-            ValueError: A part is unknown, or its value has another size or is not a number.
+            ValueError: A part is unknown, or its value has the wrong size or is not a number.
         """
         return state_from_parts(self.env, self._initial, parts)
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Best and mean return, effective number and failures of the last improvement's samples.
+        """Best return, mean return, effective sample size and number of failed samples of the last improvement.
 
-        Numbers, or with several plants (plants,) float32 on the CPU.
+        The values are numbers, or with several plants (plants,) float32 tensors on the CPU.
         """
         names = ("best_return", "mean_return", "effective_samples", "failed_samples")
         columns = self._summary.numpy().T
@@ -517,12 +516,12 @@ def _view(array: Any) -> torch.Tensor | None:
 
 
 def _put(target: torch.Tensor, values: torch.Tensor, where: torch.Tensor | None) -> None:
-    """Write values, which may be one for all, into the rows of a mask; without a mask, into all rows."""
+    """Write values, broadcast if necessary, into the masked rows; without a mask, into all rows."""
     target.copy_(values.expand_as(target) if where is None else torch.where(where, values, target))
 
 
 def _update_of(config: MPPIConfig) -> PlanUpdate:
-    """The update that a planner's settings name, or a copy of the object that they hold."""
+    """Make the update named in the settings, or copy the given object."""
     if isinstance(config.update, PlanUpdate):
         return copy.copy(config.update)
     if config.update == "cem":
@@ -538,8 +537,8 @@ class MPPI(Planner):  # noqa: D101
 class CEM(MPPI):
     """The cross-entropy method: ``lw.CEM(task, ...)`` is ``lw.MPPI(task, update="cem", ...)``.
 
-    The new plan is the mean of the best samples, and their standard deviation is the new one of the noise. It is kept
-    between calls, and ``reset`` restores the initial one. In the names of other packages:
+    The new plan is the mean of the best samples, and the new standard deviation of the noise is theirs. It persists
+    between calls; ``reset`` restores the initial one. Names in other packages:
 
     ============= =============== ========================
     here          hydrax          judo
@@ -561,8 +560,8 @@ class CEM(MPPI):
 class PredictiveSampling(MPPI):
     """Predictive sampling: ``lw.MPPI`` with ``update="predictive_sampling"``.
 
-    The best sample is the new plan. Howell et al. (2022), hydrax, judo and MuJoCo MPC plan with knots: give ``knots``
-    and ``spline``. It takes the arguments of ``lw.MPPI``, except ``update``.
+    The best sample is the new plan. Howell et al. (2022), hydrax, judo and MuJoCo MPC plan with knots: to do the same,
+    set ``knots`` and ``spline``. It takes the arguments of ``lw.MPPI``, except ``update``.
     """
 
     _only_update = "predictive_sampling"

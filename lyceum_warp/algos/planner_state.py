@@ -31,15 +31,15 @@ def state_from_parts(env: Env, initial: torch.Tensor, parts: Mapping[str, Any]) 
 
 
 def checked_state(env: Env, state: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
-    """One state of an environment, (state_space.size,) float64, or one for each plant; a single row is unpacked.
+    """Check the state to plan from, or the states of all plants; a single row is unpacked.
 
     Args:
         env: The environment whose states these are.
-        state: The state, or the states.
-        like: The buffer for it.
+        state: The state, (state_space.size,) float64, or the states, (plants, state_space.size).
+        like: The buffer that will receive it.
 
     Raises:
-        ValueError: The state has another shape or type, or it lies on the CPU and is not finite.
+        ValueError: The state has the wrong shape or type, or is on the CPU and not finite.
     """
     if isinstance(state, torch.Tensor) and state.ndim == 2 and len(state) == 1 and like.ndim == 1:
         state = state[0]
@@ -53,10 +53,11 @@ def checked_state(env: Env, state: torch.Tensor, like: torch.Tensor) -> torch.Te
             f"{which} to plan from must be {described(like)}, not {described(state)}: call env.get_state() of the same "
             f"task, or {hint}. (fields=[...] may make the states of an environment longer.)"
         )
-    if state.device.type != "cpu":  # the check would wait for the device; there every sample fails, and the plan stays
+    if state.device.type != "cpu":  # the check would wait; all samples will fail, and the plan stays
         return state
     values = state.numpy().ravel()
-    # one call, as a plan may take a millisecond; only values that are not finite, or beyond 1e150, are checked again
+    # a single call, because a plan may take only a millisecond; the slow check runs only if the dot product is not
+    # finite
     if not math.isfinite(values.dot(values)) and not (finite := np.isfinite(values)).all():
         where = int(np.flatnonzero(~finite)[0])
         plant, column = divmod(where, env.state_space.size)

@@ -1,4 +1,4 @@
-"""Define policies: diagonal Gaussians around the output of a network."""
+"""Define Gaussian policies with a diagonal covariance, whose mean is computed by a network."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -16,15 +16,15 @@ _LARGEST = torch.finfo(torch.float32).max
 
 @document_attributes
 class GaussianPolicy(Normalized):
-    """Actions from N(mean(obs), exp(log_std)^2), with a log_std that is independent of the observation.
+    """Draws actions from N(mean(obs), exp(log_std)^2), where log_std does not depend on the observation.
 
     Example:
         >>> policy = GaussianPolicy(nobs, nact, network=MyNetwork())  # any nn.Module, (..., nobs) -> (..., nact)
         >>> npg = NPG(env, policy)
 
     Args:
-        nobs: Numbers in an observation.
-        nact: Numbers in an action.
+        nobs: Length of an observation.
+        nact: Length of an action.
         hidden: Widths of the hidden layers.
         network: A module that replaces the default network. It maps (normalised) observations, (..., nobs), to mean
             actions, (..., nact), independently for each row, in float32. NPG also requires second derivatives.
@@ -64,7 +64,7 @@ class GaussianPolicy(Normalized):
             self.shape["limit"] = limit
         if network is None:
             self.shape |= {"hidden": layer_sizes(hidden), "activation": activation}
-            # with a last layer near zero, mean actions start near the middle of their range (as in mjrl)
+            # with a last layer near zero, initial mean actions are near zero (as in mjrl)
             network = mlp([nobs, *hidden, nact], activation=activation, last_scale=1e-2, generator=generator)
         elif isinstance(network, nn.Module):
             self.shape["own"] = _class_name(network)
@@ -88,7 +88,7 @@ class GaussianPolicy(Normalized):
         if (own := shape.get("own")) is not None:
             normalize = ", normalize=True" if shape["normalize"] else ""
             raise ValueError(
-                f"the policy is of a class of its own, {own}: give one of this class, as in lw.load(run, "
+                f"the policy has a custom class, {own}: pass one of this class, as in lw.load(run, "
                 f"policy=lw.GaussianPolicy({shape['nobs']}, {shape['nact']}, network=...{normalize}))"
             )
         return GaussianPolicy(**shape)
@@ -136,7 +136,7 @@ Policy: TypeAlias = nn.Module | Callable[[torch.Tensor], torch.Tensor]
 
 
 def acting(policy: Policy) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Get the function from observations to actions: a policy's ``act``, or the function itself."""
+    """Get the function that maps observations to actions: a policy's ``act``, or the function itself."""
     act: Callable[[torch.Tensor], torch.Tensor] = getattr(policy, "act", policy)
     return act
 

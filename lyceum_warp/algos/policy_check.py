@@ -14,22 +14,22 @@ _ROWS = 4
 
 
 def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
-    """Check that an algorithm can learn a policy in an environment.
+    """Check that an algorithm can train a policy in an environment.
 
-    The policy must be a ``GaussianPolicy``. It must map observations (..., nobs) to mean actions (..., nact),
+    The policy must be a ``GaussianPolicy``. It must map observations (..., nobs) to mean actions (..., nact)
     deterministically and independently for each row, and be differentiable with respect to its trainable parameters.
 
     Args:
         policy: The policy.
         env: The environment; its worlds do not change.
-        twice: Whether the policy must be differentiable twice, as NPG requires.
+        twice: Whether the policy must be twice differentiable, as NPG requires.
 
     Raises:
         ValueError: The policy violates one of these rules.
     """
     if not isinstance(policy, GaussianPolicy):
         kind = getattr(policy, "__name__", None) or type(policy).__name__
-        fix = "lw.GaussianPolicy(nobs, nact, network=net) makes one of a network of your own"
+        fix = "lw.GaussianPolicy(nobs, nact, network=net) makes one from your own network"
         raise ValueError(f"policy must be a GaussianPolicy, not {kind}: {fix}")
     policy = moved(policy, env)
     sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
@@ -39,7 +39,7 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
             f"has {wanted[0]} and {wanted[1]}"
         )
     if not any(p.requires_grad for p in policy.parameters() if p is not policy.log_std):
-        raise ValueError("the policy's network has no parameter to learn: unfreeze it with policy.requires_grad_(True)")
+        raise ValueError("the policy's network has no trainable parameter: use policy.requires_grad_(True)")
     obs = env.obs.repeat(-(-_ROWS // env.nworld), 1)[:_ROWS]
     noise = torch.randn(obs.shape, generator=torch.Generator().manual_seed(0))  # make the rows differ
     obs = obs + 0.1 * noise.to(obs.device)
@@ -53,7 +53,7 @@ def _check_output(policy: GaussianPolicy, obs: torch.Tensor) -> None:
     if mean.isfinite().all() and not torch.equal(mean, again):
         raise ValueError(
             "the policy gives two different mean actions for the same observations: it must not draw random numbers "
-            "(dropout: call eval() on its network), nor keep anything from one call to the next"
+            "(dropout: call eval() on its network), or keep state between calls"
         )
     if not mean.isfinite().all():
         raise ValueError("the policy's mean actions are not finite for finite observations")
@@ -86,7 +86,7 @@ def _check_derivatives(policy: GaussianPolicy, obs: torch.Tensor, *, twice: bool
         mean = policy(obs)
         sums = mean.sum()
         if not sums.requires_grad:
-            raise ValueError("the policy's mean actions depend on no parameter: leave out detach() and no_grad()")
+            raise ValueError("the policy's mean actions depend on no parameter: remove detach() and no_grad()")
         gradients = torch.autograd.grad(sums, [p for _, p in named], allow_unused=True)
         if unused := [name for (name, _), gradient in zip(named, gradients, strict=True) if gradient is None]:
             raise ValueError(
@@ -112,7 +112,7 @@ def check_value(value: ValueFunction, env: Env) -> None:
     """Check that a value function fits an environment's observations.
 
     Raises:
-        ValueError: Its group or its number of observations does not fit, or a parameter is not finite.
+        ValueError: The value function's group or input size does not fit, or a parameter is not finite.
     """
     name = env.task.name
     check_group(value.group, env.obs_groups, name)
@@ -124,9 +124,9 @@ def check_value(value: ValueFunction, env: Env) -> None:
         )
     for part, numbers in value.state_dict().items():
         if not numbers.isfinite().all():
-            raise ValueError(f"the value function's {part!r} is not finite: leave it out for a new value function")
+            raise ValueError(f"the value function's {part!r} is not finite: omit it to get a new value function")
 
 
 def _first_line(error: BaseException) -> str:
-    """Shorten an error's message to its first sentence; torch's messages can fill a page."""
+    """Shorten an error message to its first sentence; torch's messages can fill a page."""
     return (str(error).strip() or type(error).__name__).splitlines()[0].split(". ")[0][:200]

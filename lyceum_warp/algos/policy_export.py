@@ -1,4 +1,4 @@
-"""Export policies to ONNX or to torch's format, to run them without this package."""
+"""Export policies to ONNX or to torch's format, so that they run without this package."""
 
 import contextlib
 import copy
@@ -23,12 +23,12 @@ _SUFFIXES = (".onnx", ".pt2")
 def export_policy(policy: torch.nn.Module, path: str | Path) -> Path:
     """Export a policy's ``act`` to a file that runs without this package.
 
-    The file maps observations, (n, nobs) float32 for any n, to actions without noise, and includes the normaliser. An
-    environment also clips controls to the ranges of the model's actuators.
+    The file maps observations, (n, nobs) float32 for any n, to actions without noise, and includes the normaliser.
+    Environments also clip controls to the actuators' ranges; the file does not.
 
     ===========  ======================================================================================
     ``.onnx``    input ``obs``, output ``action``; for ONNX Runtime, TensorRT, OpenVINO, ...
-    ``.pt2``     ``torch.export.load(path).module()(obs)``, without further packages; also for C++ (AOTInductor)
+    ``.pt2``     ``torch.export.load(path).module()(obs)``, needs only torch; also for C++ (AOTInductor)
     ===========  ======================================================================================
 
     Example:
@@ -44,8 +44,8 @@ def export_policy(policy: torch.nn.Module, path: str | Path) -> Path:
         The file's path.
 
     Raises:
-        ImportError: The extra ``export``, which ``.onnx`` requires, is not installed.
-        ValueError: The file has another suffix, or the policy's network cannot be exported.
+        ImportError: The extra ``export`` is not installed, which ``.onnx`` requires.
+        ValueError: The file has an unsupported suffix, or the policy's network cannot be exported.
     """
     if not (isinstance(policy, torch.nn.Module) and hasattr(policy, "act") and hasattr(policy, "nobs")):
         raise ValueError(f"policy must be a policy as lw.load(run) returns it, not {described(policy)}")
@@ -61,7 +61,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path) -> Path:
                 program = torch.onnx.export(
                     program, input_names=["obs"], output_names=["action"], dynamo=True, verbose=False
                 )
-    except Exception as error:  # torch raises many types
+    except Exception as error:  # torch raises many types of errors
         first = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
         raise ValueError(f"the policy's network cannot be exported to {path.suffix} ({first})") from error
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -75,7 +75,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path) -> Path:
 
 
 class _Acting(torch.nn.Module):
-    """Wraps a policy so that ``forward``, which torch exports, is its ``act``."""
+    """Wraps a policy so that ``forward``, which torch exports, calls its ``act``."""
 
     def __init__(self, policy: Any) -> None:
         super().__init__()
@@ -97,7 +97,7 @@ def check_export(path: Path) -> None:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence warnings of torch's exporter about its internals and about optional packages."""
+    """Silence the warnings of torch's exporter about its internals and about optional packages."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

@@ -2,7 +2,7 @@
 
 The algorithm of Schulman et al. (2017, "Proximal Policy Optimization Algorithms") as implemented in rsl_rl (Rudin et
 al. 2022, "Learning to Walk in Minutes Using Massively Parallel Deep Reinforcement Learning"): with a clipped value
-loss, a learning rate that follows the KL divergence, and the same mini-batches in every epoch.
+loss, a learning rate adapted to the KL divergence, and the same mini-batches in every epoch.
 """
 
 import collections
@@ -34,15 +34,15 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 
 RECENT = 100
-"""Episodes in ``return_recent``."""
+"""Number of episodes in ``return_recent``."""
 
 _EPS = 1e-2
-"""Added to the standard deviations of the normaliser, as in rsl_rl."""
+"""Added to the normaliser's standard deviations, as in rsl_rl."""
 
 _SMALLEST_STD = 1e-6
 
 _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
-"""Lower and upper limit of the adaptive learning rate, and the factor by which it changes."""
+"""Lower and upper limits of the adaptive learning rate, and the factor by which it changes."""
 
 
 @document_attributes
@@ -50,12 +50,12 @@ _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
 class PPOIteration(OnPolicyIteration):
     """Statistics of one iteration of PPO.
 
-    Numbers about episodes cover the episodes that ended in the iteration; they are nan if none ended. The worlds' first
-    episodes are not counted if they started at a random step (``stagger``).
+    Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended. The worlds'
+    first episodes are not counted if they started at a random step (``stagger``).
     """
 
     return_recent: float
-    """Mean return of the last 100 episodes, of this iteration or earlier ones."""
+    """Mean return of the last 100 episodes, including earlier iterations."""
     learning_rate: float
     """Learning rate after the iteration."""
     surrogate_loss: float
@@ -116,7 +116,7 @@ class PPO(OnPolicyLearner):
                 f"{config.minibatches} mini-batches are more than the {count} samples: give more worlds, or make "
                 "minibatches smaller"
             )
-        # with a last layer near zero, as NPG's, the adaptive learning rate would start much too high
+        # with a last layer near zero, as in NPG, the adaptive learning rate would start much too high
         limit = math.inf if config.normalize else LIMIT
         self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)
         self._make_rollout(steps)
@@ -157,15 +157,15 @@ class PPO(OnPolicyLearner):
             self.sample()
             self.env.update_shared(team.sum)
 
-            # 2. Values and advantages, from the value function before its fit to these samples.
+            # 2. Compute values and advantages with the value function before the update.
             samples = self.evaluated_samples()
             timer.mark()
 
-            # 3. Epochs of mini-batches; each is a step on the clipped surrogate, the value loss and the entropy.
+            # 3. Run epochs of mini-batches; each is a step on the clipped surrogate, the value loss and the entropy.
             self.update(samples)
             kl = self.divergence()
 
-        # One copy transfers the statistics of all processes to the host, another one the returns.
+        # One copy transfers the statistics of all processes to the host, another copy the returns.
         losses = self._losses / (config.epochs * config.minibatches)
         finite = torch.stack([numbers.isfinite().all() for numbers in (losses, *self._parameters)]).all()
         numbers = [
@@ -217,8 +217,8 @@ class PPO(OnPolicyLearner):
     def sample(self) -> None:
         """Fill the rollout buffer with the current policy and new noise.
 
-        Each step updates the normalisers with its observations. Values and densities are computed for all steps at once
-        in ``evaluated_samples``.
+        Each step updates the normalisers with its observations. ``evaluated_samples`` computes values and densities for
+        all steps at once.
         """
         env, rollout, std = self.env, self.rollout, self.policy.log_std.exp()
         with one_thread():
@@ -236,12 +236,12 @@ class PPO(OnPolicyLearner):
 
     @torch.no_grad()
     def evaluated_samples(self) -> dict[str, torch.Tensor]:
-        """Compute the inputs of the update from the samples and the old networks, each (steps, nworld, ...).
+        """Compute the inputs of the update, each (steps, nworld, ...), from the samples and the old networks.
 
-        Every transition bootstraps from the observation that it led to, before events of the task: a push or a new
-        command between two steps changes the value of the state, but no action caused that change, so advantages and
-        targets leave it out. Time limits, faults and the end of the rollout bootstrap in the same way. The value
-        function's targets are its predictions plus the advantages.
+        Every transition bootstraps from its next observation before any events of the task: a push or a new command
+        between two steps changes the value of the state, but no action caused that change, so advantages and targets
+        exclude it. Time limits, faults and the end of the rollout bootstrap in the same way. The value function's
+        targets are its predictions plus the advantages.
         """
         rollout, config, team = self.rollout, self.config, self.team
         obs, final_obs = rollout.obs_groups[self.value.group], rollout.final_obs_groups[self.value.group]
@@ -317,7 +317,7 @@ class PPO(OnPolicyLearner):
         self.rate.copy_(torch.where(kl > wanted * 2.0, lower, raised))
 
     def _log_std(self) -> torch.Tensor:
-        """Logarithms of the learned standard deviations, (nact,)."""
+        """Logarithms of the standard deviations, (nact,)."""
         if self.config.std_type == "log":
             return self.std.clamp_min(math.log(_SMALLEST_STD))
         return self.std.clamp_min(_SMALLEST_STD).log()
@@ -328,12 +328,12 @@ class PPO(OnPolicyLearner):
 
     @torch.no_grad()
     def divergence(self) -> torch.Tensor:
-        """KL divergence from the policy that sampled to the current policy, averaged over the samples."""
+        """KL divergence from the sampling policy to the current policy, averaged over the samples."""
         kl = divergence(self._mean, self._old_log_std, self.policy(self.rollout.obs), self.policy.log_std).mean()
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
-        """Returns of the counted episodes of all processes that ended in the iteration, in the order of the steps."""
+        """Returns of the counted episodes that ended in the iteration in any process, in step order."""
         ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
         ended = self.team.gather(ended.T).T
         found: list[float] = ended[~ended.isnan()].tolist()
@@ -359,4 +359,4 @@ class PPO(OnPolicyLearner):
             self.std.copy_(state["std"])
         self._recent.clear()
         self._recent.extend(state["recent"])
-        self.minibatches.forget()  # the graph holds the addresses of the old moments
+        self.minibatches.forget()  # the graph stores the addresses of the old moments

@@ -25,40 +25,40 @@ class PPOConfig:
     """
 
     num_steps: int = 24
-    """Steps of every world in an iteration."""
+    """Steps of every world per iteration."""
     epochs: int = 5
-    """Passes over the samples of an iteration."""
+    """Passes over an iteration's samples."""
     minibatches: int = 4
-    """Mini-batches in an epoch, of equal size. Remaining samples are not used."""
+    """Number of equal mini-batches per epoch. Remaining samples are not used."""
     gamma: float = 0.99
     """Discount factor."""
     lam: float = 0.95
     """Lambda of the generalised advantage estimate."""
     clip: float = 0.2
-    """Clipping range of the probability ratio around 1, and with clip_value_loss of the values around the old
+    """Clipping range of the probability ratio around 1 and, with clip_value_loss, of the values around the old
     values."""
     clip_value_loss: bool = True
-    """Whether the value loss is the larger of the errors of the prediction and of the clipped prediction."""
+    """Whether the value loss is the larger of two errors: with the prediction and with the clipped prediction."""
     value_coef: float = 1.0
     """Coefficient of the value loss."""
     entropy_coef: float = 0.01
     """Coefficient of the policy's entropy."""
     final_entropy_coef: float | None = None
-    """Coefficient of the entropy after entropy_decay; by default the coefficient is constant."""
+    """Entropy coefficient after entropy_decay; by default it stays constant."""
     entropy_decay: tuple[int, int] = (150, 200)
-    """First and last iteration of the coefficient's linear change to final_entropy_coef."""
+    """First and last iteration of the linear change from entropy_coef to final_entropy_coef."""
     learning_rate: float = 1e-3
-    """Learning rate of Adam; the initial one if it is adaptive."""
+    """Learning rate of Adam; the initial value if it is adaptive."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
-    """"adaptive" divides the learning rate by 1.5 after a mini-batch with a KL divergence above twice desired_kl, and
-    multiplies it by 1.5 after one below half of desired_kl, within 1e-5 and 1e-2."""
+    """"adaptive" divides the learning rate by 1.5 if a mini-batch's KL divergence exceeds twice desired_kl, and
+    multiplies it by 1.5 if the divergence is below half of desired_kl, between 1e-5 and 1e-2."""
     desired_kl: float = 0.02
-    """KL divergence that the adaptive learning rate aims at. With 0.02 PPO learns go1_velocity faster than with mjlab's
+    """Target KL divergence of the adaptive learning rate. With 0.02, PPO learns go1_velocity faster than with mjlab's
     0.01 (bench/README.md)."""
     max_grad_norm: float = 1.0
     """Maximum Euclidean norm of the gradient, for the policy and the value function separately."""
     whiten_minibatches: bool = False
-    """Whether to normalise advantages to mean 0 and standard deviation 1 in each mini-batch, instead of over all
+    """Whether to normalise advantages to mean 0 and standard deviation 1 within each mini-batch instead of over all
     samples."""
     hidden: tuple[int, ...] = (512, 256, 128)
     """Widths of the policy's hidden layers."""
@@ -91,7 +91,7 @@ class PPOConfig:
         object.__setattr__(self, "entropy_decay", _iterations("entropy_decay", self.entropy_decay))
 
     def entropy_weight(self, iteration: int) -> float:
-        """Coefficient of the entropy in an iteration, counted from 1."""
+        """Entropy coefficient in an iteration, counted from 1."""
         if self.final_entropy_coef is None:
             return self.entropy_coef
         first, last = self.entropy_decay
@@ -100,7 +100,7 @@ class PPOConfig:
 
 
 def _iterations(name: str, value: Any) -> tuple[int, int]:
-    """Check a pair of increasing numbers of iterations."""
+    """Check a pair of increasing iteration numbers."""
     try:
         first, last = value
     except (TypeError, ValueError):

@@ -1,7 +1,7 @@
-"""Update plans by predictive sampling: the sample with the largest return is the new plan.
+"""Update plans by predictive sampling: the sample with the largest return becomes the new plan.
 
-The last plan is among the samples (``planner.py``), so that only a better plan replaces it. Source: Howell et al.
-(2022, "Predictive sampling: real-time behaviour synthesis with MuJoCo"), whose plans are splines with a few knots.
+The last plan is one of the samples (``planner.py``), so only a better plan replaces it. Source: Howell et al. (2022,
+"Predictive sampling: real-time behaviour synthesis with MuJoCo"), whose plans are splines with a few knots.
 """
 
 from lyceum_warp.algos.cem import EliteWeights

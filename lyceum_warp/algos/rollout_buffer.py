@@ -17,7 +17,7 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_group, check_kind, whole_number
 
 _LARGE = 1e18
-"""Bound of observations whose squares float32 can represent."""
+"""Bound on observations, so that float32 can represent their squares."""
 
 
 class Sampler(Protocol):
@@ -30,14 +30,14 @@ class Sampler(Protocol):
 
 @document_attributes
 class Rollout:
-    """A buffer for the samples of a fixed number of steps of every world, allocated once.
+    """A preallocated buffer for the samples of a fixed number of steps of every world.
 
     Args:
         env: The environment.
         steps: Number of steps.
         groups: Groups of observations to store in addition to "policy", such as ``("critic",)``.
         first_only: Whether to count only each world's first episode since ``restart``. If all worlds start together,
-            counting all episodes that end is biased towards short episodes.
+            counting all episodes that end would be biased towards short episodes.
 
     Raises:
         ValueError: The task has no such group of observations.
@@ -61,24 +61,24 @@ class Rollout:
     """Evaluation metric after each step, (steps, nworld)."""
     terminated: torch.Tensor
     """Whether the task ended the episode, (steps, nworld) bool. A fault counts as truncation: learners bootstrap from
-    the last good observation."""
+    the last valid observation."""
     done: torch.Tensor
     """Whether the episode ended for any reason, (steps, nworld) bool."""
     success: torch.Tensor
-    """Whether the goal was met after each step, (steps, nworld) bool."""
+    """Whether the goal is met after each step, (steps, nworld) bool."""
     episode_return: torch.Tensor
-    """Sum of the rewards of the episode so far, (steps, nworld); nan in episodes that are not counted."""
+    """Sum of the episode's rewards so far, (steps, nworld); NaN in episodes that are not counted."""
     episode_length: torch.Tensor
-    """Steps of the episode so far, (steps, nworld)."""
+    """Number of the episode's steps so far, (steps, nworld)."""
     episode_metrics: dict[str, torch.Tensor]
-    """Sums of the task's metrics over the episode so far by name, each (steps, nworld)."""
+    """Sums of the task's metrics over the episode so far, by name, each (steps, nworld)."""
     metrics: dict[str, torch.Tensor]
-    """The task's metrics of each step by name, each (steps, nworld)."""
+    """The task's metrics at each step, by name, each (steps, nworld)."""
 
     running_return: torch.Tensor
-    """Sum of the rewards of each world's current episode, (nworld,); nan in episodes that are not counted."""
+    """Sum of the rewards of each world's current episode, (nworld,); NaN in episodes that are not counted."""
     faults: torch.Tensor
-    """Faults of each world within these steps, (nworld,) int32."""
+    """Number of faults of each world within these steps, (nworld,) int32."""
 
     def __init__(self, env: Env, steps: int, *, groups: Collection[str] = (), first_only: bool = False) -> None:
         check_kind("env of Rollout", env, Env, "as lw.make(...) makes it")
@@ -127,7 +127,7 @@ class Rollout:
         self._after_step = graphs.sequence([Phase("store outputs", self._launch_outputs)])
 
     def _stored(self, source: torch.Tensor, into: list["_Rows"]) -> torch.Tensor:
-        """Allocate storage, (steps, nworld, size), that is filled before or after each step."""
+        """Allocate storage, (steps, nworld, size), to be filled before or after each step."""
         into.append(_Rows(source, self.steps, self.env.device))
         return into[-1].stored
 
@@ -148,7 +148,7 @@ class Rollout:
             self.store_outputs()
 
     def begin(self) -> None:
-        """Start filling the buffer from its first step, for callers that step the environment themselves."""
+        """Start filling the buffer from the first step, for callers that step the environment themselves."""
         self._index.zero_()
         self._fault.zero_()
 
@@ -168,13 +168,13 @@ class Rollout:
         self.running_return.zero_()
 
     def stagger(self, generator: torch.Generator, team: Team | None = None) -> None:
-        """Set the worlds' step counters to random steps of an episode, so that time limits are spread over time.
+        """Set the worlds' step counters to random values, so that time limits are spread over time.
 
-        Otherwise worlds that start together and never terminate would reach their time limits in the same rollout. The
-        returns of these shortened episodes are not counted.
+        Otherwise worlds that start together and never terminate would all reach their time limits in the same rollout.
+        The returns of these shortened episodes are not counted.
 
         Args:
-            generator: Draws the steps, the same in every process.
+            generator: Draws the values, identically in every process.
             team: The processes.
         """
         env, team = self.env, team or Team()
@@ -190,12 +190,12 @@ class Rollout:
     def restart_some(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
         """Restart random worlds so that at least ``least`` worlds started an episode within the last ``steps`` steps.
 
-        Interrupted episodes are not counted. Not for buffers with ``first_only``, which would count restarted worlds
-        twice. Nothing waits for the device.
+        Interrupted episodes are not counted. Do not use this with ``first_only``, which would count restarted worlds
+        twice. The host does not wait for the device.
 
         Args:
-            least: Number of worlds of all processes.
-            generator: Draws the worlds, the same in every process.
+            least: Minimum number of worlds, over all processes.
+            generator: Draws the worlds, identically in every process.
             team: The processes.
         """
         env, team = self.env, team or Team()
@@ -208,9 +208,9 @@ class Rollout:
         self.running_return.masked_fill_(mask, 0.0)
 
     def explain_not_finite(self) -> str:
-        """Describe the first number that is not finite or too large for float32, and how to fix it, in a sentence.
+        """Describe in one sentence the first number that is not finite or too large for float32, and how to fix it.
 
-        Waits for the device. A task's own rewards and observations are finite, because others are faults.
+        Waits for the device. Rewards and observations from a task are always finite, because others are faults.
         """
         kinds: list[tuple[str, torch.Tensor, float, Mapping[str, slice]]] = [("reward", self.reward, torch.inf, {})]
         for groups in (self.obs_groups, self.final_obs_groups):
@@ -262,6 +262,6 @@ class _Rows:
         self.stored = torch_view(self._rows)
 
     def store(self, index: wp.array) -> None:
-        """Launch a copy of the buffer to the step at an index."""
+        """Launch a copy of the buffer into the row given by the index."""
         args = [index, self._source, self._rows]
         wp.launch(collect.store_rows, self._source.shape, args, device=self._rows.device)

@@ -1,4 +1,4 @@
-"""Compute statistics of the episodes that ended in a rollout."""
+"""Compute statistics over the episodes that ended in a rollout."""
 
 import dataclasses
 import math
@@ -20,7 +20,7 @@ Scalar: TypeAlias = Any
 class OnPolicyIteration(Iteration):
     """Statistics of one iteration of NPG or PPO.
 
-    Numbers about episodes cover the episodes that ended in the iteration; they are nan if none ended.
+    Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended.
     """
 
     kl: float
@@ -28,11 +28,11 @@ class OnPolicyIteration(Iteration):
     std_mean: float
     """Mean standard deviation of the policy's actions."""
     faults: int
-    """Number of faults of worlds in this iteration."""
+    """Number of faults in this iteration, over all worlds."""
     time_sample: float
     """Seconds for sampling."""
     time_mean: float
-    """Seconds for the evaluation of the mean policy."""
+    """Seconds for evaluating the mean policy."""
     samples_per_second: float
     """Samples divided by ``time_sample``."""
 
@@ -43,24 +43,24 @@ class OnPolicyIteration(Iteration):
 
 
 class EpisodeSums(NamedTuple):
-    """Sums over the episodes that ended in one process's worlds."""
+    """Statistics of the episodes that ended in one process's worlds."""
 
     episodes: Scalar
     """Number of episodes."""
     return_mean: Scalar
-    """Mean of their returns."""
+    """Mean return of the episodes."""
     return_square: Scalar
-    """Sum of the squared deviations of their returns from their mean."""
+    """Sum of the squared deviations of the returns from their mean."""
     return_min: Scalar
     """Smallest return; infinity if no episode ended."""
     return_max: Scalar
     """Largest return; minus infinity if no episode ended."""
     length: Scalar
-    """Sum of their lengths."""
+    """Sum of the episode lengths."""
     terminal_reward: Scalar
-    """Sum of their last rewards."""
+    """Sum of the episodes' last rewards."""
     eval: Scalar
-    """Sum of the evaluation metrics at their ends."""
+    """Sum of the evaluation metrics at the episodes' ends."""
     success: Scalar
     """Number of episodes that ended with the goal met."""
 
@@ -74,7 +74,7 @@ class Moments(NamedTuple):
 
 
 def finished(rollout: Rollout) -> EpisodeSums:
-    """Compute sums over the episodes that ended within a rollout, scalar tensors on its device."""
+    """Compute sums over the episodes that ended in a rollout, as scalar tensors on its device."""
     ended = _ended(rollout)
     returns = rollout.episode_return.double()
     infinity = torch.inf
@@ -98,10 +98,10 @@ def finished(rollout: Rollout) -> EpisodeSums:
 
 
 def metric_sums(rollout: Rollout) -> tuple[torch.Tensor, ...]:
-    """Sum the task's metrics within a rollout, scalar tensors on its device.
+    """Sum the task's metrics over a rollout, as scalar tensors on its device.
 
-    The sums over the episodes that ended come first, then the means over all samples, in which a metric that is not
-    finite counts as 0, as in the sums.
+    The sums over the episodes that ended come first, then the means over all samples. Non-finite metrics count as 0 in
+    both.
     """
     ended = _ended(rollout)
     sums = [sums.double().masked_fill(~ended, 0.0).sum() for sums in rollout.episode_metrics.values()]
@@ -114,11 +114,11 @@ def _ended(rollout: Rollout) -> torch.Tensor:
 
 
 def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Any]:
-    """Compute ``metrics``, means over the episodes that ended (nan if none ended), and ``step_metrics``.
+    """Compute ``metrics``, means over the episodes that ended (NaN if no episode ended), and ``step_metrics``.
 
     Args:
-        episodes: Number of episodes of all processes.
-        sums: The numbers of ``metric_sums`` of each process.
+        episodes: Number of episodes, over all processes.
+        sums: Each process's result of ``metric_sums``.
         names: Names of the metrics.
     """
     totals = [sum(parts) for parts in zip(*sums, strict=True)]
@@ -130,7 +130,7 @@ def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequen
 
 
 def episode_statistics(sums: Sequence[EpisodeSums]) -> dict[str, float]:
-    """Compute statistics of finished episodes from the sums of all processes; nan if none ended."""
+    """Compute statistics of finished episodes from the sums of all processes; NaN if no episode ended."""
     episodes, mean, square = pooled([Moments(part.episodes, part.return_mean, part.return_square) for part in sums])
     if not episodes:
         return dict.fromkeys(_EPISODE_STATISTICS, math.nan)
@@ -153,7 +153,7 @@ _EPISODE_STATISTICS = (
 
 
 def pooled(parts: Sequence[Moments]) -> Moments:
-    """Combine the moments of several sets of numbers."""
+    """Pool the moments of several sets of numbers."""
     n = sum(part.n for part in parts)
     mean = sum(part.n * part.mean for part in parts) / n if n else 0.0
     return Moments(n, mean, sum(part.square + part.n * (part.mean - mean) ** 2 for part in parts))

@@ -43,7 +43,7 @@ class PhaseTimer:
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Limit torch to one CPU thread, for operations that are too small to divide.
+    """Limit torch to one CPU thread, for operations too small to parallelise.
 
     On a busy machine torch's threads would spend more time waiting for each other than computing.
     """
@@ -57,10 +57,10 @@ def one_thread() -> Iterator[None]:
 
 @contextlib.contextmanager
 def beside(function: Callable[[], Result], *, allowed: bool) -> Iterator[Callable[[], Result]]:
-    """Run a function in parallel with the block, each with one torch thread, if torch has exactly two threads.
+    """If torch has exactly two threads, run a function in parallel with the block, each on one thread.
 
-    Mini-batches do not profit from a second thread, and large products speed up by less than two. With another number
-    of threads, or if not allowed, the function is called when the block requests its result.
+    Mini-batches do not benefit from a second thread, and large products speed up by less than a factor of two.
+    With any other number of threads, or if not allowed, the function is called when the block requests its result.
 
     Args:
         function: The function; it must not share state with the block.
@@ -72,5 +72,5 @@ def beside(function: Callable[[], Result], *, allowed: bool) -> Iterator[Callabl
     if not allowed or torch.get_num_threads() != 2:
         yield function
         return
-    with one_thread(), ThreadPoolExecutor(1) as pool:  # joins the function also after an error
+    with one_thread(), ThreadPoolExecutor(1) as pool:  # waits for the function even after an error
         yield pool.submit(function).result

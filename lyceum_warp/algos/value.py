@@ -18,12 +18,12 @@ class ValueFunction(Normalized):
     """A network that predicts discounted returns.
 
     Args:
-        nobs: Numbers in an observation.
+        nobs: Length of an observation.
         hidden: Widths of the hidden layers.
         activation: Activation of the hidden layers.
-        scale: Factor of the network's output until ``rescale`` fits it to returns.
-        time_orders: Highest power of the time features t, t^2, ... with t = step / 1000 (as in mjrl); 0 for none. With
-            a time limit that observations do not contain, the return depends on the step.
+        scale: Factor on the network's output until ``rescale`` fits it to returns.
+        time_orders: Highest power of the time features t, t^2, ... with t = step / 1000 (as in mjrl); 0 for none. They
+            help if the time limit is not observable, because returns then depend on the step.
         normalize: Whether to normalise observations by their running mean and variance.
         limit: Normalised observations are clipped to [-limit, limit]; inf for no limit.
         discount: Discount factor of the predicted returns, if known.
@@ -35,14 +35,14 @@ class ValueFunction(Normalized):
     """
 
     LATER = ("shift", "scale")
-    """Buffers that files of earlier releases lack: their shift is 0, and their scale is an argument."""
+    """Buffers missing in files of earlier releases; the initial values are used instead."""
 
     group: str
     """The group of observations that is the input."""
     shift: torch.Tensor
     """Offset of the scaled output: the mean of the returns."""
     scale: torch.Tensor
-    """Factor of the network's output: the standard deviation of the returns."""
+    """Factor on the network's output: the standard deviation of the returns."""
     discount: float | None
     """Discount factor of the predicted returns, if known."""
     orders: torch.Tensor
@@ -77,7 +77,7 @@ class ValueFunction(Normalized):
         if limit != LIMIT:  # files of earlier releases lack it
             self._shape["limit"] = limit
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)
-        # with a last layer of zeros, the prediction is the mean of the returns
+        # with a last layer of zeros, the initial prediction is the mean return
         self.network = mlp(sizes, activation=activation, last_scale=0.0, generator=generator)
         self.register_buffer("shift", torch.zeros((), dtype=torch.float64))
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
@@ -106,16 +106,16 @@ class ValueFunction(Normalized):
 
     @torch.no_grad()
     def rescale(self, returns: torch.Tensor, *, first: bool = False, team: Team | None = None) -> None:
-        """Set shift and scale to mean and standard deviation of returns, and preserve the predictions.
+        """Set shift and scale to the mean and standard deviation of returns, without changing the predictions.
 
-        The last layer compensates the change (Pop-Art; van Hasselt et al. 2016, "Learning values across many orders of
-        magnitude"). Returns are clipped to ``BOUND`` scales around the shift, and the scale changes at most by this
-        factor. If more than a quarter of the returns lie outside, as after a change of the task, they are no outliers,
-        and the bounds follow from their quartiles. Equal returns leave the scale unchanged.
+        The last layer compensates for the change (Pop-Art; van Hasselt et al. 2016, "Learning values across many orders
+        of magnitude"). Returns are clipped to ``BOUND`` scales around the shift, and the scale changes at most by this
+        factor. If more than a quarter of the returns lie outside, as after a change of the task, they do not count as
+        outliers, and the bounds are computed from the quartiles. If all returns are equal, the scale does not change.
 
         Args:
             returns: Returns, of any shape.
-            first: Whether the function was never fitted, so that its scale is arbitrary.
+            first: Whether the value function has never been fitted, so that its scale is arbitrary.
             team: The processes; each brings the same number of returns.
         """
         team = team or Team()
@@ -127,12 +127,12 @@ class ValueFunction(Normalized):
         ordered = team.gather(returns).nan_to_num().sort().values
         quartile, median, other = (ordered[i * (len(ordered) - 1) // 4] for i in (1, 2, 3))
         width = 20.0 * (other - quartile)
-        width.masked_fill_(width == 0.0, torch.inf)  # as with sparse rewards
+        width.masked_fill_(width == 0.0, torch.inf)  # for instance with sparse rewards
         low, high = torch.where(new, median - width, low), torch.where(new, median + width, high)
         returns = torch.minimum(torch.maximum(returns, low), high).nan_to_num()
         mean = team.sum(returns.sum()) / count
         std = (team.sum((returns - mean).square().sum()) / count).sqrt()
-        # equal returns differ by float32 rounding
+        # equal returns may differ by float32 rounding
         scale = torch.where(std > 1e-6 * mean.abs(), torch.maximum(std, 1e-3 * mean.abs()), self.scale)
         near = torch.minimum(torch.maximum(scale, self.scale / BOUND), self.scale * BOUND)
         scale = torch.where(new, scale, near)
@@ -150,11 +150,11 @@ class ValueFunction(Normalized):
 
 
 BOUND = 10.0
-"""Returns and advantages further than this number of scales from the mean are outliers."""
+"""Returns and advantages more than this number of scales from the mean are outliers."""
 
 
 def value_group(env: Env, given: str | None) -> str:
-    """Choose the group of observations of a new value function: by default "critic" if the task has it, else "policy".
+    """The observation group of a new value function: by default "critic" if the task has it, else "policy".
 
     Raises:
         ValueError: The task has no such group.

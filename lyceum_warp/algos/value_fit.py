@@ -12,15 +12,15 @@ from lyceum_warp.algos.value import BOUND, ValueFunction
 
 
 class ValueFit:
-    """Fits a value function by mini-batch Adam on the squared error, in random order.
+    """Fits a value function by Adam on the squared error, in random mini-batches.
 
     The mini-batches do not depend on the number of processes: each process uses the samples of its own worlds, and the
-    gradients are summed. On CUDA the step of a mini-batch is one graph, which replaces some 40 launches. On the CPU a
-    network of ``mlp`` is fitted without autograd.
+    gradients are summed. On CUDA, a mini-batch step is one graph that replaces about 40 launches. On the CPU, a network
+    made by ``mlp`` is fitted without autograd.
 
     Args:
         value: The value function.
-        samples: Samples of all processes.
+        samples: Number of samples, over all processes.
         nworld: Worlds of this process.
         rate: Learning rate.
         epochs: Passes over the samples.
@@ -49,13 +49,13 @@ class ValueFit:
     def __call__(
         self, obs: torch.Tensor, step: torch.Tensor, target: torch.Tensor, generator: torch.Generator
     ) -> torch.Tensor:
-        """Fit to returns. If a parameter or a moment becomes non-finite, all are restored.
+        """Fit to returns. If any parameter or moment of Adam becomes non-finite, all are restored.
 
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
             step: Steps since the reset, (samples,).
             target: Returns, (samples,); clipped to ``BOUND`` scales around the value function's shift.
-            generator: Draws the order of all processes' samples.
+            generator: Draws the order of the samples of all processes.
 
         Returns:
             Whether the fit is finite, a bool tensor.
@@ -87,13 +87,13 @@ class ValueFit:
         return finite
 
     def _numbers(self) -> list[torch.Tensor]:
-        """Parameters and, after the first step, Adam's moments."""
+        """The parameters and, after the first step, Adam's moments."""
         moments = [moment for p in self.parameters for moment in self.optimizer.state.get(p, {}).values()]
         return [*self.parameters, *moments]
 
     @torch.no_grad()
     def _keep_if_finite(self) -> torch.Tensor:
-        """Back up parameters and moments, unless one is not finite; nothing waits for the device."""
+        """Back up parameters and moments unless one is not finite; the host does not wait for the device."""
         present = torch.cat([numbers.reshape(-1) for numbers in self._numbers()])
         # initial moments are zero
         good = torch.nn.functional.pad(self._good, (0, len(present) - len(self._good)))
@@ -113,7 +113,7 @@ class ValueFit:
         if self.team.size == 1:
             return index, 1.0 / len(index)
         places, own = self.team.locate(index, self.nworld)
-        if self.cuda:  # selecting own samples would synchronise with the device, so others get the weight 0
+        if self.cuda:  # selecting own samples would synchronise with the device, so other samples get weight 0
             return places, own.unsqueeze(-1) / len(index)
         return places[own], 1.0 / len(index)
 
@@ -134,11 +134,11 @@ class ValueFit:
         self.optimizer.load_state_dict(state)
         for group in self.optimizer.param_groups:
             group["capturable"] = self.cuda
-        self.captured = None  # the graph holds the addresses of the old moments
+        self.captured = None  # the graph stores the addresses of the old moments
 
 
 class DenseSteps:
-    """Mini-batch steps of a ``ValueFit`` on the CPU without autograd and torch's Adam.
+    """Mini-batch steps of a ``ValueFit`` on the CPU, without autograd or torch's Adam.
 
     Parameters and moments are flat copies, which ``store`` writes back into the value function and the optimizer.
     """
@@ -207,7 +207,7 @@ class DenseSteps:
 
 
 class CapturedStep:
-    """Mini-batch steps of a ``ValueFit`` as a CUDA graph, in which a device counter selects the mini-batch.
+    """Mini-batch steps of a ``ValueFit`` as a CUDA graph; a counter on the device selects the mini-batch.
 
     The constructor uses only the shapes and the device of ``features`` and ``target``.
     """
@@ -248,7 +248,7 @@ class CapturedStep:
         self.at.zero_()
 
     def _capture(self, times: int) -> None:
-        """Run some steps directly, which allocate Adam's moments, and then capture the graph."""
+        """Run ``times`` steps directly, which allocates Adam's moments, and then capture the graph."""
         with side_stream():
             for _ in range(times):
                 self.learn()

@@ -1,4 +1,4 @@
-"""Run a command of the shell: find its module by its name, parse its options, print its errors."""
+"""Run the command line: import a command's module by name, parse its options, print errors."""
 
 import difflib
 import importlib
@@ -16,16 +16,16 @@ from lyceum_warp.viz import NoVideoError
 _COMMANDS = {
     "tasks": ("list_tasks", "Tasks", "List the tasks of the package, their sizes and the sources of their models."),
     "new": ("new_task", "New", "Write a task file for a model."),
-    "check": ("check", "Check", "Check that a task keeps every rule of an environment."),
+    "check": ("check", "Check", "Check that a task follows every rule of an environment."),
     "train": ("train", "Train", "Train a policy on a task, with the natural policy gradient or with PPO."),
-    "eval": ("evaluate", "Eval", "Evaluate the policy of a run, and print statistics of its episodes."),
-    "export": ("export", "Export", "Write the policy of a run to an ONNX or .pt2 file."),
+    "eval": ("evaluate", "Eval", "Evaluate a run's policy, and print statistics of its episodes."),
+    "export": ("export", "Export", "Write a run's policy to an ONNX or .pt2 file."),
     "plan": ("plan", "Plan", "Control a task with a planner, and report rewards, success and planning times."),
     "view": ("view", "View", "Show a task, a policy, a planner or saved episodes in a browser."),
     "bench": ("bench", "Bench", "Run an experiment or another program of bench/."),
 }
-"""The module of each command, its class, and its line in the help. A command's module is imported once it is named:
-most of them load torch, Warp and MuJoCo."""
+"""Each command's module, class and help line. A module is imported only when its command is run, because most load
+torch, Warp and MuJoCo."""
 
 _DESCRIPTION = """Batched MuJoCo worlds for robot learning.
 
@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the program ``lyceum-warp``.
 
     Returns:
-        0; 1 if --require-return was not met, or if check found a broken rule; 2 for bad input; 130 or 143 after
+        0 on success; 1 if --require-return was not met or check found a broken rule; 2 for bad input; 130 or 143 after
         Ctrl-C or SIGTERM.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
@@ -91,6 +91,6 @@ def _run(argv: list[str]) -> int:
         raise ValueError(f"there is no command {name!r}: {hint}")
     module, kind, _ = _COMMANDS[name]
     command = getattr(importlib.import_module(f"lyceum_warp.cli.{module}"), kind)
-    # the words after the name of a program of bench/ belong to that program
+    # arguments after the name of a bench/ program belong to that program
     words, rest = (words[:1], words[1:]) if name == "bench" else (words, [])
     return int(tyro.cli(command, prog=f"lyceum-warp {name}", args=words).run(*rest))

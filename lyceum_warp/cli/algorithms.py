@@ -1,4 +1,4 @@
-"""Make flags of the hyperparameters of all algorithms that lyceum-warp train knows."""
+"""Generate flags for the hyperparameters of all algorithms of lyceum-warp train."""
 
 import dataclasses
 from typing import Any
@@ -19,10 +19,10 @@ for _algorithm, (_, _config) in ALGORITHMS.items():
     default={name: f"({', '.join(words)})" for name, words in _DEFAULTS.items()},
 )
 class Hyperparameters:
-    """Hyperparameters. The help lists the algorithms that have each one, with their defaults."""
+    """Hyperparameters. For each flag, the help lists the algorithms that have it, with their defaults."""
 
     def on_top_of(self, config: Any, algorithm: str) -> Any:
-        """Replace hyperparameters of a configuration by the given flags.
+        """Override a configuration's hyperparameters with the given flags.
 
         Args:
             config: The configuration; None for the algorithm's defaults.
@@ -39,7 +39,7 @@ class Hyperparameters:
                 other for other, (_, config) in ALGORITHMS.items() if name in config.__dataclass_fields__
             )
             raise ValueError(
-                f"--{name.replace('_', '-')} is a setting of {fitting}, not of {algorithm}: leave it out, or give "
+                f"--{name.replace('_', '-')} is a setting of {fitting}, not of {algorithm}: omit it, or give "
                 f"--algorithm {fitting}"
             )
         return kind(**values) if config is None else dataclasses.replace(config, **values)

@@ -1,4 +1,4 @@
-"""Define the arguments that commands share: flags made from options, and values as NAME=VALUE."""
+"""Define the arguments that commands share: flags generated from options, and NAME=VALUE arguments."""
 
 import ast
 import dataclasses
@@ -14,7 +14,7 @@ from lyceum_warp.options import OPTIONS, EnvOptions, PhysicsOptions
 from lyceum_warp.support.docstrings import attribute_docs
 
 Repeated = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")]
-"""A flag that may be given several times, with one NAME=VALUE each."""
+"""A repeatable flag with one NAME=VALUE each."""
 
 ParamWords = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -64,16 +64,17 @@ _UNIONS = (UnionType, type(typing.Union[int, str]))  # noqa: UP007 (the type of 
 def optional_flags(
     *options: type, omit: Collection[str] = (), default: str | Mapping[str, str] | None = None
 ) -> Callable[[type[Class]], type[Class]]:
-    """Class decorator: add the fields of dataclasses as flags, with their docstrings as help texts.
+    """Class decorator: add the fields of dataclasses as flags, with their docstrings as help text.
 
-    The class declares fields that need another type or help text in a shell, and all fields of several types. Values
-    are validated when the dataclass is made, because the parser would print errors in a box of several lines.
+    The class itself declares fields that need a different type or help text on the command line, and all fields with
+    union types. Values are validated when the options are made, because the parser would print errors in a multi-line
+    box.
 
     Args:
-        options: The dataclasses. If several have a field, the first one determines its type and help text.
-        omit: Fields that get no flag.
-        default: Text for the default in the help, for all flags or by the name of the field; flags then default to
-            None. Without it flags have the defaults of the dataclass.
+        options: The dataclasses. If several have the same field, the first determines its type and help text.
+        omit: Fields without a flag.
+        default: Text that describes the default in the help, for all flags or by field name; flags then default to
+            None. If it is None, flags have the dataclass's defaults.
     """
 
     def decorated(cls: type[Class]) -> type[Class]:
@@ -89,7 +90,7 @@ def optional_flags(
                     setattr(cls, name, field.default if default is None else None)
                 value = getattr(cls, name)
                 flag = own.pop(name, None) or hints[name]
-                if value is None and flag is hints[name]:  # the docstring explains None, and the shell cannot give it
+                if value is None and flag is hints[name]:  # the docstring explains None; a flag cannot be None
                     (kind_of_flag,) = {*(typing.get_args(flag) if isinstance(flag, _UNIONS) else [flag])} - {type(None)}
                     flag = Annotated[kind_of_flag | None, tyro.conf.DisallowNone]
                 text = default[name] if isinstance(default, Mapping) else default or ""
@@ -122,25 +123,36 @@ class Placement:
     """cpu, or a CUDA device such as cuda:0."""
 
 
+@optional_flags(EnvOptions, omit=NO_FLAGS, default="")
+class EnvFlags:
+    """Where the worlds run, and the length of their episodes: by default those of the run, if there is one."""
+
+    engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
+    """mujoco (the C engine, on CPU cores), warp, or auto (the default): warp on a CUDA device and mujoco on the CPU."""
+    device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
+    """cpu (the default), or a CUDA device such as cuda:0. Without this flag a run with the engine auto is evaluated on
+    the CPU, where a few worlds step fastest."""
+
+
 @optional_flags(PhysicsOptions, default="")
 class Physics:
-    """How the worlds are simulated. Options that are not given come from the task or its model."""
+    """How the worlds are simulated. The defaults come from the task or its model."""
 
     solver: Repeated = ()
-    """A limit of the constraint solver, such as iterations=4, ls_iterations=10 or noslip_iterations=0; may be given
-    several times. By default the model's."""
+    """A limit of the constraint solver, such as iterations=4, ls_iterations=10 or noslip_iterations=0; may be repeated.
+    By default the model's limits."""
 
     def given(self) -> dict[str, Any]:
-        """The options that were given, by name.
+        """The given options, by name.
 
         Raises:
-            ValueError: A limit is not written as NAME=VALUE.
+            ValueError: A limit is not of the form NAME=VALUE.
         """
         limits = {"solver": dict(map(parameter, self.solver))} if self.solver else {}
         return given(self) | limits
 
     def options(self) -> PhysicsOptions:
-        """The options that were given, validated.
+        """The given options, validated.
 
         Raises:
             ValueError: A value is not valid.
@@ -149,15 +161,15 @@ class Physics:
 
 
 def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Parse the parameters of a task from the texts of a repeated flag.
+    """Parse a task's parameters from the values of a repeated flag.
 
     Args:
-        texts: The texts, each NAME=VALUE.
-        command: The command's arguments; the error for an option among the parameters names their flags.
-        instead: Flags for options that have another name in this command.
+        texts: The strings, each NAME=VALUE.
+        command: The command's arguments; if a parameter is really an option, the error names its flag.
+        instead: Flags of options that have a different name in this command.
 
     Raises:
-        ValueError: A text is not written as NAME=VALUE, or sets an option.
+        ValueError: A string is not of the form NAME=VALUE, or sets an option.
     """
     found: dict[str, Any] = {}
     for text in texts:
@@ -176,12 +188,12 @@ def _flag_names(command: Any) -> list[str]:
 
 
 def parameter(text: str) -> tuple[str, Any]:
-    """Parse NAME=VALUE or NAME=0.7,inf: a parameter of a task, or a limit of the solver.
+    """Parse NAME=VALUE or NAME=0.7,inf: a task parameter or a solver limit.
 
-    The path of a table, a ``.npy`` file, becomes absolute.
+    The path of a ``.npy`` table becomes absolute.
 
     Raises:
-        ValueError: The text has another form.
+        ValueError: The string has a different form.
     """
     name, equals, value = text.partition("=")
     if not equals or not name.strip():

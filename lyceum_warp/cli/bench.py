@@ -1,4 +1,4 @@
-"""Run programs of bench/: lyceum-warp bench."""
+"""Run programs in bench/: lyceum-warp bench."""
 
 import contextlib
 import dataclasses
@@ -14,14 +14,14 @@ import tyro
 from lyceum_warp.support.interrupts import Interrupted
 
 FOLDER = Path(__file__).resolve().parents[2] / "bench"
-"""The folder of the programs in a checkout. An installed package has none."""
+"""The folder of the programs in a checkout; an installed package does not have it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Bench:
-    """Run an experiment or another program of bench/ in a checkout; without a name, list the experiments.
+    """Run an experiment or another program in bench/, in a checkout; without a name, list the experiments.
 
-    The program gets all arguments after its name, and explains them with --help.
+    All arguments after the name are passed to the program, which explains them with --help.
 
     $ lyceum-warp bench
     $ lyceum-warp bench throughput --short
@@ -30,13 +30,13 @@ class Bench:
     """
 
     name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")] = "overview"
-    """A program of bench/, without .py."""
+    """A program in bench/, without .py."""
 
     def run(self, *arguments: str) -> int:
         """Run the command.
 
         Args:
-            arguments: Arguments of the program.
+            arguments: Arguments for the program.
 
         Returns:
             The program's exit code.
@@ -61,7 +61,7 @@ class Bench:
             code = child.wait()
         except Interrupted:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                child.wait(3.0)  # Ctrl-C in a terminal has also reached the child
+                child.wait(3.0)  # Ctrl-C in a terminal also reaches the child
             child.terminate()
             child.wait()
             raise

@@ -1,4 +1,4 @@
-"""Check the rules of an environment for a task: lyceum-warp check."""
+"""Check that a task follows the rules of an environment: lyceum-warp check."""
 
 import dataclasses
 import difflib
@@ -14,11 +14,11 @@ from lyceum_warp.testing import CHECKS, Context, check_task
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Check:
-    """Check that a task keeps every rule of an environment, and print the rules with the time of each check.
+    """Check that a task follows every rule of an environment, and print the rules and the time of each check.
 
-    The rules hold for all tasks of the package: a saved state steps to the same numbers, functions write only their
-    outputs and read within bounds, a fault stays in its world, and others. Check a new task on both engines. The exit
-    code is 1 if a rule is broken. In Python, use check_task of lyceum_warp.testing.
+    The rules hold for all tasks of the package: stepping from a saved state gives the same numbers, functions write
+    only their outputs and read within bounds, a fault does not affect other worlds, and more. Check a new task on both
+    engines. The exit code is 1 if a rule is broken. In Python, use lyceum_warp.testing.check_task.
 
     $ lyceum-warp check path/to/my_task.py
     $ lyceum-warp check path/to/my_task.py --engine warp --steps 50
@@ -28,17 +28,17 @@ class Check:
     nworld: int = 4
     """Number of worlds, at least 2."""
     steps: int = 200
-    """Steps of the long checks."""
+    """Number of steps in long checks."""
     seed: int = 0
     """Seed of the worlds and of the random actions."""
     rule: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
-    """A rule to check, by its name in the report; may be given several times. By default all."""
+    """A rule to check, by its name in the report; may be repeated. By default all rules."""
     param: ParamWords = ()
     env: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
     def run(self) -> int:
-        """Run the command; returns the exit code."""
+        """Run the command, and return the exit code."""
         words = vars(self.env) | self.physics.options().given() | parameters(self.param, self)
         checks = [_check(name) for name in self.rule] or CHECKS
         console = make_console()

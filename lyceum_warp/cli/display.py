@@ -1,4 +1,4 @@
-"""Print the output of commands: progress, tables, and paths of plots and videos."""
+"""Print the output of commands: progress, tables, and the paths of plots and videos."""
 
 import contextlib
 import math
@@ -31,7 +31,7 @@ _TABLE_ROWS = 15
 
 
 def make_console() -> Console:
-    """A console; without a terminal it has 120 columns, so that tables are not wrapped."""
+    """Make a console; if stdout is not a terminal, it has 120 columns, so that tables are not wrapped."""
     return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=120)
 
 
@@ -41,7 +41,7 @@ def note(line: str) -> None:
 
 
 class Display(training.Display):
-    """Progress of a training run: a live bar of at most 80 columns on a terminal, otherwise a line for each iteration.
+    """Progress of a training run: a live bar of at most 80 columns on a terminal, otherwise one line per iteration.
 
     Args:
         console: The output.
@@ -58,7 +58,7 @@ class Display(training.Display):
 
     @contextlib.contextmanager
     def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
-        """Print the task, its worlds and the run's folder, and show the bar within the context."""
+        """Print the task, its worlds and the run folder, and show the bar within the context."""
         env, size = learner.env, learner.team.size
         processes = f" each in {size} processes" if size > 1 else ""
         self.console.print(
@@ -79,7 +79,7 @@ class Display(training.Display):
             self.mean = it.mean_return
         shown = self.mean if self.console.is_terminal else math.nan if it.mean_return is None else self.mean
         row = _known(it.row())
-        # no return is known before an episode has ended
+        # the return is unknown until an episode has ended
         reward = f"reward {row['reward_mean']:.3g} a step" if "reward_mean" in row else ""
         result = f"return {row['return_mean']:.4g}" if "return_mean" in row else reward
         mean = "" if math.isnan(shown) else f"(mean policy {shown:.4g})"
@@ -102,7 +102,7 @@ class Display(training.Display):
             sys.stdout.flush()
 
     def work(self, text: str, unit: str, done: int, total: int) -> None:
-        """Show the progress of work between two iterations."""
+        """Show the progress of work between two iterations, such as rendering a video."""
         if self.console.is_terminal:
             self.progress.update(self.bar, text=f"{text}: {done}/{total} {unit}")
             return
@@ -114,14 +114,14 @@ class Display(training.Display):
 
 
 _COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skipped update"}
-"""Columns that count problems, with their names in messages. Not every algorithm has all of them."""
+"""Columns that count problems, with their names in messages. Not every algorithm has all columns."""
 
 _BAR_WIDTH = 36
-"""Width of the bar, the number of the iteration and the times, in columns."""
+"""Width of the bar with the iteration number and the times, in characters."""
 
 
 def counted(number: int, what: str) -> str:
-    """A number with a noun."""
+    """A number with a noun, in the plural if necessary."""
     return f"{number:,d} {what}{'s' if number > 1 else ''}"
 
 
@@ -131,13 +131,14 @@ _COLUMNS = [
     ("length", "length_mean", ".0f"), ("eval", "eval_mean", ".3g"), ("success", "success", ".0%"),
     ("KL", "kl", ".3f"), ("samples/s", "samples_per_second", ",.0f"),
 ]  # fmt: skip
-"""Headings of the table of iterations, with their columns in metrics.csv and formats."""
+"""Columns of the table of iterations: heading, column in metrics.csv, format."""
 
 
 def curve_table(rows: list[dict[str, float | None]]) -> Table:
-    """A table of a run's iterations, at most 15 of them, without empty columns.
+    """A table of at most 15 of a run's iterations, without empty columns.
 
-    If at least 5 iterations have an evaluation of the mean policy, the table has only these, the first and the last.
+    If the mean policy was evaluated in at least 4 iterations between the first and the last, other iterations are
+    omitted.
     """
     table = Table(box=rich.box.SIMPLE, padding=0, pad_edge=False)  # fits into 80 columns
     known = [_known(row) for row in rows]
@@ -173,9 +174,9 @@ def _known(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
-    """The path that a function returns, or "none" with the reason.
+    """Call a function that writes a file; return the path, or "none" with the reason if it fails.
 
-    Plots and videos are made of saved results. If one fails, the command has still succeeded.
+    Plots and videos are made from saved results, so the command succeeds even if one of them fails.
     """
     try:
         return str(make(*args, **words))
@@ -184,14 +185,14 @@ def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
 
 
 def policy_video(env: Env, policy: Policy, path: Path, seed: int, *, camera: CameraChoice = None) -> Path:
-    """Run an episode of a policy in a new world, and write a video of it; returns the video's path."""
+    """Run an episode of a policy in a new world, write a video of it, and return the video's path."""
     with LongWork("running an episode for the video", "steps", make_console()) as work:
         one, states = policy_states(env, policy, seed, progress=work)
     return states_video(one, states, path, camera=camera)
 
 
 def states_video(env: Env, states: torch.Tensor, path: Path, *, camera: CameraChoice = None) -> Path:
-    """Write a video of given states; returns its path."""
+    """Write a video of the given states, and return its path."""
     with LongWork("drawing the video", "frames", make_console()) as work:
         return write_video(env, states, path, camera=camera, progress=work)
 
@@ -200,10 +201,10 @@ def states_video(env: Env, states: torch.Tensor, path: Path, *, camera: CameraCh
 
 
 class PlanDisplay:
-    """Progress of an episode under a planner: a live line on a terminal, and a line at the end of the episode.
+    """Progress of a planner's episode: a live line on a terminal, and a line at the end of the episode.
 
-    Without ``real_time`` the live line shows the rate of the plant, otherwise the rate of the plans and the age of the
-    action. Rates are means over the episode so far.
+    With ``real_time`` the live line shows the rate of plans and the age of the action, otherwise the rate of the plant.
+    Rates are means over the episode so far.
     """
 
     def __init__(
@@ -228,7 +229,7 @@ class PlanDisplay:
         """Show a step."""
         if self.console.is_terminal:
             time = max(now.time, 1e-9)
-            if self.real_time:  # the first plan was made before the clock started
+            if self.real_time:  # the first plan is made before the clock starts
                 pace = f"{(now.plans - 1) / time:.0f} plans/s action {1000 * now.age:.3g} ms old"
             else:
                 pace = f"{now.step / time:.0f} Hz {now.step / time * self.timestep:.2f}x real time"
@@ -247,7 +248,7 @@ class PlanDisplay:
 
 
 def report_table(report: ControlReport, *, success: bool = True) -> Table:
-    """A table of a controller's report, with its row ``success`` only if the task has a goal."""
+    """The table of a controller's report; without ``success``, the row of that name is omitted."""
     table = Table(box=rich.box.SIMPLE, show_header=False)
     for row in report.rows():
         if success or row[0] != "success":

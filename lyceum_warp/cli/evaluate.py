@@ -1,4 +1,4 @@
-"""Evaluate the policy of a run: lyceum-warp eval."""
+"""Evaluate a run's policy: lyceum-warp eval."""
 
 import dataclasses
 from pathlib import Path
@@ -11,7 +11,7 @@ from rich.table import Table
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, ParamWords, Trust, given, optional_flags, parameters
+from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Trust, given, parameters
 from lyceum_warp.cli.display import make_console, note, policy_video, tried
 from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.controllers.trajectory import source
@@ -27,23 +27,12 @@ from lyceum_warp.viz.long_work import LongWork
 from lyceum_warp.viz.video import check_video
 
 
-@optional_flags(EnvOptions, omit=NO_FLAGS, default="(default: the run's)")
-class OtherEnv:
-    """Options of the environment."""
-
-    engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """mujoco (the C engine, on CPU cores), warp, or auto."""
-    device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu, or a CUDA device such as cuda:0. Without this flag a run with the engine auto is evaluated on the CPU, where
-    a few worlds step fastest."""
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Eval:
-    """Evaluate the mean policy of a run in whole episodes, in the run's own physics, and print statistics.
+    """Evaluate a run's mean policy in whole episodes, with the run's own physics, and print statistics.
 
-    If the task's file or model has moved or changed since the run began, the command uses the run's own copy and prints
-    a line.
+    If the task's file or model has moved or changed since the run started, the command uses the run's own copy and
+    prints a message.
 
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
     $ lyceum-warp eval runs/hopper-20260101-120000 --video --camera track=torso --camera azimuth=45
@@ -53,34 +42,34 @@ class Eval:
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     which: str = "last"
-    """Which policy: last, best, or the number of an iteration that was kept."""
+    """Which policy: last, best, or the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """A task, by name or file, that is used with its own physics and defaults instead of the run's task. It may be the
-    present version of the run's task. Observations and actions must have the same sizes."""
+    """A task, by name or file, to use with its own physics and defaults instead of the run's task. It may be the
+    current version of the run's task. Observations and actions must have the same sizes."""
     param: ParamWords = ()
     episodes: int = 32
     """Number of episodes."""
     seed: int = 1
-    """Seed of the initial states. They differ from the initial states of training with this seed."""
+    """Seed of the initial states, which differ from those of training with this seed."""
     nworld: int = 32
-    """Largest number of worlds; never more than episodes."""
+    """Maximum number of worlds; never more than episodes."""
     video: bool = False
     """Whether to write a video of one episode, eval.mp4 in the run's folder."""
     camera: CameraWords = ()
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Folder, new or empty, for a file of each episode in the format of lyceum-warp plan: episode-000.npz and so on."""
+    """A new or empty folder for one file per episode, in the format of lyceum-warp plan: episode-000.npz and so on."""
     trust: Trust = False
-    env: tyro.conf.OmitArgPrefixes[OtherEnv] = dataclasses.field(default_factory=OtherEnv)
+    env: tyro.conf.OmitArgPrefixes[EnvFlags] = dataclasses.field(default_factory=EnvFlags)
 
     def run(self) -> int:
-        """Run the command; returns the exit code."""
+        """Run the command, and return the exit code."""
         if self.episodes < 1 or self.nworld < 1:
             raise ValueError(f"eval needs at least 1 episode and 1 world, not {self.episodes} and {self.nworld}")
         camera = parsed_camera(self.camera)
         if self.video:
             check_video()
         elif camera is not None:
-            raise ValueError("--camera has no effect without --video: give both, or leave out --camera")
+            raise ValueError("--camera has no effect without --video: give both, or omit --camera")
         if self.episodes_to is not None:
             Run.check_free(self.episodes_to)
         run = Run.open(self.folder)
@@ -122,15 +111,15 @@ class Eval:
 
 
 def run_worlds(run: Run, flags: Any, params: dict[str, Any], *, nworld: int, task: str | None, trust: bool) -> Env:
-    """Make worlds of a run's task, with the run's options and parameters unless they are given.
+    """Make worlds of a run's task, with the run's options and parameters as defaults.
 
     Args:
         run: The run.
-        flags: Flags of options; without a device, few worlds run on the CPU.
-        params: Parameters that replace the run's.
+        flags: Flags that override options; without a device, the worlds run on the CPU if the engine is auto.
+        params: Parameters that override the run's.
         nworld: Number of worlds.
-        task: Another task, which is used with its own options and parameters.
-        trust: Whether to run the task of a run that this user did not make on this machine.
+        task: A different task, with its own options and parameters.
+        trust: Whether to execute the task of a run that this user did not make on this machine.
     """
     saved = Configuration.of(run)
     known, own = saved.options.changed({"seed": 0}), dict(saved.params)
@@ -147,7 +136,7 @@ def run_worlds(run: Run, flags: Any, params: dict[str, Any], *, nworld: int, tas
 
 
 def _save_episodes(env: Env, policy: Policy, options: Eval, source: dict[str, Any]) -> str:
-    """Run the same episodes again, and write a file of each; returns a pattern that matches the files."""
+    """Run the same episodes again, write one file per episode, and return a pattern that matches the files."""
     assert options.episodes_to is not None
     whose = {"name": type(policy).__name__, "run": str(options.folder.resolve()), "which": options.which}
     with LongWork("running the episodes that are saved", "steps", make_console()) as work:
@@ -162,7 +151,7 @@ def _save_episodes(env: Env, policy: Policy, options: Eval, source: dict[str, An
 
 
 def _source(env: Env, run: Run) -> dict[str, Any]:
-    """The entry ``source`` of saved episodes, with the run's copy of the model if it was used."""
+    """The ``source`` of saved episodes, with the run's copy of the model if it was used."""
     made, copy = source(env), run.config.get("kept", {}).get("model")
     if copy is not None and env.options.model is not None and "model" not in made["options"]:
         made["options"]["model"] = str((run.task_folder / copy).resolve())

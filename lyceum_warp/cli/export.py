@@ -1,4 +1,4 @@
-"""Export the policy of a run: lyceum-warp export."""
+"""Export a run's policy: lyceum-warp export."""
 
 import dataclasses
 from pathlib import Path
@@ -13,10 +13,10 @@ from lyceum_warp.runs.folder import Run, load
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write the policy of a run, with its observation normaliser, to a file that runs without lyceum_warp.
+    """Write a run's policy, including its observation normaliser, to a file that runs without lyceum_warp.
 
-    An .onnx file has the input "obs", (n, observations) float32 with any n, and the output "action", the mean actions.
-    It needs pip install 'lyceum-warp[export]'. A .pt2 file is loaded by torch: torch.export.load(file).module()(obs).
+    An .onnx file has the input "obs", (n, observations) float32 for any n, and the output "action", the mean actions.
+    Writing it needs pip install 'lyceum-warp[export]'. torch loads a .pt2 file: torch.export.load(file).module()(obs).
 
     $ lyceum-warp export runs/hopper-20260101-120000
     $ lyceum-warp export runs/hopper-20260101-120000 --which best --to robot/policy.onnx
@@ -25,12 +25,12 @@ class Export:
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     to: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """The file, .onnx or .pt2; policy.onnx in the run's folder by default. It is replaced if it exists."""
+    """The file, .onnx or .pt2; by default policy.onnx in the run's folder. An existing file is replaced."""
     which: str = "last"
-    """Which policy: last, best, or the number of an iteration that was kept."""
+    """Which policy: last, best, or the number of a saved iteration."""
 
     def run(self) -> int:
-        """Run the command; returns the exit code."""
+        """Run the command, and return the exit code."""
         path = self.to or self.folder / "policy.onnx"
         check_export(path)
         policy = load(Run.open(self.folder), which=self.which)

@@ -24,7 +24,7 @@ from lyceum_warp.task import Task
 _HEADINGS = ("task", "obs", "act", "skip", "dt", "horizon", "model")
 
 _LEGEND = """obs, act: numbers in an observation and an action; skip: substeps in a step; dt: seconds in a step.
-A task of your own: lyceum-warp new --help"""
+To write your own task: lyceum-warp new --help"""
 
 _UNKNOWN = "-"
 
@@ -32,24 +32,24 @@ _ONE_CONTROL = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE, mujoc
 """Types of actuators that have one control each."""
 
 _WIDTH = 100
-"""Columns of a description, at most."""
+"""Maximum width of a description, in characters."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Tasks:
     """List the tasks of the package, their sizes and the sources of their models.
 
-    The list includes tasks whose models need an extra or MuJoCo Menagerie, with the missing package.
+    The list includes tasks whose models need an extra or MuJoCo Menagerie, and names the missing package.
 
     $ lyceum-warp tasks
     $ lyceum-warp tasks gymnasium
     """
 
     word: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="WORD")] = ""
-    """Only tasks with this word in their name, their description or the source of their model."""
+    """List only tasks with this word in their name, description or model source."""
 
     def run(self) -> int:
-        """Run the command; returns the exit code."""
+        """Run the command, and return the exit code."""
         entries = [entry for entry in map(_entry, task_names()) if entry.has(self.word)]
         if not entries:
             raise ValueError(
@@ -79,7 +79,7 @@ class _Entry:
 
     name: str
     task: type[Task] | None = None
-    """None if the task's file raises an error."""
+    """None if importing the task's file raises an error."""
     about: str = ""
     source: str = _UNKNOWN
     note: str = ""
@@ -91,7 +91,7 @@ class _Entry:
 
 
 def _entry(name: str) -> _Entry:
-    """The entry of a task, without the sizes, for which the model must be read."""
+    """The entry of a task, without the sizes, which require the model."""
     entry = _Entry(name)
     try:
         task = entry.task = find_task(name)
@@ -104,7 +104,7 @@ def _entry(name: str) -> _Entry:
 
 
 def _cells(entry: _Entry) -> tuple[str, ...]:
-    """The cells of a task's row. If its model cannot be read, the entry's note says why."""
+    """The cells of a task's row. If its model cannot be loaded, the entry's note says why."""
     task = entry.task
     if task is None:
         return (entry.name, *[_UNKNOWN] * 5, entry.source)
@@ -116,20 +116,20 @@ def _cells(entry: _Entry) -> tuple[str, ...]:
         spec = task_spec(task)
         actions = str(_controls(spec)) if task.actions is None else actions
         timestep = f"{spec.option.timestep * task.frame_skip:g} s"
-    except Exception as error:  # a missing package with the model, or a mistake in the task
+    except Exception as error:  # a missing model package, or a mistake in the task
         entry.note = entry.note or _reason(error)
     return (entry.name, obs, actions, str(task.frame_skip), timestep, str(task.horizon or "none"), entry.source)
 
 
 def _controls(spec: mujoco.MjSpec) -> int:
-    """The number of a model's controls. Compiling a model takes up to a second, so it is avoided if possible."""
+    """The number of a model's controls. Compiling a model takes up to a second, so this is avoided if possible."""
     if all(actuator.gaintype in _ONE_CONTROL for actuator in spec.actuators):
         return len(spec.actuators)
     return compile_model(spec, (), PhysicsOptions()).nu
 
 
 def _source(task: type[Task]) -> str:
-    """The source of a task's model, with its extra if it needs one."""
+    """The source of a task's model, with the extra that it needs, if any."""
     model: Any = task.model() if callable(task.model) else task.model
     if not isinstance(model, str | ModelFile):
         return f"made in {task.__module__.rpartition('.')[2]}.py"
@@ -141,7 +141,7 @@ def _source(task: type[Task]) -> str:
 
 
 def _reason(error: Exception) -> str:
-    """An error in one line, reduced to the command that fixes it if it names one."""
+    """An error in one line; if it names a pip command that fixes it, only that."""
     text = " ".join(str(error).split())
     command = text.rpartition(": ")[2]
     if command.startswith("pip install"):

@@ -24,7 +24,7 @@ _SOURCES: dict[str, Callable[[str], ModelFile]] = {
     "gymnasium": gymnasium_model,
     "gymnasium_robotics": gymnasium_robotics_model,
 }
-"""Functions that name a model, by the prefix before the colon in --model."""
+"""Functions that locate a model, by the prefix before the colon in --model."""
 
 _TAKEN = ("World", "Params", "Row")
 """Names that the file uses itself."""
@@ -32,11 +32,10 @@ _TAKEN = ("World", "Params", "Row")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class New:
-    """Write a task file for a model: it can be checked, stepped and trained at once, with a reward of zero.
+    """Write a task file for a model, with a reward of zero; it can be checked, stepped and trained immediately.
 
-    The policy observes positions and velocities and what the model's sensors measure, or only the sensors where they
-    measure every joint. It acts through the model's actuators. A step takes about 20 ms. Comments in the file say how
-    to go on.
+    The policy observes positions, velocities and the model's sensors, or only the sensors if they measure every joint.
+    It acts through the model's actuators. A step lasts about 20 ms. Comments in the file explain the next steps.
 
     $ lyceum-warp new walk --model robots/dog.xml
     $ lyceum-warp new tasks/hop.py --model gymnasium:hopper.xml
@@ -44,14 +43,14 @@ class New:
     """
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
-    """The name of the task, in snake_case, for the file TASK.py in the current folder; or the file: path/to/task.py."""
+    """The task's name in snake_case, to write TASK.py in the working directory; or a file, path/to/task.py."""
     model: Annotated[str, tyro.conf.arg(metavar="FILE")]
-    """An MJCF or URDF file; or menagerie:ROBOT/FILE.xml, of the checkout of MuJoCo Menagerie to which the environment
-    variable MENAGERIE_ROOT points; or gymnasium:FILE.xml or gymnasium_robotics:PATH, of these packages. A relative path
-    is written relative to the task file."""
+    """An MJCF or URDF file; menagerie:ROBOT/FILE.xml, from the MuJoCo Menagerie checkout at the environment variable
+    MENAGERIE_ROOT; or gymnasium:FILE.xml or gymnasium_robotics:PATH, from these packages. A relative path is stored
+    relative to the task file."""
 
     def run(self) -> int:
-        """Run the command; returns the exit code."""
+        """Run the command, and return the exit code."""
         path = Path(self.task if self.task.endswith(".py") else f"{self.task}.py").expanduser()
         class_name = _class_name(path)
         if path.exists():
@@ -81,7 +80,7 @@ class New:
 
 
 def _class_name(path: Path) -> str:
-    """The name of the class in a task file.
+    """The name of the class for a task file.
 
     Raises:
         ValueError: The file's name cannot be the name of a task, or belongs to another task or module.
@@ -94,7 +93,7 @@ def _class_name(path: Path) -> str:
         or keyword.iskeyword(class_name)
     ):
         raise ValueError(f"a task can't be named {name!r}: use letters, digits and _, as in my_robot")
-    if snake_case(class_name) != name:  # the class alone has the name of the task
+    if snake_case(class_name) != name:  # the task's name is derived from the class's
         raise ValueError(f"a task can't be named {name!r}: use {snake_case(class_name)!r}, for the class {class_name}")
     if class_name in _TAKEN:
         raise ValueError(f"a task can't be named {name!r}: its file uses {class_name} for something else")
@@ -107,14 +106,14 @@ def _class_name(path: Path) -> str:
 
 
 def _model(text: str, path: Path) -> tuple[str, str, mujoco.MjSpec]:
-    """A model as an expression in a task file, what to call it, and the model itself.
+    """The expression for a model in a task file, its description, and the model itself.
 
     Args:
-        text: The model as it is given on the command line.
+        text: The model as given on the command line.
         path: The task file.
 
     Raises:
-        FileNotFoundError: There is no such file, or its package or checkout is not there.
+        FileNotFoundError: The file, its package or the checkout is missing.
         ValueError: MuJoCo cannot read the file.
     """
     where, _, file = text.partition(":")
@@ -128,7 +127,7 @@ def _model(text: str, path: Path) -> tuple[str, str, mujoco.MjSpec]:
 
 
 def _title(file: str) -> str:
-    """What the docstring of a task file calls a model."""
+    """The description of a model in the docstring of a task file."""
     plain = file.isprintable() and not set(file) & set('\\"') and len(file) <= 50
     return f"the model {file}" if plain else "a model"
 

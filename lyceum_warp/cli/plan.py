@@ -2,9 +2,7 @@
 
 import dataclasses
 import datetime
-import math
 import signal
-import time
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -30,25 +28,25 @@ from lyceum_warp.cli.arguments import (
 )
 from lyceum_warp.cli.display import PlanDisplay, make_console, report_table, states_video, tried
 from lyceum_warp.controllers.checked_controller import CheckedController
-from lyceum_warp.controllers.control_report import control_report
+from lyceum_warp.controllers.control_report import ControlReport, control_report
 from lyceum_warp.controllers.loop import control
 from lyceum_warp.controllers.real_time import control_async
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.runs.folder import Run, load_value
 from lyceum_warp.support.interrupts import Interrupted
-from lyceum_warp.support.validate import positive_number, whole_number
+from lyceum_warp.support.validate import whole_number
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 from lyceum_warp.viz.control_plot import control_plot
 
 
 @optional_flags(MPPIConfig, default="(default: the task's)")
 class Settings:
-    """Settings of the planner. By default they are the task's."""
+    """Settings of the planner. The defaults come from the task."""
 
     noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
-    """Standard deviation of the noise around the plan, in units of the action: one number, or one for each action. A
-    covariance can be given in Python."""
+    """Standard deviation of the noise around the plan, in units of the action: one number, or one for each action.
+    Python also accepts a covariance."""
     smoothing: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="B0 B1 B2")] = None
     fill: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="WORD|FLOAT ...")] = None
     termination: Annotated[str | None, tyro.conf.arg(metavar="stop|ignore")] = None
@@ -59,7 +57,7 @@ class Settings:
     risk: Annotated[str | None, tyro.conf.arg(metavar="mean|worst")] = None
 
     def on_top_of(self, config: MPPIConfig) -> MPPIConfig:
-        """Replace settings of a configuration by the given flags.
+        """Override a configuration's settings with the given flags.
 
         Raises:
             ValueError: A setting is not valid.
@@ -77,12 +75,12 @@ class Settings:
 class Plan:
     """Control a task with a planner that replans at every step, and report rewards, success and planning times.
 
-    The planner is MPPI, or with --update the cross-entropy method (cem) or predictive sampling. Its settings come from
-    the task unless they are given. Options of the physics (--integrator, --solver, ...) apply only to the planner.
+    The planner is MPPI, or with --update the cross-entropy method (cem) or predictive sampling. Its default settings
+    come from the task. Physics options (--integrator, --solver, ...) apply only to the planner.
 
-    The folder then holds config.json, versions.json, report.json, plan.png, video.mp4 of the first episode, and a file
-    for each episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy). After Ctrl-C the
-    interrupted episode has a file, but is not in the report.
+    The command writes config.json, versions.json, report.json, plan.png, a video of the first episode (video.mp4), and
+    one file per episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy) into a
+    folder. After Ctrl-C the interrupted episode is saved too, but is not part of the report.
 
     $ lyceum-warp plan reach
     $ lyceum-warp plan reach --real-time --episodes 10
@@ -95,52 +93,43 @@ class Plan:
     task: TaskWord
     episodes: int = 1
     """Number of episodes."""
-    minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """Begin no further episode after so long."""
     steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Steps of an episode; by default the task's horizon."""
+    """Number of steps in an episode; by default the task's horizon."""
     replan_every: int = 1
-    """Steps between two plans. The steps in between apply the plan's next actions."""
+    """Steps from one plan to the next. The steps in between apply the plan's next actions."""
     seed: int = 0
     """Seed of the first episode's initial state and noise; it increases by one with each episode."""
     real_time: bool = False
     """Step the world in real time while the planner plans, instead of waiting for each plan."""
-    rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
-    """Plans per second, which define the deadline of a plan in the report; by default one plan for each step, or for
-    the steps of --replan-every."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """The folder, new or empty; runs/plan-TASK-DATE by default."""
+    """A new or empty folder; by default runs/plan-TASK-DATE."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """NPG run of this task. Its value function is the value of the last state of each sample."""
+    """NPG or PPO run of this task. Its value function gives the value of each sample's final state."""
     param: ParamWords = ()
     planner_param: Repeated = ()
-    """A parameter of the planner's task, if it differs from the controlled world's."""
+    """A parameter for the planner only, if it differs from the controlled world's; may be repeated."""
     planner_model: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """The planner's model, if it differs from the controlled world's."""
     video: bool = True
     """Whether to make a video of the first episode."""
     camera: CameraWords = ()
     plot: bool = True
-    """Whether to draw rewards, planning times and ages."""
+    """Whether to plot rewards, planning times and ages of actions."""
     planner: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
     """Where the planner's worlds run. The controlled world runs in one thread of the mujoco engine."""
     mppi: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
     planner_physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
     def run(self) -> int:
-        """Run the command; returns the exit code."""
+        """Run the command, and return the exit code."""
         whole_number("episodes", self.episodes, low=1)
         whole_number("seed", self.seed, low=0)
         whole_number("seed of the last episode", self.seed + self.episodes - 1, low=0)
-        if self.minutes is not None:
-            positive_number("minutes", self.minutes, "minutes")
-        if self.rate is not None and not 0 < self.rate < float("inf"):
-            raise ValueError(f"rate must be a positive number of plans per second, not {self.rate}")
         every = whole_number("replan_every", self.replan_every, low=1)
         if every > 1 and self.real_time:
             raise ValueError(
                 f"--replan-every {every} has no effect with --real-time, where plans follow one another without a "
-                "break: leave out one of them"
+                "break: omit one of them"
             )
         if self.value is not None:
             _check_value_task(self.value, self.task)
@@ -148,10 +137,10 @@ class Plan:
             "runs", f"plan-{task_name(find_task(self.task))}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         )
         Run.check_free(out)
-        # every wrong option is found before the folder is made
+        # all options are checked before the folder is created
         camera = parsed_camera(self.camera)
         if camera is not None and not self.video:
-            raise ValueError("--camera has no effect with --no-video: leave out one of them")
+            raise ValueError("--camera has no effect with --no-video: omit one of them")
         torch.set_num_threads(1)
         instead = {"model": "--planner-model"}
         params = parameters(self.param, self, instead=instead | {"horizon": "--steps"})
@@ -165,21 +154,21 @@ class Plan:
             "planner_model": self.planner_model and str(_model(self.planner_model)),
             "value": self.value and str(self.value.resolve()), **vars(self.planner),
             "engine": planner.env.engine.name, "episodes": self.episodes, "steps": self.steps,
-            "replan_every": every, "seed": self.seed, "real_time": self.real_time, "rate": self.rate,
+            "replan_every": every, "seed": self.seed, "real_time": self.real_time,
         }  # fmt: skip
         return _run(Run.create(out, config, device=self.planner.device), plant, planner, self)
 
 
 def _check_value_task(run: Path, task: str) -> None:
-    """Refuse the value function of a run of another task.
+    """Refuse the value function of a run that trained a different task.
 
     Raises:
-        ValueError: The run's configuration names another task.
+        ValueError: The run's configuration names a different task.
     """
     try:
         config = Run.open(run.parent if run.is_file() else run).config
     except FileNotFoundError:
-        return  # loading reports what is missing, and a file may be anywhere
+        return  # load_value reports what is missing; a policy file may be outside a run folder
     found = str(config.get("task"))
     names = {_stem(found), snake_case(found.partition(":")[2]), str(config.get("kept", {}).get("name"))}
     if not names & {_stem(task), task_name(find_task(task))}:
@@ -190,7 +179,7 @@ def _check_value_task(run: Path, task: str) -> None:
 
 
 def _stem(task: str) -> str:
-    """The name of a task, or of its file."""
+    """The name of a task, or its file's name without suffix."""
     return Path(task.partition(":")[0]).stem
 
 
@@ -213,7 +202,7 @@ def _fill(words: tuple[str, ...]) -> Any:
     try:
         numbers = [float(word) for word in words]
     except ValueError:
-        return " ".join(words)  # MPPIConfig knows the words
+        return " ".join(words)  # MPPIConfig checks the words
     return numbers[0] if len(numbers) == 1 else numbers
 
 
@@ -238,19 +227,15 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
     aborted: list[Trajectory] = []
     method: Any = control_async if options.real_time else partial(control, replan_every=options.replan_every)
     shown: dict[str, Any] = dict(steps=plant.horizon, timestep=plant.timestep, real_time=options.real_time)
-    deadline = math.inf if options.minutes is None else time.monotonic() + 60 * options.minutes
     try:
         for episode in range(options.episodes):
-            if done and time.monotonic() >= deadline:
-                console.print(f"{options.minutes:g} minutes are over after {len(done)} of {options.episodes} episodes")
-                break
             with PlanDisplay(console, episode, options.episodes, **shown) as display:
                 seed = options.seed + episode
                 trajectory = method(plant, planner, seed=seed, on_step=display, on_abort=aborted.append)
             done.append(trajectory)
             display.done(trajectory)
             _save(run, done, options)
-    except BaseException as error:  # later signals are ignored until the files are written
+    except BaseException as error:  # further signals are ignored until the files are written
         if done:
             _save(run, done, options)
         path = aborted[0].save(_file(run, len(done))) if aborted else None
@@ -261,15 +246,8 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
     return _report(run, plant, done, options)
 
 
-def _rate(options: Plan, episode: Trajectory) -> float | None:
-    """Plans per second, for the deadline; None for one plan for each step."""
-    if options.rate is not None or options.replan_every == 1:
-        return options.rate
-    return 1 / (options.replan_every * episode.timestep)
-
-
 def _left(run: Run, whole: int, aborted: list[Trajectory], path: Path | None) -> str:
-    """Describe the files of a run that was interrupted after some whole episodes."""
+    """Describe the files of a run that was interrupted after ``whole`` complete episodes."""
     steps = f"after {aborted[0].steps} step{'s' * (aborted[0].steps != 1)}" if aborted else "before its first step"
     if not whole:
         where = f"it is in {path}" if path else f"{run.folder} holds no episode"
@@ -285,13 +263,18 @@ def _file(run: Run, episode: int) -> Path:
 def _save(run: Run, done: list[Trajectory], options: Plan) -> None:
     """Write the last episode, and the report of all episodes."""
     done[-1].save(_file(run, len(done) - 1))
-    control_report(done, rate=_rate(options, done[0])).write(run.folder / "report.json")
+    _summary(done, options).write(run.folder / "report.json")
+
+
+def _summary(done: list[Trajectory], options: Plan) -> ControlReport:
+    """The report of some episodes. A plan has the time of the steps to the next one."""
+    return control_report(done, rate=1 / (options.replan_every * done[0].period))
 
 
 def _report(run: Run, plant: Env, done: list[Trajectory], options: Plan) -> int:
-    """Print the report, draw the plot and the video, and list the files."""
+    """Print the report, make the plot and the video, and list the files."""
     console, camera = make_console(), parsed_camera(options.camera)
-    report = control_report(done, rate=_rate(options, done[0]))
+    report = _summary(done, options)
     console.print(report_table(report, success=plant.task.functions["success"] is not None))
     paths = [("episodes", str(run.folder / "episode-*.npz")), ("report", str(run.folder / "report.json"))]
     if options.plot:

@@ -6,16 +6,16 @@ import mujoco
 import numpy as np
 
 _STEP = 0.02
-"""Seconds that a step should take, all its substeps together."""
+"""Desired duration of a step, seconds."""
 
 _EPISODE = 10.0
-"""Seconds of an episode."""
+"""Duration of an episode, seconds."""
 
 _NAMES = 8
-"""Names of elements of one kind that a comment lists."""
+"""Maximum number of names that a comment lists per kind of element."""
 
 _WIDTH = 118
-"""Columns of a comment after its sign."""
+"""Width of a comment after the #, in characters."""
 
 _ELEMENTS = {
     "bodies": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
@@ -25,15 +25,15 @@ _ELEMENTS = {
     "actuators": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nactuator"),
     "keyframes": (mujoco.mjtObj.mjOBJ_KEY, "nkey"),
 }
-"""The kinds of elements that a comment names, with the fields of MjModel that hold their numbers."""
+"""The kinds of elements that a comment lists, with the MjModel fields that hold their counts."""
 
 _Sensor = mujoco.mjtSensor
 
 _UNOBSERVED = (_Sensor.mjSENS_USER, _Sensor.mjSENS_PLUGIN, _Sensor.mjSENS_CLOCK)
-"""Sensors that say nothing about the state of the robot, or nothing without code of the user's own."""
+"""Sensors that do not measure the robot's state, or only with custom code."""
 
 _FREE_SENSORS = (_Sensor.mjSENS_FRAMEQUAT, _Sensor.mjSENS_GYRO, _Sensor.mjSENS_FRAMEANGVEL)
-"""Sensors on a floating body of which one shows that the model's author measures its motion."""
+"""Any of these sensors on a floating body shows that the model measures the body's motion."""
 
 
 def task_text(file: str, class_name: str, source: str, title: str, model: mujoco.MjModel) -> str:
@@ -42,8 +42,8 @@ def task_text(file: str, class_name: str, source: str, title: str, model: mujoco
     Args:
         file: The name of the file.
         class_name: The name of the task's class.
-        source: The model as an expression in Python, such as ``"robot.xml"`` with its quotes.
-        title: What the docstring calls the model.
+        source: The model as a Python expression, such as ``"robot.xml"`` including the quotes.
+        title: The description of the model in the docstring.
         model: The compiled model.
     """
     fields, parts, put = _observation(model)
@@ -60,7 +60,7 @@ def task_text(file: str, class_name: str, source: str, title: str, model: mujoco
 
 
 def _lengths(model: mujoco.MjModel) -> list[str]:
-    """The lines that set the length of a step and of an episode."""
+    """The lines that set the lengths of steps and episodes."""
     substep = model.opt.timestep
     frame_skip = max(1, round(_STEP / substep))
     horizon = max(1, round(_EPISODE / (frame_skip * substep)))
@@ -71,15 +71,15 @@ def _lengths(model: mujoco.MjModel) -> list[str]:
 
 
 def _has_other_ranges(model: mujoco.MjModel) -> bool:
-    """Whether every control has a range, and not all have -1 to 1."""
+    """Whether every control has a range, and at least one differs from -1 to 1."""
     limited, ranges = model.actuator_ctrllimited.astype(bool), model.actuator_ctrlrange
     return bool(limited.all() and (ranges[:, 0] < ranges[:, 1]).all() and (ranges != (-1.0, 1.0)).any())
 
 
 def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list[str]]:
-    """The fields of World, the parts of the observation with their sizes, and the lines that write it.
+    """The fields of World, the sizes of the observation's parts, and the lines that write the observation.
 
-    Only the sensors if they measure every joint; otherwise positions and velocities, then the sensors.
+    The observation is only the sensors if they measure every joint; otherwise positions, velocities and sensors.
     """
     fields = ["qpos: Row[float]", "qvel: Row[float]"]
     sensed = _sensor_places(model)
@@ -104,7 +104,7 @@ def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list
 
 
 def _sensor_places(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """The places in sensordata that are observed, as (first, last), with first <= i < last."""
+    """The ranges of sensordata that are observed, as (first, last), with first <= i < last."""
     places: list[tuple[int, int]] = []
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
         return places
@@ -119,7 +119,7 @@ def _sensor_places(model: mujoco.MjModel) -> list[tuple[int, int]]:
 
 
 def _all_joints_are_sensed(model: mujoco.MjModel) -> bool:
-    """Whether sensors measure the position and the velocity of every joint, and the motion of every floating body."""
+    """Whether sensors measure every joint's position and velocity and every floating body's motion."""
     sensors = list(zip(model.sensor_type.tolist(), model.sensor_objtype.tolist(), model.sensor_objid.tolist(),
                        strict=True))  # fmt: skip
     objects = {kind: {i for found, _, i in sensors if found == kind} for kind in set(model.sensor_type.tolist())}
@@ -156,20 +156,20 @@ def _elements(model: mujoco.MjModel) -> str:
     comment = [
         "Names in the model. A default in Params turns one into an index, as in",
         f"    {example}",
-        f"with {field} in World, s.{field}[p.tip] then is a position; lw.joint, lw.sensor, ... find the other kinds",
+        f"with {field} in World, s.{field}[p.tip] is then a position; lw.joint, lw.sensor, ... find other kinds",
         *lines,
     ]
     return "".join(f"# {line}\n" for line in comment) + "\n\n"
 
 
 def _names(model: mujoco.MjModel, kind: str) -> list[str]:
-    """Names of all elements of a kind; empty for those without one."""
+    """Names of all elements of a kind; empty for unnamed elements."""
     objtype, count = _ELEMENTS[kind]
     return [mujoco.mj_id2name(model, objtype, i) or "" for i in range(getattr(model, count))]
 
 
 def _listed(kind: str, names: list[str]) -> list[str]:
-    """A line with the first names of a kind, as many as fit; no line where there are no names."""
+    """A line with as many names of a kind as fit; no line if there are no names."""
     for shown in range(min(len(names), _NAMES), 0, -1):
         rest = f", ... ({len(names)} in all)" if shown < len(names) else ""
         line = f"  {kind}: {', '.join(names[:shown])}{rest}"
@@ -183,7 +183,7 @@ def _indented(lines: list[str]) -> str:
 
 
 def literal(text: str) -> str:
-    """A text as a literal of Python, in double quotes."""
+    """A string as a Python literal in double quotes."""
     return json.dumps(text, ensure_ascii=False)
 
 
@@ -204,7 +204,7 @@ class World:  # the fields that the functions read, by MuJoCo's names: add xpos,
 
 
 @wp.struct
-class Params:  # what can be changed from outside, as --param reset_noise=0.1
+class Params:  # parameters that users can set, as in --param reset_noise=0.1
     dt: float  # filled in: seconds in a step
     reset_noise: float = 0.01
 
@@ -216,7 +216,7 @@ def observe(s: World, p: Params, obs: Row[float]):
 
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    # of the step from s0 to s1, for example: return s1.qvel[0] - 0.001 * lw.sum_squares(action)
+    # reward of the step from s0 to s1, for example: return s1.qvel[0] - 0.001 * lw.sum_squares(action)
     return 0.0
 
 
@@ -230,7 +230,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 #
 # @wp.func
 # def evaluate(s: World, p: Params) -> float:
-#     return s.qpos[0]  # a metric in physical units, apart from the reward
+#     return s.qpos[0]  # a metric in physical units, separate from the reward
 #
 #
 # @wp.func

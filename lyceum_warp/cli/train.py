@@ -17,13 +17,12 @@ from lyceum_warp.algos.networks import moved
 from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.cli.algorithms import Hyperparameters
 from lyceum_warp.cli.arguments import (
-    NO_FLAGS,
     CameraWords,
+    EnvFlags,
     ParamWords,
     Physics,
     Trust,
     given,
-    optional_flags,
     parameters,
 )
 from lyceum_warp.cli.display import Display, curve_table, make_console, note, policy_video, tried
@@ -45,7 +44,7 @@ _FINAL_EPISODES = 32
 _SETTINGS: dict[str, Any] = {
     "iterations": 100, "target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0,
 }  # fmt: skip
-"""Settings that may change when a run is resumed, and their defaults."""
+"""Settings that may change when a run is resumed, with their defaults."""
 
 _KEPT = {
     "from_run": "--from", "task": "TASK", "algorithm": "--algorithm", "seed": "--seed", "threads": "--threads",
@@ -54,23 +53,13 @@ _KEPT = {
 """Flags that are refused with --resume."""
 
 
-@optional_flags(EnvOptions, omit=NO_FLAGS, default="")
-class EnvFlags:
-    """Where the worlds run, and the length of their episodes."""
-
-    engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """mujoco (the C engine, on CPU cores), warp, or auto (the default): warp on a CUDA device and mujoco on the CPU."""
-    device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu (the default), or a CUDA device such as cuda:0."""
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Train:
     """Train a policy on a task, with the natural policy gradient or with PPO.
 
-    The run's folder then holds config.json, versions.json, metrics.csv (one row for each iteration), policy.pt,
-    best.pt, checkpoint.pt, curve.png and video.mp4. Ctrl-C ends the run after the current iteration and saves it; a
-    second Ctrl-C ends it at once.
+    The command writes config.json, versions.json, metrics.csv (one row per iteration), policy.pt, best.pt,
+    checkpoint.pt, curve.png and video.mp4 into the run's folder. Ctrl-C saves and ends the run after the current
+    iteration; a second Ctrl-C ends it immediately.
 
     $ lyceum-warp train hopper --iterations 100 --seed 1
     $ lyceum-warp train half_cheetah --param ctrl_cost_weight=0.05 --param reset_noise_scale=0 --hidden 32 32
@@ -81,10 +70,10 @@ class Train:
     $ lyceum-warp train hopper --algorithm ppo --iterations 300 --learning-rate 3e-4
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
-    Processes of torchrun share the worlds, also on several machines. With --device cuda each process uses the GPU of
-    its local rank. Their number changes only the rounding of the results, and may differ when a run is resumed.
-    Rank 0 writes files and messages. After Ctrl-C or SIGTERM to torchrun or to any process, all processes finish the
-    iteration and end together; torchrun waits 30 s for them, or its --shutdown-timeout.
+    The processes of torchrun share the worlds, even across machines. With --device cuda each process uses the GPU of
+    its local rank. The number of processes affects only the rounding of the results, and may change when a run is
+    resumed. Rank 0 writes files and messages. After Ctrl-C or SIGTERM to torchrun or to any process, all processes
+    finish the iteration and end together; torchrun waits for them for 30 s, or for its --shutdown-timeout.
     """
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
@@ -96,46 +85,47 @@ class Train:
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Seed of the networks, the noise and the worlds' initial states."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """The run's folder, new or empty; runs/TASK-DATE by default."""
+    """The run's folder, new or empty; by default runs/TASK-DATE."""
     resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Continue the run in this folder exactly, with its settings, up to --iterations."""
     from_run: Annotated[Path | None, tyro.conf.arg(name="from", metavar="RUN")] = None
-    """Begin a new run with the policy, the value function and the normaliser of this run. Settings that are not given
-    come from that run, except its parameters with another TASK, and its hyperparameters with another --algorithm."""
+    """Start a new run from the policy, the value function and the normaliser of this run. Its settings are the
+    defaults, except its parameters if TASK is a different task, and its hyperparameters if --algorithm is different."""
     which: str = "last"
-    """Which policy of --from: last, best, or the number of an iteration that was kept."""
+    """Which policy of --from: last, best, or the number of a saved iteration."""
     target_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """End the run once the return of the mean policy reaches this number; without --mean-every the mean return."""
+    """End the run once the return of the mean policy reaches this number; with --mean-every 0, the mean return of the
+    sampled episodes."""
     minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """End with the iteration in which the training has lasted for so long; --resume goes on."""
+    """Time limit: training ends after the iteration that exceeds it. --resume continues."""
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Iterations between two numbered policies, 0 for none. The last and the best policy are always kept."""
+    """Iterations between two numbered policies; 0 for none. The last and the best policy are always saved."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Iterations between two saves of the policy and the complete state, from which a killed run continues; 0 for every
-    30 s, or more often while saving takes at most 1 % of the time."""
+    """Iterations between two saves of the policy and the complete state, from which a killed run resumes; 0 for every
+    30 s, or more often if saving takes at most 1 % of the time."""
     tensorboard: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
-    """Whether to also write the metrics for TensorBoard, into the run's folder."""
+    """Whether to also write metrics for TensorBoard into the run's folder."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Worlds of all processes together; by default 64, or 4096 for each GPU. With npg, each world makes
-    samples / nworld steps per iteration: whole episodes if they fit (as in the paper, with 10 worlds, 10,000 samples
-    and episodes of 1,000 steps), otherwise segments of episodes."""
+    """Total number of worlds of all processes; by default 64, or 4096 per GPU. With npg, each world makes samples /
+    nworld steps per iteration: whole episodes if they fit (as in the paper, with 10 worlds, 10,000 samples and episodes
+    of 1,000 steps), otherwise segments of episodes."""
     threads: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 1)")] = None
-    """Threads of torch on the CPU. Small networks gain little from more. Runs are equal to the bit only with the same
-    number. --nthread sets the threads of the mujoco engine."""
+    """Number of torch threads on the CPU. Small networks gain little from more threads. Runs are identical bit for bit
+    only with the same number. --nthread sets the threads of the mujoco engine."""
     param: ParamWords = ()
     video: bool = True
-    """Whether to write a video of one episode of the trained policy at the end."""
+    """Whether to write a video of one episode of the trained policy."""
     video_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Iterations between two videos of the mean policy, videos/000100.mp4 and so on in the run's folder; 0 for none."""
     camera: CameraWords = ()
     trust: Trust = False
     take_over: bool = False
-    """Continue a run that another process still locks, on this or another host. That process ends at its next write."""
+    """Continue a run that another process has locked, on this or another host. The other process ends at its next
+    write."""
     view: bool = False
-    """Whether to show the newest policy while the run trains, as lyceum-warp view FOLDER --follow does in another
-    shell."""
+    """Whether to show the newest policy during training, like lyceum-warp view FOLDER --follow in another shell."""
     plot: bool = True
-    """Whether to draw the learning curve at the end."""
+    """Whether to plot the learning curve at the end."""
     require_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Exit with code 1 unless the return of the trained mean policy exceeds this number."""
     env: tyro.conf.OmitArgPrefixes[EnvFlags] = dataclasses.field(default_factory=EnvFlags)
@@ -143,20 +133,18 @@ class Train:
     hyperparameters: tyro.conf.OmitArgPrefixes[Hyperparameters] = dataclasses.field(default_factory=Hyperparameters)
 
     def run(self) -> int:
-        """Run the command; returns the exit code."""
+        """Run the command, and return the exit code."""
         if self.resume is not None:
             for name, flag in _KEPT.items():
                 if getattr(self, name) is not None:
-                    raise ValueError(
-                        f"{flag} has no effect with --resume, which continues a run as it is: leave it out"
-                    )
+                    raise ValueError(f"{flag} has no effect with --resume, which continues a run as it is: omit it")
         elif self.from_run is None and self.task is None:
             raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
         folder = self.resume or self.from_run
         if self.trust and folder is None:
-            raise ValueError("--trust has no effect without --resume or --from: leave it out")
+            raise ValueError("--trust has no effect without --resume or --from: omit it")
         if self.take_over and self.resume is None:
-            raise ValueError("--take-over has no effect without --resume: leave it out")
+            raise ValueError("--take-over has no effect without --resume: omit it")
         source = None if folder is None else Run.open(folder)
         saved = {} if source is None else source.config
         settings = {}
@@ -165,9 +153,9 @@ class Train:
         if self.resume is None:
             settings["target_return"] = self.target_return
         if parsed_camera(self.camera) is not None and not (self.video or settings["video_every"]):
-            raise ValueError("--camera has no effect with --no-video: leave out one of them")
+            raise ValueError("--camera has no effect with --no-video: omit one of them")
         with join(self.env.device or saved.get("device", "cpu")) as team:
-            with team.together():  # every mistake in the options is found before the folder is made
+            with team.together():  # all options are checked before the folder is created
                 learner, folder, entries = self._learner(source, team)
             console, leads, total = make_console(), learner.team.leads, settings["iterations"]
             try:
@@ -198,7 +186,7 @@ class Train:
             return self._report(run, learner, console)
 
     def configuration(self, source: Run | None, team: Team) -> Configuration:
-        """The configuration of another run, or the defaults, with the given flags."""
+        """The configuration of the source run, or the defaults, overridden by the given flags."""
         words = given(self.env) | self.physics.given()
         for name, value in (("nworld", self.nworld), ("seed", self.seed)):
             if value is not None:
@@ -229,7 +217,7 @@ class Train:
         )  # fmt: skip
 
     def _learner(self, source: Run | None, team: Team) -> tuple[Learner, Path, dict[str, Any]]:
-        """Make the learner; returns it with the run's folder and further entries of its config.json."""
+        """Make the learner; return it with the run's folder and additional entries for config.json."""
         configuration = self.configuration(source, team)
         if self.out is not None and team.leads:
             Run.check_free(self.out)
@@ -239,7 +227,7 @@ class Train:
             policy, value, iteration = saved_networks(source, self.which if self.resume is None else None)
             if self.resume is None:
                 entries["from"] = {"run": str(source.folder.resolve()), "which": self.which, "iteration": iteration}
-        says = note if team.leads else _silent
+        says = note if team.leads else lambda line: None
         learner = configuration.learner(
             team, run=source, networks=(policy, value), note=says, task=self.task, trust=self.trust
         )
@@ -248,7 +236,7 @@ class Train:
             for name, value in given(self.hyperparameters).items():
                 if (found := getattr(fitted, name)) != value:
                     raise ValueError(
-                        f"the networks in {self.from_run or self.resume} have {name} {found}, not {value}: leave out "
+                        f"the networks in {self.from_run or self.resume} have {name} {found}, not {value}: omit "
                         f"--{name.replace('_', '-')}"
                     )
         if source is not None and self.task is None and self.resume is None:
@@ -257,7 +245,7 @@ class Train:
         return learner, self.resume or self.out or Path("runs", name), entries
 
     def _report(self, run: Run, learner: Learner, console: Console) -> int:
-        """Print the table, evaluate the policy, draw the curve and the video; returns the exit code."""
+        """Print the table, evaluate the policy, make the plot and the video; return the exit code."""
         env, policy, seed = learner.env, learner.policy, learner.env.options.seed + 1
         console.print(curve_table(read_metrics(run.metrics)))
         few = evaluation_worlds(env, _FINAL_EPISODES)
@@ -284,7 +272,3 @@ class Train:
             note(f"the mean policy's return is {final:.1f}; --require-return demands more than {self.require_return:g}")
             return 1
         return 0
-
-
-def _silent(line: str) -> None:
-    """Print nothing, on all ranks but 0."""

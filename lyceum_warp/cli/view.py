@@ -1,4 +1,4 @@
-"""Show a task, a policy, a planner or episodes: lyceum-warp view."""
+"""Show a task, a policy, a planner or saved episodes: lyceum-warp view."""
 
 import contextlib
 import dataclasses
@@ -39,21 +39,21 @@ _NICE = 10  # niceness of the process of `lw.RunViewer`
 
 @optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)")
 class Place:
-    """Where the worlds run, with --mppi the planner's worlds."""
+    """Where the worlds run; with --mppi, where the planner's worlds run."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu, or a CUDA device such as cuda:0. Without this flag a run with the engine auto is shown on the CPU."""
+    """cpu, or a CUDA device such as cuda:0. By default a run with engine auto is shown on the CPU."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View:
     """Show a task, a policy, a planner or episodes in a browser.
 
-    With a task the viewer shows its worlds, lets you push bodies with the mouse, and with --mppi runs a planner in real
-    time. With a run it shows the run's policy, and with --follow the newest policy while the run trains. Files of
-    episodes, or a folder of lyceum-warp plan, are played back.
+    For a task, the viewer shows its worlds, lets you push bodies with the mouse, and with --mppi runs a planner in real
+    time. For a run, it shows the run's policy, and with --follow the newest policy while the run trains. Episode files,
+    or a folder of lyceum-warp plan, are played back.
 
     The viewer is a web page. The command prints its address, which contains a secret, and over ssh the command that
     forwards the port.
@@ -66,15 +66,15 @@ class View:
     """
 
     what: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TASK|RUN|FILE...")]
-    """A task's name or a file with one, a run's folder, or files of episodes."""
+    """A task's name or file, a run's folder, or episode files."""
     mppi: bool = False
-    """Control the shown world with a planner: MPPI, or another one with --update."""
+    """Control the shown world with a planner: MPPI, or with --update a different one."""
     follow: bool = False
     """Show the newest policy of a run while it trains."""
     which: str = "last"
-    """Which policy of a run: last, best, or the number of an iteration that was kept."""
+    """Which policy of a run: last, best, or the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """The task of a run or of episodes, a name or a file, if it is not found."""
+    """The task of a run or of episodes, as a name or a file, if it cannot be found."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of worlds: by default 16 for a run, 1 otherwise."""
     seed: int = 0
@@ -82,7 +82,7 @@ class View:
     paused: bool = False
     """Whether to start paused."""
     host: str = "127.0.0.1"
-    """Address on which the page is served. Other machines can reach the page only with another address than this."""
+    """Address on which to serve the page. The default is reachable only from this machine."""
     port: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Port of the page; by default the first free port from 8080 on."""
     param: ParamWords = ()
@@ -137,7 +137,7 @@ class View:
 
 
 def _check(options: View) -> None:
-    """Refuse numbers out of range, and flags without an effect, before worlds are made."""
+    """Refuse numbers out of range and flags without effect, before worlds are made."""
     whole_number("seed", options.seed, low=0)
     if options.nworld is not None:
         whole_number("nworld", options.nworld, low=1)
@@ -149,7 +149,7 @@ def _check(options: View) -> None:
 
 
 def _kind(what: tuple[str, ...]) -> str:
-    """The kind of the arguments: "task", "run" or "episodes"."""
+    """What to show: "task", "run" or "episodes"."""
     first = Path(what[0])
     if first.suffix == ".npz":
         return "episodes"
@@ -181,7 +181,7 @@ def _task_worlds(options: View) -> Env:
 
 
 def _planner(options: View, env: Env) -> MPPI:
-    """The planner, on the engine and device of the flags."""
+    """The planner, on the engine and device given by the flags."""
     config = options.planner.on_top_of(task_config(env.task.task, None))
     words = given(options.place) | ({} if env.options.model is None else {"model": env.options.model})
     return MPPI(env.task.task, config, seed=options.seed, params=env.given_params, **words)

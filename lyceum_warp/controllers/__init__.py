@@ -1,4 +1,4 @@
-"""Control worlds, synchronously or in real time; record trajectories and make reports.
+"""Control a world synchronously or in real time, store the trajectory, and make reports.
 
-The *plant* is the world under control. A planner simulates its plans in worlds of its own.
+The *plant* is the world under control. A planner simulates its plans in separate worlds.
 """

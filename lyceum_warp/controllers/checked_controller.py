@@ -1,4 +1,4 @@
-"""Check the results of controllers, and convert between the time steps of plant and plan."""
+"""Check the actions of controllers, and convert between the time steps of plant and plan."""
 
 import inspect
 import json
@@ -21,8 +21,8 @@ class CheckedController:
         env: The plant.
 
     Raises:
-        ValueError: The controller cannot be called with a state and an observation, plans in the plant itself or for
-            several plants, or has a time step that is not positive.
+        ValueError: The controller cannot be called with a state and an observation, uses the plant for planning or
+            plans for several plants, or its time step is not positive.
     """
 
     def __init__(self, controller: Controller, env: Env) -> None:
@@ -48,12 +48,12 @@ class CheckedController:
 
         Args:
             state: State of the plant, (state_size,) float64.
-            obs: Its observation, (nobs,).
-            shift: Steps of the controller since the state of its last plan.
+            obs: The plant's observation, (nobs,).
+            shift: Number of controller steps since the state of its last plan.
             step: Step of the plant, for error messages.
 
         Returns:
-            The plan, (horizon, nact) float32, a copy on the CPU. A single action counts as a plan of horizon 1.
+            The plan, (horizon, nact) float32, copied to the CPU. A single action counts as a plan of horizon 1.
 
         Raises:
             ValueError: The plan has the wrong shape, or is not finite.
@@ -69,7 +69,7 @@ class CheckedController:
             reset(seed)
 
     def quality(self) -> tuple[float, float]:
-        """Number of failed samples of the last plan, and its effective sample size; NaN if unknown."""
+        """The last plan's number of failed samples and effective sample size; NaN if unknown."""
         summary = getattr(self._controller, "summary", None)
         if not isinstance(summary, Mapping):
             return math.nan, math.nan
@@ -86,11 +86,11 @@ class CheckedController:
         return self.steps(now) - self.steps(before)
 
     def index(self, plant_steps: int, horizon: int) -> int:
-        """Index of the action to apply when the plant has made this many steps since the plan's state."""
+        """Index of the action to apply after ``plant_steps`` steps of the plant since the plan's state."""
         return min(self.steps(plant_steps), horizon - 1)
 
     def check_horizon(self, horizon: int, steps: int) -> None:
-        """Check that a plan covers a number of plant steps.
+        """Check that a plan of length ``horizon`` covers a number of plant steps.
 
         Raises:
             ValueError: The plan is shorter.
@@ -112,7 +112,7 @@ class CheckedController:
             found |= settings
         if isinstance(env := getattr(controller, "env", None), Env):
             found |= {"engine": env.engine.name, "device": env.device.alias}
-        # a round trip through JSON, so that the result equals the content of a saved file; other types become text
+        # a JSON round trip, so that the result equals the content of a saved file; other types become strings
         return dict(json.loads(json.dumps(found, default=str)))
 
     def _checked(self, value: Any, ndim: int, step: int) -> torch.Tensor:
@@ -144,7 +144,7 @@ def _check_call(controller: Any) -> None:
 
 
 def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
-    """The signature of a function; None if it is unknown, as for some C functions."""
+    """The signature of a function; None if it cannot be determined, as for some C functions."""
     try:
         return inspect.signature(function)
     except (TypeError, ValueError):

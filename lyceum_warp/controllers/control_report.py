@@ -19,10 +19,10 @@ from lyceum_warp.support.validate import positive_number
 @document_attributes
 @dataclasses.dataclass(frozen=True)
 class ControlReport:
-    """Statistics of a controller's episodes, as returned by ``control_report``.
+    """Statistics of a controller's episodes; the result of ``control_report``.
 
-    A value is None if there are too few plans, if it does not apply, or if the controller does not report it. The first
-    plan of each trajectory loads kernels and captures graphs, so only ``first_plan_ms`` includes its planning time.
+    A value is None if there are too few plans, if it does not apply, or if the controller does not report it. Each
+    trajectory's first plan loads kernels and captures graphs, so only ``first_plan_ms`` includes its planning time.
     """
 
     task: str
@@ -36,9 +36,9 @@ class ControlReport:
     steps: int
     """Total number of steps."""
     plans: int
-    """Number of plans, without the first plan of each trajectory."""
+    """Number of plans, excluding the first plan of each trajectory."""
     first_plan_ms: float | None
-    """Longest planning time of a first plan, milliseconds."""
+    """Longest planning time of any first plan, milliseconds."""
     plan_mean_ms: float | None
     """Mean planning time, milliseconds."""
     plan_p50_ms: float | None
@@ -56,26 +56,26 @@ class ControlReport:
     plans_per_second: float | None
     """Finished plans per second of wall time."""
     deadline_ms: float
-    """Deadline of a plan, milliseconds: 1 / rate, or the plant's period."""
+    """Deadline of a plan, milliseconds: 1 / ``rate``, or the plant's period."""
     misses: int
     """Number of plans that took longer than the deadline."""
     miss_share: float | None
-    """Share of the plans that took longer than the deadline."""
+    """Fraction of the plans that took longer than the deadline."""
     blind_plans: int | None
-    """Number of plans whose samples all failed, first plans included. Such a plan repeats the previous plan, moved
-    forward in time."""
+    """Number of plans whose samples all failed, including first plans. Such a plan is the previous plan shifted in
+    time."""
     known_plans: int
-    """Number of plans with a known number of failed samples, first plans included."""
+    """Number of plans with a known number of failed samples, including first plans."""
     failed_share: float | None
-    """Share of failed samples in these plans."""
+    """Fraction of failed samples in these plans."""
     effective_samples_mean: float | None
-    """Mean effective sample size of a plan: 1 if a single sample decides, 0 if all failed."""
+    """Mean effective sample size of a plan: 1 if a single sample has all the weight, 0 if all samples failed."""
     tick_jitter_ms: float | None
     """Standard deviation of the delay of the plant's steps, milliseconds; None in a synchronous run."""
     tick_delay_max_ms: float | None
     """Longest delay of a step, milliseconds."""
     late_ticks: int | None
-    """Number of steps that began late because the previous step was not finished in time."""
+    """Number of steps that started late because the previous step was not finished in time."""
     age_mean_ms: float
     """Mean age of the applied actions, milliseconds; see ``Trajectory.ages``."""
     age_max_ms: float
@@ -95,7 +95,7 @@ class ControlReport:
     eval_mean: float
     """Mean evaluation metric in the last states of the episodes."""
     success: float
-    """Share of the episodes that end in success."""
+    """Fraction of the episodes that end in success."""
     success_low: float
     """Lower bound of the 95 % confidence interval of ``success`` (Wilson 1927)."""
     success_high: float
@@ -108,7 +108,7 @@ class ControlReport:
     """Packages, Python and machine of the first trajectory."""
 
     def to_json(self) -> str:
-        """The report as JSON; missing and infinite numbers are null."""
+        """The report as JSON; missing and non-finite numbers become null."""
         return json.dumps(_finite(dataclasses.asdict(self)), indent=2, allow_nan=False)
 
     def write(self, path: str | Path) -> Path:
@@ -120,7 +120,7 @@ class ControlReport:
         return path
 
     def rows(self) -> list[tuple[str, str]]:
-        """The report as rows of text: a label, and a number with its unit, or "-" if the number is missing."""
+        """The report as rows of strings: a label, and a number with its unit or "-" if it is missing."""
         rows = [
             ("episodes", f"{self.episodes} of {self.task} ({self.steps} steps, {self.mode})"),
             ("return", _text(self.return_mean, ".4g") + _text(self.return_std, ".2g", " ± {}", "")),
@@ -160,10 +160,10 @@ def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: flo
 
     Args:
         trajectories: Episodes of the same task, engine, mode and controller.
-        rate: Required plans per second, which set the deadline; by default one plan per period of the plant.
+        rate: Required plans per second, which determine the deadline; by default one plan per period of the plant.
 
     Raises:
-        ValueError: There is no trajectory, the trajectories are of different kinds, or the rate is not positive.
+        ValueError: There is no trajectory, the trajectories differ in one of these, or the rate is not positive.
     """
     episodes = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
     if not episodes:
@@ -201,12 +201,12 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-# the quantiles, each with the number of plans from which on one plan is expected beyond it
+# the quantiles, each with the smallest number of plans at which one plan is expected beyond it
 _QUANTILES = {"p50": (0.5, 2), "p90": (0.9, 10), "p99": (0.99, 100), "p99_9": (0.999, 1000)}
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson's 95 % confidence interval of a share (Wilson 1927)."""
+    """Wilson's 95 % confidence interval of a proportion (Wilson 1927)."""
     z = 1.959963984540054
     share = successes / trials
     middle = share + z * z / (2 * trials)
@@ -220,7 +220,7 @@ def _joined(parts: Iterable[torch.Tensor]) -> np.ndarray:
 
 
 def _std(values: np.ndarray) -> float | None:
-    """Sample standard deviation (n - 1); None for fewer than two values, or if one is not finite."""
+    """Sample standard deviation (n - 1); None if there are fewer than two values or if any is not finite."""
     return float(values.std(ddof=1)) if len(values) > 1 and np.isfinite(values).all() else None
 
 
@@ -231,7 +231,7 @@ def _differing_names(mappings: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _plan_statistics(episodes: Sequence[Trajectory], deadline: float) -> dict[str, Any]:
-    """Planning times and missed deadlines, without the first plan of each episode."""
+    """Planning times and missed deadlines, excluding the first plan of each episode."""
     times = _joined(episode.plan_times[1:] for episode in episodes)
     misses = int((times > deadline).sum())
     return {
@@ -252,7 +252,7 @@ def _plan_statistics(episodes: Sequence[Trajectory], deadline: float) -> dict[st
 
 
 def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:
-    """Plans per second, without the first plan of each episode and the wall time that it took."""
+    """Plans per second, excluding the first plan of each episode and its planning time."""
     plans, seconds = 0, 0.0
     for episode in episodes:
         ends = episode.plan_starts + episode.plan_times
@@ -262,7 +262,7 @@ def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:
 
 
 def _sample_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
-    """Failed and effective samples of the plans for which the controller reports them."""
+    """Numbers of failed and effective samples, over the plans for which the controller reports them."""
     failed, effective = (_joined(getattr(e, name) for e in episodes) for name in ("plan_failed", "plan_effective"))
     failed, effective = failed[np.isfinite(failed)], effective[np.isfinite(effective)]
     samples = episodes[0].controller.get("samples")

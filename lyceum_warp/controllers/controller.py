@@ -1,4 +1,4 @@
-"""Define the protocols of a controller: the members that ``lw.control`` and ``lw.control_async`` use."""
+"""Define the protocols of controllers, which ``lw.control`` and ``lw.control_async`` call."""
 
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
@@ -11,8 +11,8 @@ from lyceum_warp.env import Env
 class Controller(Protocol):
     """A function that returns an action for the state and the observation of one world, the plant.
 
-    A plain function is a controller, and so is ``lw.MPPI``. To control with a policy, pass
-    ``lambda state, obs: policy(obs)``. All further members, listed in ``PlanningController``, are optional.
+    Plain functions and ``lw.MPPI`` are controllers. To control with a policy, pass ``lambda state, obs: policy(obs)``.
+    All other members, listed in ``PlanningController``, are optional.
     """
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, /) -> torch.Tensor:
@@ -20,7 +20,7 @@ class Controller(Protocol):
 
         Args:
             state: State of the plant as in ``env.get_state()[0]``, (state_size,) float64, on the plant's device.
-            obs: Its observation, (nobs,) float32, on the same device.
+            obs: The plant's observation, (nobs,) float32, on the same device.
 
         Returns:
             The action, (nu,), finite, on any device.
@@ -30,9 +30,9 @@ class Controller(Protocol):
 
 @runtime_checkable
 class PlanningController(Controller, Protocol):
-    """A controller that makes a plan, a sequence of actions, at every call. ``lw.MPPI`` is one.
+    """A controller that returns the first action of a plan, a sequence of actions. ``lw.MPPI`` is one.
 
-    A controller implements the members that it needs, and need not derive from this class.
+    A controller implements only the members that it needs, and need not derive from this class.
     """
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, /, *, shift: int = 1) -> torch.Tensor:
@@ -41,18 +41,18 @@ class PlanningController(Controller, Protocol):
         Args:
             state: See ``Controller``.
             obs: See ``Controller``.
-            shift: Steps of length ``timestep`` since the state of the last plan, 0 for the first plan after a reset.
-                With ``reset=False`` the loops assume that the last plan was made in the previous step, or with
-                ``replan_every`` in the last step that is due for a plan. They pass ``shift`` only to controllers
-                that have an argument of this name.
+            shift: Number of steps of length ``timestep`` since the state of the last plan; 0 for the first plan after a
+                reset. With ``reset=False`` the loops assume that the last plan was made in the previous step, or with
+                ``replan_every`` in the last step when a plan was due. They pass ``shift`` only to controllers that have
+                this argument.
 
         Returns:
-            The first action of the plan, (nu,). The loops read ``actions`` instead, if the controller has it.
+            The first action of the plan, (nu,). If the controller has ``actions``, the loops read these instead.
         """
         ...
 
     def reset(self, seed: int | None, /) -> object:
-        """Prepare for a new episode. The loops call it with the seed of the run, unless ``reset=False``."""
+        """Prepare for a new episode. The loops call it with the run's seed, unless ``reset=False``."""
         ...
 
     @property
@@ -67,7 +67,7 @@ class PlanningController(Controller, Protocol):
 
     @property
     def plants(self) -> int:
-        """Number of plants to plan for, by default 1. The loops accept no other number."""
+        """Number of plants to plan for, by default 1. The loops support only 1."""
         ...
 
     @property
@@ -82,7 +82,7 @@ class PlanningController(Controller, Protocol):
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """Settings for ``Trajectory.controller``. Values without a JSON type are converted to text."""
+        """Settings for ``Trajectory.controller``. Values without a JSON type are converted to strings."""
         ...
 
     @property

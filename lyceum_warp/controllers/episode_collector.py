@@ -1,4 +1,4 @@
-"""Begin the episode of a control loop, collect its steps and plans, and report its progress."""
+"""Start the episode of a control loop, collect its steps and plans, and report its progress."""
 
 import dataclasses
 import time
@@ -16,24 +16,24 @@ from lyceum_warp.support.validate import check_flag, check_function, check_kind,
 @document_attributes
 @dataclasses.dataclass(frozen=True)
 class ControlProgress:
-    """Progress of an episode after a step, the argument of ``on_step``."""
+    """Progress of an episode after a step; the argument of ``on_step``."""
 
     step: int
     """Number of steps so far."""
     time: float
-    """Wall time so far, this step included, seconds."""
+    """Wall time so far, including this step, seconds."""
     reward: float
     """Reward of the step."""
     eval: float
     """Evaluation metric of the state after the step."""
     success: bool
-    """Whether that state is a success."""
+    """Whether the state after the step is a success."""
     plan_time: float
-    """Planning time of the action's plan, seconds."""
+    """Planning time of the plan that contains the action, seconds."""
     age: float
     """Age of the action when it was applied, seconds; see ``Trajectory.ages``."""
     plans: int
-    """Number of plans up to and including that plan."""
+    """Number of plans up to and including this plan."""
 
 
 OnStep = Callable[[ControlProgress], object]
@@ -45,14 +45,14 @@ class TimedPlan:
     """A finished plan and its planning time."""
 
     index: int
-    step: int  # of the state that it was made from
-    begun: float  # by the clock of the run
+    step: int  # of the state that it starts from
+    begun: float  # time by the run's clock
     seconds: float
     actions: torch.Tensor  # (horizon, nact)
 
 
 def check_arguments(env: Env, *, reset: bool, on_step: OnStep | None, on_abort: OnAbort | None) -> None:
-    """Check the types of the arguments that both loops share."""
+    """Check the arguments that both loops share."""
     check_kind("env", env, Env, "as lw.make(..., autoreset=False) makes it")
     check_flag("reset", reset)
     check_function("on_step", on_step)
@@ -62,10 +62,10 @@ def check_arguments(env: Env, *, reset: bool, on_step: OnStep | None, on_abort: 
 def begin_episode(
     env: Env, controller: CheckedController, steps: int | None, seed: int | None, *, reset: bool
 ) -> tuple[int, int]:
-    """Reset the plant and the controller, unless the run continues from their states.
+    """Reset the plant and the controller, unless ``reset`` is False.
 
     Returns:
-        The number of steps after which to stop, and the step of the episode at which the run begins.
+        The maximum number of steps, and the step of the episode at which the run starts.
 
     Raises:
         ValueError: The environment has several worlds or automatic resets, its episodes may never end, the episode is
@@ -83,20 +83,20 @@ def begin_episode(
         env.rand_reset(seed)
         controller.reset(seed)
     elif seed is not None:
-        raise ValueError(f"seed={seed} has no effect with reset=False: leave out one of them")
+        raise ValueError(f"seed={seed} has no effect with reset=False: omit one of them")
     if env.done.item():
-        raise ValueError("the episode is over before its first step: reset the environment, or leave out reset=False")
+        raise ValueError("the episode is over before its first step: reset the environment, or omit reset=False")
     return limit, 0 if reset else int(env.episode_step.item())
 
 
 class EpisodeCollector:
-    """Collects the states, actions, outcomes and plans of an episode, and makes a ``Trajectory`` of them.
+    """Collects the states, actions, outcomes and plans of an episode, and makes a ``Trajectory``.
 
     For each step, a loop calls ``before_step``, steps the plant and calls ``after_step``.
 
     Args:
         env: The plant, in its initial state.
-        controller: Its controller.
+        controller: The checked controller.
         mode: "sync" or "async"; see ``Trajectory.mode``.
         period: Wall time between two steps, seconds.
         seed: Seed of the run.
@@ -118,7 +118,7 @@ class EpisodeCollector:
         self.start = now()
 
     def restart_clock(self) -> None:
-        """Count wall time from now on, instead of from the construction of the collector."""
+        """Measure wall time from now instead of from the construction of the collector."""
         self.start = self._now()
 
     def elapsed(self) -> float:
@@ -126,23 +126,23 @@ class EpisodeCollector:
         return self._now() - self.start
 
     def add_plan(self, plan: TimedPlan, quality: tuple[float, float]) -> None:
-        """Add a finished plan; ``quality`` has its number of failed samples and its effective sample size."""
+        """Add a finished plan; ``quality`` is its number of failed samples and its effective sample size."""
         self._plans.append((plan.step, plan.begun - self.start, plan.seconds, *quality))
 
     def before_step(self, plan: TimedPlan, now: float, age: float, *, late: bool) -> None:
-        """Add the action in ``env.action``, just before it is applied.
+        """Record the current ``env.action`` just before it is applied.
 
         Args:
             plan: The action's plan.
             now: Seconds since the clock started.
             age: Age of the action, seconds.
-            late: Whether the step begins late.
+            late: Whether the step starts late.
         """
         self._applied.append((self.env.action[0].clone(), plan, age, late))
         self.times.append(now)
 
     def after_step(self, on_step: OnStep | None) -> None:
-        """Add the state, the observation and the outcome of a step, and report progress."""
+        """Record the state, the observation and the outcome of a step, and report progress."""
         env = self.env
         self.states.append(env.get_state()[0])
         self.obs.append(env.final_obs[0].clone())
@@ -159,7 +159,7 @@ class EpisodeCollector:
 
     def trajectory(self, wall_seconds: float, done_reason: int) -> Trajectory:
         """Make the trajectory of all complete steps."""
-        steps = len(self._outcomes)  # outcomes are added last, so an interrupted step has none
+        steps = len(self._outcomes)  # outcomes are recorded last, so an interrupted step has none
         rewards, evals, success = zip(*self._outcomes, strict=True)
         actions, applied, ages, late = zip(*self._applied[:steps], strict=True)
         plan_steps, *plans = zip(*self._plans, strict=True)

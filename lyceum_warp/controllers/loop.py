@@ -1,4 +1,4 @@
-"""Run the synchronous loop, ``lw.control``: the plant waits for each plan."""
+"""Implement the synchronous loop, ``lw.control``: the plant waits for each plan."""
 
 import time
 
@@ -37,14 +37,14 @@ def control(
         env: The plant: one world, made with ``autoreset=False``.
         controller: Called for each plan; see ``lw.Controller``. It must not step ``env``.
         steps: Steps after which to stop if the episode has not ended.
-        replan_every: Steps from one plan to the next. The steps in between apply the next actions of the plan, so
-            values above 1 need a controller with ``actions``.
+        replan_every: Number of steps from one plan to the next. The steps in between apply the next actions of the
+            plan, so values above 1 need a controller with ``actions``.
         seed: Seed of the initial state and of the controller.
-        reset: Whether to reset the plant and the controller first. With False the run continues from the plant's
-            state and the controller's last plan; the last run must have had the same ``replan_every``.
+        reset: Whether to reset the plant and the controller first. If False, the run continues from the plant's state
+            and the controller's last plan; ``replan_every`` must be the same as in the last run.
         on_step: Called with a ``ControlProgress`` after each step. Planning times do not include it.
-        on_abort: Called with the trajectory of the complete steps, if there are any, when an exception ends the run
-            (Ctrl-C included). Its ``done_reason`` is 0. The exception is raised afterwards.
+        on_abort: Called with the trajectory of the complete steps, if there are any, when an exception, including
+            Ctrl-C, ends the run. Its ``done_reason`` is 0. The exception is raised afterwards.
 
     Returns:
         The episode. Its ``period`` is the plant's time step.
@@ -56,7 +56,7 @@ def control(
     check_arguments(env, reset=reset, on_step=on_step, on_abort=on_abort)
     every = whole_number("replan_every", replan_every, low=1)
     checked = CheckedController(controller, env)
-    # steps count from the reset, so a run in several parts shifts its plans like one run
+    # steps are counted from the reset, so a run in several parts shifts its plans as a single run would
     limit, first = begin_episode(env, checked, steps, seed, reset=reset)
     episode = EpisodeCollector(env, checked, mode="sync", period=env.timestep, seed=seed)
     planned = max(first - 1, 0) // every * every

@@ -1,4 +1,4 @@
-"""Run episodes of a policy in many worlds at once, and return them as trajectories."""
+"""Run a policy's episodes in many worlds at once, and return them as trajectories."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -21,10 +21,10 @@ def policy_episodes(
     controller: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Iterator[Trajectory]:
-    """Run whole episodes of a policy from random initial states, and return them as trajectories.
+    """Run a policy for whole episodes from random initial states, and yield them as trajectories.
 
     With the same reset seed and number of worlds, these are the episodes of ``lw.evaluate``. The policy acts in all
-    worlds at once, so the times in a trajectory are times of the whole batch.
+    worlds at once, so the times in a trajectory refer to the whole batch.
 
     Args:
         env: An environment made with ``autoreset=False``; its worlds are reset.
@@ -32,7 +32,7 @@ def policy_episodes(
         episodes: Number of episodes.
         seed: Seed of the initial states; by default the worlds continue their random streams.
         controller: Description of the policy; see ``Trajectory.controller``.
-        progress: Called every ten steps with the number of steps so far and its upper bound.
+        progress: Called every ten steps with the number of steps so far and the maximum number.
 
     Yields:
         The first episodes of all worlds, then the second episodes of all worlds, and so on.
@@ -101,7 +101,7 @@ class _Batch:
         self._reasons[over] = env.done_reason.cpu()[over].long()
 
     def trajectory(self, world: int, **origin: Any) -> Trajectory:
-        """The episode of a world; ``origin`` has the attributes that describe its origin."""
+        """The episode of a world; ``origin`` holds the attributes that describe its origin."""
         env, steps = self.env, int(self._lengths[world])
         states, obs = (torch.stack([row[world] for row in rows[: steps + 1]]) for rows in (self._states, self._obs))
         rewards, evals, success = torch.stack([row[:, world] for row in self._outcomes[:steps]], 1)

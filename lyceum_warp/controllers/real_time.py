@@ -1,4 +1,4 @@
-"""Run the loop in real time, ``lw.control_async``: the plant keeps its rate while a thread plans."""
+"""Implement the real-time loop, ``lw.control_async``: the plant keeps its rate while a thread plans."""
 
 import atexit
 import contextlib
@@ -29,9 +29,9 @@ from lyceum_warp.support.validate import check_kind, positive_number
 
 # all in seconds
 _SPIN = 0.0005  # the last part of a wait, which polls the clock instead of sleeping
-_PATIENCE = 0.2  # longest wait of an exception for an unfinished plan
-_EXIT_PATIENCE = 5.0  # longest wait of the program's end for an unfinished plan
-_SWITCH_INTERVAL = 0.0005  # Python's default of 5 ms is most of a fast plant's period
+_PATIENCE = 0.2  # how long an exception waits for an unfinished plan
+_EXIT_PATIENCE = 5.0  # how long the exit of the program waits for an unfinished plan
+_SWITCH_INTERVAL = 0.0005  # Python's default, 5 ms, is most of a fast plant's period
 
 
 @torch.no_grad()
@@ -52,36 +52,36 @@ def control_async(
     The plant steps in the calling thread. Step k is due at ``k * period``; a late step does not delay later steps. The
     controller plans in a second thread, each time from the newest state, and never twice from the same state.
 
-    Each step applies the newest finished plan. If d simulated seconds have passed since the plan's state, the action is
-    number ``round(d / timestep)`` of the plan, or the last one if the plan is shorter. This compensates for the
+    Each step applies the newest finished plan. If d simulated seconds have passed since the plan's state, it applies
+    action ``round(d / timestep)`` of the plan, or the last action if the plan is shorter. This compensates for the
     planning delay up to the length of the plan. The plant waits for the first plan, so the first action has age 0. All
     other actions are at least one step old, and exactly one step old if every plan takes less than a period.
 
     Before the clock starts, the controller is called three times with the first state, and the plant takes three steps
-    and returns to its state. This warm-up loads kernels and captures graphs, because Warp cannot capture a graph while
-    another thread launches kernels. For the same reason ``on_step`` must not call functions that evaluate given states,
-    such as ``env.get_reward(before, action, after)``.
+    and is restored to its state. This warm-up loads kernels and captures graphs, because Warp cannot capture a graph
+    while another thread launches kernels. For the same reason ``on_step`` must not call functions that evaluate given
+    states, such as ``env.get_reward(before, action, after)``.
 
     During the run Python switches between threads more often than usual (``sys.setswitchinterval``). To keep the plant
-    on time, leave a CPU core free with ``nthread`` of the planner's environment. Put the plant on the CPU: on the
-    planner's GPU both would share one stream, and each step would wait for the previous plan.
+    on time, leave a CPU core free by setting ``nthread`` of the planner's environment, and put the plant on the CPU: on
+    the planner's GPU both would share a stream, and each step would wait for the previous plan.
 
-    When the episode ends, the unfinished plan is completed and counted. When an exception ends the run (Ctrl-C
-    included), the loop waits at most 0.2 seconds for the unfinished plan. The controller must not be used until the
-    thread, which is named "lyceum_warp planner", has ended.
+    When the episode ends, the unfinished plan is completed and counted. When an exception, including Ctrl-C, ends the
+    run, the loop waits at most 0.2 seconds for the unfinished plan. Do not use the controller again until the thread,
+    named "lyceum_warp planner", has ended.
 
     Args:
         env: The plant: one world, made with ``autoreset=False``.
-        controller: Called in the second thread; see ``lw.Controller``. It plans in an environment of its own.
+        controller: Called in the second thread; see ``lw.Controller``. It must plan in a separate environment.
         period: Wall time between steps, seconds; by default the plant's time step, which is real time.
         steps: Steps after which to stop if the episode has not ended.
         seed: Seed of the initial state and of the controller.
-        reset: Whether to reset the plant and the controller first. With False the run continues from the plant's state
+        reset: Whether to reset the plant and the controller first. If False, the run continues from the plant's state
             and the controller's last plan.
         on_step: Called with a ``ControlProgress`` after each step, in the calling thread. Slow calls delay the plant.
-        on_abort: Called with the trajectory of the complete steps, if there are any, when an exception ends the run
-            (Ctrl-C included). Its ``done_reason`` is 0. The exception is raised afterwards.
-        clock: Replaces the wall clock, for example by a subclass that does other work while the plant waits.
+        on_abort: Called with the trajectory of the complete steps, if there are any, when an exception, including
+            Ctrl-C, ends the run. Its ``done_reason`` is 0. The exception is raised afterwards.
+        clock: Replaces the wall clock, for instance by a subclass that does other work while the plant waits.
 
     Returns:
         The episode.
@@ -121,7 +121,7 @@ def control_async(
 
 
 class Clock:
-    """The wall clock, with a wait that is more precise than ``time.sleep``."""
+    """The wall clock, with waits more precise than ``time.sleep``."""
 
     def now(self) -> float:
         """Seconds since an arbitrary origin."""
@@ -135,7 +135,7 @@ class Clock:
             pass
 
     def wait_for(self, event: threading.Event) -> None:
-        """Wait until an event is set. The loop waits in this way for the first plan."""
+        """Wait until an event is set. The loop uses this to wait for the first plan."""
         event.wait()
 
 
@@ -148,7 +148,7 @@ def run_plant(
     limit: int,
     on_step: OnStep | None,
 ) -> float:
-    """Step the plant by the clock until its episode ends; returns the time at the end of the last period, seconds."""
+    """Step the plant by the clock until its episode ends; return the end of the last period, seconds."""
     start, period = episode.start, episode.period
     for k in range(limit):
         due = start + k * period
@@ -157,7 +157,7 @@ def run_plant(
         plan = plans.newest()
         env.action[0] = plan.actions[controller.index(k - plan.step, len(plan.actions))]
         now = episode.elapsed()
-        # the first action has age 0, because the clock started when its plan was finished
+        # the first action has age 0, because the clock starts when its plan is finished
         planned_from = episode.times[plan.step] if plan.step < k else now
         episode.before_step(plan, now, now - planned_from, late=late)
         if k > 0:
@@ -196,8 +196,8 @@ class PlannerThread:
         controller: The controller.
         clock: The clock of the run.
         seed: Seed of the run.
-        first: Step of the episode at which the run begins.
-        reset: Whether the run began with a reset.
+        first: Step of the episode at which the run starts.
+        reset: Whether the run started with a reset.
     """
 
     def __init__(
@@ -208,13 +208,13 @@ class PlannerThread:
         self._qualities: list[tuple[float, float]] = []  # one per plan, appended after the plan
         self._error: BaseException | None = None
         self._begun = threading.Event()  # set after the first plan, or an error
-        # implemented in C, so no thread switch happens while one side holds a lock that the other side needs
+        # SimpleQueue is implemented in C, so no thread switch happens while one side holds a lock that the other needs
         self._states: queue.SimpleQueue[tuple[int, torch.Tensor, torch.Tensor] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="lyceum_warp planner", daemon=True)
         self._thread.start()
 
     def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor) -> None:
-        """Make the next plan from this state, unless a newer state is published first. The tensors must not change."""
+        """Plan from this state next, unless a newer state is published first. The tensors must not change."""
         self._states.put((step, state, obs))
 
     def wait(self) -> None:
@@ -233,11 +233,11 @@ class PlannerThread:
         return self._plans[-1]
 
     def stop(self, patience: float | None = None) -> None:
-        """End the thread after its unfinished plan.
+        """End the thread after its current plan.
 
         Args:
-            patience: Timeout in seconds, None for no limit. After a timeout the thread ends after its plan, or with
-                the program.
+            patience: Timeout in seconds; None for no limit. After a timeout the thread still ends after its current
+                plan, or at the exit of the program.
         """
         self._states.put(None)
         self._thread.join(patience)
@@ -294,9 +294,9 @@ _unfinished: "weakref.WeakSet[threading.Thread]" = weakref.WeakSet()
 
 
 def _interrupt_unfinished() -> None:
-    """End planner threads at the end of the program; otherwise Python frees memory that the engine uses, and crashes.
+    """End planner threads at the exit of the program; otherwise Python frees memory that the engine uses, and crashes.
 
-    Python raises the exception in the thread when the engine's current call returns, after one iteration of the plan.
+    Python raises the exception in the thread once the engine's current call returns, after one iteration of the plan.
     """
     for thread in list(_unfinished):
         if thread.is_alive() and thread.ident is not None:

@@ -16,16 +16,16 @@ def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajec
     """Load episodes of one task whose states have the same layout.
 
     Args:
-        paths: Files written by ``Trajectory.save``, ``lyceum-warp plan`` or ``lyceum-warp eval --episodes-to``. For a
-            folder, its ``.npz`` files are loaded in the order of their names.
+        paths: Files written by ``Trajectory.save``, ``lyceum-warp plan`` or ``lyceum-warp eval --episodes-to``. The
+            ``.npz`` files of a folder are loaded in alphabetical order.
 
     Returns:
         The episodes by file, in the given order.
 
     Raises:
         FileNotFoundError: A file does not exist, or a folder holds no episode.
-        ValueError: A file is broken, was written by a newer release, or has another task or another model than the
-            first file.
+        ValueError: A file is broken, was written by a newer release, or has a different task or model than the first
+            file.
     """
     episodes: dict[Path, Trajectory] = {}
     for path in _files([paths] if isinstance(paths, str | Path) else paths):
@@ -42,23 +42,23 @@ def episode_env(
 ) -> Env:
     """Make an environment for the states of saved episodes, with one world and no automatic resets.
 
-    It has the parameters, the model and the physics of the first episode. ``env.set_state`` accepts the states of all
-    given episodes.
+    The environment has the parameters, the model and the physics of the first episode. ``env.set_state`` accepts the
+    states of all given episodes.
 
-    An episode's file may come from another person. It names the file of its task, which Python would run. Without
-    ``task``, this function runs a task's file only if the file and its folder belong to this user or to root, and no
-    other user can write them.
+    Files of episodes may come from other people, and they name a task file, which is run as Python code. Without
+    ``task``, this function runs a task file only if the file and its folder belong to this user or to root, and no
+    other user can write to them.
 
     Args:
         episodes: The episodes, as ``load_episodes`` returns them.
-        task: The task. Needed if it was defined in a notebook, if its file has moved, or if other users can write the
-            file. It must have the name of the episodes' task.
-        changes: Further options and parameters of ``lw.make``.
+        task: The task. Required if it was defined in a notebook, if its file has moved, or if other users can write to
+            the file. It must have the same name as the episodes' task.
+        changes: Additional options and parameters of ``lw.make``.
 
     Raises:
         FileNotFoundError: The file of the task or of its model is missing.
-        ValueError: The task cannot be found or has another name, other users can write its file, or the states do not
-            fit the task.
+        ValueError: The task cannot be found or has a different name, other users can write to its file, or the states
+            do not fit the task.
     """
     if isinstance(episodes, Trajectory):
         episodes = {Path("the episode"): episodes}
@@ -86,7 +86,7 @@ def check_episode(env: Env, episode: Trajectory, name: str | Path = "the episode
         name: Name of the episode in error messages.
 
     Raises:
-        ValueError: The episode has another task, or its states have another layout.
+        ValueError: The episode has a different task, or its states have a different layout.
     """
     if episode.task != env.task.name:
         raise ValueError(f"{name} is an episode of the task {episode.task!r}, not of {env.task.name!r}")
@@ -123,7 +123,7 @@ def _check_same(first: Path, one: Trajectory, path: Path, other: Trajectory) -> 
 
 
 def _difference(wanted: Mapping[str, Sequence[int]], found: Mapping[str, Sequence[int]]) -> str:
-    """The first difference between two layouts of states, as "qpos of 7 numbers, not 9"; empty without one."""
+    """The first difference between two state layouts, such as "qpos of 7 numbers, not 9"; empty if they are equal."""
     for name in {**wanted, **found}:
         one, other = (parts[name][1] - parts[name][0] if name in parts else None for parts in (wanted, found))
         if one != other:
@@ -157,7 +157,7 @@ def _task(path: Path, episode: Trajectory, given: str | Path | type[Task] | None
 
 
 def _foreign(file: Path) -> str:
-    """Why a file may hold another user's code, as "it can be written by other users"; empty if it cannot."""
+    """Why a file may hold another user's code, such as "it can be written by other users"; empty if it cannot."""
     if not hasattr(os, "getuid"):
         return "this system does not say who can write it"
     for place, name in ((file, "it"), (file.parent, f"its folder {file.parent}")):
@@ -170,7 +170,7 @@ def _foreign(file: Path) -> str:
 
 
 def _is_private(group: int) -> bool:
-    """Whether a group's only member is this user (many systems give each user a group) or root."""
+    """Whether a group is root's or has only this user as a member (many systems give each user a group)."""
     import grp
     import pwd
 

@@ -1,4 +1,4 @@
-"""Store one episode of a controlled world, in memory and in a file: ``lw.Trajectory``."""
+"""Store one episode of a controlled world, in memory and in files: ``lw.Trajectory``."""
 
 import dataclasses
 import json
@@ -19,7 +19,7 @@ from lyceum_warp.support.versions import versions
 FORMAT = 1
 """Version of the file format. It increases when older releases cannot read new files."""
 
-# type and axes of every array; axes of the same name have the same length
+# dtype and axes of each array; axes with the same name have the same length
 _ARRAYS = {
     "states": (torch.float64, ("steps + 1", "state_size")), "obs": (torch.float32, ("steps + 1", "nobs")),
     "actions": (torch.float32, ("steps", "nu")), "rewards": (torch.float32, ("steps",)),
@@ -41,7 +41,7 @@ _SCALARS: dict[str, Callable[[Any], Any]] = {
 class Trajectory:
     """One episode of one world, the plant, under a controller. All tensors are on the CPU.
 
-    Step k leads from state k to state k + 1 under action k. To replay the episode bit by bit on the same engine, set
+    Step k leads from state k to state k + 1 under action k. To replay the episode bit for bit on the same engine, set
     the first state with ``set_state`` and step with each action.
 
     Times are seconds of wall time. The clock starts before the first plan in a synchronous run, and after it in an
@@ -51,7 +51,7 @@ class Trajectory:
     states: torch.Tensor
     """States, (steps + 1, state_size) float64. After a fault the last state is the first state of the next episode."""
     obs: torch.Tensor
-    """Observations of the states, (steps + 1, nobs) float32. After a fault the previous observation is repeated."""
+    """Observations of the states, (steps + 1, nobs) float32. After a fault the last valid observation is repeated."""
     actions: torch.Tensor
     """Applied actions, (steps, nact) float32."""
     rewards: torch.Tensor
@@ -63,17 +63,17 @@ class Trajectory:
     times: torch.Tensor
     """Time at which each action was applied, (steps,) float64, seconds."""
     ages: torch.Tensor
-    """Age of each action when it was applied, (steps,) float64, seconds: the time since the plant was in the state that
-    the plan starts from. In a synchronous run the first action of a plan is as old as the planning time."""
+    """Age of each action when it was applied, (steps,) float64, seconds: the time since the plant was in the plan's
+    initial state. In a synchronous run the age of a plan's first action is the planning time."""
     late: torch.Tensor
-    """Whether a step began late because the previous step was not finished in time, (steps,) bool. Always False in a
-    synchronous run."""
+    """Whether each step started late because the previous step was not finished in time, (steps,) bool. Always False in
+    a synchronous run."""
     plan_of: torch.Tensor
-    """Index of each action's plan, (steps,) int64."""
+    """Index of the plan that each action is from, (steps,) int64."""
     plan_steps: torch.Tensor
     """Index of the state that each plan starts from, (plans,) int64."""
     plan_starts: torch.Tensor
-    """Time at which planning began, (plans,) float64, seconds. Negative for the first plan of an asynchronous run."""
+    """Time at which planning started, (plans,) float64, seconds. Negative for the first plan of an asynchronous run."""
     plan_times: torch.Tensor
     """Planning time, including the copy of the actions to the CPU, (plans,) float64, seconds."""
     plan_failed: torch.Tensor
@@ -89,7 +89,7 @@ class Trajectory:
     mode: str
     """"sync" if the plant waited for each plan, "async" if it ran in real time."""
     done_reason: int
-    """Bits of ``Done``: why the episode ended. 0 if the run stopped before."""
+    """Bits of ``Done``: why the episode ended; 0 if the run stopped earlier."""
     task: str
     """Name of the task."""
     engine: str
@@ -97,7 +97,7 @@ class Trajectory:
     params: Mapping[str, Any]
     """Parameters of the task."""
     versions: Mapping[str, Any]
-    """Packages, Python, machine and commit."""
+    """Versions of packages and Python, the machine, and the commit."""
     seed: int | None
     """Seed of the initial state and of the controller, or None."""
     controller: Mapping[str, Any]
@@ -109,9 +109,9 @@ class Trajectory:
     action_names: Sequence[str]
     """Names of the action columns."""
     source: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Arguments of ``lw.make`` from which ``episode_env`` rebuilds the plant: ``task``, a name or "file:class", None
-    for a task from a notebook or script; ``params``, the names of the given parameters; ``options``. Empty in files of
-    earlier releases."""
+    """Arguments of ``lw.make`` from which ``episode_env`` rebuilds the plant: ``task``, a name or "file:class" (None
+    for a task from a notebook or script); ``params``, the names of the parameters that were given; and ``options``.
+    Empty in files of earlier releases."""
 
     @property
     def steps(self) -> int:
@@ -144,7 +144,7 @@ class Trajectory:
         return torch.arange(self.steps) - self.plan_steps[self.plan_of]
 
     def part(self, name: str) -> torch.Tensor:
-        """View of a part of all states, (steps + 1, size), such as ``part("qpos")``.
+        """View of one part of all states, (steps + 1, size), such as ``part("qpos")``.
 
         Raises:
             ValueError: The states have no such part.
@@ -155,11 +155,12 @@ class Trajectory:
         return self.states[:, start:stop]
 
     def save(self, path: str | Path) -> Path:
-        """Write the trajectory to a file, atomically, and return the file's path.
+        """Write the trajectory to a file atomically, and return the file's path.
 
-        The file is a compressed ``.npz``, which numpy reads without pickle. Each tensor attribute is an array of that
-        name. ``info``, a string array without axes, holds the other attributes and ``format`` (1) as JSON. For example,
-        with ``start, stop = info["state_parts"]["qpos"]``, the positions are ``states[:, start:stop]``.
+        The file is a compressed ``.npz`` that numpy reads without pickle. Each tensor attribute is stored as an array
+        of the same name. ``info``, a zero-dimensional string array, holds the other attributes and ``format`` (1) as
+        JSON. For example, with ``start, stop = info["state_parts"]["qpos"]``, the positions are ``states[:,
+        start:stop]``.
         """
         path = Path(path)
         info = {"format": FORMAT, **{name: getattr(self, name) for name in _SCALARS}}
@@ -190,7 +191,7 @@ class Trajectory:
                     return cls(**content, **scalars)
         except OSError:
             raise
-        except Exception as error:  # numpy and zipfile raise many types
+        except Exception as error:  # numpy and zipfile raise many types of errors
             text = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise ValueError(f"{path} is broken, or is not a trajectory of lyceum_warp ({text[:200]})") from error
         raise newer_format(path, info["format"], FORMAT)
@@ -210,7 +211,7 @@ def _check(arrays: Mapping[str, torch.Tensor]) -> None:
 
 
 def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor]) -> None:
-    """Reject parts that are not columns of their array, and a source with wrong types."""
+    """Reject parts outside their array's columns, and a source with wrong types."""
     for name, array in (("state_parts", "states"), ("obs_parts", "obs")):
         for part, place in scalars[name].items():
             whole = isinstance(place, list) and len(place) == 2 and all(type(column) is int for column in place)
@@ -225,7 +226,7 @@ def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor
 
 
 def provenance(env: Env) -> dict[str, Any]:
-    """Attributes of a trajectory that describe its origin: task, engine, versions, names of columns."""
+    """A trajectory's attributes that describe its origin: task, engine, versions, column names."""
     params = {name: np.asarray(value).tolist() for name, value in env.task.params.items()}
     return {
         "task": env.task.name, "engine": env.engine.name, "params": params, "versions": versions(env.device.alias),

@@ -1,1 +1,1 @@
-"""Physics behind one contract: the C engine (mujoco.batch) and the Warp engine (mujoco_warp)."""
+"""Simulate physics behind one interface: the C engine (mujoco.batch) and the Warp engine (mujoco_warp)."""

@@ -1,4 +1,4 @@
-"""Define the contract between an environment and the physics behind it."""
+"""Define the interface between an environment and its physics engine."""
 
 import abc
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -21,38 +21,38 @@ from lyceum_warp.support.docstrings import document_attributes
 class Engine(abc.ABC):
     """Many worlds of one model, stepped together.
 
-    An engine knows nothing of tasks. Its fields lie in Warp arrays with a leading ``nworld`` axis. The addresses of the
-    arrays never change, so graphs that read them are captured once.
+    An engine knows nothing of tasks. Its fields are Warp arrays with a leading ``nworld`` axis. Their addresses never
+    change, so graphs that read them are captured once.
 
-    The order of calls in a step is: write ``ctrl`` and other inputs, ``step``, ``find_faults``, read fields and
-    ``fault``. Worlds that restart continue with ``reset``, writing state fields and model fields, ``commit``,
-    ``apply_model``, optionally ``settle``, and ``refresh``. After construction the arrays hold no state: reset all
-    worlds first. Model fields begin with the model's values, and resets do not change them.
+    The order of calls in a step is: write ``ctrl`` and other inputs, call ``step`` and ``find_faults``, read fields and
+    ``fault``. For worlds that restart, the caller then calls ``reset``, writes state fields and model fields, and calls
+    ``commit``, ``apply_model``, optionally ``settle``, and ``refresh``. A new engine holds no state: reset all worlds
+    first. Model fields start at the model's values, and resets do not change them.
 
     Args:
-        model: The compiled model; the engine keeps it and does not change it.
+        model: The compiled model; the engine stores it and does not change it.
         nworld: Number of worlds.
         device: Where the arrays live.
-        fields: The fields to keep, from ``fields.describe``. No other field can be read later.
+        fields: The fields to provide, from ``fields.describe``. No other field can be read later.
         dynamics: The model fields that differ between worlds, from ``model_fields.describe_model_field``.
         initial: The state that ``reset`` puts worlds into, (integration_size,); None for the model's own.
 
     Raises:
-        ValueError: A field is listed twice, once lagged and once current, the initial state has another shape, or a
+        ValueError: A field is listed twice, once lagged and once current, the initial state has the wrong shape, or a
             model field cannot differ between worlds of this model.
     """
 
     name: str
     """The engine's name, as in ``make(engine=...)``."""
     launch_threads: int = 1
-    """Threads that share the worlds in launches around a step.
+    """Threads that share the worlds in kernel launches around a step.
 
-    An engine with several of them makes its launches only through ``lyceum_warp.support.arrays``.
+    An engine with several threads must launch kernels only through ``lyceum_warp.support.arrays``.
     """
     capturable: bool
-    """Whether every method is made of Warp launches, so that a whole step can be captured as one graph.
+    """Whether every method consists of Warp launches, so that a whole step can be captured as one graph.
 
-    On other engines only methods that are documented as made of launches are captured.
+    On other engines, only methods documented as Warp launches are captured.
     """
     model: mujoco.MjModel
     """The compiled model."""
@@ -61,11 +61,11 @@ class Engine(abc.ABC):
     device: wp.Device
     """Where the arrays live."""
     fields: dict[str, Field]
-    """The fields that are kept, by name; ``ctrl`` is always among them."""
+    """The fields that the engine provides, by name; always includes ``ctrl``."""
     dynamics: dict[str, ModelField]
     """The model fields that differ between worlds, by name."""
     nominal: dict[str, wp.array]
-    """The model's own values of those model fields, (1, ...), float32."""
+    """The model's own values of these fields, (1, ...), float32."""
     initial: np.ndarray
     """The state that ``reset`` puts worlds into, (integration_size,), float64."""
     arrays: dict[str, wp.array]
@@ -75,15 +75,15 @@ class Engine(abc.ABC):
     fault: wp.array
     """Bits of ``Done`` for each world, (nworld,), int32; set by ``find_faults``."""
     stage: Stage
-    """The last stage that fields of the new state need after the substeps."""
+    """The last stage that must run after the substeps, so that fields match the new state."""
     reset_stage: Stage
-    """The last stage that fields need after a reset."""
+    """The last stage that must run after a reset."""
     snapshots: list[Field]
-    """Fields that are not a function of the integration state, in the order of the state vector."""
+    """Fields that are not a function of the integration state, in state-vector order."""
     integration_size: int
-    """Floats in one world's integration state (mjSTATE_INTEGRATION)."""
+    """Number of floats in one world's integration state (mjSTATE_INTEGRATION)."""
     state_size: int
-    """Floats in one world's state: the integration state, the snapshots, and the model fields."""
+    """Number of floats in one world's state: the integration state, the snapshots, and the model fields."""
 
     def __init__(
         self, model: mujoco.MjModel, nworld: int, device: wp.Device, fields: Iterable[Field],
@@ -122,7 +122,7 @@ class Engine(abc.ABC):
     def bytes_per_world(
         cls, model: mujoco.MjModel, fields: Iterable[Field], dynamics: Iterable[ModelField] = (), **options: Any
     ) -> int:
-        """Estimated memory of each world in bytes; takes the arguments of the constructor.
+        """Estimated bytes of memory per world; takes the constructor's arguments.
 
         The default counts a float64 state and one float32 array for each field.
         """
@@ -142,45 +142,45 @@ class Engine(abc.ABC):
     def step(self, nstep: int) -> None:
         """Advance every world by ``nstep`` substeps under ``ctrl`` and the other inputs, and update the fields.
 
-        The engine first reads the arrays of all fields that are ``written``.
+        The engine first reads the arrays of all fields with ``written``.
         """
 
     def step_phases(self, nstep: int) -> list[Phase]:
-        """``step`` as phases; an engine that is not ``capturable`` can still capture its copies of fields."""
+        """``step`` as phases, so that an engine that is not ``capturable`` can still capture its copies of fields."""
         return [Phase("physics", partial(self.step, nstep), engine=True)]
 
     @abc.abstractmethod
     def find_faults(self, mask: wp.array) -> None:
-        """Write the masked worlds' ``fault``: states that are not finite, overflows and warnings since the last call.
+        """Write the masked worlds' ``fault``: non-finite states, and overflows and warnings since the last call.
 
         Made of Warp launches on every engine.
         """
 
     def check_room(self) -> None:  # noqa: B027
-        """Log a warning if the worlds' states need more room than the engine has; called once, after the first reset.
+        """Log a warning if the worlds need more contacts or constraints than fit; called once, after the first reset.
 
-        Not made of launches.
+        Does not consist of launches.
         """
 
     @abc.abstractmethod
     def reset(self, mask: wp.array) -> None:
         """Put the masked worlds into the model's initial state, state fields included.
 
-        Made of Warp launches on every engine. Derived fields follow with ``refresh``.
+        Consists of Warp launches on every engine. ``refresh`` then updates derived fields.
         """
 
     @abc.abstractmethod
     def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
-        """Copy the masked worlds' state fields, by default all that are kept, into the engine.
+        """Copy the masked worlds' state fields, by default all, into the engine.
 
         Made of Warp launches.
         """
 
     def apply_model(self, mask: wp.array) -> None:
-        """Apply the masked worlds' model fields, and recompute the constants that follow from them.
+        """Apply the masked worlds' model fields, and recompute the constants derived from them.
 
-        Unchanged values cost almost nothing. Derived fields follow with ``refresh`` or ``refresh_current``. An engine
-        that takes ``dynamics`` must implement it.
+        Unchanged values cost almost nothing. ``refresh`` or ``refresh_current`` then updates derived fields. An engine
+        that accepts ``dynamics`` must implement this method.
         """
         if self.dynamics:
             raise NotImplementedError(f"the {self.name} engine does not let model fields differ between worlds")
@@ -188,40 +188,41 @@ class Engine(abc.ABC):
     def settle(self, mask: wp.array, nstep: int) -> None:
         """Advance only the masked worlds by ``nstep`` substeps from their committed states, and update state fields.
 
-        Their time is 0 afterwards; derived fields follow with ``refresh``. Other worlds stay equal to the bit.
+        Their time is 0 afterwards; ``refresh`` then updates derived fields. No bit of any other world changes.
         """
-        raise NotImplementedError(f"the {self.name} engine cannot settle single worlds")
+        raise NotImplementedError(f"the {self.name} engine cannot settle individual worlds")
 
     def run_for(self, mask: wp.array, run: Callable[[], None]) -> None:
-        """Run launches that affect only the masked worlds; a capturable engine may skip them for an empty mask."""
+        """Run launches that affect only the masked worlds; a capturable engine may skip them if the mask is empty."""
         run()
 
     @abc.abstractmethod
     def refresh(self, mask: wp.array) -> None:
-        """Compute all derived fields of the masked worlds from their states; other worlds keep their values."""
+        """Compute the masked worlds' derived fields from their states; other worlds do not change."""
 
     @abc.abstractmethod
     def refresh_current(self, mask: wp.array) -> None:
-        """Compute the masked worlds' fields that belong to the current state, and their sensors.
+        """Compute the masked worlds' derived fields and sensors that belong to the current state.
 
-        Fields and sensors of the acceleration stage stay as the last substep left them. Other worlds, and all
-        sensors' histories, stay as they are.
+        Fields and sensors of the acceleration stage stay as the last substep left them. Other worlds and all sensor
+        histories do not change.
         """
 
     # rollouts
 
     def rollout(self, state: wp.array, controls: wp.array, nstep: int, buffers: Mapping[str, wp.array]) -> None:
-        """Step every world from a given state under given controls, and copy fields into buffers along the way.
+        """Roll out every world from a given state under given controls, and copy fields into buffers at each step.
 
-        Afterwards the state fields and ``find_faults`` describe the end; derived fields may belong to another time.
+        Afterwards the state fields and ``find_faults`` describe the final state; derived fields may be stale.
 
         Args:
             state: States to start from, (nworld, state_size or more) float64, as from ``get_state``.
             controls: Controls of each step, (steps, nworld, nu) float32.
             nstep: Substeps in a step.
-            buffers: Where fields and model fields go, by name, (steps + 1, nworld, ...); row 0 holds the start.
+            buffers: Destinations of fields and model fields, by name, (steps + 1, nworld, ...); row 0 is the initial
+                state.
         """
-        self.reset(self._everyone)  # clears warnings and warm starts of the last rollout
+        self.reset(self._everyone)  # clears the last rollout's warnings and warm starts
         self.set_state(state, self._everyone)
         self._copy_fields(buffers, 0)
         for t in range(len(controls)):
@@ -231,10 +232,10 @@ class Engine(abc.ABC):
             self._copy_fields(buffers, t + 1)
 
     def rollout_bytes_per_world(self, steps: int, nstep: int, fields: Iterable[Field]) -> int:
-        """Estimated memory of ``rollout`` for each world in bytes, without its arguments.
+        """Estimated bytes of memory per world for ``rollout``, without its arguments.
 
         Args:
-            steps: Steps of the horizon.
+            steps: Number of steps in the horizon.
             nstep: Substeps in a step.
             fields: Fields that are copied into buffers.
         """
@@ -248,7 +249,7 @@ class Engine(abc.ABC):
     # state
 
     def get_state(self, state: wp.array, mask: wp.array | None = None) -> None:
-        """Write the masked worlds' states, by default all, into (nworld, state_size) float64, exactly.
+        """Write the masked worlds' states, by default all, into ``state``, (nworld, state_size) float64, exactly.
 
         Made of Warp launches.
         """
@@ -262,7 +263,7 @@ class Engine(abc.ABC):
             start += field.size
 
     def set_state(self, state: wp.array, mask: wp.array) -> None:
-        """Put the masked worlds into the given states, exactly; afterwards every field belongs to them."""
+        """Put the masked worlds into the given states, exactly; all fields match them afterwards."""
         self._set_integration(state[:, : self.integration_size], mask)
         if self.dynamics:
             self._read_columns(state, mask, self.dynamics.values(), self.state_size - self._dynamics_size)
@@ -271,7 +272,7 @@ class Engine(abc.ABC):
         self._read_columns(state, mask, self.snapshots, self.integration_size)
 
     def _read_columns(self, state: wp.array, mask: wp.array, fields: Iterable[Field | ModelField], start: int) -> None:
-        """Read fields of the masked worlds from consecutive columns of a state, rounded to float32."""
+        """Read the masked worlds' fields from consecutive columns of a state, rounded to float32."""
         for field in fields:
             launch_rows(narrow, mask, state[:, start : start + field.size], flat(self.arrays[field.name]))
             start += field.size
@@ -295,7 +296,8 @@ class Engine(abc.ABC):
 EngineFactory = Callable[..., Engine]
 """Called with (model, nworld, device, fields, dynamics, initial, **options).
 
-An engine class is such a factory. If a factory has ``bytes_per_world``, as the classes have, memory is checked first.
+An engine class is such a factory. If the factory has ``bytes_per_world``, as engine classes do, memory is checked
+first.
 """
 
 
@@ -304,7 +306,7 @@ def _integration_size(model: mujoco.MjModel) -> int:
 
 
 def _initial_state(model: mujoco.MjModel) -> np.ndarray:
-    """The integration state of new data of a model."""
+    """The integration state of a new MjData."""
     state = np.empty(_integration_size(model))
     mujoco.mj_getState(model, mujoco.MjData(model), state, mujoco.mjtState.mjSTATE_INTEGRATION.value)
     return state

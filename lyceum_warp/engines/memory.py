@@ -1,4 +1,4 @@
-"""Check whether a number of worlds fits into memory, from an estimate of bytes per world."""
+"""Check whether a batch of worlds fits into memory, given the estimated bytes per world."""
 
 import gc
 
@@ -12,7 +12,7 @@ _KEPT_FREE = 0.1
 
 
 class NotEnoughMemoryError(ValueError):
-    """A number of worlds does not fit into the free memory of a device."""
+    """Raised if a batch of worlds does not fit into the free memory of a device."""
 
 
 def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: str = "", held: int = 0) -> None:
@@ -32,7 +32,7 @@ def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: 
     if free is not None and nworld > _most(bytes_per_world, free + held):
         gc.collect()  # frees environments that are no longer used
         if device.is_cuda:
-            torch.cuda.empty_cache()  # frees the memory that torch keeps for later
+            torch.cuda.empty_cache()  # frees memory that torch has cached
         free = free_memory(device)
     if free is None or nworld <= (most := _most(bytes_per_world, free + held)):
         return

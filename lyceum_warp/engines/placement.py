@@ -26,14 +26,14 @@ _DETERMINISTIC = "lyceum_warp.engines.deterministic.deterministic_engine", "Dete
 """The engine that replaces "warp" on a CUDA device with deterministic=True."""
 
 _SAMPLES_PER_CORE = 40
-"""With fewer samples for each CPU core, the C engine plans faster than an H100. Measured with 16 cores: they are equal
-with 27 samples a core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah (bench/README.md)."""
+"""With fewer samples per CPU core, the C engine plans faster than an H100. Measured with 16 cores, the break-even
+points are 27 samples per core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah (bench/README.md)."""
 
 _MOST_CORES = 16
-"""The most cores that count: more were not measured, and the work of a plan besides physics runs on one core."""
+"""Additional cores do not count: they were not measured, and a plan's work besides physics runs on one core."""
 
 _NOSLIP = 6
-"""How many times more samples pay for a GPU if the model uses the noslip solver, which is slow there."""
+"""Factor on the break-even point if the model uses the noslip solver, which is slow on a GPU."""
 
 
 def find_device(device: str | None) -> wp.Device:
@@ -43,7 +43,7 @@ def find_device(device: str | None) -> wp.Device:
         ValueError: This machine has no such device.
     """
     name, error, remarks = str(device or "cpu"), None, start_warp()
-    if wp.is_cuda_available() or not name.startswith("cuda"):  # without a driver, Warp would print before it fails
+    if wp.is_cuda_available() or not name.startswith("cuda"):  # without a driver, Warp would print a message first
         try:
             found = wp.get_device(name)
         except (ValueError, RuntimeError) as cause:
@@ -81,23 +81,23 @@ def open_engine(
     engine: str | EngineFactory, model: mujoco.MjModel, nworld: int, device: wp.Device, fields: Iterable[Field],
     dynamics: Iterable[ModelField] = (), initial: np.ndarray | None = None, *, reserved: int = 0, **options: Any,
 ) -> Engine:  # fmt: skip
-    """Make an engine by name, or by a class or factory of your own.
+    """Make an engine from its name, or from a class or factory of your own.
 
     Args:
         engine: "mujoco", "warp", "auto", or a callable with the signature of ``base.Engine``.
         model: The compiled model.
         nworld: Number of worlds.
         device: Where they run.
-        fields: The fields to keep, from ``fields.describe``.
+        fields: The fields to provide, from ``fields.describe``.
         dynamics: The model fields that differ between worlds, from ``model_fields.describe_model_field``.
         initial: The state that a reset puts worlds into; None for the model's own.
         reserved: Bytes for each world that the caller allocates.
-        options: The engine's options, the keyword-only arguments of its constructor. None stands for the engine's
-            default. An engine ignores a flag (True or False) that it does not take.
+        options: Keyword-only arguments of the engine's constructor. None means the engine's default. A flag (True or
+            False) that the engine does not have is ignored.
 
     Raises:
-        ValueError: There is no such engine, the worlds do not fit into memory, or the engine refuses the model, the
-            device or an option, or lets no model fields differ between worlds.
+        ValueError: There is no such engine, the worlds do not fit into memory, or the engine does not support the
+            model, the device, an option, or model fields that differ between worlds.
     """
     fields, dynamics = list(fields), list(dynamics)
     factory, given = _resolved(engine, device, options)
@@ -111,14 +111,14 @@ def bytes_per_world(
     engine: str | EngineFactory, model: mujoco.MjModel, device: wp.Device, fields: Iterable[Field],
     dynamics: Iterable[ModelField] = (), **options: Any,
 ) -> int:  # fmt: skip
-    """Estimated memory in bytes of each world of the engine that ``open_engine`` makes; 0 if unknown."""
+    """Estimated bytes of memory per world, for the engine that ``open_engine`` makes; 0 if unknown."""
     factory, given = _resolved(engine, device, options)
     estimate = getattr(factory, "bytes_per_world", None)
     return 0 if estimate is None else int(estimate(model, list(fields), list(dynamics), **given))
 
 
 def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
-    """The options to change for an environment of a few worlds, such as an evaluation's.
+    """The options to change for an environment of a few worlds, as for an evaluation.
 
     On a GPU a step of a few worlds takes nearly as long as a step of thousands. With engine="auto" they therefore run
     on the C engine, on CPU cores and in double precision.
@@ -129,7 +129,7 @@ def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device 
 def options_for_plant(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
     """The options to change for a world that a planner controls in real time.
 
-    On a GPU its steps would wait for the planner's launches. It therefore runs on the C engine, on a CPU core.
+    On a GPU its steps would wait for the planner's launches, so it runs on the C engine, on a CPU core.
     """
     name = device.alias if isinstance(device, wp.Device) else device
     on_gpu = engine in ("auto", "warp") and find_device(name).is_cuda
@@ -140,7 +140,7 @@ def place_samples(
     engine: str | EngineFactory, device: str | None, *, nthread: int | None, samples: int,
     spec: Callable[[], mujoco.MjSpec], solver: Mapping[str, int | float] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """The options to change for a planner's worlds; with engine="auto" on a GPU the number of samples decides.
+    """The options to change for a planner's worlds. With engine="auto" on a GPU, the number of samples decides.
 
     Args:
         engine: The requested engine.
@@ -167,7 +167,7 @@ def place_samples(
 
 
 def _on_cpu_cores() -> dict[str, Any]:
-    """The options that move an environment to the C engine; options that this engine does not take become None."""
+    """The options that move an environment to the C engine; options that this engine does not have become None."""
     known = _options_of(_engine_class("mujoco", wp.get_device("cpu"), False)) or []
     defaults = EnvOptions().for_engine()
     others = {name: None for name, default in defaults.items() if default is None and name not in known}
@@ -177,7 +177,7 @@ def _on_cpu_cores() -> dict[str, Any]:
 def _resolved(
     engine: str | EngineFactory, device: wp.Device, options: dict[str, Any]
 ) -> tuple[EngineFactory, dict[str, Any]]:
-    """The engine's class or factory, and the options that it receives."""
+    """The engine's class or factory, and the options to pass to it."""
     name = engine_name(engine, device.alias)
     factory = engine if callable(engine) else _engine_class(name, device, bool(options.get("deterministic")))
     given = {key: value for key, value in options.items() if value is not None and value is not False}
@@ -201,7 +201,7 @@ def _engine_class(name: str, device: wp.Device, deterministic: bool) -> type[Eng
 
 
 def _options_of(factory: EngineFactory) -> list[str] | None:
-    """The names of the options that an engine takes, or None if it takes any."""
+    """The names of an engine's options, or None if it accepts any."""
     parameters = inspect.signature(factory).parameters.values()
     if any(parameter.kind == parameter.VAR_KEYWORD for parameter in parameters):
         return None
@@ -209,6 +209,6 @@ def _options_of(factory: EngineFactory) -> list[str] | None:
 
 
 def _model_name(model: mujoco.MjModel) -> str:
-    """The name in the model's file, or nothing if it has none."""
+    """The name in the model's file; empty if it has none."""
     name = model.names[: model.names.index(b"\0")].decode(errors="replace")
     return "" if name == "MuJoCo Model" else name

@@ -1,11 +1,11 @@
 """Capture the phases of a step, a reset or a plan as graphs, and replay them.
 
-``Graphs.sequence`` turns a list of phases into calls: consecutive phases that are made of Warp launches become one
-graph, captured once and replayed. If the engine's calls are launches too, a whole step is one graph; otherwise they
-stay between the graphs.
+``Graphs.sequence`` turns a list of phases into calls: consecutive phases that consist of Warp launches become one
+graph, captured once and replayed. If the engine's calls also consist of launches, a whole step is one graph; otherwise
+they run between the graphs.
 
-On the CPU, Warp runs a launch in one thread. Phases that process every world independently therefore become several
-graphs, each for a part of the worlds, which threads replay in parallel.
+On the CPU, Warp runs each launch in one thread. Phases that process every world independently therefore become several
+graphs, one for each part of the worlds, and threads replay them in parallel.
 """
 
 import contextlib
@@ -24,33 +24,33 @@ from lyceum_warp.support.arrays import part_of_worlds
 from lyceum_warp.support.upstream import TILES_ON_CPU, separate_captures, separate_tiles, tiles
 
 Calls = tuple[Callable[[], None], ...]
-"""The result of ``Graphs.sequence``: functions to call in order."""
+"""The result of ``Graphs.sequence``: functions to be called in order."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Phase:
     """One entry of a list of phases.
 
-    It must launch the same kernels on the same arrays each time, because a graph holds their addresses and scalar
+    A phase must launch the same kernels on the same arrays each time, because a graph stores addresses and scalar
     arguments.
     """
 
     name: str
     """Name, by which the rules of an environment find it."""
     run: Callable[[], object]
-    """Takes no arguments."""
+    """The function to run, without arguments."""
     engine: bool = False
     """True for an engine call, which consists of Warp launches only on some engines."""
     by_world: bool = False
-    """Whether it only makes launches through functions like ``arrays.launch_worlds``, in which no world depends on
-    another one, so that threads can share the worlds."""
+    """Whether it only launches kernels through functions like ``arrays.launch_worlds`` and no world depends on another,
+    so that threads can share the worlds."""
 
 
 class Graphs:
-    """Turns phases into sequences of calls, and can drop all their graphs.
+    """Turns phases into sequences of calls, and can discard all their graphs.
 
     Args:
-        device: Where the launches run; Warp captures graphs on the CPU, too.
+        device: Where the launches run; Warp can also capture graphs on the CPU.
         enabled: False calls every phase directly.
         capture_engine: Whether calls into the engine are made of launches.
         workers: Threads that replay the graphs of phases with ``by_world``; by default only the caller's.
@@ -64,7 +64,7 @@ class Graphs:
         self._graphs: weakref.WeakSet[_Graph] = weakref.WeakSet()
 
     def sequence(self, phases: Iterable[Phase]) -> Calls:
-        """The calls that run some phases in order."""
+        """Turn phases into calls, in order."""
         calls: list[Callable[[], object]] = []
         together: list[Phase] = []
 
@@ -85,7 +85,7 @@ class Graphs:
         return tuple(calls)  # type: ignore[arg-type]
 
     def forget(self) -> None:
-        """Drop all graphs after arrays were replaced; the next calls capture them again."""
+        """Discard all graphs because arrays were replaced; the next calls capture them again."""
         for graph in self._graphs:
             graph.forget()
 
@@ -100,20 +100,20 @@ class Graphs:
 
 
 SECONDS_A_THREAD = 5e-4
-"""Seconds of work for each thread; waking a thread takes about 20 microseconds."""
+"""Minimum seconds of work per thread; waking a thread takes about 20 microseconds."""
 TIMED = 8
-"""Number of timed calls, of which the shortest counts, because other programs interrupt some."""
+"""Number of timed calls. The shortest counts, because other programs may interrupt some."""
 _CAPTURING = threading.RLock()
-"""Allows one capture at a time: controllers and viewers have environments in separate threads."""
+"""Allows one capture at a time: controllers and viewers use environments in separate threads."""
 separate_captures()
 separate_tiles()
 
 
 @contextlib.contextmanager
 def capturing() -> Iterator[None]:
-    """Context of a capture, without other captures and without Python's garbage collection.
+    """Context for a capture: excludes other captures and disables Python's garbage collection.
 
-    A collection may delete unused graphs of torch, which makes a CUDA capture fail.
+    A garbage collection may delete unused torch graphs, which makes a CUDA capture fail.
     """
     with _CAPTURING:
         collects = gc.isenabled()
@@ -126,10 +126,10 @@ def capturing() -> Iterator[None]:
 
 
 class _Graph:
-    """Functions made of launches as one graph, or as one for each thread if they take long.
+    """Functions that consist of launches, as one graph, or as one graph per thread if they take long.
 
-    The first call runs them directly, which loads their modules; the second captures and replays; all further calls
-    replay. With workers, the first replays are timed, and the shortest time decides how many threads share the work.
+    The first call runs them directly, which loads their modules; the second captures and replays; later calls only
+    replay. With workers, the first replays are timed, and the shortest time determines how many threads share the work.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class _Graph:
                 self._loaded = True
                 self._run()
                 return
-            if self._device.is_cuda:  # a capture may clear memory that running launches still use
+            if self._device.is_cuda:  # a capture may zero memory that running launches still use
                 wp.synchronize_device(self._device)
             self._replay = self._capture_part(0, 1)
         if self._times is None:

@@ -1,8 +1,8 @@
 """Compile kernels ahead of time, on all cores, with progress on stderr.
 
-Warp compiles a module silently at the first launch of one of its kernels. On a new GPU that takes a minute or more for
-a task. ``compile_ahead`` rehearses the launches of a step and compiles the modules that are not in Warp's cache in
-parallel.
+Warp compiles a module silently at the first launch of one of its kernels. On a new GPU this takes a minute or more per
+task. ``compile_ahead`` rehearses the launches of a step, and compiles in parallel the modules that are not in Warp's
+cache.
 """
 
 import concurrent.futures
@@ -30,17 +30,17 @@ class Built:
     known: int = 0
     """Number of modules that were already in the cache."""
     seconds: float = 0.0
-    """Duration of compiling all modules."""
+    """Wall-clock time of the compilation."""
 
 
 def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str) -> Built:
-    """Compile every kernel that a function launches and that is not in the cache, and report progress on stderr.
+    """Compile the kernels that a function launches and that are not cached, and report progress on stderr.
 
     Args:
-        function: Made of launches. It is called while launches do nothing, and may fill its arrays with meaningless
-            numbers.
+        function: Consists of launches. It is called with kernel launches disabled, so its arrays may hold garbage
+            afterwards.
         device: Where the kernels will run.
-        purpose: The kernels' purpose, for the report, as "hopper".
+        purpose: What the kernels are for, such as "hopper"; shown in the report.
     """
     with rehearse() as rehearsal:
         function()

@@ -13,30 +13,30 @@ _lock = threading.RLock()
 
 
 class Rehearsal:
-    """Replaces Warp's launches, and notes the kernels."""
+    """Replaces Warp's launch functions, and lists the kernels' modules."""
 
     def __init__(self) -> None:
         self.modules: dict[tuple[Any, int | None], None] = {}
-        """Modules and block sizes (None for the default), in the order of the launches."""
+        """Modules and block sizes (None for the default), in launch order."""
 
     def launch(self, kernel: Any, dim: Any = None, *args: Any, block_dim: int | None = None, **kwargs: Any) -> None:
-        """Note a launch."""
-        # a generic kernel is compiled for the types of its arguments; a launch without threads loads nothing
+        """Add a kernel's module to the list."""
+        # a generic kernel is compiled for its argument types; an empty launch loads no module
         if np.prod(dim) and not kernel.is_generic:
             self.modules[kernel.module, block_dim] = None
 
 
 @contextlib.contextmanager
 def rehearse() -> Iterator[Rehearsal]:
-    """Note the launches of this thread instead of making them; branches and loops in graphs run once.
+    """List this thread's launches instead of running them; graph branches and loops run once.
 
-    Copies and allocations do happen, so the called function may fill its arrays with meaningless numbers. Other threads
-    launch as usual; their own rehearsals wait.
+    Copies and allocations still run, so arrays may hold garbage afterwards. Other threads launch as usual; only their
+    rehearsals wait.
     """
     rehearsal = Rehearsal()
     functions: dict[str, Callable[..., None]] = {"launch": rehearsal.launch, "launch_tiled": rehearsal.launch}
     functions |= {"capture_while": _loop, "capture_if": _branch}
-    # their inputs would be meaningless
+    # their inputs would be garbage
     functions |= dict.fromkeys(("radix_sort_pairs", "segmented_sort_pairs", "array_scan"), _nothing)
     with _lock, replaced_in_this_thread(functions):
         yield rehearsal

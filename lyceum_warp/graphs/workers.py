@@ -16,13 +16,13 @@ class Workers:
         self._pool = ThreadPoolExecutor(max(nthread - 1, 1), "lyceum_warp")
 
     def run(self, calls: Sequence[Callable[[], object]]) -> None:
-        """Call functions that release Python's global lock, in parallel, and wait until all have returned.
+        """Call functions that release Python's GIL, in parallel, and wait until all have returned.
 
         Args:
             calls: The functions, at most ``nthread``; the caller's thread runs the first one.
 
         Raises:
-            BaseException: A function raised it; the others have ended.
+            BaseException: A function raised it; the other functions have ended.
         """
         others: list[Future[object]] = []
         try:
@@ -36,7 +36,7 @@ class Workers:
 
 
 def _wait(futures: Sequence[Future[object]]) -> None:
-    """Wait until all have ended, even after an interrupt, because they write arrays that the caller reads next."""
+    """Wait for all futures, even after an interrupt, because they write arrays that the caller reads next."""
     interrupt: KeyboardInterrupt | None = None
     while not all(future.done() for future in futures):
         try:

@@ -1,1 +1,1 @@
-"""Write and read the folder of a run: its files, its copy of the task, its checkpoints."""
+"""Write and read run folders: their files, their copy of the task, their checkpoints."""

@@ -16,19 +16,19 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.files import newer_format, replaced
 
 FORMAT = 1
-"""Format of a run's folder and its files. It increases when older releases can no longer read them."""
+"""Format version of run folders and their files. It increases when older releases can no longer read new files."""
 
 _FIX = "restore the file from a copy, or train again into another folder"
 
 PolicyContent = dict[str, Any]
-"""A saved policy and value function: ``iteration``, ``policy``, and ``value`` if there is one."""
+"""A saved policy: ``iteration``, ``policy``, and ``value`` if there is a value function."""
 
 _CLASSES: dict[str, type[nn.Module]] = {"policy": GaussianPolicy, "value": ValueFunction}
-"""The classes of networks, if their files name no other ones."""
+"""Default classes of networks, for files that name no class."""
 
 
 def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> PolicyContent:
-    """Copy a policy and a value function to the CPU, for a file.
+    """Copy a policy and a value function to the CPU, to be written to a file.
 
     Args:
         iteration: Number of complete iterations.
@@ -49,12 +49,12 @@ def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = 
 
 
 def write_content(path: Path, content: Mapping[str, Any], **options: Any) -> None:
-    """Replace a file of a policy, or a checkpoint.
+    """Replace the file of a policy or a checkpoint atomically.
 
     Args:
         path: The file.
-        content: Its content.
-        options: Further arguments of ``replaced``.
+        content: The content to write.
+        options: Additional arguments for ``replaced``.
     """
     buffer = io.BytesIO()  # Python's write raises OSError on a full disk; torch raises other errors
     torch.save(content, buffer)
@@ -63,7 +63,7 @@ def write_content(path: Path, content: Mapping[str, Any], **options: Any) -> Non
 
 
 def policy_of(content: PolicyContent, path: Path, given: nn.Module | None = None) -> nn.Module:
-    """The policy in a file.
+    """Make the policy stored in a file.
 
     Args:
         content: The file's content.
@@ -71,13 +71,13 @@ def policy_of(content: PolicyContent, path: Path, given: nn.Module | None = None
         given: A policy into which the weights are loaded; by default a new one.
 
     Raises:
-        ValueError: The file holds no policy, or its parameters do not fit the given one.
+        ValueError: The file holds no policy, or its weights do not fit the given policy.
     """
     return _filled(content, path, "policy", given)
 
 
 def value_of(content: PolicyContent, path: Path) -> nn.Module:
-    """The value function in a file.
+    """Make the value function stored in a file.
 
     Args:
         content: The file's content.
@@ -92,12 +92,12 @@ def value_of(content: PolicyContent, path: Path) -> nn.Module:
 
 
 def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | None) -> nn.Module:
-    """Load the weights of a file into a network."""
+    """Load weights from a file into a network."""
     saved = content[name]
     try:
         module = given
         if module is None:
-            with torch.device("meta"):  # the shapes are compared before memory is allocated
+            with torch.device("meta"):  # compare shapes before memory is allocated
                 module = _made(name, saved)
         if different := _difference(module, saved["state"]):
             fix = _FIX if given is None else "give one like that of the run"
@@ -112,21 +112,21 @@ def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | No
 
 
 def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
-    """Make a network of the class and shape in a file, which must be a class of the package."""
+    """Make a network of the class and shape named in a file; the class must be part of this package."""
     kind: Any = _CLASSES[name]
     own, shape = saved.get("class"), saved["shape"]
     if own is not None:
-        # other rooms have modules that run something when they are imported
+        # modules outside algos may run code when they are imported
         kind = pydoc.locate(own) if own.startswith("lyceum_warp.algos.") and shape is not None else None
         if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
             fix = f": give one, as in lw.load(run, policy={own.rpartition('.')[2]}(...))" if name == "policy" else ""
-            raise ValueError(f"the {name} is of a class of its own, {own}{fix}")
+            raise ValueError(f"the {name} has a custom class, {own}{fix}")
     module: nn.Module = kind.like(shape) if hasattr(kind, "like") else kind(**shape)
     return module
 
 
 def check_sizes(policy: Any, env: Env, path: Path) -> None:
-    """Check that a policy fits the sizes of an environment's observations and actions.
+    """Check that a policy fits an environment's observations and actions.
 
     Args:
         policy: The policy.
@@ -145,7 +145,7 @@ def check_sizes(policy: Any, env: Env, path: Path) -> None:
 
 
 def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
-    """The first difference between the shapes of a module's weights and saved ones; "" without one."""
+    """The first difference between the weight shapes of a module and of a file; "" if they are equal."""
     own, saved = ({name: tuple(part.shape) for name, part in s.items()} for s in (module.state_dict(), state))
     saved = {name: own[name] for name in getattr(module, "LATER", ())} | saved
     for name in {**own, **saved}:
@@ -158,12 +158,12 @@ def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
 def read_checkpoint(
     path: Path, device: str | torch.device = "cpu", *, parts: tuple[str, ...] = ("iteration", "policy", "state")
 ) -> dict[str, Any]:
-    """Read a checkpoint or a saved policy. No code in the file is executed.
+    """Read a checkpoint or a saved policy. This executes no code from the file.
 
     Args:
         path: The file.
         device: Device for its tensors.
-        parts: Names of entries that it must hold.
+        parts: Names of required entries.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -177,7 +177,7 @@ def read_checkpoint(
         content = torch.load(io.BytesIO(data), map_location=device, weights_only=True)
     except OSError:
         raise
-    except Exception as error:  # zipfile and torch raise errors of many types
+    except Exception as error:  # zipfile and torch raise many types of errors
         raise ValueError(
             f"the checkpoint {path} is damaged, or was not written by lyceum_warp ({_first_sentence(error)}): {_FIX}"
         ) from error
@@ -194,7 +194,7 @@ def read_checkpoint(
 
 
 def _is_network(saved: Any) -> bool:
-    """Whether a value of a file may be a saved network."""
+    """Whether a value has the structure of a saved network."""
     return (
         isinstance(saved, dict)
         and isinstance(saved.get("shape", ""), dict | None)
@@ -210,17 +210,17 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
     "state": lambda value: isinstance(value, dict) and type(value.get("iteration", 0)) is int,
     "score": lambda value: isinstance(value, dict) and isinstance(value.get("value"), int | float),
 }  # fmt: skip
-"""Whether a value may be an entry of a file, by the entry's name."""
+"""Checks of the entries of a file, by name."""
 
 
 def _check_records(data: bytes) -> None:
-    """Check the records of an archive of torch by their CRC-32, which torch writes and does not check.
+    """Verify the CRC-32 of the records in a torch archive, which torch writes but does not check.
 
     Raises:
         ValueError: A record is damaged.
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        # torch reads nothing of a record that is marked as a folder
+        # torch reads no content of a record that is marked as a folder
         folders = (record.filename for record in archive.infolist() if record.external_attr & 0x10)
         if (name := archive.testzip() or next(folders, None)) is not None:
             raise ValueError(f"its record {name} has other content than was written")
@@ -231,7 +231,7 @@ def check_format(path: Path, number: Any) -> None:
 
     Args:
         path: The file.
-        number: Its format.
+        number: The format number in the file.
 
     Raises:
         ValueError: The format is unknown.
@@ -243,6 +243,6 @@ def check_format(path: Path, number: Any) -> None:
 
 
 def _first_sentence(error: BaseException) -> str:
-    """The first sentence of an error's message, because torch's messages fill a page."""
+    """The first sentence of an error message; torch's messages can fill a page."""
     text = str(error).strip() or type(error).__name__
     return text.splitlines()[0].split(". ")[0][:200]

@@ -1,4 +1,4 @@
-"""Read the config.json of a run, and check the types of all entries that the package reads."""
+"""Read a run's config.json, and check the types of all entries that the package reads."""
 
 import json
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ from lyceum_warp.runs.checkpoints import check_format
 from lyceum_warp.support.validate import whole_number
 
 _COUNT = 0
-"""The kind of an entry that is a whole number of at least 0."""
+"""Marks entries that are non-negative whole numbers."""
 
 _ENTRIES: dict[str, Any] = {
     "task": str | None, "params": dict, "options": dict, "physics": dict, "engine": str, "device": str,
@@ -19,18 +19,17 @@ _ENTRIES: dict[str, Any] = {
     "kept": {"name": str, "file": str, "model": str, "model_given": bool, "source_hash": str, "model_hash": str,
              "modules": dict, "program": bool},
 }  # fmt: skip
-"""The kinds of entries, all of which may be missing: a type, ``_COUNT``, or the entries of a dict."""
+"""The kind of each entry: a type, ``_COUNT``, or the entries of a dict. All entries are optional."""
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Read the configuration of a run, of training or of a planner.
+    """Read the configuration of a training run or a planner run.
 
     Args:
         path: The file.
 
     Raises:
-        ValueError: The file is damaged or was written by a newer release, or an entry has another type than the package
-            writes.
+        ValueError: The file is damaged or was written by a newer release, or an entry has the wrong type.
     """
     try:
         config = json.loads(path.read_text())

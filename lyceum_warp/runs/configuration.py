@@ -1,4 +1,4 @@
-"""Convert a learner to the config.json of its run, and back."""
+"""Convert between a learner and the config.json of its run."""
 
 import contextlib
 import dataclasses
@@ -32,10 +32,10 @@ ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, 
 
 
 def describe(learner: Learner) -> dict[str, Any]:
-    """The content of config.json, from which ``Configuration`` makes the same learner."""
+    """The content of config.json; ``Configuration`` makes the same learner from it."""
     env, options = learner.env, learner.env.options
     others = options.given()
-    if learner.team.neighbours > 1:  # another number of processes may continue the run
+    if learner.team.neighbours > 1:  # a different number of processes may resume the run
         others.pop("nthread", None)
     for name in others.keys() - {"nthread", "horizon", "graphs", "fields", "dynamics"}:
         del others[name]
@@ -61,20 +61,20 @@ def describe(learner: Learner) -> dict[str, Any]:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Configuration:
-    """The configuration of a run: a task, options of its environment, and an algorithm with its hyperparameters."""
+    """A run's configuration: the task, the environment's options, and the algorithm with its hyperparameters."""
 
     task: str | None
     """The task's name or file; None if it was defined in a notebook."""
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """The task's parameters."""
     options: EnvOptions
-    """Options of the environment, with the worlds of all processes."""
+    """Options of the environment; ``nworld`` counts the worlds of all processes."""
     algorithm: str
     """Name of the algorithm."""
     hyperparameters: Any
     """The algorithm's hyperparameters; None for an algorithm that is not in ``ALGORITHMS``."""
     seed: int | None = None
-    """Seed of the algorithm; None for the environment's."""
+    """Seed of the algorithm; None for the environment's seed."""
     threads: int = 1
     """Threads of torch."""
 
@@ -87,7 +87,7 @@ class Configuration:
         """
         config = run.config
         try:
-            # earlier releases accepted options as --param and stored them under "params", or had no "physics"
+            # earlier releases accepted options as --param and stored them in "params", or had no "physics"
             words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
             words.pop("unroll", None)  # their option, which changed no numbers
             base = EnvOptions(
@@ -117,12 +117,12 @@ class Configuration:
         """Make the learner.
 
         Args:
-            team: The processes of the training.
-            run: The run of the task. Its copies replace files that have moved or changed.
+            team: The processes that train together.
+            run: The run whose task to use. Its copies replace files that have moved or changed.
             networks: The initial policy and value function; None for new ones.
             note: Called with messages about the task's files.
-            task: A task that is used as it is now instead of the run's.
-            trust: Whether ``run`` may run its task, although this user did not make it on this machine.
+            task: A task to use, in its current version, instead of the run's.
+            trust: Whether to execute the task of a run that this user did not make on this machine.
 
         Raises:
             ValueError: A value is not valid, or ``run`` is not trusted.
@@ -150,12 +150,13 @@ class Configuration:
 
 
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:
-    """The initial policy and value function of a learner, and the number of their iteration.
+    """The initial policy and value function for a learner, and their iteration.
 
     Args:
         run: The run of the networks.
-        which: Which policy of the run; None if the run is resumed. The networks are then None, unless they differ from
-            the networks of the hyperparameters: in a run that began with another run's, or with a ``limit``.
+        which: Which policy of the run; None if the run is resumed. The networks are then None, unless the
+            hyperparameters do not describe them, as in a run that started from another run's networks or that uses
+            ``limit``.
 
     Raises:
         FileNotFoundError: The run has no such policy.

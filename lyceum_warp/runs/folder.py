@@ -28,7 +28,7 @@ from lyceum_warp.support.versions import versions
 
 _CONFIG, _VERSIONS, _TASK = "config.json", "versions.json", "task"
 _UNFINISHED = {f"{name}.tmp" for name in (_CONFIG, _VERSIONS, _TASK)}
-"""What a kill may leave of a run that is being made. It is replaced."""
+"""Files that may remain if the creation of a run is killed; they are replaced."""
 
 log = logging.getLogger(__name__)
 
@@ -43,10 +43,9 @@ class Run:
     ``metrics.csv``     one row per iteration
     ``policy.pt``       the last policy, and its value function
     ``best.pt``         the policy with the best return
-    ``policies/``       the policies of every n-th iteration, with ``keep_every``
-    ``checkpoint.pt``   the complete state from which a run continues exactly, of the same iteration as ``policy.pt``
-    ``previous.pt``     the checkpoint before it
-    ``task/``           copies of the task's file, its modules and its model, if they are not the package's
+    ``policies/``       the policy of every n-th iteration, with ``keep_every`` ``checkpoint.pt``   the complete state
+    to resume from exactly, at the same iteration as ``policy.pt`` ``previous.pt``     the checkpoint before it
+    ``task/``           copies of the task's file, modules and model, unless they are part of the package
     =================== ======================================================================================
 
     Args:
@@ -55,11 +54,11 @@ class Run:
     """
 
     metrics: Path
-    """Path of the table of metrics."""
+    """Path of the metrics table."""
     checkpoint: Path
     """Path of the checkpoint."""
     previous: Path
-    """Path of the checkpoint before the last one."""
+    """Path of the previous checkpoint."""
     policy: Path
     """Path of the last policy."""
     best: Path
@@ -84,7 +83,7 @@ class Run:
         """Check that a folder can be used for a new run.
 
         Args:
-            folder: A folder, which need not exist.
+            folder: The folder; it need not exist.
 
         Raises:
             ValueError: The folder is not empty, or is a file.
@@ -92,7 +91,7 @@ class Run:
         folder = Path(folder)
         if (folder / _CONFIG).exists():
             way = f", or continue the run (train --resume {folder}, or resume=True in Python)"
-            trained = (folder / "checkpoint.pt").exists()  # unlike a run of plan
+            trained = (folder / "checkpoint.pt").exists()  # a planner run has no checkpoint
             raise ValueError(f"{folder} holds a run: give another folder{way if trained else ''}")
         if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - _UNFINISHED):
             raise ValueError(f"{folder} exists and is not an empty folder: give another folder")
@@ -106,16 +105,16 @@ class Run:
         device: str = "cpu",
         files: Mapping[str, Path | bytes] | None = None,
     ) -> "Run":
-        """Make the folder of a run, with the versions, the copy of the task, and the configuration.
+        """Create a run folder with the versions, the copy of the task, and the configuration.
 
-        If this fails, nothing is left in the folder. The run may later run its task without being asked, because it is
-        recorded in the user's state directory (``lyceum_warp.runs.trust``).
+        If this fails, nothing is left in the folder. The run is recorded as trusted in the user's state directory
+        (``lyceum_warp.runs.trust``), so its task can be executed later without ``trust=True``.
 
         Args:
             folder: A new or empty folder.
-            config: The configuration, of values that JSON can hold.
+            config: The configuration, consisting of JSON values.
             device: Device of the run; see ``versions``.
-            files: Files of the folder ``task`` by path: files to copy, or their contents.
+            files: Contents of the folder ``task``, by path: files to copy, or bytes.
 
         Raises:
             ValueError: The folder is not empty, or is a file.
@@ -123,7 +122,7 @@ class Run:
         folder = Path(folder)
         cls.check_free(folder)
         run = cls(folder, {"format": FORMAT, **config})
-        text = json.dumps(run.config, indent=2)  # may fail, so it comes before the folder is made
+        text = json.dumps(run.config, indent=2)  # may fail, so it comes before the folder is created
         task, now = folder / f"{_TASK}.tmp", json.dumps(versions(device), indent=2)
         try:
             shutil.rmtree(task, ignore_errors=True)
@@ -173,11 +172,11 @@ class Run:
 
     @contextlib.contextmanager
     def settings(self) -> Iterator[None]:
-        """Add the name of ``config.json`` to an error that its settings may cause within the block.
+        """Add the path of ``config.json`` to errors that its settings may cause within the block.
 
         Raises:
             ValueError: The settings do not make an environment or a learner.
-            FileNotFoundError: A file that they name is missing.
+            FileNotFoundError: A file named in the settings is missing.
         """
         try:
             yield
@@ -188,10 +187,10 @@ class Run:
             raise kind(f"{error} (with the settings in {self.folder / _CONFIG})") from error
 
     def changed(self, now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-        """Compare versions with those at the start of the run, and add changes to ``versions.json``.
+        """Compare versions with the versions at the start of the run, and add changes to ``versions.json``.
 
         Args:
-            now: The present versions, as ``versions()`` returns them.
+            now: The current versions, from ``versions()``.
 
         Returns:
             The changed entries, as (then, now). The file lists them under "resumed".
@@ -209,7 +208,7 @@ class Run:
         return changed
 
     def rows(self) -> list[dict[str, float | None]]:
-        """Read the rows of the table. An empty cell is None.
+        """Read the rows of the metrics table. Empty cells become None.
 
         Raises:
             FileNotFoundError: The run has no table yet.
@@ -222,7 +221,7 @@ class Run:
     # policies
 
     def numbered(self, iteration: int) -> Path:
-        """Path of the policy of an iteration, if the run keeps it."""
+        """Path of an iteration's policy, if it was saved."""
         return self.folder / "policies" / f"{iteration:06d}.pt"
 
     def policy_file(self, which: str | int = "last") -> Path:
@@ -256,7 +255,7 @@ class Run:
         return ", ".join([*known, *map(str, numbers)]) or "none yet"
 
     def best_score(self, *, note: Callable[[str], None] = log.warning) -> tuple[int, float] | None:
-        """The iteration and the score of the best policy; None if there is none.
+        """The iteration and the score of the best policy; None if there is no best policy.
 
         Args:
             note: Called with a message if the file of the best policy is damaged.
@@ -273,11 +272,11 @@ class Run:
     # the checkpoint
 
     def save(self, content: PolicyContent, state: Mapping[str, Any]) -> None:
-        """Replace the last policy and the checkpoint atomically. The old checkpoint becomes the previous one.
+        """Replace the last policy and the checkpoint atomically. The old checkpoint becomes ``previous.pt``.
 
         Args:
             content: The policy and the value function.
-            state: The state of the algorithm: tensors, numbers, strings and containers of them.
+            state: The state of the algorithm: tensors, numbers, strings, and dicts and lists of them.
         """
         write_content(self.policy, content)
         checkpoint = {**content, "state": dict(state)}
@@ -286,7 +285,7 @@ class Run:
     def read(self, device: str | torch.device = "cpu", *, note: Callable[[str], None] = log.warning) -> dict[str, Any]:
         """Read the checkpoint: ``iteration``, ``policy``, ``state``, and ``value`` if there is one.
 
-        If it is broken or missing, the previous checkpoint is read.
+        If it is broken or missing, the previous checkpoint is read instead.
 
         Args:
             device: Device for its tensors.
@@ -316,21 +315,21 @@ def load(
     policy: Any = None,
     device: str | torch.device = "cpu",
 ) -> Any:
-    """Load the policy of a run, with its observation normaliser: ``action = policy.act(obs)`` has no noise.
+    """Load a run's policy, including its observation normaliser. ``policy.act(obs)`` returns actions without noise.
 
-    A ``GaussianPolicy`` also returns its mean actions when it is called, ``policy(obs)``. The parameters are frozen;
-    ``NPG(env, policy=lw.load(RUN))`` trains them further.
+    For a ``GaussianPolicy``, ``policy(obs)`` returns the same mean actions. The parameters are frozen; ``NPG(env,
+    policy=lw.load(RUN))`` unfreezes and trains them.
 
     Args:
-        run: A run's folder, or a file of it with a policy.
-        which: "last", "best" (see ``train``), or the number of a kept iteration.
-        policy: A policy into which the weights are loaded; required for policies or networks of your own classes.
+        run: A run's folder, or a policy file in it.
+        which: "last", "best" (see ``train``), or the number of a saved iteration.
+        policy: A policy into which the weights are loaded; required for custom classes of policies or networks.
         device: Device for its parameters.
 
     Raises:
-        FileNotFoundError: There is no run, or it has no such policy.
-        ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release; or
-            ``policy`` is required, or does not fit.
+        FileNotFoundError: There is no such run, or it has no such policy.
+        ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release; or ``policy``
+            is required but missing, or does not fit.
     """
     check_kind("policy", policy, torch.nn.Module | None, "as lw.GaussianPolicy(nobs, nact, network=...)")
     content, path = _content(run, which, device)
@@ -338,15 +337,15 @@ def load(
 
 
 def load_value(run: str | Path | Run, *, which: str | int = "last", device: str | torch.device = "cpu") -> Any:
-    """Load the value function of a run, as a ``ValueFunction``: ``value(obs, step)`` predicts discounted returns.
+    """Load a run's value function, a ``ValueFunction``: ``value(obs, step)`` predicts discounted returns.
 
     Args:
-        run: A run's folder, or a file of it with a value function.
-        which: As for ``load``.
+        run: A run's folder, or a file in it with a value function.
+        which: See ``load``.
         device: Device for its parameters.
 
     Raises:
-        FileNotFoundError: There is no run, or it has no such file.
+        FileNotFoundError: There is no such run, or it has no such file.
         ValueError: The file holds no value function, is broken, was not written by lyceum_warp, or was written by a
             newer release.
     """
@@ -355,7 +354,7 @@ def load_value(run: str | Path | Run, *, which: str | int = "last", device: str 
 
 
 def _content(run: str | Path | Run, which: str | int, device: str | torch.device) -> tuple[PolicyContent, Path]:
-    """A saved policy and its file."""
+    """The content of a saved policy, and its file."""
     check_kind("run", run, str | Path | Run, "a run's folder")
     check_kind("which", which, str | int, "as 'last', 'best' or 100")
     check_kind("device", device, str | torch.device, "as 'cpu' or 'cuda:0'")

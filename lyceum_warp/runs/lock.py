@@ -1,4 +1,4 @@
-"""Lock the folder of a run, so that only one process writes it."""
+"""Lock a run folder, so that only one process writes to it."""
 
 import contextlib
 import json
@@ -16,19 +16,20 @@ from typing import IO, Any
 log = logging.getLogger(__name__)
 
 BEAT, STALE = 10.0, 120.0
-"""Seconds between two heartbeats, and after which a lock without one is stale."""
+"""Seconds between heartbeats, and seconds without a heartbeat after which a lock is stale."""
 
 
 class RunLock:
-    """The lock of a run, held within a ``with`` block: a file ``lock`` that names the process and its host.
+    """The lock of a run, held within a ``with`` block: a file ``lock`` that stores the process and its host.
 
-    A daemon thread sets the time of the file every 10 s. A lock of this host is taken over if its process is gone or if
-    its time is more than 120 s ago. Clocks of hosts differ, so a lock of another host is only taken over on request.
+    A daemon thread updates the file's modification time every 10 s. A lock from this host is taken over if its process
+    is gone or its time is more than 120 s old. Clocks of different hosts differ, so a lock from another host is taken
+    over only on request.
 
     Args:
         folder: The run's folder.
-        take_over: Whether to take the lock from any other process.
-        note: Called with a message if the lock is taken from another process.
+        take_over: Whether to take over the lock from any other process.
+        note: Called with a message if the lock is taken over.
 
     Raises:
         ValueError: Another process has the lock.
@@ -68,18 +69,18 @@ class RunLock:
                 self._path.unlink()
 
     def check(self) -> None:
-        """Check that no other process has taken the lock over.
+        """Check that no other process has taken over the lock.
 
         Raises:
             ValueError: Another process has the lock.
-            OSError: The file is gone.
+            OSError: The lock file is gone.
         """
         with self._file("r+") as file:
             if (text := file.read()) != self._own:
                 raise ValueError(f"the run in {self._folder} was taken over by {_named(_owner(text))}")
 
     def _free(self, other: dict[str, Any]) -> str:
-        """The reason why the lock of another process is free; "" if it is not."""
+        """The reason why another process's lock can be taken over; "" if it cannot."""
         if other.get("host") != platform.node():
             return ""
         if _started(other["pid"]) != other["started"]:
@@ -95,7 +96,7 @@ class RunLock:
 
     @contextlib.contextmanager
     def _file(self, mode: str) -> Iterator[IO[str]]:
-        """Open the lock's file; no other process opens it within the block."""
+        """Open the lock file exclusively within the block."""
         while True:
             with self._path.open(mode) as file:
                 with contextlib.suppress(ImportError, OSError):  # Windows, and file systems without flock
@@ -106,11 +107,11 @@ class RunLock:
                     file.seek(0)
                     yield file
                     return
-            # the file was deleted while this process waited
+            # the file was deleted while this process waited: try again
 
 
 def _owner(text: str) -> dict[str, Any]:
-    """The process that a lock's file names; an empty dict if the file is damaged."""
+    """The process stored in a lock file; an empty dict if the file is damaged."""
     try:
         other = json.loads(text)
         return {"host": str(other["host"]), "pid": int(other["pid"]), "started": str(other["started"])}
@@ -123,7 +124,7 @@ def _named(owner: dict[str, Any]) -> str:
 
 
 def _started(pid: int) -> str:
-    """When a process began, to tell it from a later one with its number; "" if there is none."""
+    """The start time of a process, to distinguish it from later ones with its pid; "" if it does not exist."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         return "" if state[0] == "Z" else state[19]  # a zombie has ended

@@ -1,4 +1,4 @@
-"""Append to, read and truncate the table of a run's iterations, metrics.csv."""
+"""Append to, read and truncate metrics.csv, the table of a run's iterations."""
 
 import contextlib
 import csv
@@ -10,11 +10,11 @@ from lyceum_warp.support.files import replaced
 
 
 def append_row(path: Path, row: Mapping[str, Any]) -> None:
-    """Append a row. A new column, for example after an update of the task, is empty in earlier rows.
+    """Append a row. New columns, for instance after a change of the task, are empty in earlier rows.
 
     Args:
-        path: The table, which need not exist.
-        row: Values by column. None becomes an empty cell; floats keep all digits.
+        path: The table; it need not exist.
+        row: Values by column. None becomes an empty cell; floats are written with all digits.
     """
     lines: list[list[str]] = []
     if path.exists():
@@ -62,14 +62,14 @@ def _lines(path: Path) -> list[str]:
 
 
 def cut_rows(path: Path, iteration: int) -> None:
-    """Drop rows after an iteration, and an incomplete last row.
+    """Delete the rows after an iteration, and an incomplete last row.
 
     Args:
-        path: The table, which need not exist.
-        iteration: Number of the last iteration to keep. The first row may have another number than 1.
+        path: The table; it need not exist.
+        iteration: Number of the last iteration to keep. The first row need not be iteration 1.
 
     Raises:
-        ValueError: A row that is kept is damaged. The file stays as it is.
+        ValueError: A row to be kept is damaged. The file does not change.
     """
     if not path.exists():
         return
@@ -78,7 +78,7 @@ def cut_rows(path: Path, iteration: int) -> None:
     column = header.index("iteration") if "iteration" in header else None
     kept = []
     for i, line in enumerate(lines):
-        number: float = i  # of the row, if the cell is broken; read_metrics reports broken lines
+        number: float = i  # the line's index if the cell is broken; _rows below reports broken lines
         with contextlib.suppress(ValueError, IndexError, csv.Error):
             number = float(next(csv.reader([line]))[column]) if i and column is not None else i
         if line.endswith("\n") and (i == 0 or number <= iteration):

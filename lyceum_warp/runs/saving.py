@@ -1,4 +1,4 @@
-"""Decide when a run is saved, and save it."""
+"""Decide when to save a run, and save it."""
 
 import logging
 import math
@@ -14,22 +14,22 @@ from lyceum_warp.runs.metrics_table import append_row
 log = logging.getLogger(__name__)
 
 SAVE_SECONDS = 30.0
-"""Seconds after which a run is saved."""
+"""Maximum number of seconds between saves."""
 
 SHARE = 100
-"""A run is saved earlier once it has trained this many times as long as the last save took."""
+"""A run is saved earlier once it has trained for this multiple of the last save's duration."""
 
 
 class Saver:
     """Writes a run's files.
 
-    The row of an iteration, a new best policy and numbered policies are written at once. The last policy and the
-    complete state are saved together: at the start, at the end, and after each iteration that ends 30 s after the last
-    save, or earlier, once training has taken 100 times as long as that save. A save of 20 ms thus happens every 2 s and
-    takes 1 % of the time; a save of 1 s happens every 30 s and takes 3 %. After ``kill -9`` the run continues from the
-    last save.
+    Rows of iterations, a new best policy and numbered policies are written immediately. The last policy and the
+    complete state are saved together: at the start, at the end, and after the first iteration that ends at least 30 s
+    after the last save, or earlier, once training has taken 100 times as long as the last save. So saves of 20 ms
+    happen every 2 s and take 1 % of the time; saves of 1 s happen every 30 s and take 3 %. After ``kill -9`` the run
+    resumes from the last save.
 
-    All ranks have a saver and make the same calls; rank 0 writes.
+    All ranks have a saver and make the same calls; only rank 0 writes.
 
     Args:
         run: The run; None on ranks that do not write.
@@ -37,7 +37,7 @@ class Saver:
         keep_every: Iterations between two numbered policies; 0 for none.
         save_every: Iterations between two saves; 0 for the rule above.
         saved: Number of the iteration whose state is saved; -1 for none.
-        lock: The run's lock, which is checked before anything is written.
+        lock: The run's lock, checked before every write.
         note: Called with a message if the file of the best policy is damaged.
     """
 
@@ -63,10 +63,10 @@ class Saver:
         self._seconds, self._when = 0.0, time.perf_counter()
 
     def write(self, iteration: Iteration) -> float | None:
-        """Write the row of an iteration, and its policy if it is the best one or is numbered.
+        """Write an iteration's row, and its policy if it is the best so far or is to be numbered.
 
         Returns:
-            The return that selects the best policy; None if the iteration has none.
+            The return that selects the best policy; None if the iteration has no return.
         """
         assert self.run is not None
         if self._lock is not None:
@@ -77,7 +77,7 @@ class Saver:
         score = None if score is None or math.isnan(score) else score
         better = score is not None and score > self._best
         numbered = self.keep_every > 0 and learner.iteration % self.keep_every == 0
-        # the episodes of an iteration are sampled by the policy before its step
+        # an iteration's episodes are sampled by the policy before its update
         sampled = name == "return_mean"
         before = self._before
         if better or numbered or sampled:

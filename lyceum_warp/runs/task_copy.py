@@ -1,4 +1,4 @@
-"""Copy a run's task into its folder, and decide whether later commands use the copy."""
+"""Copy a run's task into its folder, and choose between the copy and the original later."""
 
 import hashlib
 import io
@@ -26,22 +26,22 @@ log = logging.getLogger(__name__)
 Note = Callable[[str], None]
 
 Files = dict[Path, Path | bytes]
-"""Files with their contents, or paths to copy from."""
+"""Files, with their contents or the paths to copy from."""
 
 _MODEL, _TABLES = "model", "tables"
 _APART = 2
-"""A task's file is at most this many folders below the common folder of it and its model."""
+"""If a task's file lies deeper than this below the common folder with its model, both get separate folders."""
 _LARGEST = 512 * 2**20
-"""Models with larger files, in bytes, are not copied."""
+"""Models whose files exceed this size, bytes, are not copied."""
 _MOST_MODULES, _LARGEST_MODULES = 100, 8 * 2**20
-"""Modules that a task imports from its folder are not copied if there are more, or if they have more bytes."""
+"""Modules imported from a task's folder are not copied if their number or total size, bytes, exceeds these limits."""
 
 
 def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
-    """Copy an environment's task for a run's folder, except a task of the package.
+    """Collect an environment's task for a run folder; tasks of the package are not copied.
 
     Returns:
-        The entry ``kept`` of config.json; and the files of the folder ``task`` by path.
+        The entry ``kept`` of config.json, and the files for the folder ``task`` by path.
     """
     task, given = env.task.task, env.options.model is not None
     loaded, own = source_files(task), not task.__module__.startswith("lyceum_warp.")
@@ -68,7 +68,7 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
 
 
 def json_value(name: str, value: Any) -> Any:
-    """A parameter of a task as a value of JSON, for config.json."""
+    """A task parameter as a JSON value, for config.json."""
     if (table := _table(value)) is not None:
         return str(value) if isinstance(value, str | Path) else f"{name}.npy" if table.size else []
     if isinstance(value, bool | int | float | str):
@@ -77,7 +77,7 @@ def json_value(name: str, value: Any) -> Any:
 
 
 def _table(value: Any) -> Any:
-    """The file or the array of a table; None for other parameters."""
+    """The file or the array of a table parameter; None for other parameters."""
     if _is_table(value):
         return Path(value)
     array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
@@ -85,7 +85,7 @@ def _table(value: Any) -> Any:
 
 
 def _is_table(value: Any) -> bool:
-    """Whether a parameter is the path of a table."""
+    """Whether a parameter is the path of a ``.npy`` file."""
     return isinstance(value, str | Path) and str(value).endswith(".npy")
 
 
@@ -97,7 +97,7 @@ def _npy(array: np.ndarray) -> bytes:
 
 
 def _sources(file: Path, loaded: Mapping[Path, bytes]) -> dict[Path, bytes]:
-    """A task's file and the modules that it imports from its folder, unless they are too many or too large."""
+    """A task's file and, within the limits, the modules that it imports from its folder."""
     size = sum(map(len, loaded.values())) - len(loaded[file])
     if len(loaded) - 1 <= _MOST_MODULES and size <= _LARGEST_MODULES:
         return dict(loaded)
@@ -114,19 +114,19 @@ def run_env(
     task: str | None = None,
     trust: bool = False,
 ) -> Env:
-    """Make an environment of a run's task.
+    """Make an environment for a run's task.
 
-    If a file or a model has moved or changed since the run began, the run's own copy is used, and ``note`` gets a
-    message. A task of the package is used as it is now.
+    If a file or a model has moved or changed since the run started, the run's own copy is used, and ``note`` is called.
+    Tasks of the package are used in their current version.
 
     Args:
         run: The run.
         options: Options of the environment.
         params: Parameters of the task.
         note: Called with each message.
-        task: Another task, which is used as it is.
-        trust: Whether a run that this user did not make on this machine may run the task and read the files that it
-            names; see ``lyceum_warp.runs.trust``.
+        task: A different task, used in its current version.
+        trust: Whether to execute the task and read the files of a run that this user did not make on this machine; see
+            ``lyceum_warp.runs.trust``.
 
     Raises:
         ValueError: The task does not fit, or the run is not trusted.
@@ -160,7 +160,7 @@ def run_env(
     params, copy = run_params(run, params), run.task_folder / kept.get("model", "")
     if not copy.is_file():
         return Env(chosen, options, **params)
-    if kept.get("model_given") and not isinstance(options.model, str):  # it was made in Python
+    if kept.get("model_given") and not isinstance(options.model, str):  # the model was made in Python
         return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
     try:
         env = Env(chosen, options, **params)
@@ -174,7 +174,7 @@ def run_env(
 
 
 def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, bytes] | None = None) -> list[str]:
-    """List changes of a task's file and its modules since the run began.
+    """List changes to a task's file and its modules since the run started.
 
     Args:
         file: The task's file.
@@ -193,7 +193,7 @@ def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, b
 
 
 def note_changes(run: Run, env: Env, *, note: Note = log.warning) -> None:
-    """Report that an environment's task or model differs from the run's. Both are used as they are.
+    """Report differences between an environment's task or model and the run's; the environment's are used.
 
     Args:
         run: The run.
@@ -202,7 +202,7 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning) -> None:
     """
     kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
     file = next(iter(loaded), None)
-    hashed = None if kept.get("program") else kept.get("source_hash")  # a program that trains changes on its own
+    hashed = None if kept.get("program") else kept.get("source_hash")  # a training script may change for other reasons
     for change in _source_changes(file, {**kept, "source_hash": hashed}, loaded) if file is not None else ():
         note(f"{change}: it is used as it is now" if "changed" in change else change)
     if _model_changed(run, env):
@@ -210,7 +210,7 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning) -> None:
 
 
 def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters of a run's task, with the run's own copies of missing tables."""
+    """The task parameters, with missing tables replaced by the run's own copies."""
     found = dict(params)
     for name, value in params.items():
         copy = run.task_folder / _TABLES / f"{name}.npy"
@@ -220,7 +220,7 @@ def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _model_changed(run: Run, env: Env) -> bool:
-    """Whether the model has changed since the run began; False with another version of MuJoCo."""
+    """Whether the model has changed since the run started; False with a different version of MuJoCo."""
     known = run.config.get("kept", {}).get("model_hash")
     return run.versions().get("mujoco") == mujoco.__version__ and known not in (None, _model_hash(env))
 
@@ -250,10 +250,10 @@ def _beside(path: Path, file: Path) -> str:
 
 
 def _names_in_copy(paths: Collection[Path], file: Path | None, modules: Collection[Path] = ()) -> dict[Path, str]:
-    """The paths in the folder ``task`` of a task's file, its modules and its model's files.
+    """The paths within the folder ``task`` for a task's file, its modules and its model's files.
 
-    Their relative paths stay the same, so that the copied task finds the copied model. If the task's file and its model
-    have distant folders, each gets a separate folder.
+    Relative paths are preserved, so that the copied task finds the copied model. If the task's file and its model are
+    in distant folders, each gets a separate folder.
     """
     if not paths:
         return {}
@@ -266,9 +266,9 @@ def _names_in_copy(paths: Collection[Path], file: Path | None, modules: Collecti
 
 
 def _model_files(env: Env) -> tuple[Path | None, Files]:
-    """The main file of a task's model, and all its files.
+    """The main file and all files of a task's model.
 
-    A model that was made in Python is written as MJCF; the files that it refers to are copied unchanged.
+    A model made in Python is written as MJCF; the files that it refers to are copied unchanged.
     """
     task, given = env.task.task, env.options.model
     source = given if given is not None else task.model
@@ -283,7 +283,7 @@ def _model_files(env: Env) -> tuple[Path | None, Files]:
         spec = env.task.spec.copy()
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the environment has logged them
+                warnings.simplefilter("ignore")  # the environment has already logged them
                 spec.compile()
                 text = spec.to_xml()
         except (ValueError, mujoco.FatalError) as error:
@@ -301,10 +301,10 @@ def _model_files(env: Env) -> tuple[Path | None, Files]:
 
 
 def _dependencies(source: Path) -> list[Path]:
-    """The files that a model file refers to: included files, other models, meshes, textures, height fields."""
+    """The files that a model file refers to: includes, other models, meshes, textures, height fields."""
     if source.suffix.lower() != ".urdf":
         return [path for name in mujoco.mju_getXMLDependencies(str(source)) if (path := Path(name)) != source]
-    root = ET.parse(source).getroot()  # MuJoCo lists nothing for a URDF
+    root = ET.parse(source).getroot()  # MuJoCo lists no dependencies of a URDF
     folders = [source.parent / (compiler.get("meshdir") or "") for compiler in root.iter("compiler")]
     names = [mesh.get("filename", "").removeprefix("package://") for mesh in root.iter("mesh")]
     found = {

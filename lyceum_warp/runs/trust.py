@@ -1,4 +1,4 @@
-"""Record the run folders that this user made or trusts, and refuse to run or read what other folders name."""
+"""Record the runs that this user made or trusts, and refuse to execute or read the files of other runs."""
 
 import datetime
 import hashlib
@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 
 
 def remember(folder: Path, config: Mapping[str, Any]) -> None:
-    """Record a run in this user's state directory, as a run that may run its task.
+    """Record a run as trusted, in this user's state directory.
 
     Args:
         folder: The run's folder.
@@ -29,13 +29,13 @@ def remember(folder: Path, config: Mapping[str, Any]) -> None:
 
 
 def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, runs: bool, trust: bool) -> None:
-    """Check that this user made a run on this machine, or trusts it.
+    """Check that this user made a run on this machine or trusts it.
 
     Args:
         folder: The run's folder.
         config: The content of its config.json.
-        named: A file that the folder names, for the message.
-        runs: Whether the file is run as code; otherwise it is only read.
+        named: A file that the run refers to, for the message.
+        runs: Whether the file is executed; otherwise it is only read.
         trust: Whether to trust and record the run.
 
     Raises:
@@ -52,13 +52,13 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
 
 
 def _record(folder: Path, config: Mapping[str, Any]) -> Path:
-    """The file that records a run. Its name is a digest of all that the folder can run or read."""
+    """The file that records a run. Its name is a hash of everything that the run can execute or read."""
     kept = config.get("kept", {})
     paths = [{key: value for key, value in config.get(part, {}).items() if isinstance(value, str)}
              for part in ("params", "options")]  # fmt: skip
     found = hashlib.sha256(json.dumps([config.get("task"), kept, paths], sort_keys=True).encode())
     task = folder / "task"
-    # a task's file outside may be edited, unless the folder has no copy with which it is compared
+    # hash the copy, so that the original may be edited; without a copy, hash the original
     main = task / kept["file"] if "file" in kept else Path(str(config.get("task")).partition(":")[0])
     for name, path in [*((str(path.relative_to(task)), path) for path in sorted(task.rglob("*"))), ("", main)]:
         link, content = os.readlink(path) if path.is_symlink() else None, ""

@@ -1,1 +1,1 @@
-"""Provide helpers that depend on no other room."""
+"""Provide helpers that use no other part of the package."""

@@ -1,4 +1,4 @@
-"""Make views of Warp arrays, also in torch, and launch kernels over worlds and their rows."""
+"""Make views of Warp arrays, also as torch tensors, and launch kernels over worlds and their rows."""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -10,36 +10,35 @@ import torch
 import warp as wp
 
 WORLDS_A_BLOCK = 32
-"""Threads of a CUDA block if each thread processes a world. Larger blocks would leave most multiprocessors without
-worlds."""
+"""Threads in a CUDA block if each thread processes a world. Larger blocks would leave most multiprocessors idle."""
 
 _SPARE = 256
-"""Elements behind an array without elements."""
+"""Elements allocated behind an empty array."""
 
 
 def alias(array: wp.array, dtype: type, shape: tuple[int, ...], strides: tuple[int, ...] | None = None) -> wp.array:
-    """An alias of an array's memory with another type, shape or strides, which keeps the memory alive."""
+    """An alias of an array's memory with a different type, shape or strides; it keeps the memory alive."""
     view: Any = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device)
     view.owner = array
     return view
 
 
 def flat(array: wp.array) -> wp.array:
-    """The same memory as a (nworld, n) array of float32, for copies regardless of type."""
+    """The same memory as a (nworld, n) float32 array, for type-agnostic copies."""
     n = array.size * wp.types.type_size_in_bytes(array.dtype) // 4 // max(array.shape[0], 1)
     return alias(array, wp.float32, (array.shape[0], n))
 
 
 def shared_rows(row: np.ndarray, dtype: type, count: int, device: wp.Device) -> wp.array:
-    """An array of many equal rows, (count, ...), which share the memory of one row (stride 0); read-only."""
+    """A read-only array of equal rows, (count, ...), that all share the memory of one row (stride 0)."""
     single: Any = wp.array(row[None], dtype=dtype, device=device)
     return alias(single, dtype, (count, *single.shape[1:]), (0, *single.strides[1:]))
 
 
 def with_memory(array: wp.array) -> wp.array:
-    """The array, or, if it has no elements, one of the same shape with allocated memory.
+    """The array itself, or, if it is empty, an empty array of the same shape with memory behind it.
 
-    Otherwise a task that reads an element of it by mistake would crash the process.
+    Otherwise a task that reads an element by mistake would crash the process.
     """
     if array.size:
         return array
@@ -52,12 +51,12 @@ def torch_view(array: wp.array) -> torch.Tensor:
 
 
 _PART: ContextVar[tuple[int, int]] = ContextVar("_PART", default=(0, 1))
-"""The part of the worlds for which the functions below launch, and the number of parts."""
+"""The part of the worlds that the functions below launch kernels for, and the number of parts."""
 
 
 @contextlib.contextmanager
 def part_of_worlds(part: int, parts: int) -> Iterator[None]:
-    """Context in which the functions below launch their kernels only for one part of the worlds.
+    """Context in which the functions below launch kernels for only one part of the worlds.
 
     Args:
         part: Index of the part.
@@ -87,19 +86,19 @@ def _block(device: wp.Device | None) -> int:
 
 
 def launch_worlds(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device | None) -> None:
-    """Launch a kernel with a thread for each world, or each row; its last argument is the first one."""
+    """Launch a kernel with one thread per world or row; the kernel's last argument is the index of the first one."""
     _launch(kernel, (nworld,), 0, args, device, block_dim=_block(device))
 
 
 def launch_parts(kernel: wp.Kernel, parts: int, nworld: int, args: Sequence[Any], device: wp.Device | None) -> None:
-    """Launch a kernel with a thread for each part of the work on each world, (parts, nworld)."""
+    """Launch a kernel over (parts, nworld): several threads share the work on each world."""
     _launch(kernel, (parts, nworld), 1, args, device, block_dim=_block(device))
 
 
 def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device) -> None:
-    """Launch a kernel over (nworld, lanes), whose last arguments are the number of lanes and the first world.
+    """Launch a kernel over (nworld, lanes); its last arguments are the number of lanes and the first world.
 
-    The lanes are threads that share a world's rows: 1 on the CPU and a warp on a GPU, for coalesced access.
+    The lanes are threads that share a world's rows: one on the CPU, and a warp on a GPU for coalesced access.
     """
     lanes = 32 if device.is_cuda else 1
     _launch(kernel, (nworld, lanes), 0, [*args, lanes], device)
@@ -108,7 +107,7 @@ def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp
 def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.array) -> None:
     """Launch one of the copying kernels of ``kernels.state`` over the masked rows of the target, (nworld, n).
 
-    Its last arguments are the number of lanes and the first row.
+    The kernel's last arguments are the number of lanes and the first row.
     """
     if target.size == 0:
         return
@@ -127,7 +126,7 @@ def launch_several_rows(kernel: wp.Kernel, mask: wp.array, pairs: Sequence[tuple
 
     Args:
         kernel: The kernel.
-        mask: Which rows, (n,).
+        mask: Rows to copy, (n,) bool.
         pairs: Sources and targets, (n, columns) each.
     """
     pairs = [pair for pair in pairs if pair[1].size]

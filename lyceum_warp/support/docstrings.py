@@ -1,7 +1,8 @@
-"""Show the docstrings of attributes and of overloaded Warp functions in ``help()``.
+"""Make ``help()`` show the docstrings of attributes and of overloaded Warp functions.
 
-Python discards a string after an attribute, so ``help`` does not show it: ``document_attributes`` reads these strings
-from the source and appends them to the docstring of the class. An overloaded Warp function has no docstring at all.
+Python discards a string after an attribute, so ``help`` does not show it. ``document_attributes`` reads these strings
+from the source and appends them to the docstring of the class. An overloaded Warp function has no docstring;
+``document_overloads`` sets it.
 """
 
 import ast
@@ -17,7 +18,7 @@ Class = TypeVar("Class", bound=type)
 
 
 def attribute_docs(cls: type) -> dict[str, str]:
-    """The docstrings of a class's attributes by name, in the order of the source; empty without source."""
+    """The docstrings of a class's attributes by name, in source order; empty if there is no source."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(cls)))
     except (OSError, TypeError, SyntaxError):

@@ -1,4 +1,4 @@
-"""Replace files atomically, and refuse formats of newer releases."""
+"""Replace files atomically, and report file formats of newer releases."""
 
 import contextlib
 import os
@@ -11,13 +11,13 @@ from pathlib import Path
 def replaced(path: Path, *, durable: bool = False, previous: Path | None = None) -> Iterator[Path]:
     """Replace a file atomically: a reader finds the old file or the complete new one.
 
-    The block writes into the yielded path, a temporary file beside the target. If the block raises, the target stays
+    The block writes to the yielded path, a temporary file beside the target. If the block raises, the target stays
     unchanged and the temporary file is deleted.
 
     Args:
         path: The file.
-        durable: Whether to flush the new content to the disk before the old file is replaced, in case of a power loss.
-        previous: Where to keep the old file.
+        durable: Whether to flush the new content to disk before replacing the old file, in case of a power loss.
+        previous: Where to save the old file; by default it is lost.
     """
     temporary = path.with_name(path.name + ".tmp")
     try:
@@ -29,11 +29,11 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
             previous.unlink(missing_ok=True)
             try:
                 os.link(path, previous)
-            except OSError:  # a file system without links
+            except OSError:  # a file system without hard links
                 _moved(path, previous)
         _moved(temporary, path)
     except OSError as error:
-        if error.filename is None:  # as on a full disk
+        if error.filename is None:  # for instance on a full disk
             error.filename = str(path)
         raise
     finally:
@@ -42,7 +42,7 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
 
 
 def _moved(source: Path, target: Path) -> None:
-    """Move a file, and retry once: on a network drive, or while another program reads the file, it may fail."""
+    """Move a file, and retry once: a move can fail on a network drive or while another program reads the file."""
     try:
         os.replace(source, target)
     except OSError:
@@ -55,7 +55,7 @@ def newer_format(path: Path, number: int, known: int) -> ValueError:
 
     Args:
         path: The file.
-        number: Its format.
+        number: The format number in the file.
         known: The newest format that this release can read.
     """
     return ValueError(

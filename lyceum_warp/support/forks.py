@@ -1,4 +1,4 @@
-"""Let environments raise an error in forked children, which would wait for threads of the parent forever."""
+"""Make environments raise an error in forked children, where they would wait forever for the parent's threads."""
 
 import os
 import weakref
@@ -37,7 +37,7 @@ def _call_in(process: int, function: Callable[[], object]) -> None:
 def _after_fork() -> None:
     for thing, attributes in _watched.items():
         for name in attributes:
-            _kept.append(getattr(thing, name))  # destroying an engine would wait for its threads, too
+            _kept.append(getattr(thing, name))  # destroying an engine would also wait for its threads
             setattr(thing, name, LeftInParent())
 
 

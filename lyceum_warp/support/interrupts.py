@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 _NUMBERS = [int(getattr(signal, name)) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-"""Ctrl-C, SIGTERM and SIGHUP, which Windows lacks."""
+"""The numbers of SIGINT, SIGTERM and, except on Windows, SIGHUP."""
 
 
 class Interrupted(BaseException):
-    """A signal requested the end of the program."""
+    """Raised when a signal requests the end of the program."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -18,11 +18,11 @@ class Interrupted(BaseException):
 
 
 def _ignore(number: int, frame: Any) -> None:
-    """Ignore a signal after Interrupted was raised; ``obeyed`` replaces this handler, but never SIG_IGN."""
+    """Ignore a signal after Interrupted was raised; ``obeyed`` replaces this handler, but not SIG_IGN."""
 
 
 def _interrupt(number: int, frame: Any) -> None:
-    """Raise Interrupted, and ignore further signals."""
+    """Raise Interrupted, and ignore all later signals."""
     for other in _NUMBERS:
         if signal.getsignal(other) is _interrupt:
             signal.signal(other, _ignore)
@@ -35,11 +35,11 @@ def _leave(number: int, frame: Any) -> None:
 
 @contextlib.contextmanager
 def _handling(handler: Callable[[int, Any], None], replaces: Callable[[Any], bool]) -> Iterator[dict[int, Any]]:
-    """Within the context a handler replaces others.
+    """Within the context, ``handler`` replaces other handlers.
 
     Args:
         handler: The handler.
-        replaces: Called with a current handler; whether to replace it.
+        replaces: Called with a current handler; returns whether to replace it.
 
     Yields:
         The replaced handlers by signal, to be restored at the end.
@@ -59,7 +59,7 @@ def _handling(handler: Callable[[int, Any], None], replaces: Callable[[Any], boo
 def _is_active(handler: Any) -> bool:
     """Whether a signal with this handler reaches the program.
 
-    A shell makes background programs ignore SIGINT, and nohup makes programs ignore SIGHUP.
+    Shells make background programs ignore SIGINT, and nohup makes programs ignore SIGHUP.
     """
     return handler not in (signal.SIG_IGN, _ignore)
 
@@ -85,7 +85,7 @@ def ending() -> Iterator[None]:
 def obeyed() -> Iterator[None]:
     """Within the context another Ctrl-C, SIGTERM or SIGHUP raises Interrupted after the first one of ``signals``.
 
-    Long work at the end of a program can thus be cancelled.
+    This allows the user to cancel long work at the end of a program.
     """
     with _handling(_interrupt, lambda handler: handler is _ignore):
         yield
@@ -93,15 +93,15 @@ def obeyed() -> Iterator[None]:
 
 @contextlib.contextmanager
 def postponed(*, insist: bool = False) -> Iterator[list[int]]:
-    """Within the block, list Ctrl-C, SIGTERM and SIGHUP; the first is handled at the end of the block.
+    """Within the context, collect Ctrl-C, SIGTERM and SIGHUP in the yielded list; the first is handled at the end.
 
     Once Interrupted is raised, later signals are ignored.
 
     Args:
-        insist: Whether a second signal is handled at once.
+        insist: Whether a second signal is handled immediately.
 
     Raises:
-        Interrupted: A signal came, and the caller did not raise it.
+        Interrupted: A signal was postponed, and ``signals`` is active.
     """
     noted: list[int] = []
 

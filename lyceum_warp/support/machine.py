@@ -1,4 +1,4 @@
-"""Count the CPU cores and the free memory that this process may use."""
+"""Count the CPU cores that this process may use, and the free memory."""
 
 import os
 from pathlib import Path

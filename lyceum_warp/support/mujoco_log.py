@@ -10,8 +10,8 @@ log = logging.getLogger(__name__)
 def quiet() -> None:
     """Send MuJoCo's warnings to the log, for the whole process.
 
-    By default MuJoCo prints each warning and appends it to MUJOCO_LOG.TXT in the current folder. The engines report a
-    world's warnings as a done reason.
+    By default MuJoCo prints each warning and appends it to MUJOCO_LOG.TXT in the working directory. The engines report
+    a world's warnings as a done reason.
     """
     mujoco.set_mju_user_warning(_log)
 

@@ -1,6 +1,6 @@
 """Access and patch internals of Warp and MuJoCo Warp.
 
-No other module does, so that only this one depends on their versions.
+Only this module does, so that no other depends on their versions.
 """
 
 import contextlib
@@ -44,7 +44,7 @@ def extend_structs() -> None:
 def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
     """Whether a module of kernels is loaded or in Warp's cache, for a block size.
 
-    False if Warp's internals have changed, which only costs time.
+    Returns False if Warp's internals have changed, which only costs time.
     """
     if (device.context, block) in module.execs:
         return True
@@ -65,7 +65,7 @@ def forward_functions() -> Mapping[str, Any]:
 
 
 def has_sdf_functions() -> bool:
-    """Whether a distance function of SDF plugins was registered with MuJoCo Warp, whose default only fails."""
+    """Whether a distance function for SDF plugins was registered with MuJoCo Warp; its default only raises an error."""
     collision_sdf = importlib.import_module("mujoco_warp._src.collision_sdf")
     return bool(collision_sdf.user_sdf.func.__module__ != collision_sdf.__name__)
 
@@ -83,10 +83,11 @@ class _PerThread(threading.local):
 
 
 def separate_captures() -> None:
-    """Make captures of launches on the CPU thread-local.
+    """Make captures of CPU launches thread-local.
 
-    Warp's library captures only launches of the thread that began a capture, but its Python code applies a capture to
-    all threads: loops of other threads would enter the graph, and their launches would overwrite its arguments.
+    Warp's native library captures only launches of the thread that started the capture, but its Python code applies the
+    capture to all threads: loops of other threads would enter the graph, and their launches would overwrite its
+    arguments.
     """
     for name in ("_apic_capture", "_apic_graph"):
         setattr(wp._src.context.Runtime, name, _PerThread())
@@ -100,12 +101,12 @@ class _Tiles(threading.local):
 
 tiles = _Tiles()
 TILES_ON_CPU = threading.RLock()
-"""Lock held while kernels with tiles run on the CPU: compiled for x86, they keep the address of their tiles in a static
-variable, so two threads would overwrite each other's tiles."""
+"""Lock held while kernels with tiles run on the CPU. Compiled for x86, they store the address of their tiles in a
+static variable, so two threads would overwrite each other's tiles."""
 
 
 def separate_tiles() -> None:
-    """Serialise launches of kernels with tiles on the CPU, and note the launches in ``tiles``."""
+    """Serialise launches of kernels with tiles on the CPU, and set ``tiles.launched`` at each such launch."""
     launch_tiled = wp.launch_tiled
 
     def launch(*args: Any, **options: Any) -> Any:
@@ -119,7 +120,7 @@ def separate_tiles() -> None:
 
 @contextlib.contextmanager
 def replaced_in_this_thread(functions: Mapping[str, Callable[..., Any]]) -> Iterator[None]:
-    """Replace functions of Warp for the calls of this thread.
+    """Replace functions of Warp for calls from this thread.
 
     Args:
         functions: The new functions, by their names in ``warp`` or ``warp.utils``.

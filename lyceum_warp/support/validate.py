@@ -9,7 +9,7 @@ import torch
 
 
 def whole_number(name: str, value: Any, *, low: int, high: int = 2**31 - 1) -> int:
-    """Convert a number of any type to an int, and check its bounds.
+    """Convert a number of any type to an int within bounds.
 
     Raises:
         ValueError: The value is not a whole number from low to high.
@@ -67,7 +67,7 @@ def check_flag(name: str, value: Any) -> None:
 
 
 def check_word(name: str, value: Any, words: Sequence[str], others: str = "") -> None:
-    """Check that a value is one of a few words; the message appends ``others``, further accepted values.
+    """Check that a value is one of the given words; the message appends ``others``, which describes additional values.
 
     Raises:
         ValueError: The value is something else.
@@ -103,7 +103,7 @@ def check_tensor(value: Any, name: str, like: torch.Tensor) -> None:
     """Check that a value has the shape, the type and the device of a buffer.
 
     Raises:
-        ValueError: The value is not a tensor, or differs from the buffer.
+        ValueError: The value is not a tensor, or has a different shape, type or device.
     """
     if not isinstance(value, torch.Tensor) or value.shape != like.shape or value.dtype != like.dtype:
         raise ValueError(f"{name} must be {described(like)}, not {described(value)}")
@@ -121,7 +121,7 @@ def described(value: Any) -> str:
 
 
 def finite_number(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf) -> float:
-    """Convert a finite number of any type to a float, and check its bounds.
+    """Convert a finite number of any type to a float within bounds.
 
     Raises:
         ValueError: The value is not a finite number from low to high.

@@ -15,10 +15,10 @@ _PACKAGES = ("lyceum-warp", "mujoco", "mujoco-warp", "warp-lang", "torch", "nump
 
 
 def versions(device: str = "cpu") -> dict[str, Any]:
-    """Versions of the packages and of Python, the machine, and the commit in a git checkout.
+    """Versions of the packages and of Python, a description of the machine, and the commit in a git checkout.
 
     Args:
-        device: Device of the run; a CUDA device adds the names of the GPU and of the CUDA version.
+        device: Device of the run; for a CUDA device, the GPU's name and the CUDA version are added.
     """
     found: dict[str, Any] = {}
     for package in _PACKAGES:

@@ -1,4 +1,4 @@
-"""Initialise Warp without its greeting, and send its messages about the CUDA driver to Python's log."""
+"""Initialise Warp without its banner, and send its messages about the CUDA driver to Python's log."""
 
 import contextlib
 import logging
@@ -19,18 +19,18 @@ _remarks: list[str] | None = None
 def start_warp() -> list[str]:
     """Initialise Warp quietly, and log its messages about the CUDA driver.
 
-    At its default log level Warp prints a greeting and a line for every module that it loads, so the level is raised to
-    warnings; a level set by the user stays. Without a GPU, Warp's library prints messages about the driver to stderr:
-    these are logged instead, and all other output is printed.
+    At its default log level, Warp prints a banner and a line for every module that it loads, so the level is raised to
+    warnings, unless the user has set another one. Without a GPU, Warp's native library prints messages about the driver
+    to stderr; these are logged instead, and all other output is printed.
 
     Returns:
-        The messages about the driver, for errors of callers that need a CUDA device.
+        The messages about the driver, for the error messages of callers that need a CUDA device.
     """
     global _remarks
     with _lock:
         if _remarks is None:
             level = wp.LOG_WARNING if wp.config.log_level == wp.LOG_INFO else wp.config.log_level
-            wp.config.log_level = max(level, wp.LOG_ERROR)  # Warp's Python code repeats one of the messages
+            wp.config.log_level = max(level, wp.LOG_ERROR)  # Warp's Python code would repeat one of the messages
             try:
                 printed = _stderr_of_start()
             finally:

@@ -33,13 +33,13 @@ CHECKS: tuple[Callable[[Context], None], ...] = tuple(
     for name, value in vars(module).items()
     if name.startswith("check_")
 )
-"""All checks, which are the functions ``check_*`` of the modules of rules, in the order in which they run."""
+"""All checks, the functions ``check_*`` of the rule modules, in the order in which they run."""
 
 
 @document_attributes
 @dataclasses.dataclass
 class Report:
-    """The result of ``check_task`` for a task that keeps every rule."""
+    """The result of ``check_task`` for a task that follows every rule."""
 
     task: str
     """The task's name."""
@@ -68,18 +68,18 @@ def check_task(
     checks: Sequence[Callable[[Context], None]] = CHECKS,
     **options: Any,
 ) -> Report:
-    """Check that a task keeps every rule of an environment on an engine.
+    """Check that a task follows every rule of an environment on an engine.
 
     Args:
         task: Name of a task, a file with one, or its class.
-        engine: As for ``make``, or an engine class (see ``engines.base``).
-        device: As for ``make``.
+        engine: See ``make``; or an engine class (see ``engines.base``).
+        device: See ``make``.
         nworld: Number of worlds, at least 2.
-        steps: Steps of the long checks (determinism, memory).
+        steps: Number of steps in long checks (determinism, memory).
         seed: Seed of the worlds and of the random actions.
         checks: The rules to check, a selection of ``CHECKS``.
-        options: Further options of ``make`` and parameters of the task. On a CUDA device ``deterministic`` is True by
-            default, because the rules compare numbers to the bit.
+        options: Additional options of ``make`` and parameters of the task. On a CUDA device ``deterministic`` is True
+            by default, because the rules compare numbers bit for bit.
 
     Returns:
         A report of the checks, which can be printed.

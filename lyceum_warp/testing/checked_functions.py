@@ -58,8 +58,8 @@ class CheckedFunctions:
     """The checked copies of some functions, with a kernel for each.
 
     A kernel gets the report, (places, 3) int32, and for each argument of its function the values of all worlds: a
-    ``Batch`` for the task's World, (nworld,) or (1,) for Params, (nworld, size) for a row. The report has, for each
-    place, the number of times that its index was out of range, the first such index and the size.
+    ``Batch`` for the task's World, (nworld,) or (1,) for Params, (nworld, size) for a row. The report has one row per
+    place: how often its index was out of range, the first such index, and the size.
 
     Raises:
         Unchecked: A function can't be copied.
@@ -97,7 +97,7 @@ class CheckedFunctions:
         return len(self.places) - 1
 
     def number(self, function: wp.Function) -> int:
-        """The number of a function's copy, which is made at the first call."""
+        """The number of a function's copy; the first call makes the copy."""
         if function not in self._numbers:
             number = self._numbers[function] = len(self._numbers)
             for overload in overloads(function):
@@ -188,7 +188,7 @@ class _Rewriter(ast.NodeTransformer):
         return visited
 
     def _refused(self, node: ast.Name | ast.Attribute) -> ast.AST:
-        """Refuse a function that is used as a value: its copy has one more argument."""
+        """Refuse a function that is used as a value, because its copy has an additional argument."""
         function = self.source.value(node)
         if isinstance(function, wp.Function) and function.func is not None:
             raise Unchecked(
@@ -267,7 +267,7 @@ class _Rewriter(ast.NodeTransformer):
         return _call("bounds_from_end" if constant else "bounds_at", _name("bounds_report"), place, index, size)
 
     def visit_While(self, node: ast.While) -> list[ast.stmt]:
-        """Insert a counter that ends an endless loop."""
+        """Insert a counter that breaks an endless loop."""
         place = self.checked.place(self.source, node, f"while {ast.unparse(node.test)}", "loops")
         self.loops += 1
         rounds = f"bounds_rounds_{self.loops}"
@@ -288,7 +288,7 @@ def _call(name: str, *arguments: ast.expr) -> ast.Call:
 
 
 def _loaded(node: ast.expr) -> ast.expr:
-    """A copy of an expression, to be read."""
+    """Copy an expression with load context."""
     loaded = copy.deepcopy(node)
     if isinstance(loaded, ast.Attribute | ast.Subscript | ast.Name):
         loaded.ctx = ast.Load()

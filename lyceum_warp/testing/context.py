@@ -18,7 +18,7 @@ OUTCOMES = (*steps.OUTCOMES, "obs", "final_obs")
 """The buffers that a step fills."""
 
 SHORT = 8
-"""Steps of a check that needs only a few."""
+"""Number of steps in short checks."""
 
 
 @document_attributes
@@ -33,7 +33,7 @@ class Context:
     make: Callable[..., Env]
     """Makes another environment with the same options and the given changes."""
     steps: int
-    """Steps of the long checks."""
+    """Number of steps in long checks."""
     seed: int
     """Seed of the worlds and of the random actions."""
     task: str
@@ -57,7 +57,7 @@ class Context:
             self.fail(problem)
 
     def equal(self, found: torch.Tensor, wanted: torch.Tensor, what: str) -> None:
-        """Fail unless two tensors have the same shape, type and values to the bit (NaN equals NaN)."""
+        """Fail unless two tensors have the same shape and type and bitwise equal values (NaN equals NaN)."""
         if found.shape != wanted.shape or found.dtype != wanted.dtype:
             self.fail(f"{what}: {found.dtype} {tuple(found.shape)} instead of {wanted.dtype} {tuple(wanted.shape)}")
         differ = ~((found == wanted) | ((found != found) & (wanted != wanted)))
@@ -86,7 +86,7 @@ class Context:
         return (low + draws * (high - low)).to(env.action)
 
     def mask(self, *worlds: int) -> torch.Tensor:
-        """A mask of some worlds, by default of every second one, (nworld,) bool."""
+        """A mask of the given worlds, or by default of every second world, (nworld,) bool."""
         numbers = torch.arange(self.a.nworld)
         mask = torch.isin(numbers, torch.tensor(worlds)) if worlds else numbers % 2 == 0
         return mask.to(self.a.action.device)
@@ -102,7 +102,7 @@ class Context:
         return ~env.worlds.changed_view
 
     def run(self, env: Env, actions: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Step through actions, and return the state and the outcome of every step, (steps, nworld, ...)."""
+        """Apply a sequence of actions, and return the state and the outcome of every step, (steps, nworld, ...)."""
         kept: dict[str, list[torch.Tensor]] = {name: [] for name in ("state", "calm", *OUTCOMES)}
         for action in actions:
             env.step(action)
@@ -113,13 +113,13 @@ class Context:
         return {name: torch.stack(values) for name, values in kept.items()}
 
     def same_runs(self, found: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor], what: str) -> None:
-        """Fail unless two results of ``run`` are the same to the bit."""
+        """Fail unless two results of ``run`` are bitwise equal."""
         for name in wanted:
             self.equal(found[name], wanted[name], f"{name} {what} (step, world, ...)")
 
     @contextlib.contextmanager
     def changed(self, *envs: Env, **choices: Any) -> Iterator[None]:
-        """Context in which environments have another ``horizon``, ``autoreset`` or ``graphs``."""
+        """Context in which environments have a different ``horizon``, ``autoreset`` or ``graphs``."""
         kept: list[Any] = [
             {"horizon": env.horizon, "autoreset": env.autoreset, "graphs": env.worlds.programs.graphs.enabled}
             for env in envs

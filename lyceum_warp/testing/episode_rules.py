@@ -23,7 +23,7 @@ def _check_flags(ctx: Context, env: Env) -> None:
 def check_truncation(ctx: Context) -> None:
     """At the horizon an episode is truncated; ``final_obs`` is its last observation, ``obs`` the first of the next.
 
-    Truncation does not set ``terminated``. In worlds that go on, both observations are equal. All of this holds for
+    Truncation does not set ``terminated``. In worlds that continue, both observations are equal. All of this holds for
     every group of observations.
     """
     a, b, horizon = ctx.a, ctx.b, 4
@@ -54,7 +54,7 @@ def check_truncation(ctx: Context) -> None:
 
 
 def check_no_autoreset(ctx: Context) -> None:
-    """Without automatic resets ``done`` stays set, the world steps on, and ``final_obs`` equals ``obs``."""
+    """Without automatic resets ``done`` stays set, the world keeps stepping, and ``final_obs`` equals ``obs``."""
     env, horizon = ctx.a, 3
     with ctx.changed(env, horizon=horizon, autoreset=False):
         ctx.restart()
@@ -74,7 +74,7 @@ def check_no_autoreset(ctx: Context) -> None:
 
 
 def check_graphs(ctx: Context) -> None:
-    """Steps and resets have the same numbers with and without graphs, to the bit."""
+    """Steps and resets are bitwise equal with and without graphs."""
     a, b, n = ctx.a, ctx.b, 20
     with ctx.changed(a, horizon=6, graphs=True), ctx.changed(b, horizon=6, graphs=False):
         ctx.restart()

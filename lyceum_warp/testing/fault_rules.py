@@ -1,4 +1,4 @@
-"""Check that a fault ends the episode of its world and changes no other world."""
+"""Check that a fault ends its world's episode and changes no other world."""
 
 from collections.abc import Callable
 
@@ -50,7 +50,7 @@ def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, 
 
 
 def check_bad_state(ctx: Context) -> None:
-    """A state that is NaN or beyond 1e10 ends the episode of its world and changes no other world."""
+    """A state that is NaN or beyond 1e10 ends its world's episode and changes no other world."""
     for part, value in (("qpos", np.nan), ("qvel", np.nan), ("qvel", np.inf), ("qpos", 1e11), ("qvel", -1e11)):
 
         def spoil(env: Env, world: int, part: str = part, value: float = value) -> None:
@@ -62,7 +62,7 @@ def check_bad_state(ctx: Context) -> None:
 
 
 def check_bad_action(ctx: Context) -> None:
-    """An action that is not finite counts as zero, ends the episode of its world and changes no other world."""
+    """An action that is not finite counts as zero, ends its world's episode and changes no other world."""
     for value in (np.nan, np.inf, -np.inf):
 
         def spoil(env: Env, world: int, value: float = value) -> None:
@@ -72,7 +72,7 @@ def check_bad_action(ctx: Context) -> None:
 
 
 def check_bad_warmstart(ctx: Context) -> None:
-    """A warm start of NaN changes no other world, and a reset of its world removes it."""
+    """A NaN warm start changes no other world, and a reset clears it."""
     a, b, bad = ctx.a, ctx.b, 0
     if "qacc_warmstart" not in a.state_space.parts:
         return

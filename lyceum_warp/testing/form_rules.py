@@ -9,7 +9,7 @@ from lyceum_warp.world_arrays import memory_columns
 
 
 def check_groups(ctx: Context) -> None:
-    """The group ``policy`` is ``env.obs``, and a fault leaves the last good observation of every group."""
+    """The group ``policy`` is ``env.obs``, and a fault leaves the last valid observation of every group."""
     a = ctx.a
     ctx.that(a.obs is a.obs_groups["policy"], "the group policy is not env.obs")
     ctx.that(a.final_obs is a.final_obs_groups["policy"], "the final group policy is not env.final_obs")
@@ -86,7 +86,7 @@ def check_metrics(ctx: Context) -> None:
 
 
 def check_success_steps(ctx: Context) -> None:
-    """``success`` needs ``success_steps`` steps in a row; their count belongs to the state, and a reset clears it.
+    """``success`` needs ``success_steps`` good steps in a row; their count is part of the state, and a reset clears it.
 
     To see whether a state meets the goal, the check sets it with a full count and reads ``success``.
     """

@@ -15,13 +15,13 @@ from lyceum_warp.testing.context import Context
 from lyceum_warp.worlds import Worlds
 
 _RESET = ("startup", "initialize", "randomize")
-"""The functions that a reset runs on the engine's initial state, in order."""
+"""The functions that a reset runs, in order."""
 
 _FEW = 20
-"""Steps on an engine with slow steps, MuJoCo Warp on a CPU."""
+"""Number of steps on a slow engine, MuJoCo Warp on a CPU."""
 
 _MOST_LISTED = 8
-"""Problems that the message of a failure lists."""
+"""Maximum number of problems listed in a failure message."""
 
 
 def check_bounds(ctx: Context) -> None:
@@ -91,7 +91,7 @@ class _Run:
             self._run_step(self.worlds)
 
     def _run_before_restart(self, state: torch.Tensor, action: torch.Tensor) -> None:
-        """Run the functions of a step on the state in which a fault ended the episode; ``env`` has restarted since.
+        """Run the functions of a step on the state in which a fault ended the episode, before ``env`` restarted.
 
         A read out of range may return NaN and so cause the fault.
         """
@@ -127,7 +127,7 @@ class _Run:
             self._run(name, self.after)
 
     def _keep_start(self) -> None:
-        """Keep the initial state before the task's functions change it."""
+        """Copy the initial state before the task's functions change it."""
         env = self.ctx.b
         env.engine.reset(env.worlds.everyone)
         self._copy(env.worlds.after, self.start)
@@ -161,7 +161,7 @@ class _Run:
         return batch
 
     def _array(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        """An array of zeros. A row without elements has memory for one, which a checked function may touch."""
+        """An array of zeros. An empty row has memory for one element, which a checked function may access."""
         with wp.ScopedDevice(self.env.device):
             made: wp.array = wp.zeros([max(size, 1) for size in shape], dtype=dtype)
             self.keep.append(made)

@@ -16,22 +16,22 @@ from lyceum_warp.testing.context import SHORT, Context
 from lyceum_warp.world_arrays import memory_columns
 
 _SMALLEST = 1e-4
-"""Numbers are compared only if inputs or model fields move a coordinate by at least this much."""
+"""Coordinates are compared only if inputs or model fields move one by at least this much."""
 
 
 def predicted(
     env: Env, before: torch.Tensor, after: torch.Tensor | None = None, *, nstep: int, dynamics: bool = True,
     inputs: bool = True,
 ) -> np.ndarray:  # fmt: skip
-    """The coordinates of every world after ``mj_step``, (nworld, nq).
+    """The coordinates of every world after ``mj_step``, (nworld, nq), as computed by MuJoCo itself.
 
     Args:
         env: The environment of the states.
-        before: States to start from, (nworld, state_space.size).
-        after: States with the controls and inputs of the step; by default ``before``.
-        nstep: Substeps.
-        dynamics: Whether model fields have their values in ``before``; otherwise their nominal values.
-        inputs: Whether to take inputs from ``after``; otherwise from ``before``.
+        before: Initial states, (nworld, state_space.size).
+        after: States that hold the controls and inputs of the step; by default ``before``.
+        nstep: Number of substeps.
+        dynamics: If True, take model fields from ``before``; otherwise use their nominal values.
+        inputs: If True, take inputs from ``after``; otherwise from ``before``.
     """
     parts, size = env.state_space.parts, env.engine.integration_size
     start = before.cpu().numpy().copy()
@@ -73,7 +73,7 @@ def closer(
 
 
 def check_inputs(ctx: Context) -> None:
-    """Inputs that ``control`` writes act in the same step and belong to the state; a reset clears them."""
+    """Inputs written by ``control`` act in the same step and belong to the state; a reset clears them."""
     env, b = ctx.a, ctx.b
     written = [name for name in INPUTS if name in env.task.writes.get("control", ())]
     if not written:
@@ -108,7 +108,7 @@ def check_inputs(ctx: Context) -> None:
 
 
 def check_dynamics(ctx: Context) -> None:
-    """Model fields of a world belong to its state and act in its physics; draws never add up over resets.
+    """A world's model fields belong to its state and affect its physics; draws never accumulate over resets.
 
     ``reset`` restores nominal values, except in fields that are drawn once for each world.
     """

@@ -1,4 +1,4 @@
-"""Check how an episode begins: from a keyframe, with rejected draws, after substeps in which it settles."""
+"""Check how episodes start: from a keyframe, after rejected draws, after settling."""
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ from lyceum_warp.testing.context import Context
 from lyceum_warp.testing.physics_rules import closer, predicted
 
 _RESETS = 6
-"""Resets in the check of rejected draws."""
+"""Number of resets in the check of rejected draws."""
 
 
 def check_keyframe(ctx: Context) -> None:
@@ -30,7 +30,7 @@ def check_keyframe(ctx: Context) -> None:
 
 
 def check_rejection(ctx: Context) -> None:
-    """No episode begins in a state that the task rejects, unless all draws are used; worlds draw independently."""
+    """No episode starts in a state that the task rejects, unless all draws are used; worlds draw independently."""
     a, b = ctx.a, ctx.b
     reject = a.task.kernels.reject_worlds
     if reject is None:
@@ -66,7 +66,7 @@ def check_rejection(ctx: Context) -> None:
 
 
 def check_settle(ctx: Context) -> None:
-    """An episode begins at time 0 after the substeps of ``settle``."""
+    """An episode starts at time 0 after the substeps of ``settle``."""
     a, b = ctx.a, ctx.b
     nstep = a.task.task.settle
     if nstep == 0:

@@ -26,7 +26,7 @@ def check_round_trip(ctx: Context) -> None:
 
 
 def check_restoring(ctx: Context) -> None:
-    """Steps after ``set_state`` repeat the original steps, through automatic resets, also in another environment."""
+    """Steps after ``set_state`` repeat the original steps, through automatic resets and even in another environment."""
     a, b = ctx.a, ctx.b
     with ctx.changed(a, b, horizon=6):
         ctx.restart()
@@ -35,14 +35,14 @@ def check_restoring(ctx: Context) -> None:
         first = ctx.run(a, actions)
         a.set_state(state)
         ctx.same_runs(ctx.run(a, actions), first, "after restoring")
-        b.rand_reset(ctx.seed + 5)  # another random stream
+        b.rand_reset(ctx.seed + 5)  # a different random stream
         ctx.run(b, ctx.actions(3, 2))
         b.set_state(state)
         ctx.same_runs(ctx.run(b, actions), first, "after restoring in another environment")
 
 
 def check_masked_restoring(ctx: Context) -> None:
-    """``set_state`` with a mask leaves the other worlds unchanged, to the bit."""
+    """``set_state`` with a mask changes no bit of the other worlds."""
     a, b = ctx.a, ctx.b
     ctx.restart()
     mask = ctx.mask()
@@ -119,7 +119,7 @@ def check_purity(ctx: Context) -> None:
 
 
 def check_determinism(ctx: Context) -> None:
-    """Two environments with the same options and actions have the same numbers, to the bit, through all resets."""
+    """Two environments with the same options and actions stay bitwise equal through all resets."""
     ctx.restart()
     for i, action in enumerate(ctx.actions(ctx.steps)):
         ctx.a.step(action)
@@ -138,16 +138,16 @@ def _physics(env: Env, state: torch.Tensor) -> torch.Tensor:
 
 
 def _lasting_columns(env: Env) -> list[slice]:
-    """The columns of a state that resets keep: lasting memory, and model fields that no reset draws."""
+    """The state columns that resets preserve: lasting memory, and model fields that no reset randomizes."""
     names = [field.name for field in env.task.dynamics if field.name not in env.task.reset_dynamics]
     parts = env.state_space.parts
     return [parts[name] for name in (*env.task.memory["lasting_memory"], *names)]
 
 
 def check_reset(ctx: Context) -> None:
-    """``reset`` leads to the same state whatever happened before, with zero actions.
+    """``reset`` leads to the same state regardless of the past, with zero actions.
 
-    It may depend on columns that resets keep, which are therefore the same before both resets and in all worlds.
+    It may depend on columns that resets keep, so these are made equal before both resets and in all worlds.
     """
     env = ctx.a
     lasting = _lasting_columns(env)
@@ -180,7 +180,7 @@ def check_reset(ctx: Context) -> None:
 
 
 def check_masked_reset(ctx: Context) -> None:
-    """Resets with a mask leave the other worlds unchanged, to the bit."""
+    """Resets with a mask change no bit of the other worlds."""
     env = ctx.a
     mask = ~ctx.mask()
     for reset in (env.reset, env.rand_reset):
@@ -195,7 +195,7 @@ def check_masked_reset(ctx: Context) -> None:
 
 
 def check_rand_reset(ctx: Context) -> None:
-    """``rand_reset(seed)`` repeats its draws; further draws, worlds and seeds differ; actions are zero."""
+    """``rand_reset(seed)`` repeats its draws; later draws, other worlds and other seeds differ; actions are zero."""
     a, b = ctx.a, ctx.b
     ctx.run(a, ctx.actions(5))
     ctx.restart()
@@ -220,7 +220,7 @@ def check_rand_reset(ctx: Context) -> None:
 
 
 def check_world_count(ctx: Context) -> None:
-    """A seed gives a world the same initial state for any number of worlds."""
+    """With the same seed, a world has the same initial state for any number of worlds."""
     n = ctx.a.nworld
     doubled = {name: np.concatenate([v, v]) for name, v in ctx.a.task.parameters.per_world.items()}
     more = ctx.make(nworld=2 * n, seed=ctx.seed, **doubled)

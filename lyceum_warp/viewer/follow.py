@@ -93,7 +93,7 @@ def wait_for_run(folder: Path, *, seconds: float) -> Run:
 
 
 class RunViewer:
-    """Shows a run while it trains, in another process: ``lw.train(npg, folder, callback=lw.RunViewer(folder))``.
+    """Shows a run while it trains, in another process: ``with lw.RunViewer(folder): lw.train(npg, folder)``.
 
     The process waits for the folder, and shows the run's newest policy in worlds of its own on the CPU, at a lower
     priority than the training. It ends with ``close``, at the end of a ``with`` block, and with this program. Closing
@@ -116,9 +116,6 @@ class RunViewer:
         with contextlib.suppress(OSError):  # a process that ended at once has printed the reason
             self._process.stdin.write(job + "\n")
             self._process.stdin.flush()
-
-    def __call__(self, iteration: Any) -> None:
-        """Do nothing: as a callback of ``lw.train``, the viewer reads the run's files."""
 
     @property
     def is_open(self) -> bool:

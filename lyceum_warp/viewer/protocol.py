@@ -10,8 +10,8 @@ import numpy as np
 
 Mode: TypeAlias = Literal["passive", "controller", "playback"]
 
-WorldChoice: TypeAlias = int | Literal["next", "previous", "best", "worst", "last_ended"]
-"""A world's number, or a rule that finds it: by its return so far, or the world whose episode ended last."""
+WorldChoice: TypeAlias = int | Literal["next", "previous", "best", "worst"]
+"""A world's number, or a rule that finds it: the best and the worst by their returns so far."""
 
 MOST_GHOSTS = 32
 """Maximum number of other worlds, and of other episodes, that are drawn at once."""
@@ -234,9 +234,8 @@ class Perturb:
 class SetVideo:
     """Start a video, or end it."""
 
-    on: bool
-    camera: dict[str, Any] | None = None
-    """Attributes of the ``mujoco.MjvCamera``; None for the default camera."""
+    camera: dict[str, Any] | None
+    """Attributes of the ``mujoco.MjvCamera``; None ends the video."""
 
 
 @dataclasses.dataclass(frozen=True)

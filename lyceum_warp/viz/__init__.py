@@ -5,4 +5,4 @@ EXTRA = "pip install 'lyceum-warp[viz]'"
 
 
 class NoVideoError(RuntimeError):
-    """The machine cannot draw, or lacks a package for videos. The message names it and the fix."""
+    """Raised if the machine cannot render, or if a package for videos is missing. The message says how to fix it."""

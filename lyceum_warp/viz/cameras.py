@@ -63,14 +63,14 @@ def find_camera(model: mujoco.MjModel, camera: CameraChoice = None) -> mujoco.Mj
 
 
 def parsed_camera(words: Iterable[str]) -> str | FreeCamera | None:
-    """Parse a camera from words of a shell.
+    """Parse a camera from command-line words.
 
     Args:
         words: A name or an index; or parts of a pose as NAME=VALUE: lookat=X,Y,Z, distance, azimuth, elevation, track.
             Without words the result is None.
 
     Raises:
-        ValueError: The words have another form.
+        ValueError: The words have a different form.
     """
     words = list(words)
     if not words or (len(words) == 1 and "=" not in words[0]):

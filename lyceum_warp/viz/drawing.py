@@ -1,4 +1,4 @@
-"""Control the subprocess that draws a video or pictures."""
+"""Control the subprocess that renders a video or pictures."""
 
 import contextlib
 import importlib.util
@@ -43,7 +43,7 @@ def libraries() -> list[str]:
 
 
 class DrawingProcess:
-    """A subprocess that draws poses, with the first graphics library that works; a context manager.
+    """A subprocess that renders poses, with the first graphics library that works; a context manager.
 
     Args:
         model: The model.
@@ -72,7 +72,7 @@ class DrawingProcess:
         self._ends = contextlib.ExitStack()
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: Any = None
-        self._lock = threading.Lock()  # for abandon, which another thread calls
+        self._lock = threading.Lock()  # other threads may call abandon
         self._abandoned = False
 
     def __enter__(self) -> Self:
@@ -108,9 +108,9 @@ class DrawingProcess:
             raise NoVideoError(f"{self.product} could not be written ({self._ended()[1]})")
 
     def abandon(self) -> None:
-        """Kill the process, and start no other one. Other threads may call this; it does not wait.
+        """Kill the process and do not start another. Other threads may call this; it does not wait.
 
-        The drawing thread then gets a ``NoVideoError``.
+        The rendering thread then gets a ``NoVideoError``.
         """
         with self._lock:
             self._abandoned = True
@@ -148,7 +148,7 @@ class DrawingProcess:
         return True
 
     def _answer(self) -> str:
-        """The next answer of the process, or "" if it has ended."""
+        """The next reply of the process, or "" if it has ended."""
         assert self._process is not None and self._process.stdout is not None
         for line in self._process.stdout:
             if line in (b"ready\n", b"frame\n"):  # drivers may print other lines

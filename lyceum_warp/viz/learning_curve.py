@@ -13,7 +13,7 @@ from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_pn
 def learning_curve(run: str | Path | Run, out: str | Path | None = None) -> Path:
     """Draw a run's learning curve as PNG: returns, the evaluation metric and the task's own metrics against samples.
 
-    Without any ended episode or evaluation, the mean reward of a step is drawn instead of returns.
+    If no episode has ended and none was evaluated, the plot shows the mean reward per step instead of returns.
 
     Args:
         run: A run, or its folder.

@@ -1,4 +1,4 @@
-"""Draw an environment's worlds as arrays."""
+"""Render an environment's worlds to arrays."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from lyceum_warp.viz.video import shots
 
 
 class WorldPictures(DrawingProcess):
-    """Draws the current state of an environment's worlds.
+    """Renders the current state of an environment's worlds.
 
     Args:
         env: The environment.
@@ -30,10 +30,10 @@ class WorldPictures(DrawingProcess):
         self.env = env
 
     def __call__(self) -> list[np.ndarray]:
-        """A picture of each world, (height, width, 3) uint8; the first call starts the process.
+        """Render a picture of each world, (height, width, 3) uint8; the first call starts the subprocess.
 
         Raises:
-            NoVideoError: The machine cannot draw.
+            NoVideoError: This machine cannot render.
         """
         if self._process is None:
             self.__enter__()
@@ -45,5 +45,5 @@ class WorldPictures(DrawingProcess):
         return pictures
 
     def close(self) -> None:
-        """End the process; a later call starts another one."""
+        """End the subprocess; a later call starts a new one."""
         self._stop()

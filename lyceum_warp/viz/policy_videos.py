@@ -1,4 +1,4 @@
-"""Make videos of a policy, during and after its training."""
+"""Make videos of a policy, during and after training."""
 
 import logging
 from collections.abc import Callable
@@ -23,13 +23,13 @@ NamedProgress: TypeAlias = Callable[[str, str, int, int], object]
 
 
 def policy_states(env: Env, policy: Policy, seed: int, *, progress: Progress | None = None) -> tuple[Env, torch.Tensor]:
-    """Run an episode of a policy in a world of its own; returns its environment, and the states for ``write_video``.
+    """Run an episode of a policy in a new world; return the environment, and the states for ``write_video``.
 
     Args:
         env: An environment of the policy's task.
         policy: The policy.
         seed: Seed of the initial state.
-        progress: Called now and then with the number of steps so far and the horizon.
+        progress: Called regularly with the number of steps so far and the horizon.
     """
     one = evaluation_worlds(env, 1, autoreset=False)
     policy = moved(policy, one) if isinstance(policy, torch.nn.Module) else policy
@@ -45,12 +45,12 @@ class Videos:
 
     Args:
         learner: The algorithm.
-        folder: Folder of the videos, which have the numbers of their iterations.
+        folder: Folder of the videos, which are named by iteration.
         every: Iterations between two videos; 0 for none.
         seed: Seed of the initial state, the same for all videos.
         camera: The camera; see ``write_video``.
-        note: Called with the line that reports an error.
-        progress: Called now and then while a video is made.
+        note: Called with the message about an error.
+        progress: Called regularly while a video is made.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Videos:
         self.camera, self.note, self.progress = camera, note, progress
 
     def __call__(self, iteration: Iteration) -> None:
-        """Write a video after an iteration, if it is time for one."""
+        """Write a video after an iteration, if one is due."""
         if not self.every or iteration.iteration % self.every:
             return
         path = self.folder / f"{iteration.iteration:06d}.mp4"

@@ -37,7 +37,7 @@ class Shot(TypedDict):
     model_fields: dict[str, np.ndarray]
     """Values of model fields by name. Other fields have the model's values."""
     ghosts: list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[float, ...]]]
-    """Further poses of the model, each with a colour."""
+    """Additional poses of the model, each with a colour."""
     lines: list[tuple[np.ndarray, tuple[float, ...], float]]
     """Points of lines, (points, 3), each with a colour and a width in pixels."""
     frames: int
@@ -59,7 +59,7 @@ class Painter:
         width, height = size
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
         model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-        # without a GPU, a finer shadow map takes half of the time of a frame and shows no more
+        # without a GPU, a finer shadow map would take half of a frame's time without a visible gain
         model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, 2 * max(size))
         self.renderer = mujoco.Renderer(model, height, width)
         self.data, self.ghost = mujoco.MjData(model), mujoco.MjData(model)

@@ -13,7 +13,7 @@ def new_figure(purpose: str, width: float, height: float) -> Any:
     """Make a figure without pyplot, so that it needs no display and shares no state with the user's figures.
 
     Args:
-        purpose: Name of the drawing, for the error message.
+        purpose: Name of the plot, for the error message.
         width: Width in inches.
         height: Height in inches.
 
@@ -31,7 +31,7 @@ def new_figure(purpose: str, width: float, height: float) -> Any:
 
 
 def finish_axes(all_axes: Iterable[Any]) -> None:
-    """Add a grid behind the lines, and remove the upper and the right border."""
+    """Add a grid behind the lines, and remove the top and right borders."""
     for axes in all_axes:
         axes.grid(color=GRID)
         axes.set_axisbelow(True)
@@ -39,7 +39,7 @@ def finish_axes(all_axes: Iterable[Any]) -> None:
 
 
 def save_png(figure: Any, out: str | Path) -> Path:
-    """Write a figure to a PNG file, and make the folder for it; return the path."""
+    """Write a figure to a PNG file, create its folder, and return the path."""
     path = Path(out)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150, format="png")

@@ -1,14 +1,12 @@
-"""Write curves and hyperparameters of a run for TensorBoard, with the extra ``tensorboard``.
+"""Write curves of a run for TensorBoard, with the extra ``tensorboard``.
 
 ``metrics.csv`` holds the same numbers; the files written here are a copy for another viewer.
 """
 
 import importlib.util
-import json
 import math
 import os
 import time
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,7 @@ _GROUPS = {
     "mean_": "mean_policy", "return_": "return", "value_": "value", "time_": "time", "metrics/": "metrics",
     "step_metrics/": "step_metrics",
 }  # fmt: skip
-"""Groups of curves by the beginnings of their columns in metrics.csv."""
+"""Groups of curves, by the prefix of their columns in metrics.csv."""
 
 _TAGS = {
     "iteration": "time/iteration", "samples": "time/samples", "samples_per_second": "time/samples_per_second",
@@ -30,37 +28,33 @@ _TAGS = {
     "skipped_updates": "policy/skipped_updates", "reward_mean": "return/reward",
     "explained_variance": "value/explained_variance",
 }  # fmt: skip
-"""Names of curves that do not follow from the columns."""
-
-_COMPARED = ("return/mean", "mean_policy/return", "episode/eval", "episode/success")
-"""The curves whose last values the tab of hyperparameters shows."""
+"""Names of curves that cannot be derived from the columns."""
 
 
 class TensorBoard:
     """Writes a run's iterations where TensorBoard reads them; the horizontal axis counts samples.
 
     Every number of an iteration is a curve, named by its group: return/, episode/, mean_policy/, policy/, value/, time/
-    metrics/ and step_metrics/. The hyperparameters appear in the tabs HPARAMS and TEXT.
+    metrics/ and step_metrics/.
 
     In a folder that already holds curves, the curves continue: what they hold from the samples of the first new
     iteration on is replaced.
 
     Example:
-        >>> with TensorBoard(Path("runs/mine"), {"gamma": 0.99}) as board:
+        >>> with TensorBoard("runs/mine") as board:
         ...     for it in NPG(env):
         ...         board(it)
 
     Args:
         folder: The folder; it is made if it does not exist. ``tensorboard --logdir`` takes it, or one above it.
-        config: The hyperparameters, which may be nested.
 
     Raises:
         ImportError: The package tensorboard is not installed.
     """
 
-    def __init__(self, folder: str | Path, config: Mapping[str, Any]) -> None:
+    def __init__(self, folder: str | Path) -> None:
         check_tensorboard()
-        self._folder, self._config = Path(folder), dict(config)
+        self._folder = Path(folder)
         self._folder.mkdir(parents=True, exist_ok=True)
         self._file: Any = None
 
@@ -71,7 +65,7 @@ class TensorBoard:
         self.close()
 
     def __call__(self, iteration: Iteration) -> None:
-        """Add an iteration. Numbers that are not finite, such as returns where no episode ended, are left out."""
+        """Add an iteration. Non-finite numbers, such as returns if no episode ended, are omitted."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
         values = []
@@ -81,7 +75,7 @@ class TensorBoard:
         self._write(Summary(value=values), iteration.samples, replaced=iteration.samples)
 
     def close(self) -> None:
-        """Close the file. A later iteration opens another one."""
+        """Close the file. A later iteration opens a new one."""
         if self._file is not None:
             file, self._file = self._file, None
             file.close()
@@ -95,19 +89,16 @@ class TensorBoard:
         self._file.flush()
 
     def _open(self, replaced: int) -> None:
-        """Open a file. torch's and TensorBoard's own writers would write it in a thread, which hides a full disk."""
+        """Open a file. Writers of torch and TensorBoard use a thread, which would hide a full disk."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
         from torch.utils.tensorboard import RecordWriter
 
-        number = len(list(self._folder.glob("events.out.tfevents.*")))  # files are read in the order of their names
+        number = len(list(self._folder.glob("events.out.tfevents.*")))  # TensorBoard reads files in alphabetical order
         name = f"events.out.tfevents.{int(time.time()):010d}.{number:04d}.{os.getpid()}"
         self._file = RecordWriter((self._folder / name).open("xb"))
         self._add(Event(file_version="brain.Event:2"))
-        if number:  # TensorBoard leaves out points of earlier files from this step on
+        if number:  # TensorBoard discards points of earlier files from this step on
             self._add(Event(step=replaced, session_log=SessionLog(status=SessionLog.START)))
-        else:
-            for summary in _hyperparameters(self._config):
-                self._add(Event(summary=summary))
 
     def _add(self, event: Any) -> None:
         event.wall_time = time.time()
@@ -118,37 +109,17 @@ def check_tensorboard() -> None:
     """Check that the package for TensorBoard is installed.
 
     Raises:
-        ImportError: It is not installed.
+        ImportError: The package tensorboard is not installed.
     """
     if importlib.util.find_spec("tensorboard") is None:
         raise ImportError(f"curves for TensorBoard need the package tensorboard: {EXTRA}")
 
 
 def tag(column: str) -> str:
-    """The name of a curve, by the column of ``metrics.csv`` that has its numbers."""
+    """The name of the curve for a column of ``metrics.csv``."""
     if column in _TAGS:
         return _TAGS[column]
     for beginning, group in _GROUPS.items():
         if column.startswith(beginning):
             return f"{group}/{column.removeprefix(beginning)}"
     return f"policy/{column}"
-
-
-def _hyperparameters(config: Mapping[str, Any]) -> list[Any]:
-    """What the tabs HPARAMS and TEXT show."""
-    from tensorboard.plugins.hparams.summary_v2 import HParam, Metric, hparams_config_pb, hparams_pb
-    from tensorboard.plugins.text.summary_v2 import text_pb
-
-    flat = dict(_flat(config))
-    names, metrics = [HParam(name) for name in flat], [Metric(name) for name in _COMPARED]
-    text = "\n".join("    " + line for line in json.dumps(config, indent=2, default=str).splitlines())
-    return [hparams_config_pb(names, metrics), hparams_pb(flat), text_pb("config", text)]
-
-
-def _flat(config: Mapping[str, Any]) -> Iterator[tuple[str, bool | float | str]]:
-    """The hyperparameters without nesting, as TensorBoard takes them; None is left out."""
-    for name, value in config.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value)
-        elif value is not None:
-            yield name, value if isinstance(value, (bool, int, float, str)) else str(value)

@@ -1,4 +1,4 @@
-"""Write videos of states, drawn off-screen by a subprocess."""
+"""Write videos of states, rendered off-screen in a subprocess."""
 
 import contextlib
 import math
@@ -37,11 +37,11 @@ def write_video(
     camera: CameraChoice = None,
     size: tuple[int, int] = (640, 480),
     speed: float = 1.0,
-    progress: Progress | bool = True,
+    progress: Progress | None = None,
 ) -> Path:
-    """Draw states into an mp4 file, each with its own model fields.
+    """Render states into an mp4 file, each with its own model fields.
 
-    The video has at most 60 frames per second; with a shorter time step, states are left out. A subprocess draws it,
+    The video has at most 60 frames per second; with a shorter time step, states are skipped. A subprocess draws it,
     without a display.
 
     Args:
@@ -53,8 +53,8 @@ def write_video(
             the world, else a camera that follows the first body.
         size: Width and height in pixels, even numbers.
         speed: Simulated seconds per second of the video.
-        progress: Called after each frame with the number of frames so far and in all. True shows a bar on a terminal,
-            otherwise lines on stderr; False shows nothing.
+        progress: Called after each frame with the number of frames so far and in all. By default a bar is shown on a
+            terminal, and otherwise lines on stderr.
 
     Returns:
         The file's path.
@@ -62,7 +62,7 @@ def write_video(
     Raises:
         ValueError: The states do not have the environment's shape, the model has no such camera, the size is odd, or
             the file's name does not end in ``.mp4``.
-        NoVideoError: The machine cannot draw, or lacks a package for videos.
+        NoVideoError: This machine cannot render, or a package for videos is missing.
     """
     if states.ndim != 2 or states.shape[1] != env.state_space.size or not len(states):
         raise ValueError(f"states must have the shape (steps, {env.state_space.size}), not {tuple(states.shape)}")
@@ -71,12 +71,11 @@ def write_video(
     rows = states[::stride].cpu()
     with (
         Drawing(env.model, out, camera=camera, size=size, fps=rate / stride) as drawing,
-        _shown_progress(progress) as report,
+        LongWork("drawing the video", "frames") if progress is None else contextlib.nullcontext(progress) as report,
     ):
         for i, shot in enumerate(shots(env, rows)):
             drawing.draw(shot)
-            if report is not None:
-                report(i + 1, len(rows))
+            report(i + 1, len(rows))
         return drawing.finish()
 
 
@@ -98,12 +97,6 @@ def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
             lines=[],
             frames=1,
         )
-
-
-def _shown_progress(progress: Progress | bool) -> contextlib.AbstractContextManager[Progress | None]:
-    if progress is True:
-        return LongWork("drawing the video", "frames")
-    return contextlib.nullcontext(progress or None)
 
 
 class Recorder:
@@ -141,13 +134,14 @@ class Recorder:
         self._changed = threading.Condition()  # also guards the queue
         self._ended = self._cancelled = False
         self._error: NoVideoError | OSError | None = None
-        self._thread = threading.Thread(target=self._draw, name="lyceum-warp video", daemon=True)
-        self._thread.start()
+        # a join that a signal interrupts would mark the thread as stopped (Python 3.11)
+        self._done = threading.Event()
+        threading.Thread(target=self._draw, name="lyceum-warp video", daemon=True).start()
 
     @property
     def finished(self) -> bool:
         """Whether the drawing has ended, with the file or with an error that ``close`` raises."""
-        return not self._thread.is_alive()
+        return self._done.is_set()
 
     def add(self, shot: Shot) -> None:
         """Add a shot.
@@ -174,7 +168,7 @@ class Recorder:
 
     def wait(self, seconds: float) -> None:
         """Wait until the drawing has ended, for some seconds at most."""
-        self._thread.join(max(seconds, 0.0))
+        self._done.wait(seconds)
 
     def close(self) -> Path:
         """Finish the video, wait until the file is complete, and return its path.
@@ -184,18 +178,18 @@ class Recorder:
             OSError: The file cannot be written.
         """
         self.end()
-        self._thread.join()
+        self._done.wait()
         self._check()
         return self.out
 
     def cancel(self) -> None:
         """Cancel the video at once, and write no file, unless it is complete."""
-        if self._thread.is_alive():
+        if not self.finished:
             self._cancelled = True
             self._shots.clear()
             self.end()
             self._drawing.abandon()
-            self._thread.join(_KILLED)
+            self._done.wait(_KILLED)
 
     def _check(self) -> None:
         if self._error is not None:
@@ -212,6 +206,8 @@ class Recorder:
             self._error = NoVideoError(f"the video {self.out} was cancelled") if self._cancelled else error
         except Exception as error:  # the thread has no caller
             self._error = NoVideoError(f"the video could not be written ({' '.join(str(error).split())})")
+        finally:
+            self._done.set()
 
     def _next(self) -> Shot | None:
         """The next shot, or None after the last one."""

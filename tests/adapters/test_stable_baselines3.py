@@ -130,7 +130,7 @@ def test_attributes_and_methods_are_those_of_the_worlds() -> None:
     assert torch.equal(env.env_method("get_eval", indices=2)[0], env.env.eval[2])
     assert env.env_is_wrapped(Monitor) == [True] * N
     assert env.env_is_wrapped(gymnasium.Wrapper, indices=[0]) == [False]
-    with pytest.raises(ValueError, match="'ctrl_cost_weight' belongs to all worlds together: leave indices out"):
+    with pytest.raises(ValueError, match="'ctrl_cost_weight' belongs to all worlds together: omit indices"):
         env.set_attr("ctrl_cost_weight", 1.0, indices=[1])
 
 
@@ -179,5 +179,5 @@ def test_a_step_before_a_reset_and_unknown_options_are_refused(full: StableBasel
     with pytest.raises(RuntimeError, match="there was no reset before this step: call reset"):
         env.step(np.zeros((N, 3), dtype=np.float32))
     env.set_options({"mask": 1})
-    with pytest.raises(ValueError, match="reset has no option 'mask': leave set_options out"):
+    with pytest.raises(ValueError, match="reset has no option 'mask': omit set_options"):
         env.reset()

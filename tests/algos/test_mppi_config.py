@@ -49,7 +49,7 @@ def test_a_setting_out_of_range_is_refused_by_name(name: str, wrong: list[Any], 
 
 
 def test_drawn_models_exclude_the_nominal_one() -> None:
-    with pytest.raises(ValueError, match="models=4 draws model fields, and nominal_model=True does not: leave out one"):
+    with pytest.raises(ValueError, match="models=4 draws model fields, and nominal_model=True does not: omit one"):
         MPPIConfig(models=4, nominal_model=True)
 
 

@@ -63,10 +63,10 @@ def frozen(module: nn.Module) -> nn.Module:
         (Net(lambda mean: mean.double()), r"must give a float32 tensor of .* not a float64 tensor of shape \(4, 2\)"),
         (Net(lambda mean: (mean, None)), r"must give a float32 tensor .* not tuple"),
         (Net(lambda mean: mean / 0.0), "mean actions are not finite"),
-        (Net(lambda mean: mean.detach()), "depend on no parameter: leave out detach"),
+        (Net(lambda mean: mean.detach()), "depend on no parameter: remove detach"),
         (Net(lambda mean: mean + torch.ones(3)), r"fails for observations of shape \(4, 6\) \(RuntimeError: The size"),
         (Net(Once.apply), r"cannot be differentiated twice, which NPG needs .*\): use other layers"),
-        (frozen(Net()), r"no parameter to learn: unfreeze it with policy.requires_grad_\(True\)"),
+        (frozen(Net()), r"no trainable parameter: use policy.requires_grad_\(True\)"),
         (Net().double(), r"fails for observations of shape \(4, 6\) \(RuntimeError: .*dtype"),
         (Unused(), "do not depend on its parameter 'network.spare.weight': use it"),
         (Counting(), "two different mean actions for the same observations"),
@@ -137,7 +137,8 @@ def test_a_policy_with_a_network_of_the_users_own_is_saved_and_filled(tmp_path: 
     loaded = lw.load(run, policy=lw.GaussianPolicy(6, 2, network=Net(), normalize=True))
     assert torch.equal(loaded(obs), policy(obs))
     with pytest.raises(
-        ValueError, match=r"own, test_policy_check.Net: .*lw.GaussianPolicy\(6, 2, network=..., normalize=True\)\)$"
+        ValueError,
+        match=r"custom class, test_policy_check.Net: .*lw.GaussianPolicy\(6, 2, network=..., normalize=True\)\)$",
     ):
         lw.load(run)
     with pytest.raises(
@@ -153,7 +154,7 @@ def test_a_policy_of_the_users_own_class_is_not_loaded_as_another(tmp_path: Path
 
     run = Run.create(tmp_path / "run", {})
     run.save(policy_content(0, policy := Bounded(6, 2, (4,))), {})
-    with pytest.raises(ValueError, match="of a class of its own, .*Bounded"):
+    with pytest.raises(ValueError, match="has a custom class, .*Bounded"):
         lw.load(run)
     obs = torch.randn(3, 6)
     assert torch.equal(lw.load(run, policy=Bounded(6, 2, (4,)))(obs), policy(obs))

@@ -6,6 +6,7 @@ import tyro
 
 from lyceum_warp.cli.arguments import (
     NO_FLAGS,
+    EnvFlags,
     Physics,
     Placement,
     Repeated,
@@ -14,8 +15,7 @@ from lyceum_warp.cli.arguments import (
     parameter,
     parameters,
 )
-from lyceum_warp.cli.evaluate import OtherEnv
-from lyceum_warp.cli.train import EnvFlags, Train
+from lyceum_warp.cli.train import Train
 from lyceum_warp.options import OPTIONS, EnvOptions, PhysicsOptions
 
 
@@ -75,10 +75,10 @@ def test_every_option_of_the_physics_has_a_flag() -> None:
 
 def test_every_option_of_an_environment_is_a_flag_or_left_to_the_commands() -> None:
     names = {field.name for field in dataclasses.fields(EnvOptions)}
-    for flags, others in ((EnvFlags, set()), (OtherEnv, set()), (Placement, {"horizon"})):
+    for flags, others in ((EnvFlags, set()), (Placement, {"horizon"})):
         assert {field.name for field in dataclasses.fields(flags)} == names - {*NO_FLAGS} - others
     assert vars(Placement()) == {"engine": "auto", "device": "cpu", "nthread": None}
-    assert given(OtherEnv()) == given(EnvFlags()) == {}
+    assert given(EnvFlags()) == {}
 
 
 @pytest.mark.parametrize("name", [*OPTIONS])

@@ -111,11 +111,11 @@ def test_resume_refuses_other_settings(trained: Path, tmp_path: Path, capsys: py
     before = {path: path.read_bytes() for path in trained.iterdir()}
     for options, words in [
         (["--iterations", "4"], ["already has 4 iterations", "--iterations 8"]),
-        (["--iterations", "9", "--gamma", "0.9"], ["has gamma 0.995, not 0.9", "begin a new run in another folder"]),
+        (["--iterations", "9", "--gamma", "0.9"], ["has gamma 0.995, not 0.9", "start a new run in another folder"]),
         (["--iterations", "9", "--nworld", "4"], ["has nworld 2, not 4"]),
         (["--iterations", "9", "--param", "success_distance=1"], ["has success_distance None, not 1"]),
         (["--iterations", "9", "--num-steps", "4"], ["--num-steps is a setting of ppo, not of npg"]),
-        (["--iterations", "9", "--seed", "0"], ["--seed has no effect with --resume", "leave it out"]),
+        (["--iterations", "9", "--seed", "0"], ["--seed has no effect with --resume", "omit it"]),
         (["--iterations", "9", "--algorithm", "npg"], ["--algorithm has no effect with --resume"]),
         (["--iterations", "9", "--out", str(tmp_path)], ["--out has no effect with --resume"]),
         (["--iterations", "9", "point_mass"], ["TASK has no effect with --resume"]),
@@ -181,18 +181,6 @@ def changed_config(trained: Path, folder: Path, change: Any) -> list[str]:
     return ["train", "--resume", str(folder), "--iterations", "5", *QUIET]
 
 
-def test_a_run_without_saved_physics_has_that_of_the_model(
-    trained: Path, tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]
-) -> None:
-    resume = changed_config(trained, tmp_path / "run", lambda config: config.pop("physics"))
-    assert cli.main([*resume, "--integrator", "rk4"]) == 2
-    refused(capsys, "has integrator None, not rk4")
-    made_envs.clear()
-    assert cli.main(resume) == 0
-    assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2"]) == 0
-    assert {physics(env) for env in made_envs} == {physics(lw.make("point_mass"))}
-
-
 def test_a_run_keeps_the_options_of_its_environment(
     tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -212,23 +200,6 @@ def test_a_run_keeps_the_options_of_its_environment(
     refused(capsys, "has horizon 32, not 16")
 
 
-def test_a_run_with_options_among_its_parameters_resumes_and_is_evaluated(
-    trained: Path, tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Earlier releases accepted options as --param."""
-    saved = {"frame_skip": 5, "horizon": 256, "nthread": 1, "graphs": False}
-    resume = changed_config(trained, tmp_path / "run", lambda config: config["params"].update(saved))
-    assert cli.main([*resume, "--horizon", "9"]) == 2
-    refused(capsys, "has horizon 256, not 9")
-    made_envs.clear()
-    assert cli.main(resume) == 0
-    assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2"]) == 0
-    assert made_envs
-    for env in made_envs:
-        assert (env.horizon, env.options.nthread, env.options.graphs) == (256, 1, False)
-        assert env.options.physics.frame_skip == 5
-
-
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_hyperparameter_has_a_flag(algorithm: str) -> None:
     _, config = ALGORITHMS[algorithm]
@@ -242,7 +213,7 @@ def test_a_flag_of_the_other_algorithm_is_refused(capsys: pytest.CaptureFixture[
     for words, message in (
         (
             ["--learning-rate", "3"],
-            "--learning-rate is a setting of ppo, not of npg: leave it out, or give --algorithm",
+            "--learning-rate is a setting of ppo, not of npg: omit it, or give --algorithm",
         ),
         (["--no-stagger"], "--stagger is a setting of ppo, not of npg"),
         (["--algorithm", "ppo", "--samples", "9"], "--samples is a setting of npg, not of ppo"),
@@ -392,24 +363,6 @@ def assert_continues(out: Path, output: str, trained: Path) -> None:
     assert done >= 3 and rows[:3] == metrics(trained)[:3]
     assert cli.main(["train", "--resume", str(out), "--iterations", str(done + 1), *QUIET]) == 0
     assert len(metrics(out)) == done + 1
-
-
-@pytest.mark.long  # the next test and those of plan cover it within this process and from outside
-def test_a_terminated_run_continues(trained: Path, tmp_path: Path) -> None:
-    if os.name == "nt":
-        pytest.skip("signals are POSIX's")
-    out = tmp_path / "run"
-    argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "2000"]
-    program = f"import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"
-    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if "iteration    3/" in line:
-                process.send_signal(signal.SIGTERM)
-                break
-        rest = process.stdout.read()
-    assert process.returncode == 143
-    assert_continues(out, rest, trained)
 
 
 @pytest.mark.parametrize("moment", ["step", "move", "state_dict", "save"])

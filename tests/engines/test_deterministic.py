@@ -56,7 +56,7 @@ def test_scratch_is_reserved_before_graphs_are_captured(monkeypatch: pytest.Monk
     for sizes, message in [
         (ScratchSizes(fixed=10, each=100, most=999), "1000 worlds need buffers of more than .* use nworld=999 at most"),
         (ScratchSizes(fixed=10, each=100, most=1000), ""),
-        (ScratchSizes(fixed=0, each=10 * plain, most=1000), r"^1000 worlds need about .* at most, or leave determ"),
+        (ScratchSizes(fixed=0, each=10 * plain, most=1000), r"^1000 worlds need about .* at most, or omit determ"),
     ]:
         monkeypatch.setattr(ScratchSizes, "probe", lambda capture, sizes=sizes: sizes)
         monkeypatch.setattr(memory, "free_memory", lambda device: 2 * plain * 1000)

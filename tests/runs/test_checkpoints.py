@@ -113,7 +113,7 @@ def test_a_policy_of_any_class_is_saved_without_a_value_function(tmp_path: Path)
     torch.nn.init.constant_(policy.gain, 3.0)
     run.save(policy_content(1, policy), {})
     assert load(run, policy=Mine()).act(torch.ones(2)).tolist() == [3.0, 3.0]
-    with pytest.raises(ValueError, match=r"of a class of its own, test_checkpoints.Mine: .* policy=Mine\(...\)\)$"):
+    with pytest.raises(ValueError, match=r"has a custom class, test_checkpoints.Mine: .* policy=Mine\(...\)\)$"):
         load(run)
     with pytest.raises(ValueError, match="holds no value function"):
         load_value(run)
@@ -132,5 +132,5 @@ def test_a_file_makes_only_modules_of_the_package(name: str, run: Run) -> None:
     content = read_checkpoint(run.policy, parts=("iteration", "policy"))
     content["policy"]["class"] = name
     torch.save(content, run.policy)
-    with pytest.raises(ValueError, match=f"of a class of its own, {name}"):
+    with pytest.raises(ValueError, match=f"has a custom class, {name}"):
         load(run)

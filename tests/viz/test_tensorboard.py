@@ -16,8 +16,6 @@ from lyceum_warp.viz.tensorboard import TensorBoard, tag
 
 pytest.importorskip("tensorboard")
 
-CONFIG = {"task": "point_mass", "seed": 3, "npg": {"gamma": 0.9, "hidden": [8, 8], "value_batch": None}, "params": {}}
-
 
 @pytest.fixture(scope="module")
 def first() -> lw.Iteration:
@@ -42,7 +40,7 @@ def curve(folder: Path, name: str) -> list[tuple[int, float]]:
 
 def test_every_number_of_an_iteration_is_a_curve_in_its_group(first: lw.Iteration, tmp_path: Path) -> None:
     iteration = numbered(first, 1, metrics={"forward": 2.5}, step_metrics={"forward": 0.5})
-    with TensorBoard(tmp_path / "new" / "run", CONFIG) as board:
+    with TensorBoard(tmp_path / "new" / "run") as board:
         board(iteration)
     scalars = read(tmp_path / "new" / "run").Tags()["scalars"]
     assert set(scalars) == {tag(name) for name in iteration.row()}
@@ -59,7 +57,7 @@ def test_every_number_of_an_iteration_is_a_curve_in_its_group(first: lw.Iteratio
 
 
 def test_numbers_that_are_absent_or_not_finite_are_left_out(first: lw.Iteration, tmp_path: Path) -> None:
-    with TensorBoard(tmp_path, CONFIG) as board:
+    with TensorBoard(tmp_path) as board:
         board(numbered(first, 1, return_mean=math.nan, mean_return=None))
         board(numbered(first, 2, return_mean=-3.0))
     assert curve(tmp_path, "return/mean") == [(192, -3.0)]
@@ -67,10 +65,10 @@ def test_numbers_that_are_absent_or_not_finite_are_left_out(first: lw.Iteration,
 
 
 def test_a_resumed_run_replaces_later_points_and_repeats_none(first: lw.Iteration, tmp_path: Path) -> None:
-    with TensorBoard(tmp_path, CONFIG) as board:
+    with TensorBoard(tmp_path) as board:
         for i in (1, 2, 3, 4):
             board(numbered(first, i))
-    with TensorBoard(tmp_path, CONFIG) as board:  # the checkpoint was of iteration 2
+    with TensorBoard(tmp_path) as board:  # the checkpoint was of iteration 2
         for i in (3, 4, 5):
             board(numbered(first, i, return_mean=100.0))
     assert curve(tmp_path, "policy/kl") == [(96 * i, 0.01 * i) for i in (1, 2, 3, 4, 5)]
@@ -78,33 +76,16 @@ def test_a_resumed_run_replaces_later_points_and_repeats_none(first: lw.Iteratio
 
 
 def test_points_are_in_the_file_before_it_is_closed(first: lw.Iteration, tmp_path: Path) -> None:
-    board = TensorBoard(tmp_path, CONFIG)
+    board = TensorBoard(tmp_path)
     board(numbered(first, 1))
     assert curve(tmp_path, "policy/kl") == [(96, 0.01)]
     board.close()
 
 
-def test_the_tab_of_hyperparameters_has_them_once_with_the_curves_to_compare(first, tmp_path: Path) -> None:
-    from tensorboard.plugins.hparams import metadata
-
-    for i in (1, 2):  # the second time as a resumed run
-        with TensorBoard(tmp_path, CONFIG) as board:
-            board(numbered(first, i))
-    content = read(tmp_path).PluginTagToContent(metadata.PLUGIN_NAME)
-    values = metadata.parse_session_start_info_plugin_data(content[metadata.SESSION_START_INFO_TAG]).hparams
-    assert dict(values) and values["gamma"].number_value == 0.9 and values["seed"].number_value == 3
-    assert (values["task"].string_value, values["hidden"].string_value) == ("point_mass", "[8, 8]")
-    assert "value_batch" not in values
-    experiment = metadata.parse_experiment_plugin_data(content[metadata.EXPERIMENT_TAG])
-    compared = {info.name.tag for info in experiment.metric_infos}
-    assert {"return/mean", "mean_policy/return"} <= compared <= set(read(tmp_path).Tags()["scalars"])
-    assert "config" in read(tmp_path).Tags()["tensors"]
-
-
 def test_a_full_disk_is_an_error_of_the_call(first: lw.Iteration, tmp_path: Path) -> None:
     resource = pytest.importorskip("resource")
     before, limits = signal.signal(signal.SIGXFSZ, signal.SIG_IGN), resource.getrlimit(resource.RLIMIT_FSIZE)
-    board = TensorBoard(tmp_path, CONFIG)
+    board = TensorBoard(tmp_path)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
         with pytest.raises(OSError, match="File too large"):
@@ -120,7 +101,7 @@ def test_a_full_disk_is_an_error_of_the_call(first: lw.Iteration, tmp_path: Path
 def test_a_missing_package_is_one_line_with_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"need the package tensorboard: pip install 'lyceum-warp\[tensorboard\]'$"):
-        TensorBoard(tmp_path / "run", CONFIG)
+        TensorBoard(tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 

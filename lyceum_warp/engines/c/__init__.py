@@ -1,1 +1,1 @@
-"""The C engine: MuJoCo itself, many worlds on a pool of threads."""
+"""Run the C engine: MuJoCo itself, with many worlds on a thread pool."""

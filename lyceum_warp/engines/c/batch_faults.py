@@ -1,4 +1,4 @@
-"""Count errors that MuJoCo raises in single worlds of a batch."""
+"""Count errors that MuJoCo raises in individual worlds of a batch."""
 
 import logging
 
@@ -8,14 +8,14 @@ from mujoco.batch import Batch, SimulationError
 log = logging.getLogger(__name__)
 
 _COUNTED_AS = mujoco.mjtWarning.mjWARN_INERTIA.value
-"""The type of warning as which errors are counted."""
+"""Errors are counted as this type of warning."""
 
 
 class ErrorsAsWarnings:
-    """Context that counts errors of single worlds as warnings, which ``find_faults`` reads, instead of raising them.
+    """Context that counts errors of individual worlds as warnings, for ``find_faults``, instead of raising them.
 
-    After an error MuJoCo restores the world's state from before the call, and finishes the other worlds. All steps
-    enter the same instance: a class takes a quarter of the time of a generator.
+    After an error MuJoCo restores the world's state from before the call, and finishes the other worlds. This is a
+    class, and all steps share one instance, because entering a generator-based context takes four times as long.
 
     Args:
         batch: The worlds.

@@ -1,4 +1,4 @@
-"""Step worlds by MuJoCo itself on a pool of threads (mujoco.batch), float64 inside: the C engine."""
+"""Step worlds by MuJoCo itself on a thread pool (mujoco.batch), in float64: the C engine."""
 
 import copy
 from collections.abc import Collection, Iterable, Mapping
@@ -42,17 +42,17 @@ from lyceum_warp.support.mujoco_log import quiet
 from lyceum_warp.support.validate import whole_number
 
 _BATCH_BYTES = 150
-"""Bytes that ``Batch`` keeps for each world beside its state: warnings, a status, the message of an error."""
+"""Bytes that ``Batch`` stores per world besides the state: warnings, a status, an error message."""
 
 _MOST_MASKS = 16
-"""Masks whose views are kept; an environment has fewer."""
+"""Maximum number of cached mask views; an environment has fewer masks."""
 
 
 class MujocoEngine(Engine):
     """Worlds as rows of float64 state in ``mujoco.batch.Batch``, with float32 copies of the fields.
 
     Args:
-        model, nworld, fields, dynamics: As for ``Engine``.
+        model, nworld, fields, dynamics: See ``Engine``.
         device: Must be the CPU.
         initial: The state that ``reset`` puts worlds into, rounded to float32; None for the model's own.
         nthread: Threads of the pool; 0 for all cores.
@@ -82,15 +82,15 @@ class MujocoEngine(Engine):
         super().__init__(model, nworld, device, fields, dynamics, initial)
         quiet()
         self.nthread = whole_number("nthread", nthread, low=0)
-        # launches that a subclass adds may be for all worlds, which every thread would repeat
+        # a subclass may add launches over all worlds, which every thread would repeat
         self.launch_threads = (self.nthread or cpu_cores()) if type(self) is MujocoEngine else 1
         self.native_model = copy.copy(model)
-        """The model as the batch runs it."""
-        # a world with a fault must be reported, not silently reset in the middle of a step
+        """The model that the batch runs."""
+        # a world with a fault must be reported, not silently reset within a step
         self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        # Not persistent: a step could then reuse the stages computed after the last one, but an MjData for every world
-        # does not fit into the CPU's caches. The six tasks that need such stages became slower by 4 to 33 % (128 and
-        # 1,024 worlds on two cores).
+        # The batch is not persistent. A persistent one could reuse the stages computed after the last step, but one
+        # MjData per world does not fit into the CPU's caches: the six tasks that need such stages became 4 to 33 %
+        # slower (128 and 1,024 worlds on two cores).
         self.batch = Batch(self.native_model, nworld, self.nthread)
         self._errors_as_warnings = ErrorsAsWarnings(self.batch)
         self._rows = self._alias(self.batch.state)
@@ -107,16 +107,16 @@ class MujocoEngine(Engine):
         computed = [field for field in self._derived if field.refresh > Stage.NONE]
         positions = all(DERIVED_FIELDS.get(field.name) == Stage.POSITION for field in computed)
         self._apart = bool(computed) and (positions or any(field.lagged for field in kept))
-        """Whether the stage after the substeps is a separate call."""
-        shown = [field for field in kept if field.name != "ctrl"]  # which is an input
+        """Whether the stage after the substeps needs a separate call."""
+        shown = [field for field in kept if field.name != "ctrl"]  # an input
         late = [field for field in shown if field not in computed or field.snapshot] if self._apart else []
         self._before_stage = [field for field in late if field.name not in STATE_FIELDS]
-        """Fields to copy before that call, which may use the MjData of another world."""
+        """Fields to copy before that call, because it may run in an MjData that another world used."""
         self._after_stage = [field for field in self._before_stage if field in computed]
-        """Fields of which the call computes a part: sensors up to its stage."""
+        """Fields that the call computes in part: sensors up to its stage."""
         self._last = [field for field in shown if field not in self._before_stage]
-        """Fields to copy at the end of a step, by launches."""
-        # positions do not depend on contacts, whose search takes most of their stage
+        """Fields to copy at the end of a step, by kernel launches."""
+        # positions do not depend on contacts, and collision detection takes most of the position stage
         without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if positions and computed else 0
         self._disabled = self.batch.expand("opt.disableflags") if without else np.zeros(0, dtype=int)
         self._step_flags, self._stage_flags = self._disabled.copy(), self._disabled | without
@@ -134,7 +134,7 @@ class MujocoEngine(Engine):
         self._models.apply(self._values)
 
     def _on_host(self, mask: wp.array) -> np.ndarray:
-        """A mask's memory as a NumPy array. The view is kept, because making it takes longer than reading it."""
+        """A mask's memory as a NumPy array. The view is cached, because making it takes longer than reading it."""
         if (kept := self._masks.get(id(mask))) is not None:  # the dict keeps the mask alive, so the id stays unique
             return kept[1]
         view: np.ndarray = mask.numpy()
@@ -146,7 +146,7 @@ class MujocoEngine(Engine):
         return wp.array(rows, dtype=wp.float64, device=self.device, copy=False)
 
     def _rounded_initial(self) -> wp.array:
-        """The initial state as float32 fields show it, whichever of them are kept."""
+        """The initial state rounded to float32, as the fields would hold it."""
         initial = self.initial.copy()
         for name in STATE_FIELDS:
             if name in READ_ONLY:
@@ -156,7 +156,7 @@ class MujocoEngine(Engine):
         return wp.array(initial, dtype=wp.float64, device=self.device)
 
     def _bind(self, field: Field) -> None:
-        """Make a field's float32 array, and find the float64 array that it copies."""
+        """Allocate a field's float32 array, and find the float64 array that it mirrors."""
         array = wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
         self.arrays[field.name] = array
         if field.name in STATE_FIELDS:
@@ -222,9 +222,9 @@ class MujocoEngine(Engine):
         """Copy fields of the masked worlds from the engine's float64 arrays into their float32 arrays.
 
         Args:
-            fields: Which fields.
-            mask: Which worlds; None for all.
-            early: Whether to leave out sensors of the acceleration stage.
+            fields: The fields to copy.
+            mask: Mask of the worlds; None for all.
+            early: Whether to skip sensors of the acceleration stage.
         """
         with np.errstate(over="ignore"):  # a world with a fault may hold numbers beyond float32
             for field in fields:
@@ -287,7 +287,7 @@ class MujocoEngine(Engine):
         self._read(self._state_fields, mask)
 
     def _read(self, fields: Iterable[Field], mask: wp.array) -> None:
-        """Round the engine's values of fields into their arrays, in the masked worlds, by launches."""
+        """Copy the masked worlds' field values from the engine into the float32 arrays, by kernel launches."""
         numbers = []
         for field in fields:
             array, source = self.arrays[field.name], self._sources[field.name]

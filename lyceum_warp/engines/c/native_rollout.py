@@ -1,4 +1,4 @@
-"""Roll out the whole horizon of every world in one native call of the C engine."""
+"""Roll out the whole horizon of every world in one native call."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -14,11 +14,11 @@ from lyceum_warp.model_fields import ModelField
 
 
 def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
-    """Whether ``Batch.rollout`` returns the same values as a call of ``Batch.step`` for each step.
+    """Whether ``Batch.rollout`` returns the same values as one call of ``Batch.step`` per step.
 
     A row holds values as ``mj_step`` leaves them. Its state is the new one, but quantities of the position and velocity
-    stages belong to the state before the last substep; the next row has the values of the new state. With RK4 they
-    belong to an intermediate stage instead. Sensor data mix the stages and are not exact either.
+    stages belong to the state before the last substep; those of the new state are in the next row. With RK4 they belong
+    to an intermediate stage instead. Sensor data mix the stages, so they are not exact either.
     """
     current = [field for field in fields if field.refresh > Stage.NONE]
     if any(field.snapshot for field in current):
@@ -27,10 +27,10 @@ def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
 
 
 class NativeRollout:
-    """Rolls out the worlds of a batch, which then hold the last states.
+    """Rolls out the worlds of a batch, which then hold the final states.
 
     Args:
-        batch: The worlds, without bound fields.
+        batch: The worlds; no fields may be bound.
         steps: Steps of the horizon.
         nstep: Substeps in a step.
         fields: The fields to copy into buffers.
@@ -56,7 +56,7 @@ class NativeRollout:
         self.fields = [field for field in fields if field.size]
         self.stage = max((field.refresh for field in self.fields), default=Stage.NONE)
         self.start: dict[str, slice] = {}
-        """Columns of the state vector with a field's value at the start."""
+        """Columns of the state vector that hold a field's initial value."""
         self.final: dict[str, np.ndarray] = {}
         """Values at the end of the rollout, for fields that a forward pass must compute."""
         self.rows: dict[Any, np.ndarray] = {}
@@ -85,14 +85,14 @@ class NativeRollout:
         self._outputs: dict[str, Any] = {"record": list(self.rows), "out": self.rows}
 
     def run(self, *given: Any) -> None:
-        """Roll out, and copy the fields; ``batch.state`` and ``batch.warning`` then hold the end and all warnings.
+        """Roll out and copy the fields; leave final states in ``batch.state`` and warnings in ``batch.warning``.
 
         Args:
             given: The state, the controls and the buffers of ``Engine.rollout``.
         """
         if self._given is None or any(a is not b for a, b in zip(given, self._given, strict=True)):
             self._given, (start, held, arrays) = given, given
-            # making views of Warp's arrays takes longer than filling them
+            # making views of Warp arrays takes longer than filling them
             self._views = start.numpy(), held.numpy(), {name: buffer.numpy() for name, buffer in arrays.items()}
         state, controls, buffers = self._views
         batch = self.batch
@@ -101,7 +101,7 @@ class NativeRollout:
         if self.model_columns:
             self.models.apply({name: state[:, part].astype(np.float32) for name, part in self.model_columns.items()})
         np.copyto(self.by_step, controls.transpose(1, 0, 2)[:, :, None])
-        # a world with a warning stops and repeats its last row: only the warning reveals this
+        # a world with a warning stops and repeats its last row; only the warning shows this
         with ErrorsAsWarnings(batch):
             batch.rollout(nstep=self.control.shape[1], control=self.control, **self._outputs)
         if self.stage > Stage.NONE:
@@ -115,7 +115,7 @@ class NativeRollout:
         key = STATE_FIELDS[field.name].value if field.name in STATE_FIELDS else field.name
         rows, nstep = self.rows[key], self.nstep
         if field.name in self.final:
-            # the row of a step's first substep holds values of the state before the step
+            # the row of a step's first substep holds values from before the step
             values, end = rows[:, ::nstep], self.final[field.name]
             np.copyto(target[:-1], values.swapaxes(0, 1).reshape(target[:-1].shape), "unsafe")
             np.copyto(target[-1], end.reshape(target[-1].shape), "unsafe")

@@ -1,4 +1,4 @@
-"""Write model fields that differ between worlds into a batch."""
+"""Write model fields that differ between worlds into a batch, and recompute derived constants."""
 
 from collections.abc import Iterable, Mapping
 
@@ -11,10 +11,10 @@ from lyceum_warp.model_fields import ModelField
 
 
 class WorldModels:
-    """Writes values of model fields into a batch, and recomputes the constants that follow from them.
+    """Writes values of model fields into a batch, and recomputes the constants derived from them.
 
-    The batch depends only on the float32 values: a value that equals the model's rounded value becomes the model's
-    float64 value, and all others are written unchanged.
+    Only the float32 values matter: a value equal to the model's rounded value becomes the model's float64 value, and
+    all others are written unchanged.
 
     Args:
         batch: The worlds.
@@ -36,7 +36,7 @@ class WorldModels:
             self._rounded[field.name] = self._own[field.name].astype(np.float32)
             if field.name in self._follows:
                 self._applied[field.name] = self._rows[field.name].astype(np.float32)
-        # also constants of the model's own values come from set_const, not from the compiler
+        # even with the model's own values, constants come from set_const, not from the compiler
         self._stale = np.full(batch.nsim, bool(self._follows))
 
     def apply(self, values: Mapping[str, np.ndarray], mask: np.ndarray | None = None) -> None:
@@ -44,9 +44,9 @@ class WorldModels:
 
         Args:
             values: By name, (nworld, size) float32.
-            mask: Which worlds; None for all.
+            mask: Mask of the worlds; None for all.
         """
-        if mask is not None and 1 not in mask.tobytes():  # as in most steps; faster than mask.any()
+        if mask is not None and 1 not in mask.tobytes():  # the usual case; faster than mask.any()
             return
         worlds = np.arange(self.batch.nsim) if mask is None else np.flatnonzero(mask)
         derive = self._stale[worlds]
@@ -55,7 +55,7 @@ class WorldModels:
             rows[worlds] = np.where(given == self._rounded[name], own, given)
             if name in self._follows:
                 applied = self._applied[name]
-                # bits, so that NaN equals itself
+                # compare bits, so that NaN equals itself
                 derive = derive | (given.view(np.int32) != applied[worlds].view(np.int32)).any(axis=1)
                 applied[worlds] = given
         if derive.any():
@@ -64,7 +64,7 @@ class WorldModels:
             self._set_const(chosen)
 
     def _set_const(self, worlds: np.ndarray) -> None:
-        """Recompute constants; a world whose values MuJoCo refuses gets a warning, and is tried again next time."""
+        """Recompute constants; a world whose values MuJoCo rejects gets a warning, and is retried next time."""
         counted = self.batch.warning[:, :, 1].sum(axis=1)
         with ErrorsAsWarnings(self.batch):
             self.batch.set_const(worlds)
@@ -72,11 +72,11 @@ class WorldModels:
 
 
 def bytes_per_world(model: mujoco.MjModel, fields: Iterable[ModelField]) -> int:
-    """Bytes that a batch and ``WorldModels`` take for each world."""
+    """Bytes of a batch's model fields and of ``WorldModels`` per world."""
     fields = list(fields)
     batch = Batch(model, 1, 1)
     models = WorldModels(batch, fields)
     moved = {field.name: 1.001 * field.value(model).reshape(1, -1).astype(np.float32) for field in models.fields}
-    models.apply(moved)  # only constants that differ take memory
+    models.apply(moved)  # only constants that differ are allocated
     expanded = [rows for name in MODEL_FIELDS if (rows := batch.expanded(name)) is not None]
     return sum(rows.nbytes for rows in expanded) + 4 * sum(field.size for field in fields)

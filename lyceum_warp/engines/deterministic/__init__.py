@@ -1,1 +1,1 @@
-"""The deterministic mode of the Warp engine on CUDA devices."""
+"""Make the Warp engine deterministic on CUDA devices."""

@@ -1,4 +1,4 @@
-"""Sort contacts and constraint rows, whose order MuJoCo Warp 4.0 does not fix on a GPU; see ``order_kernels``."""
+"""Sort contacts and constraint rows, whose order varies between runs of MuJoCo Warp 4.0 on a GPU."""
 
 import dataclasses
 from collections.abc import Callable
@@ -13,15 +13,16 @@ _LANES = 8
 
 
 class CanonicalOrder:
-    """Sorts the contacts and constraint rows of a data within every forward pass, through MuJoCo Warp's callbacks.
+    """Sorts a Data's contacts and constraint rows in every forward pass, through MuJoCo Warp's callbacks.
 
-    MuJoCo Warp's own deterministic mode makes sums of atomic additions repeatable, but does not sort contacts and rows.
-    Its callbacks run after the collisions, and between the making and the solving of constraints.
+    MuJoCo Warp's own deterministic mode makes sums of atomic additions reproducible, but does not sort contacts and
+    rows. Its callbacks run after collision detection, and after constraints are made but before they are solved. For
+    the order see ``order_kernels``.
 
     Args:
         model: MuJoCo Warp's model, whose callbacks are set.
         data: MuJoCo Warp's data.
-        between: Called at the beginning of both callbacks.
+        between: Called at the start of both callbacks.
 
     Raises:
         ValueError: The model has flexes, or MuJoCo Warp's contacts have a field that is not sorted.
@@ -57,7 +58,7 @@ class CanonicalOrder:
         model.callback.passive = self.sort_rows
 
     def sort_contacts(self, model: mjw.Model, data: mjw.Data) -> None:
-        """Sort the contacts; called after the collisions."""
+        """Sort the contacts; called after collision detection."""
         self._between()
         n, count = data.naconmax, data.nacon
         wp.launch(order.contact_keys, n, [count, self._contacts, n, self._key, self._place])
@@ -82,7 +83,7 @@ class CanonicalOrder:
 
 
 def _words(array: wp.array) -> wp.array:
-    """The same memory as words of 32 bits, (naconmax, words)."""
+    """The same memory as 32-bit words, (naconmax, words)."""
     rows = array.shape[0] if array.ndim else 0
     size = array.size * wp.types.type_size_in_bytes(array.dtype) // 4
     if not rows or not size:

@@ -1,4 +1,4 @@
-"""Step worlds by MuJoCo Warp with numbers that repeat to the bit on a CUDA device."""
+"""Step worlds by MuJoCo Warp with results that are reproducible bit for bit on a CUDA device."""
 
 import contextlib
 import inspect
@@ -23,17 +23,17 @@ _TIMES_THE_MEMORY = 5
 hopper (measured). ``prepare_capture`` measures it for the actual model."""
 
 _FEW = 256
-"""Below this number of worlds scratch memory is allocated on demand: it fits on any device."""
+"""Below this number of worlds, scratch memory fits on any device and is allocated on demand."""
 
 
 class DeterministicEngine(WarpEngine):
-    """A Warp engine whose steps repeat to the bit on a CUDA device; on the CPU every engine's do.
+    """A Warp engine whose steps are reproducible bit for bit on a CUDA device, as every engine's are on the CPU.
 
-    It sorts contacts and constraint rows, makes MuJoCo Warp sum in a fixed order, and shares the memory for this among
-    all launches. It takes the arguments of ``WarpEngine``.
+    It sorts contacts and constraint rows, makes MuJoCo Warp sum in a fixed order, and shares the scratch memory for
+    this between all launches. It takes the arguments of ``WarpEngine``.
     """
 
-    __signature__ = inspect.signature(WarpEngine)  # placement reads the names of the options from it
+    __signature__ = inspect.signature(WarpEngine)  # placement reads the option names from it
 
     partial_refresh = False
 
@@ -50,9 +50,9 @@ class DeterministicEngine(WarpEngine):
         return _TIMES_THE_MEMORY * super().bytes_per_world(model, fields, dynamics, **options)
 
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
-        """Another model and data with the same options and sizes, for measurements of bare MuJoCo Warp.
+        """Make another Model and Data with the same options and sizes, to benchmark MuJoCo Warp alone.
 
-        Graphs of their steps take about a hundred times the memory, because they share no scratch.
+        Graphs of their steps take about a hundred times the memory, because they do not share scratch memory.
         """
         model, data = super().bare()
         with wp.ScopedDevice(self.device):
@@ -67,7 +67,7 @@ class DeterministicEngine(WarpEngine):
         if self.nworld > sizes.most:
             raise ValueError(
                 f"{self.nworld} worlds need buffers of more than the {LARGEST_BUFFER / 1e9:.3g} GB in which Warp can "
-                f"sort with deterministic=True: use nworld={sizes.most} at most, or leave it out"
+                f"sort with deterministic=True: use nworld={sizes.most} at most, or omit it"
             )
         fields, dynamics = self.fields.values(), self.dynamics.values()
         plain = super().bytes_per_world(self.model, fields, dynamics, nconmax=self.nconmax, njmax=self.njmax)
@@ -75,7 +75,7 @@ class DeterministicEngine(WarpEngine):
         try:
             check_fit(plain + needed, self.nworld, self.device, held=self.nworld * plain)
         except ValueError as error:
-            raise ValueError(f"{error}, or leave deterministic=True out, which takes most of it") from None
+            raise ValueError(f"{error}, or omit deterministic=True, which takes most of it") from None
         self._scratch.add_block(sizes.bytes_of(self.nworld))
 
     def _captured_step(self, nworld: int) -> Scratch:

@@ -1,8 +1,8 @@
-"""Sort contacts and constraint rows into an order that does not depend on the order of threads: kernels.
+"""Sort contacts and constraint rows into an order that does not depend on thread timing: kernels.
 
 MuJoCo Warp assigns indices to contacts and constraint rows by atomic counters. On a GPU, sums over them are therefore
-rounded in another order in each run, and two runs diverge. These kernels sort contacts by (world, geoms, index within
-the pair), and each world's rows by (type, object, index within the constraint).
+rounded differently in each run, and runs diverge. These kernels sort contacts by (world, geoms, index within the pair),
+and each world's rows by (type, object, index within the constraint).
 """
 
 import warp as wp
@@ -13,7 +13,7 @@ _NO_CONTACT = wp.constant(wp.int64(2**63 - 1))
 
 @wp.struct
 class Contacts:
-    """The fields of a contact as words of 32 bits, (naconmax, words)."""
+    """The fields of contacts as 32-bit words, (naconmax, words)."""
 
     dist: wp.array2d[int]
     pos: wp.array2d[int]
@@ -116,7 +116,7 @@ class Rows:
 
 @wp.func
 def _kind(rows: Rows, w: int, r: int):
-    # all contact types are one type here, so that the rows of a contact stay together
+    # all contact types count as one, so that the rows of a contact stay together
     return wp.min(rows.type[w, r], _FIRST_CONTACT)
 
 
@@ -124,7 +124,7 @@ def _kind(rows: Rows, w: int, r: int):
 def _object(rows: Rows, eq_type: wp.array[int], w: int, r: int) -> int:
     i = rows.id[w, r]
     if rows.type[w, r] == _EQUALITY:
-        # MuJoCo Warp needs connects before welds before the other equalities
+        # MuJoCo Warp requires the order: connects, welds, other equalities
         i = i + eq_type[i] * eq_type.shape[0]
     return i
 
@@ -198,7 +198,7 @@ def move_rows(
 
 @wp.kernel(enable_backward=False)
 def move_addresses(ncontact_in: wp.array[int], rank_in: wp.array2d[int], nmax: int, contacts: Contacts):
-    """Write the new indices of rows into their contacts; launched over (naconmax, rows of a contact)."""
+    """Write the new indices of rows into their contacts; launched over (naconmax, rows per contact)."""
     c, i = wp.tid()
     if c < wp.min(ncontact_in[0], nmax):
         row = contacts.efc_address[c, i]

@@ -9,18 +9,18 @@ import warp as wp
 from lyceum_warp.engines.warp.group import Reserve, aligned
 
 LARGEST_BUFFER = 2**31 - 1
-"""Bytes of the largest array of bytes that Warp can make: an axis has fewer than 2**31 elements."""
+"""Bytes of the largest byte array that Warp can make: an axis has fewer than 2**31 elements."""
 
 _PROBED = 1024, 2048
-"""Numbers of worlds to extrapolate from: large enough that no buffer of Warp has its minimum size."""
+"""Numbers of worlds to extrapolate from; large enough that all of Warp's buffers exceed their minimum size."""
 
 
 class Scratch(Reserve):
-    """An allocator that gives the buffers of all launches the same memory.
+    """An allocator that places the buffers of all launches in the same memory.
 
-    In Warp a graph keeps separate buffers for each of its launches, which take about a hundred times the memory of the
-    worlds. But launches run one after another and clear their buffers first, so they can share them. Warp also clears
-    them during a capture: no graph may run then.
+    By default Warp allocates separate buffers for each launch in a graph, about a hundred times the memory of the
+    worlds. But launches run one after another and clear their buffers first, so they can share memory. Warp also clears
+    the buffers during a capture, so no graph may run then.
 
     Args:
         device: A CUDA device.
@@ -30,24 +30,24 @@ class Scratch(Reserve):
         super().__init__(device)
         self._block, self._used, self._now = 0, 0, 0
         self.peak = 0
-        """The most bytes that were allocated between two calls of ``open``."""
+        """The largest number of bytes allocated between two calls of ``open``."""
         self.largest = 0
-        """The most bytes of one allocation."""
+        """The largest single allocation, bytes."""
 
     def open(self) -> None:
-        """Reuse the memory from its start, for the launches that follow."""
+        """Reuse the memory from its start for the following launches."""
         self._block, self._used, self._now = 0, 0, 0
 
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
-        """Serve launches within the context from the reserve while they are captured."""
+        """Within the context, serve captured launches from the reserve."""
         self.open()
         with wp.ScopedAllocator(self.device, self):
             yield
 
     def allocate(self, size_in_bytes: int) -> int:
         """Allocate memory, from a new block once the reserve is used up, and return its address."""
-        # Warp allocates these buffers on a separate stream, outside the capture; all other memory belongs to the graph
+        # Warp allocates these buffers on a separate stream, outside the capture; other memory belongs to the graph
         if not self.device.is_capturing or self.device.stream.is_capturing:
             return int(self.below.allocate(size_in_bytes))
         size = aligned(size_in_bytes)
@@ -63,18 +63,18 @@ class Scratch(Reserve):
 
 @dataclasses.dataclass(frozen=True)
 class ScratchSizes:
-    """Bytes of scratch that worlds need, and the largest number of worlds."""
+    """Scratch bytes needed by a number of worlds, and the largest possible number of worlds."""
 
     fixed: int
-    """Bytes beside those for each world."""
+    """Bytes independent of the number of worlds."""
     each: int
-    """Bytes for each world."""
+    """Bytes per world."""
     most: int
     """The largest number of worlds whose buffers Warp can make."""
 
     @classmethod
     def probe(cls, capture: Callable[[int], Scratch]) -> "ScratchSizes":
-        """Extrapolate from the scratch memory of two numbers of worlds.
+        """Extrapolate from the scratch memory measured for two numbers of worlds.
 
         Args:
             capture: Captures a step of a number of worlds and returns the scratch memory that it used.
@@ -90,6 +90,6 @@ class ScratchSizes:
 
 
 def _line(few: int, more: int) -> tuple[int, int]:
-    """The fixed bytes and the bytes for each world, from the bytes of the two numbers of worlds."""
+    """Fixed bytes and bytes per world, from the bytes for the two probed numbers of worlds."""
     each = -(-(more - few) // (_PROBED[1] - _PROBED[0]))
     return max(0, few - _PROBED[0] * each), each

@@ -1,1 +1,1 @@
-"""The Warp engine: MuJoCo Warp on a CUDA device or on the CPU."""
+"""Run the Warp engine: MuJoCo Warp on a CUDA device or on the CPU."""

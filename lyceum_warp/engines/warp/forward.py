@@ -1,4 +1,4 @@
-"""Compute substeps and forward passes, whole or in parts, of all worlds or of a few."""
+"""Compute substeps and forward passes, whole or in part, for all worlds or a few."""
 
 import functools
 import inspect
@@ -19,25 +19,25 @@ from lyceum_warp.support.arrays import launch_rows
 from lyceum_warp.support.upstream import forward_functions
 
 Part = Callable[[mjw.Model, mjw.Data], None]
-"""A part of a forward pass, in every world of a data."""
+"""A part of a forward pass, for every world of a Data."""
 
 POSITION: tuple[Part, ...] = (mjw.kinematics, mjw.com_pos, mjw.camlight, mjw.flex, mjw.tendon)
-"""The first parts of a substep and of a forward pass, which depend only on positions."""
+"""The first parts of substeps and forward passes; they depend only on positions."""
 
 
 def step(model: mjw.Model, data: mjw.Data, done: Collection[Part] = ()) -> None:
-    """Advance every world of a data by one substep.
+    """Advance every world of a Data by one substep.
 
     Args:
         model: MuJoCo Warp's model.
-        data: Its data.
-        done: Parts of ``POSITION`` that are already computed for the data's state.
+        data: MuJoCo Warp's data.
+        done: Parts of ``POSITION`` that are already computed for the current state.
     """
     _without(frozenset(done))["step"](model, data)
 
 
 def forward(model: mjw.Model, data: mjw.Data) -> None:
-    """Compute everything that follows from the states of all worlds in a data."""
+    """Run a full forward pass for all worlds of a Data."""
     _without(frozenset())["forward"](model, data)
 
 
@@ -49,14 +49,14 @@ def inertia(model: mjw.Model, data: mjw.Data) -> None:
 
 @functools.cache
 def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
-    """MuJoCo Warp's own functions, whose first forward pass leaves out some parts.
+    """MuJoCo Warp's own functions, except that the first forward pass skips the parts in ``done``.
 
-    They are copies with some global names replaced. So a step does everything that MuJoCo Warp's does, and other users
-    of its module are not affected.
+    They are copies with some global names replaced, so a step does everything that MuJoCo Warp's does, and other users
+    of MuJoCo Warp are not affected.
 
-    ``mjw.make_constraint`` reads the velocities of bodies for connect and weld constraints, but MuJoCo Warp computes
-    them only later: it reads values of the last forward pass, from another state or, after a fault, not-a-number. Here
-    ``com_vel`` follows the positions, in every stage of a Runge-Kutta step.
+    For connect and weld constraints, ``mjw.make_constraint`` reads body velocities before MuJoCo Warp has computed
+    them: it reads stale values of the last forward pass or, after a fault, NaN. Here ``com_vel`` runs right after the
+    positions, in every stage of a Runge-Kutta step.
     """
     own_smooth = vars(forward_functions()["smooth"])
     smooth = types.SimpleNamespace(**own_smooth | {part.__name__: _nothing for part in done})
@@ -76,7 +76,7 @@ def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
 
 
 def _copy(function: str, **names: Any) -> Callable[..., Any]:
-    """A copy of a function of MuJoCo Warp with some of its global names replaced."""
+    """Copy a MuJoCo Warp function with some of its global names replaced."""
     inner: Any = inspect.unwrap(forward_functions()[function])
     if unknown := names.keys() - set(inner.__code__.co_names):
         raise ImportError(f"{function} of this mujoco_warp uses no {min(unknown)}: use mujoco-warp 4.0")
@@ -84,7 +84,7 @@ def _copy(function: str, **names: Any) -> Callable[..., Any]:
 
 
 def _nothing(model: mjw.Model, data: mjw.Data) -> None:
-    """No-op, in place of a part that is already computed."""
+    """No-op that replaces a part that is already computed."""
 
 
 _NEEDS: dict[Part, tuple[Part, ...]] = {
@@ -99,7 +99,7 @@ _NEEDS: dict[Part, tuple[Part, ...]] = {
     mjw.fwd_velocity: (mjw.com_pos, mjw.flex, mjw.tendon, mjw.transmission),
     mjw.subtree_vel: (mjw.com_vel,),
 }
-"""The parts without collisions and constraints, in order, and the parts that each needs; ``fwd_velocity`` includes
+"""All parts except collisions and constraints, in order, each with the parts that it needs; ``fwd_velocity`` includes
 ``com_vel``."""
 
 _FIELDS: dict[Part, str] = {
@@ -132,7 +132,8 @@ _SENSORS: dict[str, tuple[Part, ...]] = {
     "VELOCIMETER GYRO FRAMELINVEL FRAMEANGVEL SUBTREELINVEL SUBTREEANGMOM": (mjw.com_vel,),
     "TENDONVEL ACTUATORVEL": (mjw.fwd_velocity,),
 }
-"""The parts that sensors of the position and velocity stages need, by type; all other types need a forward pass."""
+"""The parts that sensors of the position and velocity stages need, by type; all other types need a full forward
+pass."""
 
 _PARTS_OF_SENSOR = {
     int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}")): parts
@@ -176,7 +177,7 @@ def forward_parts(model: mujoco.MjModel, names: Collection[str]) -> tuple[Part, 
 
 
 def _parts_of_sensors(model: mujoco.MjModel) -> set[Part] | None:
-    """The parts that the sensors of the position and velocity stages need, or None."""
+    """The parts that the model's sensors of the position and velocity stages need; None for a full forward pass."""
     wanted: set[Part] = set()
     camera = int(mujoco.mjtObj.mjOBJ_CAMERA)
     for i in range(model.nsensor):
@@ -192,13 +193,13 @@ def _parts_of_sensors(model: mujoco.MjModel) -> set[Part] | None:
 
 
 def _last_stage(model: mujoco.MjModel) -> Stage:
-    """The last stage before the acceleration that a sensor belongs to."""
+    """The last stage, position or velocity, that any sensor belongs to."""
     stages = [int(stage) for stage in model.sensor_needstage if stage < Stage.ACCELERATION]
     return Stage(max(stages, default=0))
 
 
 def _touching(model: mujoco.MjModel) -> bool:
-    """Whether contacts affect actuators or passive forces, as adhesion and passive contacts of a flex do."""
+    """Whether contacts affect actuators or passive forces, as with adhesion and a flex's passive contacts."""
     by_body = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()
     return bool(by_body or model.flg_adhesion or model.flex_passive.any())
 
@@ -207,17 +208,17 @@ _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
 class PartialForward:
-    """Computes fields of the masked worlds in a small group of scratch worlds, and copies them back.
+    """Computes the masked worlds' fields in a small group of scratch worlds, and copies them back.
 
-    A forward pass of all worlds costs as much as a substep, and few worlds restart in a step. So the masked worlds'
-    states are copied into the group, in as many turns as needed.
+    A forward pass of all worlds costs as much as a substep, but few worlds restart in a step. So the masked worlds'
+    states are copied into the group, in as many turns as necessary.
 
     Args:
         rows: MuJoCo Warp's model for the group.
         data: MuJoCo Warp's data of all worlds.
         group: MuJoCo Warp's data of the group.
         states: A buffer for the integration states of all worlds, (nworld, integration size), float32.
-        static: Geoms whose poses a forward pass does not compute.
+        static: Geoms whose poses the forward pass does not compute.
     """
 
     def __init__(self, rows: ModelRows, data: mjw.Data, group: mjw.Data, states: wp.array, static: StaticGeoms) -> None:
@@ -232,12 +233,12 @@ class PartialForward:
     def __call__(
         self, mask: wp.array, forward: Callable[[mjw.Model, mjw.Data], None], targets: Mapping[str, wp.array]
     ) -> None:
-        """Compute fields of the masked worlds; made of launches.
+        """Compute the masked worlds' fields; consists of launches.
 
         Args:
-            mask: Which worlds, (nworld,) bool.
-            forward: Computes the fields of a data.
-            targets: Where the fields go, (nworld, ...), by their names in MuJoCo Warp's data.
+            mask: The worlds, (nworld,) bool.
+            forward: Computes the fields of a Data.
+            targets: Destinations of the fields, (nworld, ...), by their names in MuJoCo Warp's Data.
         """
         group = self._group
 
@@ -251,7 +252,7 @@ class PartialForward:
             self._run(mask, work)
 
     def settle(self, mask: wp.array, nstep: int) -> None:
-        """Advance the masked worlds' states by some substeps, and set their time to 0; made of launches."""
+        """Advance the masked worlds' states by ``nstep`` substeps, and set their time to 0; consists of launches."""
 
         def work() -> None:
             for _ in range(nstep):
@@ -261,11 +262,11 @@ class PartialForward:
 
         with wp.ScopedDevice(self._device):
             self._run(mask, work)
-            launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # time is the first number of a state
+            launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # time is a state's first column
             mjw.set_state(self._rows.whole, self._data, self._states, _SPEC, mask)
 
     def _run(self, mask: wp.array, work: Callable[[], None]) -> None:
-        """Do some work with the group in the models and states of the masked worlds, in turns."""
+        """Call ``work`` for each group of masked worlds, with their states and model fields copied into the group."""
         model, group = self._rows.model, self._group
 
         def turn() -> None:

@@ -1,4 +1,4 @@
-"""Process masked worlds in a small group, in turns, and reserve memory for launches within graphs."""
+"""Process masked worlds one group at a time, and reserve memory for launches within graphs."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -14,7 +14,7 @@ _ALIGNED = 512
 class Reserve:
     """Blocks of memory that live as long as this object, because graphs hold their addresses.
 
-    Subclasses add ``allocate``, and so become allocators of Warp.
+    Subclasses implement ``allocate`` and can then serve as Warp allocators.
 
     Args:
         device: The device.
@@ -23,7 +23,7 @@ class Reserve:
     def __init__(self, device: wp.Device) -> None:
         self.device = device
         self.below = device.get_allocator()
-        """The device's allocator, for the blocks and for all memory that is not reserved."""
+        """The device's own allocator, for the blocks and for memory that is not reserved."""
         self.blocks: list[wp.array] = []
 
     def add_block(self, size: int) -> None:
@@ -44,21 +44,21 @@ def aligned(size: int) -> int:
 
 
 def group_size(nworld: int, device: wp.Device) -> int:
-    """Worlds in a group: more than usually restart in one step, and few enough for a cheap forward pass."""
+    """Number of worlds in a group: more than usually restart in a step, but few enough for a cheap forward pass."""
     return min(nworld, max(1 if device.is_cpu else 64, nworld // 16))
 
 
 class Turns:
-    """Copies the masked worlds into a group and back, one group at a time; made of launches.
+    """Copies the masked worlds into a group and back, one group at a time; consists of launches.
 
-    Without masked worlds there is no turn.
+    If the mask is empty, there is no turn.
 
     Args:
         nworld: Number of worlds.
-        size: Places in the group.
+        size: Number of worlds in the group.
         device: Where they live.
-        loop: Whether turns are taken in a loop. If not, the group must have a place for every world, and there is one
-            turn for any mask. Deterministic launches need this, because they cannot allocate within a loop of a graph.
+        loop: Whether turns run in a loop. If False, the group must have room for every world, and there is exactly one
+            turn for any mask. Deterministic launches require False, because they cannot allocate within a graph's loop.
     """
 
     def __init__(self, nworld: int, size: int, device: wp.Device, *, loop: bool = True) -> None:
@@ -69,7 +69,7 @@ class Turns:
         self._memory = Arena(device)
 
     def run(self, mask: wp.array, turn: Callable[[], None]) -> None:
-        """Call ``turn`` for each group; it may use ``take`` and ``give``."""
+        """Call ``turn`` for each group; it may call ``take`` and ``give``."""
         with wp.ScopedDevice(self.device):
             self._count.zero_()
             self._first.zero_()
@@ -101,15 +101,15 @@ class Turns:
             wp.launch(kernels.return_rows, rows.shape, [self._world, self._left, rows, flat(target)])
 
     def give_bits(self, source: wp.array, target: wp.array) -> None:
-        """Add the group's bits, (size,), to the bits of its worlds, (nworld,)."""
+        """Combine (bitwise or) the group's bits, (size,), into the bits of its worlds, (nworld,)."""
         wp.launch(kernels.return_bits, self.size, [self._world, self._left, source, target])
 
 
 class Arena(Reserve):
-    """An allocator for a loop or a branch of a CUDA graph, in which Warp cannot allocate.
+    """An allocator for loops and branches of CUDA graphs, where Warp cannot allocate.
 
-    A run outside a graph takes memory from the device, counts the bytes, and reserves them. Graphs then use the
-    reserve. They never run at the same time, so all of them share it.
+    A run outside a graph allocates from the device, counts the bytes, and reserves as many. Graphs then use the
+    reserve. They never run at the same time, so they can all share it.
 
     Args:
         device: Where the launches run; on the CPU nothing is reserved.
@@ -121,12 +121,12 @@ class Arena(Reserve):
         self._serving = False
 
     def open(self) -> None:
-        """Reuse the reserve from its start."""
+        """Reuse the reserve from the start."""
         self._used = 0
 
     @contextlib.contextmanager
     def __call__(self) -> Iterator[None]:
-        """The context of the launches: use the reserve during a capture, else count bytes and reserve them."""
+        """Context of the launches: a capture uses the reserve; any other run counts bytes and reserves them."""
         if self.device.is_cpu:
             yield
             return
@@ -152,7 +152,7 @@ class Arena(Reserve):
 
 
 class Conditional:
-    """Runs launches in a graph only if a mask holds a world.
+    """Runs launches within a graph only if a mask is not empty.
 
     Outside a graph it always runs them, because reading the mask would wait for the device.
 
@@ -167,7 +167,7 @@ class Conditional:
         self._inside = False
 
     def __call__(self, mask: wp.array, run: Callable[[], None]) -> None:
-        """Run launches that affect only the masked worlds, (nworld,) bool; nested calls run unconditionally."""
+        """Run launches that affect only the masked worlds, (nworld,) bool; nested calls always run."""
         if self._inside:
             run()
             return

@@ -1,4 +1,4 @@
-"""Probe how many contacts and constraints MuJoCo Warp needs room for, and estimate its memory."""
+"""Probe how many contacts and constraints MuJoCo Warp needs, and estimate its memory."""
 
 import contextlib
 import copy
@@ -22,27 +22,27 @@ log = logging.getLogger(__name__)
 _WORLDS, _HOLDS, _SUBSTEPS = 32, 25, 20
 
 _LEAST, _LEAST_WITH_FLEX = (8, 8), (256, 512)
-"""The smallest sizes, without and with a flex. A probe may miss bursts of contacts: a geom that is pressed into a flex
-touches up to 50 of its elements. The sizes with a flex are MuJoCo Warp's defaults."""
+"""The smallest sizes, without and with a flex. A probe may miss bursts of contacts: a geom pressed into a flex touches
+up to 50 of its elements. The sizes with a flex are MuJoCo Warp's defaults."""
 
 _FIRST = 32
-"""The most worlds whose first states are checked."""
+"""Maximum number of worlds whose initial states are checked."""
 
 _FRICTION = {"dof_frictionloss", "tendon_frictionloss"}
 _LIMITS = {"jnt_range", "jnt_margin", "tendon_range", "tendon_margin", "qpos0"}
 _CONTACTS = set("geom_margin geom_gap geom_size geom_pos geom_quat pair_margin pair_gap body_pos body_quat".split())
-"""Model fields on which the number of constraints or contacts depends, and which may be drawn."""
+"""Model fields that affect the number of constraints or contacts and may be randomized."""
 
 _known: dict[str, tuple[int, int]] = {}
 
 
 def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[int, int]:
-    """Contacts and constraints to make room for in each world.
+    """Numbers of contacts and constraints to allocate for each world.
 
-    These are twice the peak of random rollouts, and room for constraints that a task may turn on: inactive equality
-    constraints, friction losses if they are drawn, and all limits if their ranges are drawn. In the rollouts 32 worlds
-    start in the model's initial state or a keyframe, half of them with random velocities, and take 500 substeps on the
-    C engine under random controls, each held for 20 substeps. The result is cached for each model.
+    These are twice the peak of random rollouts, plus constraints that a task may turn on: inactive equality
+    constraints, friction losses if they are randomized, and all limits if their ranges are randomized. In the rollouts,
+    32 worlds start in the model's initial state or a keyframe, half of them with random velocities, and run 500
+    substeps on the C engine under random controls, each held for 20 substeps. The result is cached per model.
 
     Args:
         model: The compiled model.
@@ -52,14 +52,14 @@ def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[in
         (nconmax, njmax), multiples of 8: each at least 8, with a flex at least 256 and 512.
 
     Raises:
-        NotImplementedError, ValueError: MuJoCo Warp refuses the model.
+        NotImplementedError, ValueError: MuJoCo Warp does not support the model.
     """
     contacts, constraints = _probe_once(_with_friction_losses(model, varied))
     return contacts, -(-(constraints + _inactive(model) + _limits(model, varied)) // 8) * 8
 
 
 def warn_of_unknown_sizes(varied: Collection[str], nconmax: int, njmax: int) -> None:
-    """Log a warning if contacts depend on drawn fields, whose values a probe does not know."""
+    """Log a warning if contacts depend on randomized fields, whose values the probe does not know."""
     if names := sorted(_CONTACTS.intersection(varied)):
         log.warning(
             "nconmax=%d and njmax=%d were measured on the model's own %s, which the task draws: give make() both if "
@@ -76,15 +76,15 @@ def warn_of_little_room(
     nconmax: float,
     njmax: int,
 ) -> None:
-    """Log a warning if worlds begin with more contacts or constraints than fit.
+    """Log a warning if worlds start with more contacts or constraints than fit.
 
     Args:
         model: The compiled model.
         states: Integration states of worlds, (n, integration size); the first 32 are checked.
         fields: The model fields that differ between worlds.
-        values: Their values, (n, ...).
-        nconmax: Contacts that a world has room for, on average.
-        njmax: Constraints that each world has room for.
+        values: Values of these fields, by name, (n, ...).
+        nconmax: Contact capacity per world, on average.
+        njmax: Constraint capacity of each world.
     """
     own = copy.copy(model)
     data = mujoco.MjData(own)
@@ -112,7 +112,7 @@ def warn_of_little_room(
 
 
 def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> mujoco.MjModel:
-    """The model with every friction loss that a world may have switched on."""
+    """The model with every friction loss turned on that a world may turn on."""
     if names := _FRICTION.intersection(varied):
         model = copy.copy(model)
         for name in names:
@@ -135,7 +135,7 @@ def _equalities(model: mujoco.MjModel) -> int:
 
 
 def _limits(model: mujoco.MjModel, varied: Collection[str]) -> int:
-    """The number of all limits if drawn fields decide which are reached, else 0."""
+    """The total number of limits if randomized fields determine which are reached, else 0."""
     drawn = not _LIMITS.isdisjoint(varied)
     return int(model.jnt_limited.sum() + model.tendon_limited.sum()) if drawn else 0
 
@@ -151,7 +151,7 @@ def _probe_once(model: mujoco.MjModel) -> tuple[int, int]:
 
 def _probe(model: mujoco.MjModel) -> tuple[int, int]:
     with wp.ScopedDevice("cpu"):
-        mjw.put_model(model)  # raises now if it refuses the model: a probe may take a minute
+        mjw.put_model(model)  # raises early for an unsupported model: a probe may take a minute
     batch = Batch(model, _WORLDS)
     rng = np.random.default_rng(0)
     ncon, nefc = batch.bind("ncon"), batch.bind("nefc")
@@ -174,20 +174,20 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 _TEMPORARIES = 1.25
-"""A world's memory relative to MuJoCo Warp's data. The temporary arrays of a step take 1 to 9 % (measured); the rest
-is for graphs and for the group of a partial forward pass. Graphs on the CPU keep all temporary arrays and take up to
-three times as much."""
+"""A world's memory relative to MuJoCo Warp's Data. A step's temporary arrays take 1 to 9 % (measured); the rest is for
+graphs and for the group of a partial forward pass. CPU graphs keep all temporary arrays alive and take up to three
+times as much."""
 
 _TEMPORARIES_CONVEX = 3.5
-"""With convex collisions or the noslip solver: on adroit_pen the temporary arrays take 1.5 to 2.4 times the memory of
-the data."""
+"""The same with convex collisions or the noslip solver: on adroit_pen the temporary arrays take 1.5 to 2.4 times the
+memory of the Data."""
 
 _CONVEX = {mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_MESH,
            mujoco.mjtGeom.mjGEOM_HFIELD}  # fmt: skip
 
 
 def data_bytes(model: mujoco.MjModel, nconmax: int, njmax: int) -> int:
-    """Bytes of each world's data for given numbers of contacts and constraints, temporary arrays included."""
+    """Bytes of MuJoCo Warp's Data per world for given capacities, including temporary arrays."""
     sizes = []
     for nworld in (1, 2):
         with wp.ScopedDevice("cpu"):
@@ -197,7 +197,7 @@ def data_bytes(model: mujoco.MjModel, nconmax: int, njmax: int) -> int:
 
 
 def _bytes_of(data: Any) -> int:
-    """Bytes of all arrays in a dataclass, nested dataclasses included."""
+    """Bytes of all arrays in a dataclass, including nested dataclasses."""
     total = 0
     for field in dataclasses.fields(data):
         value = getattr(data, field.name)
@@ -209,7 +209,7 @@ def _bytes_of(data: Any) -> int:
 
 
 def _margin(model: mujoco.MjModel) -> float:
-    """A world's memory relative to its data."""
+    """A world's memory relative to MuJoCo Warp's Data."""
     collides = (model.geom_contype | model.geom_conaffinity) != 0
     kinds = [int(kind) for kind in model.geom_type[collides]]
     convex = not _CONVEX.isdisjoint(kinds) or kinds.count(int(mujoco.mjtGeom.mjGEOM_BOX)) > 1
@@ -221,11 +221,11 @@ _BITS = mjw.OverflowType
 CONTACT_BITS = int(_BITS.BROADPHASE | _BITS.NARROWPHASE)
 CONSTRAINT_BITS = int(_BITS.NEFC | _BITS.NJMAX_NNZ | _BITS.NVMAX)
 IGNORED_BITS = int(_BITS.ITERATIONS | _BITS.LS_ITERATIONS)
-"""A solver that reached its limit of iterations still has an answer."""
+"""A solver that reaches its iteration limit still returns a solution."""
 
 
 def report_pool_overflow(data: mjw.Data, mask: wp.array) -> None:
-    """Set the masked worlds' overflow bit if a forward pass found no room for contacts.
+    """Set the masked worlds' overflow bit if contacts did not fit in a forward pass.
 
     ``mujoco_warp.step`` sets the bit itself; ``mujoco_warp.forward`` does not.
     """

@@ -1,4 +1,4 @@
-"""Give MuJoCo Warp's model fields a row for each world, and recompute constants that follow from them."""
+"""Give MuJoCo Warp's model fields one row per world, and recompute the constants derived from them."""
 
 import copy
 from collections.abc import Collection, Iterable
@@ -17,7 +17,7 @@ _POSED_BY = {"geom_pos", "geom_quat", "body_pos", "body_quat"}
 
 
 class StaticGeoms:
-    """Poses of the geoms that cannot move, if model fields that place them differ between worlds.
+    """Places geoms that cannot move, if model fields that determine their poses differ between worlds.
 
     Args:
         model: The compiled model.
@@ -32,7 +32,7 @@ class StaticGeoms:
         self._geoms: wp.array = wp.array(np.flatnonzero(fixed), dtype=int, device=device)
 
     def place(self, model: mjw.Model, data: mjw.Data, mask: wp.array) -> None:
-        """Compute the poses in the masked worlds of a data; made of launches."""
+        """Compute the poses in the masked worlds of a Data; consists of launches."""
         if self._geoms.size:
             fields = [model.geom_bodyid, model.body_parentid]
             # MuJoCo stores a quaternion as (w, x, y, z), unlike Warp's type
@@ -55,7 +55,7 @@ _GEOM_BOUNDS = {"geom_aabb", "geom_rbound"}
 
 
 def constants_of(fields: Iterable[ModelField]) -> Constants:
-    """The groups of constants that follow from any of some fields."""
+    """The groups of constants derived from any of the fields."""
     groups = Constants.NONE
     for field in fields:
         groups |= field.constants
@@ -63,7 +63,7 @@ def constants_of(fields: Iterable[ModelField]) -> Constants:
 
 
 def outputs_of(fields: Collection[ModelField]) -> list[str]:
-    """The names of the constants that differ between worlds with some fields."""
+    """The names of the constants that differ between worlds if these fields do."""
     groups = constants_of(fields)
     names = [name for group, outputs in OUTPUTS.items() if group & groups for name in outputs]
     sized = any(field.name == "geom_size" for field in fields)
@@ -71,15 +71,15 @@ def outputs_of(fields: Collection[ModelField]) -> list[str]:
 
 
 def owner(model: mjw.Model, name: str) -> mjw.Model | mjw.Option:
-    """The object whose attribute a model field is: the model or its options."""
+    """The object that has a model field as an attribute: the model or its options."""
     return model if hasattr(model, name) else model.opt
 
 
 def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nworld: int) -> mjw.Model:
-    """MuJoCo Warp's model with a row for each world in some fields and in the constants that follow from them.
+    """MuJoCo Warp's model with one row per world in the given fields and in the constants derived from them.
 
-    ``mjw.put_model`` leaves out parts of the physics whose fields are all zero. Parts whose fields may become non-zero
-    in a world are included here.
+    ``mjw.put_model`` disables parts of the physics whose fields are all zero. Parts whose fields may become non-zero in
+    a world are enabled here.
     """
     fields = [field for field in fields if field.size]
     names = [field.name for field in fields if not field.option]
@@ -112,15 +112,15 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
 
 
 class ModelRows:
-    """A model for a group of worlds: it has its own rows of fields that differ, and shares all others.
+    """A model for a group of worlds, with its own rows of fields that differ; all other fields are shared.
 
-    In the whole model, MuJoCo Warp would read row ``world % rows`` of a field, which belongs to another world.
+    With the whole model, MuJoCo Warp would read row ``world % rows`` of a field, which belongs to another world.
 
     Args:
         whole: The model of all worlds.
         names: The fields with a row for each world.
         size: Number of worlds in the group.
-        own: Further fields to copy, because the group writes them.
+        own: Additional fields to copy, because the group writes them.
     """
 
     def __init__(self, whole: mjw.Model, names: Iterable[str], size: int, own: Iterable[str] = ()) -> None:
@@ -165,17 +165,17 @@ _GROUPS = {
 class ModelConstants:
     """Recomputes constants in the worlds whose fields changed since the last call.
 
-    They are computed in a small group of worlds with separate data, because ``mujoco_warp.set_const`` overwrites the
+    They are computed in a small group of worlds with a separate Data, because ``mujoco_warp.set_const`` overwrites the
     kinematics.
 
     Args:
         model: The compiled model.
-        put: MuJoCo Warp's model, with a row for each world in the fields and in the constants that follow.
-        fields: The fields that differ between worlds, with constants that follow.
+        put: MuJoCo Warp's model, with one row per world in the fields and in the derived constants.
+        fields: The fields that differ between worlds and from which constants are derived.
         static: Geoms whose poses ``mujoco_warp.set_const`` does not compute; tendons may wrap around them.
         nworld: Number of worlds.
         device: Where they live.
-        loop: As for ``Turns``.
+        loop: See ``Turns``.
     """
 
     def __init__(
@@ -200,7 +200,7 @@ class ModelConstants:
             self._rows = ModelRows(put, [*names, *self._outputs], size, written - set(self._outputs))
             self._scratch = mjw.make_data(model, nworld=size, nconmax=1, njmax=1)
             self._given = [flat(getattr(owner(put, name), name)).view(wp.int32) for name in names]
-            # the bits of a NaN that no value has
+            # the bits of a NaN that never occurs
             self._applied = [wp.full_like(given, -1) for given in self._given]
             self._changed = wp.zeros(nworld, dtype=bool)
             self._everyone = wp.full(size, True, dtype=bool)
@@ -210,7 +210,7 @@ class ModelConstants:
         self._turns = Turns(nworld, size, device, loop=loop)
 
     def __call__(self, mask: wp.array) -> None:
-        """Bring the masked worlds' constants up to date; made of launches."""
+        """Update the masked worlds' constants; consists of launches."""
         self._changed.zero_()
         for given, applied in zip(self._given, self._applied, strict=True):
             args = [mask, given, applied, self._changed]

@@ -35,12 +35,12 @@ _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
 class WarpEngine(Engine):
-    """Worlds in ``mujoco_warp``'s own arrays, shown without a copy.
+    """Worlds in ``mujoco_warp``'s own arrays, exposed without a copy.
 
     Args:
-        model, nworld, fields: As for ``Engine``.
-        device: A CUDA device, or the CPU (single-threaded: for tests).
-        dynamics: The model fields that differ between worlds. Room for contacts and constraints is probed with the
+        model, nworld, fields: See ``Engine``.
+        device: A CUDA device, or the CPU (single-threaded, for tests).
+        dynamics: The model fields that differ between worlds. Contact and constraint capacities are probed with the
             model's own values; see ``sizes.probe_sizes``.
         initial: The state that ``reset`` puts worlds into, rounded to float32; None for the model's own.
         nconmax: Contacts that each world has room for, on average. None probes the model, and reserves additional room
@@ -48,14 +48,14 @@ class WarpEngine(Engine):
         njmax: Constraints that each world has room for; None probes the model.
 
     Raises:
-        ValueError: MuJoCo Warp refuses the model, or an option is out of range.
+        ValueError: MuJoCo Warp does not support the model, or an option is out of range.
     """
 
     name = "warp"
     capturable = True
 
     partial_refresh = True
-    """Whether the forward pass of restarting worlds covers only them, and is skipped if there are none."""
+    """Whether the forward pass after restarts covers only the restarting worlds and is skipped if there are none."""
 
     def __init__(
         self,
@@ -90,7 +90,7 @@ class WarpEngine(Engine):
             self.arrays[varied.name] = self._alias_model(varied)
         self._static = StaticGeoms(model, self.dynamics, device)
         self._constants = self._model_constants()
-        # MuJoCo Warp's own initial state follows from model fields, which may differ between worlds
+        # MuJoCo Warp derives its initial state from model fields, which may differ between worlds
         self._start: wp.array | None = None
         if initial is not None or self.dynamics.keys() & {"qpos0", "body_pos", "body_quat"}:
             self._start = wp.array(self.initial, dtype=float, device=device)
@@ -101,12 +101,12 @@ class WarpEngine(Engine):
         if self.reset_stage < Stage.ACCELERATION:
             self._reset_parts = forward_parts(model, self._reset)
         self._columns: wp.array = wp.array(early_sensor_columns(model), dtype=int, device=device)
-        # a step reuses the parts that were computed for its first state, after a step or a restart
+        # a step reuses the parts already computed for its initial state after the last step or restart
         moved = any(field.written for name, field in self.fields.items() if name in ("mocap_pos", "mocap_quat"))
         current_parts = () if moved else self._current_parts or ()
         self._shared = tuple(part for part in current_parts if part in forward.POSITION)
-        # A geom whose position is not-a-number has contacts with every element of a flex. Their rows of the Jacobian
-        # would outlast a reset, because the solver multiplies unused rows by zero. So a reset clears the rows.
+        # A geom whose position is NaN has contacts with every element of a flex. The NaN in their Jacobian rows would
+        # survive a reset, because the solver multiplies unused rows by zero. So a reset clears the rows.
         self._jacobian = flat(self.d.efc.J if model.nflex else wp.zeros((nworld, 0), dtype=float, device=device))
         self._zeros = wp.zeros(self._jacobian.shape[1], dtype=float, device=device)
         self._conditional = Conditional(device)
@@ -120,16 +120,16 @@ class WarpEngine(Engine):
         """MuJoCo Warp's model with the engine's options."""
         with wp.ScopedDevice(self.device):
             model = put_varied_model(self.model, list(self.dynamics.values()), self.nworld)
-        # overflows are reported per world; prints from a kernel would fill the disk
+        # overflows are reported per world; messages printed by kernels would fill the disk
         model.opt.warn_overflow = 0
         return model
 
     def _on_device(self) -> contextlib.AbstractContextManager[object]:
-        """The context of every call of MuJoCo Warp."""
+        """The context for every call of MuJoCo Warp."""
         return wp.ScopedDevice(self.device)
 
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
-        """Another model and data with the same options and sizes, for measurements of bare MuJoCo Warp."""
+        """Make another Model and Data with the same options and sizes, to benchmark MuJoCo Warp alone."""
         return self._put_model(), self._make_data(self.nworld)
 
     # memory
@@ -155,14 +155,14 @@ class WarpEngine(Engine):
     # fields
 
     def _alias_model(self, field: ModelField) -> wp.array:
-        """The memory of a model field under the type of ``model_fields``."""
+        """A model field's memory as an array of the type in ``model_fields``."""
         source = getattr(owner(self.m, field.name), field.name)
         if not field.size:
             return wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
         return alias(source, field.dtype, (self.nworld, *field.shape))
 
     def _model_constants(self) -> ModelConstants | None:
-        """The constants that follow from the model fields, or None if there are none."""
+        """The constants derived from the model fields, or None if there are none."""
         fields = [field for field in self.dynamics.values() if field.size and constants_of([field])]
         if not fields:
             return None
@@ -170,7 +170,7 @@ class WarpEngine(Engine):
         return ModelConstants(self.model, self.m, fields, self._static, self.nworld, self.device, loop=loop)
 
     def _alias(self, field: Field) -> wp.array:
-        """The memory of a field under the types of ``fields``, which differ from MuJoCo Warp's only in name."""
+        """A field's memory as an array of the type in ``fields``; MuJoCo Warp's types differ only in name."""
         return alias(getattr(self.d, field.name), field.dtype, (self.nworld, *field.shape))
 
     def _copy_snapshots(self, mask: wp.array, fields: Iterable[Field]) -> None:
@@ -193,7 +193,7 @@ class WarpEngine(Engine):
         data: mjw.Data | None = None,
         model: mjw.Model | None = None,
     ) -> None:
-        """Run parts of a forward pass in every world of a data; None for all parts up to a stage."""
+        """Run parts of a forward pass in every world of a Data; None for all parts up to ``stage``."""
         m, d = self.m if model is None else model, self.d if data is None else data
         with self._on_device():
             if parts is not None:
@@ -202,14 +202,14 @@ class WarpEngine(Engine):
             elif stage == Stage.ACCELERATION:
                 forward.forward(m, d)
             else:
-                # MuJoCo Warp writes sensors of limits and contacts only while the limit or contact is active
+                # MuJoCo Warp writes limit and contact sensors only while the limit or contact is active
                 wp.launch(zero_columns, (d.nworld, len(self._columns)), [self._columns, d.sensordata])
                 mjw.fwd_position(m, d, factorize=False)
                 mjw.sensor_pos(m, d)
                 if stage == Stage.VELOCITY:
                     mjw.fwd_velocity(m, d)
                     mjw.sensor_vel(m, d)
-                if "energy" in self.fields:  # of a model whose sensors do not compute it
+                if "energy" in self.fields:  # the model's sensors do not compute it
                     mjw.energy_pos(m, d)
                     mjw.energy_vel(m, d)
 
@@ -294,7 +294,7 @@ class WarpEngine(Engine):
         self._forward(self._shared, self.reset_stage)  # the next step reuses these parts
 
     def _refresh(self, mask: wp.array) -> None:
-        """A forward pass of all worlds; those outside the mask stay as they are."""
+        """Run a forward pass of all worlds; the fields of worlds outside the mask do not change."""
         with self._histories_kept():
             self._forward(self._reset_parts, self.reset_stage)
         self._copy_snapshots(mask, [field for field in self.snapshots if field.reset > Stage.NONE])
@@ -302,12 +302,12 @@ class WarpEngine(Engine):
             sizes.report_pool_overflow(self.d, mask)
 
     def _is_partial(self) -> bool:
-        """Whether a group of worlds can be stepped without the others."""
-        # with sweep-and-prune, the broadphase of large models, a graph needs memory that cannot be reserved
+        """Whether a group of worlds can be stepped separately."""
+        # sweep-and-prune, the broadphase for large models, needs memory that cannot be reserved within a graph
         return self.partial_refresh and self.m.opt.broadphase == mjw.BroadphaseType.NXN
 
     def _partial_forward(self) -> PartialForward | None:
-        """A forward pass of only the restarting worlds, or None if it saves nothing or is not possible."""
+        """A forward pass for only the restarting worlds, or None if it is impossible or saves nothing."""
         return self._group_of_worlds() if self._is_partial() and self._reset_parts is None else None
 
     def _group_of_worlds(self) -> PartialForward:
@@ -320,7 +320,7 @@ class WarpEngine(Engine):
 
     @contextlib.contextmanager
     def _histories_kept(self) -> Iterator[None]:
-        """Restore the sensors' histories after a forward pass, because the next step adds the same samples."""
+        """Context that restores sensor histories, because the next step adds the same samples as the forward pass."""
         if self.d.history.size:
             wp.copy(self._history, self.d.history)
         yield
@@ -342,7 +342,7 @@ class WarpEngine(Engine):
 
 @contextlib.contextmanager
 def _refusals() -> Iterator[None]:
-    """Explain how to fix a model that MuJoCo Warp refuses."""
+    """Context that explains how to fix a model that MuJoCo Warp does not support."""
     try:
         yield
     except (NotImplementedError, ValueError) as error:
@@ -353,7 +353,7 @@ def _refusals() -> Iterator[None]:
 
 
 def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied: Collection[str]) -> tuple[int, int]:
-    """Contacts and constraints that each world has room for: the given numbers, else probed ones."""
+    """Contact and constraint capacities per world: the given numbers, else probed ones."""
     given = {"nconmax": nconmax, "njmax": njmax}
     sizes = [size if size is None else whole_number(name, size, low=1) for name, size in given.items()]
     with _refusals():
@@ -364,12 +364,12 @@ def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied
 
 
 def _check_sdf_plugins(model: mujoco.MjModel) -> None:
-    """Refuse SDF plugins unless a distance function was registered with MuJoCo Warp, which has none itself."""
+    """Refuse SDF plugins unless a distance function was registered with MuJoCo Warp, which has none of its own."""
     if (model.geom_plugin >= 0).any() and not has_sdf_functions():
         raise NotImplementedError("it has no functions of SDF plugins")
 
 
 def _contacts_of_one_world(model: mjw.Model) -> int:
-    """Contacts of a single world in which all bodies touch; such a world is about to be reset."""
+    """Contacts of a single world in which all bodies touch, which is about to be reset."""
     pairs = len(model.nxn_geom_pair_filtered)
     return int(min(max(256, 4 * pairs), 4096))

@@ -1,6 +1,6 @@
 """Copy masked worlds into a small group and back, place static geoms, and correct constants: kernels.
 
-Each masked world has a rank; a group holds the worlds from rank ``first`` on.
+Each masked world has a rank; a group holds consecutive ranks from ``first``.
 """
 
 import warp as wp
@@ -21,7 +21,7 @@ def place_geoms(
     geom_xpos_out: wp.array2d[wp.vec3],
     geom_xmat_out: wp.array2d[wp.mat33],
 ):
-    """Compute the poses of listed geoms in the masked worlds, from the world down; launched over (nworld, geoms)."""
+    """Compute world poses of the listed geoms in the masked worlds; launched over (nworld, geoms)."""
     w, i = wp.tid()
     if not mask_in[w]:
         return
@@ -40,7 +40,7 @@ def place_geoms(
 
 @wp.kernel(enable_backward=False)
 def find_any(mask_in: wp.array[bool], any_out: wp.array[int]):
-    """Set the one element to 1 if the mask holds a world, else leave it; launched over (nworld,)."""
+    """Set the single element to 1 if the mask is not empty, else leave it unchanged; launched over (nworld,)."""
     w = wp.tid()
     if mask_in[w]:
         any_out[0] = 1
@@ -48,7 +48,7 @@ def find_any(mask_in: wp.array[bool], any_out: wp.array[int]):
 
 @wp.kernel(enable_backward=False)
 def rank_worlds(mask_in: wp.array[bool], rank_out: wp.array[int], count_inout: wp.array[int]):
-    """Number the masked worlds, in no particular order, from a count of 0 on; launched over (nworld,)."""
+    """Number the masked worlds from 0, in no particular order; launched over (nworld,)."""
     w = wp.tid()
     if mask_in[w]:
         rank_out[w] = wp.atomic_add(count_inout, 0, 1)
@@ -56,7 +56,7 @@ def rank_worlds(mask_in: wp.array[bool], rank_out: wp.array[int], count_inout: w
 
 @wp.kernel(enable_backward=False)
 def next_group(count_in: wp.array[int], step: int, first_inout: wp.array[int], left_out: wp.array[int]):
-    """Advance by ``step`` worlds, and count the remaining ones; launched over (1,)."""
+    """Advance by ``step`` worlds, and compute how many remain; launched over (1,)."""
     first = first_inout[0] + step
     first_inout[0] = first
     left_out[0] = wp.max(0, count_in[0] - first)
@@ -64,7 +64,7 @@ def next_group(count_in: wp.array[int], step: int, first_inout: wp.array[int], l
 
 @wp.kernel(enable_backward=False)
 def choose_group(mask_in: wp.array[bool], rank_in: wp.array[int], first_in: wp.array[int], world_out: wp.array[int]):
-    """Find the world in each place of a group; launched over (nworld,)."""
+    """Assign worlds to the places of a group; launched over (nworld,)."""
     w = wp.tid()
     if mask_in[w]:
         place = rank_in[w] - first_in[0]
@@ -76,7 +76,7 @@ def choose_group(mask_in: wp.array[bool], rank_in: wp.array[int], first_in: wp.a
 def take_rows(
     world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array2d[float], target_out: wp.array2d[float]
 ):
-    """Copy rows of the worlds in a group into the group; launched over (places, width of a row)."""
+    """Copy rows of a group's worlds into the group; launched over (places, row length)."""
     place, i = wp.tid()
     if place < left_in[0]:
         target_out[place, i] = source_in[world_in[place], i]
@@ -86,7 +86,7 @@ def take_rows(
 def return_rows(
     world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array2d[float], target_out: wp.array2d[float]
 ):
-    """Copy rows of a group back to its worlds; launched over (places, width of a row)."""
+    """Copy rows of a group back to its worlds; launched over (places, row length)."""
     place, i = wp.tid()
     if place < left_in[0]:
         target_out[world_in[place], i] = source_in[place, i]
@@ -94,7 +94,7 @@ def return_rows(
 
 @wp.kernel(enable_backward=False)
 def return_bits(world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array[int], target_inout: wp.array[int]):
-    """Add bits of a group to the bits of its worlds; launched over (places,)."""
+    """Combine (bitwise or) a group's bits into the bits of its worlds; launched over (places,)."""
     place = wp.tid()
     if place < left_in[0]:
         world = world_in[place]
@@ -105,7 +105,7 @@ def return_bits(world_in: wp.array[int], left_in: wp.array[int], source_in: wp.a
 def mark_changed(
     mask_in: wp.array[bool], given_in: wp.array2d[int], applied_inout: wp.array2d[int], changed_inout: wp.array[bool]
 ):
-    """Mark the masked worlds whose bits have changed, and remember the new bits; launched over (nworld,)."""
+    """Mark the masked worlds whose bits have changed, and store the new bits; launched over (nworld,)."""
     w = wp.tid()
     if mask_in[w]:
         for i in range(given_in.shape[1]):
@@ -125,10 +125,10 @@ def correct_weights(
     body_inout: wp.array2d[wp.vec2],
     dof_inout: wp.array2d[float],
 ):
-    """Replace inverse weights that differ from mj_setConst's; launched over (nworld, nbody).
+    """Correct inverse weights so that they match mj_setConst's; launched over (nworld, nbody).
 
-    MuJoCo Warp replaces a translational or rotational weight of 0 by the other one, and does not treat simple bodies
-    that only slide separately: their weight is the inverse of their mass.
+    MuJoCo Warp replaces a translational or rotational weight of 0 by the other weight. It also lacks a special case for
+    simple bodies that only slide: their weight is the inverse of their mass.
     """
     w, body = wp.tid()
     if sliding_in[body]:

@@ -19,8 +19,7 @@ def obey(stage: Stage, command: protocol.Command) -> None:
         case protocol.SetMode():
             _set_mode(stage, command)
         case protocol.SetWorld(choice):
-            if (world := stage.main.choose(choice)) is None:
-                raise ValueError("no episode has ended yet")
+            world = stage.main.choose(choice)
             if not 0 <= world < stage.env.nworld:
                 raise ValueError(f"there is no world {world}: there are {stage.env.nworld} worlds, from 0")
             stage.show_world(world)
@@ -57,8 +56,8 @@ def obey(stage: Stage, command: protocol.Command) -> None:
             stage.frames.ghosts = command
         case protocol.Perturb():
             _perturb(stage, command)
-        case protocol.SetVideo(on, camera):
-            stage.videos.begin(camera) if on else stage.videos.end()
+        case protocol.SetVideo(camera):
+            stage.videos.end() if camera is None else stage.videos.begin(camera)
 
 
 def _set_mode(stage: Stage, command: protocol.SetMode) -> None:

@@ -307,21 +307,17 @@ class Live:
 
     # worlds to show
 
-    def choose(self, choice: int | str) -> int | None:
-        """Find the index of a world; None if no episode has ended yet. "best" and later ones wait for the device.
+    def choose(self, choice: int | str) -> int:
+        """Find the index of a world. "best" and "worst" wait for the device.
 
         Args:
-            choice: An index; "next" or "previous"; "best" or "worst" by the return of the episode so far; or
-                "last_ended", the world whose episode ended last.
+            choice: An index; "next" or "previous"; "best" or "worst" by the return of the episode so far.
         """
         if isinstance(choice, int):
             return choice
         if choice in ("next", "previous"):
             return (self.world + (1 if choice == "next" else -1)) % self.env.nworld
-        if choice in ("best", "worst"):
-            return int(self.returns.argmax() if choice == "best" else self.returns.argmin())
-        world = int(self._ends[:, 0].argmax())
-        return world if self._ends[world, 0] > 0 else None
+        return int(self.returns.argmax() if choice == "best" else self.returns.argmin())
 
     # rows for the window
 

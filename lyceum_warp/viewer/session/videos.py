@@ -48,11 +48,11 @@ class VideoTaker:
         """Whether the video needs a frame."""
         return self._running is not None and (time.perf_counter() - self._start) * FPS >= self._running.added
 
-    def begin(self, camera: dict[str, Any] | None) -> None:
+    def begin(self, camera: dict[str, Any]) -> None:
         """Start a video, after ending the one before.
 
         Args:
-            camera: Attributes of the ``mujoco.MjvCamera``; None for the camera of ``lyceum-warp eval --video``.
+            camera: Attributes of the ``mujoco.MjvCamera``.
 
         Raises:
             NoVideoError: A package for videos is not installed.
@@ -60,8 +60,8 @@ class VideoTaker:
         self.end()
         title = re.sub(r"[^\w.-]+", "-", self._title)  # the title may be a path
         file = self._folder / f"{title}-{datetime.datetime.now():%Y%m%d-%H%M%S-%f}.mp4"
-        chosen = None if camera is None else mujoco.MjvCamera()
-        for name, value in (camera or {}).items():
+        chosen = mujoco.MjvCamera()
+        for name, value in camera.items():
             setattr(chosen, name, value)
         self._running = Recorder(self._model, file, camera=chosen, fps=FPS, most_waiting=_MOST_WAITING)
         self._start = time.perf_counter()

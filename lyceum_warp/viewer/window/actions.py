@@ -101,8 +101,7 @@ class Actions:
 
     def toggle_video(self) -> None:
         """Start a video from the view's camera, or end it."""
-        on = self.status.video is None
-        self.do(protocol.SetVideo(on, self.cameras.view() if on else None))
+        self.do(protocol.SetVideo(self.cameras.view() if self.status.video is None else None))
 
     def toggle_window(self, title: str) -> None:
         """Open or close a window of the panel."""

@@ -44,7 +44,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         self.actions = Actions(scene, send)
         self.mouse = Mouse(send)
         self.values = ModelValues(model)
-        self.windows = Windows(self.actions, limit)
+        self.windows = Windows(self.actions)
         self._send, self._newest, self._screen, self._opened, self._limit = send, newest, screen, opened, limit
         self._geoms = ExtraGeoms(model, limit)
         self._swapped = -SWAP_TIME
@@ -96,9 +96,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
             mujoco.mj_setState(model, data, frame.state, mujoco.mjtState.mjSTATE_INTEGRATION)
             mujoco.mj_forward(model, data)
         groups = np.array(self.viewer.vis_options.geomgroup)
-        drawn = self._geoms.draw(frame.pose, frame.ghosts, frame.traces, frame.best, groups)
-        self.windows.drawn = drawn
-        self.viewer.extra_geoms[:] = drawn.geoms
+        self.viewer.extra_geoms[:] = self._geoms.draw(frame.pose, frame.ghosts, frame.traces, frame.best, groups)
 
     def _show_model(self, frame: Frame) -> None:
         """Set the world's values in the drawn model."""

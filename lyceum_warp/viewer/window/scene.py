@@ -1,7 +1,6 @@
 """Draw ghosts and traces, set the values of one world in the model, and choose the camera."""
 
 import copy
-import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -28,18 +27,6 @@ VISIBLE = (
 # ghosts and traces
 
 
-@dataclasses.dataclass
-class Drawn:
-    """The drawn ghosts and traces of a frame."""
-
-    geoms: list[mujoco.MjvGeom]
-    """Valid until the next frame."""
-    ghosts: int
-    """Number of ghosts."""
-    traces: int
-    """Number of traces."""
-
-
 class ExtraGeoms:
     """Draws ghosts and traces with a limited number of geoms: first the best trace, then ghosts, then other traces.
 
@@ -62,8 +49,8 @@ class ExtraGeoms:
         traces: np.ndarray | None = None,
         best: int | None = None,
         groups: np.ndarray | None = None,
-    ) -> Drawn:
-        """Make the geoms of a frame.
+    ) -> list[mujoco.MjvGeom]:
+        """Make the geoms of a frame, which are valid until the next frame.
 
         Args:
             pose: The pose of the shown world.
@@ -76,25 +63,23 @@ class ExtraGeoms:
             self._options.geomgroup = groups
         paths = [] if traces is None else list(traces)
         first = [] if best is None else [paths.pop(best)]
-        lines, one = _lines(first, BEST_COLOUR, min(self.limit, MAX_LINES))
-        bodies, drawn = self._ghosts(pose, ghosts, self.limit - len(lines))
+        lines = _lines(first, BEST_COLOUR, min(self.limit, MAX_LINES))
+        bodies = self._ghosts(pose, ghosts, self.limit - len(lines))
         left = min(self.limit - len(bodies), MAX_LINES) - len(lines)
-        others, rest = _lines(paths, TRACE_COLOUR, left)
-        return Drawn([*bodies, *lines, *others], drawn, one + rest)
+        return [*bodies, *lines, *_lines(paths, TRACE_COLOUR, left)]
 
-    def _ghosts(self, pose: Pose, ghosts: Sequence[Ghost], limit: int) -> tuple[list[mujoco.MjvGeom], int]:
-        """Draw the first ghosts that fit; return their geoms and their number."""
+    def _ghosts(self, pose: Pose, ghosts: Sequence[Ghost], limit: int) -> list[mujoco.MjvGeom]:
+        """Draw the first ghosts that fit."""
         data, scene, geoms = self._data, self._scene, []
         self._place(pose)
         positions, axes = data.geom_xpos.copy(), data.geom_xmat.copy()
-        scene.ngeom = drawn = 0
+        scene.ngeom = 0
         for ghost in ghosts:
             self._place(ghost.pose)
             begin = scene.ngeom
             mujoco.mjv_addGeoms(self.model, data, self._options, self._perturb, mujoco.mjtCatBit.mjCAT_DYNAMIC, scene)
             if scene.ngeom > limit:
                 break
-            drawn += 1
             near, turned = np.abs(data.geom_xpos - positions), np.abs(data.geom_xmat - axes)
             same = (near.max(1, initial=0.0) < 1e-3) & (turned.max(1, initial=0.0) < 1e-2)
             for geom in scene.geoms[begin : scene.ngeom]:
@@ -105,7 +90,7 @@ class ExtraGeoms:
                 geom.transparent = ghost.colour[3] < 1
                 geom.category = mujoco.mjtCatBit.mjCAT_DECOR  # cannot be selected
                 geoms.append(geom)
-        return geoms, drawn
+        return geoms
 
     def _place(self, pose: Pose) -> None:
         """Compute the kinematics of a pose."""
@@ -116,10 +101,10 @@ class ExtraGeoms:
         mujoco.mj_kinematics(self.model, data)
 
 
-def _lines(paths: Sequence[np.ndarray], colour: Sequence[float], limit: int) -> tuple[list[mujoco.MjvGeom], int]:
-    """Draw paths with at most ``limit`` lines: first with fewer points, then fewer paths; return lines and paths."""
+def _lines(paths: Sequence[np.ndarray], colour: Sequence[float], limit: int) -> list[mujoco.MjvGeom]:
+    """Draw paths with at most ``limit`` lines: first with fewer points, then fewer paths."""
     if not paths:
-        return [], 0
+        return []
     segments = min(len(paths[0]) - 1, max(limit // len(paths), FEWEST_SEGMENTS))
     paths = paths[: max(limit, 0) // max(segments, 1)]
     lines = []
@@ -132,7 +117,7 @@ def _lines(paths: Sequence[np.ndarray], colour: Sequence[float], limit: int) -> 
             line.emission = 1.0  # visible in the dark
             mujoco.mjv_connector(line, kind, LINE_WIDTH, start, end)
             lines.append(line)
-    return lines, len(paths)
+    return lines
 
 
 # the model of the shown world

@@ -8,7 +8,6 @@ import numpy as np
 from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import MAX_POINTS, MOST_BURST, MOST_GHOSTS
 from lyceum_warp.viewer.window.actions import MANY_STEPS, OTHER_KEYS, SPEEDS, Actions, key_table
-from lyceum_warp.viewer.window.scene import Drawn
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS = 200
@@ -21,15 +20,11 @@ class Windows:
 
     Args:
         actions: The user's choices.
-        limit: Maximum number of geoms of ghosts and traces.
     """
 
-    def __init__(self, actions: Actions, limit: int) -> None:
+    def __init__(self, actions: Actions) -> None:
         self.curves = Curves(len(actions.scene.curves))
-        self.drawn = Drawn([], 0, 0)
-        """The drawn ghosts and traces."""
-        self._actions, self._limit = actions, limit
-        self._scene = actions.scene
+        self._actions, self._scene = actions, actions.scene
         self._size = (0.0, 0.0)
 
     def draw(self) -> None:
@@ -114,7 +109,6 @@ class Windows:
             self._actions.do(protocol.SetWorld(world))
         choices: tuple[tuple[str, protocol.WorldChoice], ...] = (
             ("\uf053", "previous"), ("\uf054", "next"), ("best", "best"), ("worst", "worst"),
-            ("last ended", "last_ended"),
         )  # fmt: skip
         for i, (label, choice) in enumerate(choices):
             if i != 2:
@@ -164,7 +158,6 @@ class Windows:
             rows.append(("control", f"{status.plan_ms:.1f} ms"))
         rows += [(name, f"{value:.4g}") for name, value in self._last_values()]
         rows += status.text
-        rows += self.dropped()
         if imgui.BeginTable("##status", 2):
             for name, value in rows:
                 imgui.TableNextColumn()
@@ -172,18 +165,6 @@ class Windows:
                 imgui.TableNextColumn()
                 imgui.TextWrapped(value)
             imgui.EndTable()
-
-    def dropped(self) -> list[tuple[str, str]]:
-        """Ghosts and traces that are left out."""
-        frame = self._actions.frame
-        if frame is None:
-            return []
-        counts = (
-            ("ghosts", len(frame.ghosts), self.drawn.ghosts),
-            ("traces", 0 if frame.traces is None else len(frame.traces), self.drawn.traces),
-        )
-        why = f"{self._limit:,} shapes at most"
-        return [(name, f"{drawn} of {given} drawn: {why}") for name, given, drawn in counts if drawn < given]
 
     def _last_values(self) -> list[tuple[str, float]]:
         """The last value of each curve."""

@@ -40,7 +40,7 @@ def test_a_video_that_cannot_be_written_is_a_message(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(Recorder, call, full)
     session = Session(shared_env("point_mass"), seed=0)
-    window = run(session, [protocol.SetVideo(True)], lambda frame: bool(frame.messages))
+    window = run(session, [protocol.SetVideo({})], lambda frame: bool(frame.messages))
     assert "No space left on device" in window.messages[0] and window.frames[-1].status.video is None
 
 

@@ -99,15 +99,10 @@ def test_seeking_shows_a_step_of_the_episode(shared_env: SharedEnv) -> None:
 def test_worlds_are_chosen_by_number_and_by_return(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=4)
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=0)
-    session.obey(protocol.SetWorld("last_ended"))
-    assert session.stage.frame().messages == ("no episode has ended yet",)
     total = torch.zeros(4, dtype=torch.float64)
-    ended: set[int] = set()
-    while not ended or session.stage.live.made < 60:
+    for _ in range(60):  # some episodes end on the way
         session.stage.advance()
         total += env.reward
-        if env.done.any():
-            ended = set(env.done.nonzero().flatten().tolist())
         total[env.done] = 0.0
     for choice, expected in (("best", total.argmax()), ("worst", total.argmin()), (2, 2), ("next", 3), ("next", 0),
                              ("previous", 3)):  # fmt: skip
@@ -115,8 +110,6 @@ def test_worlds_are_chosen_by_number_and_by_return(shared_env: SharedEnv) -> Non
         frame = session.stage.frame()
         assert frame.status.world == int(expected), choice
         np.testing.assert_array_equal(frame.state, env.get_state()[int(expected), : len(frame.state)].numpy())
-    session.obey(protocol.SetWorld("last_ended"))
-    assert session.stage.frame().status.world in ended
     session.obey(protocol.SetWorld(4))
     assert session.stage.frame().messages == ("there is no world 4: there are 4 worlds, from 0",)
 

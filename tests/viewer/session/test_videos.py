@@ -35,7 +35,7 @@ def test_a_video_of_the_session_is_written_and_reported(
 
     def after(frame: Frame, number: int) -> list[Command] | None:
         assert (frame.status.video is not None) == (0 < number <= 15)
-        return {0: [protocol.SetVideo(True, CAMERA)], 15: [protocol.SetVideo(False)], 16: None}.get(number, [])
+        return {0: [protocol.SetVideo(CAMERA)], 15: [protocol.SetVideo(None)], 16: None}.get(number, [])
 
     Session(shared_env("hopper")).run(MemoryWindow(after))  # type: ignore[arg-type]
     printed = capsys.readouterr().out
@@ -67,7 +67,7 @@ def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> No
 
     monkeypatch.setattr(drawing.Drawing, "draw", slow)
     try:
-        taker.begin(None)
+        taker.begin(CAMERA)
         while not drawn.is_set():
             taker.add(frame)
             time.sleep(0.02)
@@ -94,11 +94,12 @@ def test_an_interrupted_viewer_completes_its_video(
 def test_a_second_signal_discards_the_videos(
     taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    begin = 0.0
-    with signals(), pytest.raises(Interrupted), taker.finishing(print):
+    begin, lines = 0.0, []
+    with signals(), pytest.raises(Interrupted), taker.finishing(lines.append):
         take(taker, frame, monkeypatch)
         begin = time.monotonic()
         threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGTERM)).start()
         signal.raise_signal(signal.SIGTERM)
     assert 0 < time.monotonic() - begin < 6
+    assert len(lines) == 1 and "was cancelled" in lines[0]
     assert not list(tmp_path.iterdir())
