@@ -40,15 +40,15 @@ class New:
 
     $ lyceum-warp new walk --model robots/dog.xml
     $ lyceum-warp new tasks/hop.py --model gymnasium:hopper.xml
-    $ MENAGERIE_ROOT=~/mujoco_menagerie lyceum-warp new go1_walk --model menagerie:unitree_go1/scene.xml
+    $ lyceum-warp new go1_walk --model menagerie:unitree_go1/scene.xml
     """
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
     """The name of the task, in snake_case, for the file TASK.py in the current folder; or the file: path/to/task.py."""
     model: Annotated[str, tyro.conf.arg(metavar="FILE")]
-    """An MJCF or URDF file; or menagerie:ROBOT/FILE.xml, of the checkout of MuJoCo Menagerie to which the environment
-    variable MENAGERIE_ROOT points; or gymnasium:FILE.xml or gymnasium_robotics:PATH, of these packages. A relative path
-    is written relative to the task file."""
+    """An MJCF or URDF file; or menagerie:ROBOT/FILE.xml, of MuJoCo Menagerie (the extra "menagerie", the package
+    mujoco-menagerie, or a checkout to which MENAGERIE_ROOT points); or gymnasium:FILE.xml or gymnasium_robotics:PATH,
+    of these packages. A relative path is written relative to the task file."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
