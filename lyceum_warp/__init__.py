@@ -47,8 +47,8 @@ if TYPE_CHECKING:
     from lyceum_warp.options import EnvOptions, PhysicsOptions
     from lyceum_warp.runs.folder import load, load_value
     from lyceum_warp.task import (
-        Planning, Row, Task, act, actuator, body, camera, ctrl, dof, equality, geom, joint, mocap, qpos, sensor, site,
-        tendon)
+        Planning, Row, Task, act, actuator, body, camera, ctrl, dof, equality, from_model, geom, joint, mocap, qpos,
+        sensor, site, tendon)
     from lyceum_warp.training import train
     from lyceum_warp.viewer.follow import RunViewer
     from lyceum_warp.viewer.show import view
@@ -59,9 +59,9 @@ __all__ = [
     "PPOConfig", "PhysicsOptions", "PlanSamples", "PlanUpdate", "Planner", "Planning", "PlanningController",
     "PredictiveSampling", "Rollout", "Row", "RunViewer", "Sigmoid", "Task", "Trajectory", "ValueFunction", "act",
     "actuator", "all_inside", "angle_between", "body", "body_velocity", "camera", "control", "control_async",
-    "control_report", "ctrl", "dof", "equality", "evaluate", "export_policy", "follow_velocity", "geom", "grasp_terms",
-    "gymnasium_model", "gymnasium_robotics_model", "inside", "joint", "load", "load_value", "local_velocity", "make",
-    "menagerie_model", "mocap", "normal", "package_model", "put", "put_upright", "qpos", "quat", "quat_angle",
+    "control_report", "ctrl", "dof", "equality", "evaluate", "export_policy", "follow_velocity", "from_model", "geom",
+    "grasp_terms", "gymnasium_model", "gymnasium_robotics_model", "inside", "joint", "load", "load_value",
+    "local_velocity", "make", "menagerie_model", "mocap", "normal", "package_model", "put", "put_upright", "qpos", "quat", "quat_angle",
     "quat_difference", "quat_from_axis_angle", "quat_from_euler", "quat_from_mat", "quat_from_rotvec", "quat_inverse",
     "quat_mul", "quat_random", "quat_rotate", "quat_rotate_inverse", "quat_to_euler", "quat_to_mat", "quat_to_rotvec",
     "register", "sensor", "site", "sum_squares", "task_names", "tendon", "tolerance", "train", "uniform", "vec10",
@@ -103,7 +103,9 @@ _NAMES = {
     "openloop": "OpenLoop",
     "options": "EnvOptions PhysicsOptions",
     "runs.folder": "load load_value",
-    "task": "Planning Row Task act actuator body camera ctrl dof equality geom joint mocap qpos sensor site tendon",
+    "task":
+        "Planning Row Task act actuator body camera ctrl dof equality from_model geom joint mocap qpos sensor site "
+        "tendon",
     "training": "train",
     "viewer.follow": "RunViewer",
     "viewer.show": "view",

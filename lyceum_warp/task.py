@@ -4,7 +4,7 @@ import dataclasses
 import inspect
 import sys
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import mujoco
@@ -231,6 +231,26 @@ def mocap(body: str) -> int:
     return Element("mocap_pos", body)
 
 
+@dataclasses.dataclass(frozen=True)
+class FromModel:
+    """A parameter that is computed from the compiled model. ``from_model`` makes it."""
+
+    function: Callable[[mujoco.MjModel, Any], Any]
+
+
+def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
+    """As a default in Params: a value that a function computes from the compiled model and from other parameters.
+
+    ``mass: float = lw.from_model(lambda model, p: model.body_subtreemass[p.trunk])`` is the mass of the robot. It is
+    computed again if another parameter changes, unless it was given itself.
+
+    Args:
+        function: A function of the MjModel and of an object with the parameters as attributes: those with other
+            defaults, and those computed before this one, in the order of Params.
+    """
+    return FromModel(function)
+
+
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Planning:
@@ -273,7 +293,7 @@ class Task:
     its index. ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``, ``lw.actuator``,
     ``lw.ctrl``, ``lw.act``, ``lw.tendon``, ``lw.equality``, ``lw.sensor`` and ``lw.mocap`` work likewise. A field of
     type ``wp.array[float]``, ``wp.array2d[wp.vec3]`` or the like is a table that all worlds share, such as a motion to
-    follow; its default is a nested list or an array.
+    follow; its default is a nested list or an array. ``lw.from_model`` computes a default from the compiled model.
 
     Functions:
     {functions}

@@ -237,14 +237,13 @@ class BoundTask:
         Raises:
             ValueError: There is no such parameter, or the observation would change its size.
         """
-        previous = self.parameters.values
-        self.parameters.values = self.parameters.checked(params)
+        previous, self.parameters = self.parameters, self.parameters.changed(params)
         try:
             same = obs_layouts(self.task, self.params) == self.obs_layouts
         except ValueError:  # one value per world for a parameter that sets a size
             same = False
         if not same:
-            self.parameters.values = previous
+            self.parameters = previous
             raise ValueError(f"{', '.join(params)} would change the observation's parts: make a new environment")
 
     def _check_class(self) -> None:

@@ -1,7 +1,9 @@
 """Check the values of a task's parameters, the fields of its ``Params``, and make the array for its kernels."""
 
+import copy
 from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -10,7 +12,7 @@ import warp as wp
 
 from lyceum_warp.fields import elements, rows
 from lyceum_warp.options import OPTIONS, suggestion
-from lyceum_warp.task import Element
+from lyceum_warp.task import Element, FromModel
 
 _FILLED_IN = ("dt", "substep_dt")
 """Fields of ``Params`` that are filled in: seconds in a step and in a substep."""
@@ -62,16 +64,19 @@ class Parameters:
                 "would get its value: rename it in Params"
             )
         found = defaults(struct) | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
+        self._computed = {name for name, value in found.items() if isinstance(value, FromModel)}
+        """Names of the values that are computed from the model."""
         self.values: dict[str, Any] = {name: found[name] for name in struct.vars if name in found}
-        self.values = self.checked(given)
+        self.values = self.changed(given).values
+        self._computed -= set(given)
 
     @property
     def per_world(self) -> dict[str, np.ndarray]:
         """The values that differ between worlds, by name, (nworld, ...)."""
         return {name: v for name, v in self.values.items() if isinstance(v, np.ndarray) and name not in self.tables}
 
-    def checked(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """The values with some replaced, each converted to the type of its field.
+    def changed(self, given: Mapping[str, Any]) -> "Parameters":
+        """A copy with some values replaced, each converted to the type of its field. Both use the same arrays.
 
         Raises:
             ValueError: A name is unknown, a value is missing or does not fit its field.
@@ -89,7 +94,29 @@ class Parameters:
                 raise ValueError(f"the task {self._task_name!r} has no parameter {name!r}: {hint}")
         if missing := [name for name in known if name not in self.values and name not in given]:
             raise ValueError(f"the task {self._task_name!r} needs values for {', '.join(missing)}")
-        return {name: self._converted(name, value) for name, value in {**self.values, **given}.items()}
+        other = copy.copy(self)
+        other._computed = self._computed - set(given)
+        other.values = {
+            name: self._converted(name, value)
+            for name, value in {**self.values, **given}.items()
+            if name not in other._computed
+        }
+        for name in known:
+            if name in other._computed:
+                other.values[name] = self._compute(name, other.values)
+        return other
+
+    def _compute(self, name: str, values: Mapping[str, Any]) -> Any:
+        """The value of a default that is computed from the model; the previous table if it has not changed."""
+        try:
+            found = getattr(self._struct.cls, name).function(self._model, SimpleNamespace(**values))
+        except Exception as error:  # a function of the task may raise any
+            message = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+            raise ValueError(
+                f"the parameter {name} of {self._task_name!r} can't be computed from the model: {message}"
+            ) from error
+        value, before = self._converted(name, found), self.values[name]
+        return before if name in self.tables and np.array_equal(before, value) else value
 
     def array(self, device: wp.Device) -> wp.array:
         """The values for the kernels: one entry for all worlds, or one per world if any value differs.
