@@ -61,11 +61,11 @@ __all__ = [
     "actuator", "all_inside", "angle_between", "body", "body_velocity", "camera", "control", "control_async",
     "control_report", "ctrl", "dof", "equality", "evaluate", "export_policy", "follow_velocity", "from_model", "geom",
     "grasp_terms", "gymnasium_model", "gymnasium_robotics_model", "inside", "joint", "load", "load_value",
-    "local_velocity", "make", "menagerie_model", "mocap", "normal", "package_model", "put", "put_upright", "qpos", "quat", "quat_angle",
-    "quat_difference", "quat_from_axis_angle", "quat_from_euler", "quat_from_mat", "quat_from_rotvec", "quat_inverse",
-    "quat_mul", "quat_random", "quat_rotate", "quat_rotate_inverse", "quat_to_euler", "quat_to_mat", "quat_to_rotvec",
-    "register", "sensor", "site", "sum_squares", "task_names", "tendon", "tolerance", "train", "uniform", "vec10",
-    "view"]
+    "local_velocity", "make", "menagerie_model", "mocap", "normal", "package_model", "put", "put_upright", "qpos",
+    "quat", "quat_angle", "quat_difference", "quat_from_axis_angle", "quat_from_euler", "quat_from_mat",
+    "quat_from_rotvec", "quat_inverse", "quat_mul", "quat_random", "quat_rotate", "quat_rotate_inverse",
+    "quat_to_euler", "quat_to_mat", "quat_to_rotvec", "register", "sensor", "site", "sum_squares", "task_names",
+    "tendon", "tolerance", "train", "uniform", "vec10", "view"]
 
 _NAMES = {
     "actuators": "follow_velocity",

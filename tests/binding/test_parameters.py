@@ -282,8 +282,6 @@ class Uncomputable:
 
 
 def test_a_parameter_that_cannot_be_computed_is_named(model: mujoco.MjModel) -> None:
-    with pytest.raises(
-        ValueError, match="parameter body of 'arm' can't be computed from .*: Attri.* 'body_mas'"
-    ):
+    with pytest.raises(ValueError, match="parameter body of 'arm' can't be computed from .*: Attri.* 'body_mas'"):
         parameters(model, Uncomputable)
     assert parameters(model, Uncomputable, body=1).values["body"] == 1
