@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 # fmt: off
 # isort: off
 if TYPE_CHECKING:
+    import lyceum_warp.terms
     from lyceum_warp.actuators import follow_velocity
     from lyceum_warp.algos.evaluation import Episodes, evaluate
     from lyceum_warp.algos.learner import Iteration, Learner
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
         quat_angle, quat_difference, quat_from_axis_angle, quat_from_euler, quat_from_mat, quat_from_rotvec,
         quat_inverse, quat_mul, quat_random, quat_rotate, quat_rotate_inverse, quat_to_euler, quat_to_mat,
         quat_to_rotvec)
-    from lyceum_warp.kernels.terms import (
+    from lyceum_warp.kernels.task_helpers import (
         Sigmoid, all_inside, angle_between, body_velocity, grasp_terms, inside, local_velocity, put, put_upright,
         sum_squares, tolerance)
     from lyceum_warp.model_files import (
@@ -96,7 +97,7 @@ _NAMES = {
     "kernels.rotations":
         "quat_angle quat_difference quat_from_axis_angle quat_from_euler quat_from_mat quat_from_rotvec quat_inverse "
         "quat_mul quat_random quat_rotate quat_rotate_inverse quat_to_euler quat_to_mat quat_to_rotvec",
-    "kernels.terms":
+    "kernels.task_helpers":
         "Sigmoid all_inside angle_between body_velocity grasp_terms inside local_velocity put put_upright sum_squares "
         "tolerance",
     "model_files": "ModelFile gymnasium_model gymnasium_robotics_model menagerie_model package_model",
@@ -120,6 +121,8 @@ _MODULES = {name: module for module, names in _NAMES.items() for name in names.s
 
 def __getattr__(name: str) -> Any:
     """Load a public name."""
+    if name == "terms":  # a room whose functions have no names in this module
+        return importlib.import_module(f"{__name__}.terms")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
@@ -128,4 +131,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, "terms"})
