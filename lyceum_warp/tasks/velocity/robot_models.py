@@ -5,13 +5,13 @@ indices of joints and of sites. The base is the body of the first joint, which m
 """
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 
-_JOINT, _GEOM, _SENSOR = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_SENSOR
+_JOINT, _SENSOR = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_SENSOR
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 _FORCE, _NET = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3  # parameters of a contact sensor
 
@@ -148,11 +148,14 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
     are the corners of their bounding boxes.
 
     Raises:
-        ValueError: A foot has no geom that can touch the ground.
+        ValueError: A foot has no geom in ``foot_geoms``.
     """
     data = _straight(model)
     spheres = []
-    for foot, geoms in zip(p.feet, _contact_geoms(model, p.feet), strict=True):
+    for foot in p.feet:
+        geoms = [geom for geom in p.foot_geoms if model.geom_bodyid[geom] == model.site_bodyid[foot]]
+        if not geoms:
+            raise ValueError(f"none of foot_geoms belongs to the body of the foot {model.site(foot).name!r}")
         found = np.concatenate([_spheres(model, data, geom) for geom in geoms])
         found[:, :3] -= data.xanchor[_chain(model, foot)[-1]]
         spheres.append(found)
@@ -161,8 +164,21 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
-    """The geoms of all feet that can touch the ground."""
-    return [geom for geoms in _contact_geoms(model, p.feet) for geom in geoms]
+    """The geoms of the bodies of the feet that can touch the ground, that is, a geom of the world.
+
+    Raises:
+        ValueError: A foot has none.
+    """
+    ground = np.flatnonzero(model.geom_bodyid == 0).tolist()
+    pairs = {frozenset(pair) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
+    found = []
+    for foot in p.feet:
+        geoms = np.flatnonzero(model.geom_bodyid == model.site_bodyid[foot]).tolist()
+        touching = [geom for geom in geoms if any(_collide(model, geom, other, pairs) for other in ground)]
+        if not touching:
+            raise ValueError(f"the foot {model.site(foot).name!r} has no geom that can touch the ground")
+        found += touching
+    return found
 
 
 def foot_forces(model: mujoco.MjModel, p: Any) -> list[int]:
@@ -205,20 +221,6 @@ def _straight(model: mujoco.MjModel) -> mujoco.MjData:
     data.qpos[start : start + 7] = 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
     mujoco.mj_kinematics(model, data)
     return data
-
-
-def _contact_geoms(model: mujoco.MjModel, feet: Iterable[int]) -> list[list[int]]:
-    """The geoms of each foot's body that can touch a geom of the world."""
-    ground = np.flatnonzero(model.geom_bodyid == 0)
-    pairs = {frozenset(pair) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
-    found = []
-    for foot in feet:
-        geoms = np.flatnonzero(model.geom_bodyid == model.site_bodyid[foot]).tolist()
-        touching = [geom for geom in geoms if any(_collide(model, geom, other, pairs) for other in ground.tolist())]
-        if not touching:
-            raise ValueError(f"the foot {model.site(foot).name!r} has no geom that can touch the ground")
-        found.append(touching)
-    return found
 
 
 def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[int]]) -> bool:

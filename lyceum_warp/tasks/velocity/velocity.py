@@ -313,3 +313,86 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     lw.put_upright(s.qpos, 0, start, lw.uniform(rng, -p.start_yaw, p.start_yaw))
     terms.draw_timer(s.push_timer, p.push_seconds, rng)
     draw_command(s, p, rng)
+
+
+# the reward; c is the command in the state before the step
+
+
+@wp.func
+def foot_clearance_and_slip(active: float, s: World, p: Params) -> wp.vec2:
+    """Both terms in one function, so that positions and velocities of the feet are computed once."""
+    clearance, slip = float(0.0), float(0.0)
+    for foot in range(p.feet.shape[0]):
+        x, v = foot_motion(s, p, foot)
+        clearance += terms.clearance(height(x, s, p), v, p.swing_target)
+        if s.contact_time[foot] > 0.0:
+            slip += terms.ground_speed(v) * terms.ground_speed(v)
+    return wp.vec2(clearance * active, slip * active)
+
+
+@wp.func
+def weighted(s0: World, action: Row[float], s1: World, p: Params) -> lw.vec10:
+    c = command(s0, p)
+    active = terms.active(c, p.least_command)
+    v, w = terms.linear_velocity(s1.qpos, s1.qvel), terms.angular_velocity(s1.qvel)
+    feet = foot_clearance_and_slip(active, s1, p)
+    return p.dt * lw.vec10(
+        2.0 * terms.track_linear_velocity(c, v, p.linear_velocity_variance),
+        2.0 * terms.track_angular_velocity(c, w, p.angular_velocity_variance),
+        1.0 * terms.upright(terms.gravity(s1.qpos), p.tilt_variance),
+        1.0
+        * terms.pose(
+            c,
+            s1.qpos,
+            p.joint_qpos,
+            p.default_pose,
+            p.standing_pose_std,
+            p.walking_pose_std,
+            p.least_command,
+        ),
+        -1.0 * terms.joint_limits(s1.qpos, p.joint_qpos, s1.jnt_range, p.joints, p.soft_limit),
+        -0.1 * terms.action_rate_l2(action, s1.previous_action),
+        -2.0 * feet[0],
+        -0.25 * terms.foot_swing_height(s1.contact_time, s1.swing_height, p.swing_target, p.dt, active),
+        -0.1 * feet[1],
+        -1e-5 * terms.soft_landing(s1.contact_time, s1.sensordata, p.foot_forces, p.dt, p.substep_dt, active),
+    )
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    return wp.dot(weighted(s0, action, s1, p), lw.vec10(1.0))
+
+
+@wp.func
+def velocity_error(c: wp.vec3, s: World) -> float:
+    return terms.velocity_error(c, terms.linear_velocity(s.qpos, s.qvel))
+
+
+@wp.func
+def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float]):
+    c = command(s0, p)
+    k = lw.put(metrics, 0, weighted(s0, action, s1, p))
+    k = lw.put(metrics, k, velocity_error(c, s1))
+    lw.put(metrics, k, terms.yaw_rate_error(c, terms.angular_velocity(s1.qvel)))
+
+
+@wp.func
+def evaluate(s: World, p: Params) -> float:  # velocity error, m/s
+    return velocity_error(command(s, p), s)
+
+
+@wp.func
+def terminated(s: World, p: Params) -> bool:
+    return terms.fell_over(terms.gravity(s.qpos), p.fall_angle) or terms.too_low(
+        terms.base_height(s.qpos), p.least_height
+    )
+
+
+class Velocity(lw.Task):
+    frame_skip, horizon = 4, 1000
+    metrics = (
+        "track_linear_velocity", "track_angular_velocity", "upright", "pose", "dof_pos_limits", "action_rate_l2",
+        "foot_clearance", "foot_swing_height", "foot_slip", "soft_landing", "velocity_error", "yaw_rate_error",
+    )  # fmt: skip
+    cleared = ("sensordata",)  # zero before the first substep; mjlab computes it for the first state
