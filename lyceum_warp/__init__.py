@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 # fmt: off
 # isort: off
 if TYPE_CHECKING:
-    import lyceum_warp.terms
+    import lyceum_warp.terms  # noqa: F401
     from lyceum_warp.actuators import follow_velocity
     from lyceum_warp.algos.evaluation import Episodes, evaluate
     from lyceum_warp.algos.learner import Iteration, Learner

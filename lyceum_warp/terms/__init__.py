@@ -5,16 +5,15 @@ task. A name of an argument means the same in all functions; ``ARGUMENTS`` expla
 """
 
 from lyceum_warp.support.docstrings import document_arguments
+
 # fmt: off
 # isort: off
-from lyceum_warp.terms.actions import action_acceleration_l2, action_rate_l2
+from lyceum_warp.terms.action_changes import action_acceleration_l2, action_rate_l2
 from lyceum_warp.terms.base_motion import (
-    alive, angular_velocity, base_height, base_height_l2, fell_over, gravity, heading, linear_velocity, orientation,
-    roll_pitch_rate_l2, tilt_l2, too_low, track_angular_velocity, track_linear_velocity, track_planar_velocity,
-    track_yaw_rate, upright, velocity_error, vertical_velocity_l2, yaw_rate_error)
-from lyceum_warp.terms.commands import (
-    active, command_size, draw_flag, draw_forward_only, draw_heading, draw_timer, draw_velocity, heading_yaw_rate,
-    is_due, run_timer, velocity_command)
+    alive, angular_momentum_l2, angular_velocity, base_height, base_height_l2, fell_over, gravity, heading,
+    linear_velocity, orientation, roll_pitch_rate_l2, tilt_l2, too_low, track_angular_velocity,
+    track_linear_velocity, track_planar_velocity, track_yaw_rate, upright, velocity_error, vertical_velocity_l2,
+    yaw_rate_error)
 from lyceum_warp.terms.draws import (
     chosen, draw_delay, draw_friction, draw_row, log_uniform, scale_elements, scale_gains, scale_mass,
     shift_center_of_mass, uniform_int)
@@ -29,21 +28,24 @@ from lyceum_warp.terms.joints import (
 from lyceum_warp.terms.motors import dc_motor_torque, servo_torque
 from lyceum_warp.terms.observations import add_normal_noise, add_uniform_noise, gather, gather_positions
 from lyceum_warp.terms.pushes import push
+from lyceum_warp.terms.velocity_commands import (
+    active, command_size, draw_flag, draw_forward_only, draw_heading, draw_timer, draw_velocity, heading_yaw_rate,
+    is_due, run_timer, velocity_command)
 
 __all__ = [
     "absolute_power", "action_acceleration_l2", "action_rate_l2", "active", "add_normal_noise", "add_uniform_noise",
-    "alive", "angular_velocity", "base_height", "base_height_l2", "change_inertia", "chosen", "clearance",
-    "command_size", "dc_motor_torque", "delayed_action", "draw_delay", "draw_flag", "draw_forward_only",
-    "draw_friction", "draw_heading", "draw_inertia", "draw_row", "draw_timer", "draw_velocity", "feet_in_air",
-    "fell_over", "follow_swing", "foot_clearance", "foot_slip", "foot_swing_height", "gait_pose", "gather",
-    "gather_positions", "gravity", "ground_speed", "heading", "heading_yaw_rate", "history_length", "is_due",
-    "joint_acceleration_l2", "joint_limits", "joint_velocity_l2", "landed", "linear_velocity", "log_uniform",
-    "long_swings", "orientation", "pose", "pose_l1", "posture", "power", "push", "push_history", "put_history",
-    "read_history", "roll_pitch_rate_l2", "run_clocks", "run_contact_clocks", "run_timer", "scale_elements",
-    "scale_gains", "scale_mass", "sensor_vector", "servo_torque", "shift_center_of_mass", "soft_landing",
-    "sum_squares_at", "symmetric_eigenvectors", "tilt_l2", "too_low", "torque_l2", "track_angular_velocity",
-    "track_linear_velocity", "track_planar_velocity", "track_yaw_rate", "uniform_int", "upright",
-    "velocity_command", "velocity_error", "vertical_velocity_l2", "yaw_rate_error"]
+    "alive", "angular_momentum_l2", "angular_velocity", "base_height", "base_height_l2", "change_inertia", "chosen",
+    "clearance", "command_size", "dc_motor_torque", "delayed_action", "draw_delay", "draw_flag",
+    "draw_forward_only", "draw_friction", "draw_heading", "draw_inertia", "draw_row", "draw_timer", "draw_velocity",
+    "feet_in_air", "fell_over", "follow_swing", "foot_clearance", "foot_slip", "foot_swing_height", "gait_pose",
+    "gather", "gather_positions", "gravity", "ground_speed", "heading", "heading_yaw_rate", "history_length",
+    "is_due", "joint_acceleration_l2", "joint_limits", "joint_velocity_l2", "landed", "linear_velocity",
+    "log_uniform", "long_swings", "orientation", "pose", "pose_l1", "posture", "power", "push", "push_history",
+    "put_history", "read_history", "roll_pitch_rate_l2", "run_clocks", "run_contact_clocks", "run_timer",
+    "scale_elements", "scale_gains", "scale_mass", "sensor_vector", "servo_torque", "shift_center_of_mass",
+    "soft_landing", "sum_squares_at", "symmetric_eigenvectors", "tilt_l2", "too_low", "torque_l2",
+    "track_angular_velocity", "track_linear_velocity", "track_planar_velocity", "track_yaw_rate", "uniform_int",
+    "upright", "velocity_command", "velocity_error", "vertical_velocity_l2", "yaw_rate_error"]
 # isort: on
 # fmt: on
 
@@ -58,6 +60,7 @@ ARGUMENTS = {
     "angular_velocity": "of the base, in the base's axes, rad/s",
     "angular_velocity_variance": "squared error at which the term is 1 / e, (rad/s)^2",
     "at": "index of the first number",
+    "base": "index of the body of the base",
     "base_height": "of the base's origin in the world, m",
     "bodies": "table: indices of bodies",
     "body": "index of a body",
@@ -155,6 +158,7 @@ ARGUMENTS = {
     "standing_pose_std": "table: standard deviation of each joint while standing, rad",
     "stretch": "logarithms of the diagonal of the matrix D",
     "substep_dt": "seconds in a substep",
+    "subtree_angmom": "the field",
     "swing_height": "memory: for each foot the greatest height of its last swing, m",
     "swing_target": "wanted height of a foot in its swing, m",
     "swing_time": "memory: for each foot the seconds of its last swing",

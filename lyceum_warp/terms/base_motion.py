@@ -116,6 +116,15 @@ def roll_pitch_rate_l2(angular_velocity: wp.vec3) -> float:
 
 
 @wp.func
+def angular_momentum_l2(subtree_angmom: Row[wp.vec3], base: int) -> float:
+    """|L|^2 of the whole robot about its centre of mass, (kg m^2/s)^2.
+
+    mjlab 1.6.0, ``angular_momentum_penalty``.
+    """
+    return wp.length_sq(subtree_angmom[base])
+
+
+@wp.func
 def tilt_l2(gravity: wp.vec3) -> float:
     """g_x^2 + g_y^2: the squared sine of the tilt, from 0 to 1.
 

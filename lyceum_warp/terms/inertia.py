@@ -52,8 +52,8 @@ def change_inertia(
     """Map the mass of a body by x -> D x + t in the body's frame, and multiply it by exp(2 density).
 
     D = [[exp d1, s12, s13], [0, exp d2, s23], [0, 0, exp d3]] with (d1, d2, d3) = stretch, (s12, s13, s23) = shear and
-    t = shift; 0 is no change. Rucker and Wensing 2022; the parameters of mjlab 1.6.0's ``pseudo_inertia``, with
-    density = alpha.
+    t = shift; zeros leave the body unchanged. Rucker and Wensing 2022; the parameters of mjlab 1.6.0's
+    ``pseudo_inertia``, with density = alpha.
     """
     d = wp.mat33(
         wp.exp(stretch[0]), shear[0], shear[1], 0.0, wp.exp(stretch[1]), shear[2], 0.0, 0.0, wp.exp(stretch[2])

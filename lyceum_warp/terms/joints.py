@@ -7,7 +7,7 @@ standard deviations.
 import warp as wp
 
 from lyceum_warp.task import Row
-from lyceum_warp.terms.commands import command_size
+from lyceum_warp.terms.velocity_commands import command_size
 
 
 @wp.func

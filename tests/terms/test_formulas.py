@@ -50,7 +50,7 @@ VALUES: dict[str, Any] = {
     "joint_qpos": [8, 7, 10, 14, 12], "joint_dof": [6, 9, 7, 8, 11],
     "least_air_time": 0.05, "most_air_time": 0.1, "wanted_air_time": 0.5, "swing_target": 0.1,
     "qpos": QPOS, "qvel": normal(12), "qacc": normal(12), "qfrc_actuator": normal(12), "row": normal(6),
-    "sensordata": normal(24), "site_xpos": normal(6, 3),
+    "sensordata": normal(24), "subtree_angmom": normal(4, 3), "base": 2, "site_xpos": normal(6, 3),
 }  # fmt: skip
 """A value of each argument, for all worlds or for each."""
 
@@ -143,6 +143,7 @@ FORMULAS: dict[str, Callable[..., Any]] = {
     ),
     "vertical_velocity_l2": lambda linear_velocity: linear_velocity[:, 2] ** 2,
     "roll_pitch_rate_l2": lambda angular_velocity: total(angular_velocity[:, :2] ** 2),
+    "angular_momentum_l2": lambda subtree_angmom, base: total(subtree_angmom[:, base] ** 2),
     "tilt_l2": lambda gravity: total(gravity[:, :2] ** 2),
     "upright": lambda gravity, tilt_variance: np.exp(-total(gravity[:, :2] ** 2) / tilt_variance),
     "base_height_l2": lambda base_height, target_height: (base_height - target_height) ** 2,

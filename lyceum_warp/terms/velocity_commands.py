@@ -2,11 +2,11 @@
 
 The parts of a command are rows of memory, which one call each draws::
 
+    terms.draw_timer(s.command_timer, p.command_seconds, rng)
     terms.draw_velocity(s.drawn_velocity, p.command_low, p.command_high, rng)
     terms.draw_heading(s.heading_target, s.heading_controlled, p.heading_share, rng)
     terms.draw_flag(s.standing, p.standing_share, rng)
     terms.draw_forward_only(s.drawn_velocity, p.forward_share, p.least_forward_velocity, rng)
-    terms.draw_timer(s.command_timer, p.command_seconds, rng)
 
 The order is mjlab 1.6.0's, ``UniformVelocityCommand``. ``velocity_command`` turns them into the command.
 """
