@@ -3,6 +3,8 @@
 ``python examples/commanded_speed.py`` checks and steps it; ``lyceum-warp train examples/commanded_speed.py`` trains it.
 """
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import warp as wp
@@ -34,8 +36,9 @@ class World:
     body_mass: Row[float]
     geom_friction: Row[wp.vec3]
     actuator_gainprm: Row[lw.vec10]
-    memory: Row[float]  # the command in m/s, and seconds since a foot touched the ground
-    lasting_memory: Row[float]  # level of the curriculum, 0 to 1
+    command: Row[float] = lw.memory()  # m/s
+    air_time: Row[float] = lw.memory()  # seconds since a foot touched the ground
+    level: Row[float] = lw.lasting_memory()  # of the curriculum, 0 to 1
 
 
 @wp.struct
@@ -48,42 +51,63 @@ class Params:
     gait: wp.array2d[float] = GAIT  # joint angles to imitate, a row for each phase
     period: float = 0.4  # of the gait, s
     weights: wp.vec4 = wp.vec4(1.0, 0.3, -0.02, -0.5)  # of the reward's terms
-    feet: int = lw.sensor("bfoot")  # the next sensor is the other foot's
+    feet: wp.array[int] = lw.sensors("bfoot", "ffoot")
     floor: int = lw.geom("floor")
 
 
-@wp.func
-def observe(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):  # noisy measurements of the robot
-    for i in range(8):
-        obs[i] = s.qpos[i + 1] + p.noise * lw.normal(rng)
-    for i in range(9):
-        obs[8 + i] = s.qvel[i] + 10.0 * p.noise * lw.normal(rng)
-    obs[17] = s.memory[0]
-    obs[18] = wp.sin(wp.tau * s.time / p.period)
-    obs[19] = wp.cos(wp.tau * s.time / p.period)
+@wp.struct
+class Policy:  # noisy measurements of the robot
+    position: Row[float] = lw.part(8)
+    velocity: Row[float] = lw.part(9)
+    command: Row[float] = lw.part()
+    phase: Row[wp.vec2] = lw.part()
+
+
+@wp.struct
+class Critic(Policy):  # privileged observations, available in simulation only
+    mass: Row[float] = lw.part(7)
+    friction: Row[float] = lw.part()
+    gravity: Row[float] = lw.part()
 
 
 @wp.func
-def observe_critic(s: World, p: Params, obs: Row[float]):  # privileged observations, available in simulation only
+def observe_robot(s: World, p: Params, obs: Any):  # for both groups
     for i in range(8):
-        obs[i] = s.qpos[i + 1]
+        obs.position[i] = s.qpos[i + 1]
     for i in range(9):
-        obs[8 + i] = s.qvel[i]
+        obs.velocity[i] = s.qvel[i]
+    obs.command[0] = s.command[0]
+    angle = wp.tau * s.time / p.period
+    obs.phase[0] = wp.vec2(wp.sin(angle), wp.cos(angle))
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Policy, rng: Row[wp.uint32]):
+    observe_robot(s, p, obs)
+    for i in range(8):
+        obs.position[i] += p.noise * lw.normal(rng)
+    for i in range(9):
+        obs.velocity[i] += 10.0 * p.noise * lw.normal(rng)
+
+
+@wp.func
+def observe_critic(s: World, p: Params, obs: Critic):
+    observe_robot(s, p, obs)
     for i in range(7):
-        obs[17 + i] = s.body_mass[i + 1]
-    obs[24] = s.geom_friction[p.floor][0]
-    obs[25] = s.gravity[2]
+        obs.mass[i] = s.body_mass[i + 1]
+    obs.friction[0] = s.geom_friction[p.floor][0]
+    obs.gravity[0] = s.gravity[2]
 
 
 @wp.func
 def terms(s0: World, action: Row[float], s1: World, p: Params) -> wp.vec4:
-    error = (s1.qpos[0] - s0.qpos[0]) / p.dt - s0.memory[0]
+    error = (s1.qpos[0] - s0.qpos[0]) / p.dt - s0.command[0]
     row = int(s1.time / p.period * float(p.gait.shape[0])) % p.gait.shape[0]
     distance, effort = float(0.0), float(0.0)
     for i in range(6):
         distance += (s1.qpos[3 + i] - p.gait[row, i]) ** 2.0
         effort += action[i] * action[i]
-    found = wp.vec4(wp.exp(-error * error), wp.exp(-2.0 * distance), effort, wp.min(s1.memory[1], 0.5))
+    found = wp.vec4(wp.exp(-error * error), wp.exp(-2.0 * distance), effort, wp.min(s1.air_time[0], 0.5))
     return wp.cw_mul(p.weights, found)
 
 
@@ -96,7 +120,7 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
 def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float]):
     for i in range(4):
         metrics[i] = terms(s0, action, s1, p)[i]
-    metrics[4] = s1.lasting_memory[0]
+    metrics[4] = s1.level[0]
 
 
 @wp.func
@@ -111,34 +135,33 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):  # at every reset, from
     for i in range(6):
         s.actuator_gainprm[i][0] = lw.uniform(rng, 0.9, 1.1)
     s.geom_friction[p.floor][0] = lw.uniform(rng, 0.3, 1.0)
-    s.memory[0] = lw.uniform(rng, 0.0, 1.0 + s.lasting_memory[0] * (p.fastest - 1.0))
+    s.command[0] = lw.uniform(rng, 0.0, 1.0 + s.level[0] * (p.fastest - 1.0))
 
 
 @wp.func
 def event(s: World, p: Params, rng: Row[wp.uint32]):  # on average a new command every 2 s, a push every second
     if lw.uniform(rng, 0.0, 2.0) < p.dt:
-        s.memory[0] = lw.uniform(rng, 0.0, 1.0 + s.lasting_memory[0] * (p.fastest - 1.0))
+        s.command[0] = lw.uniform(rng, 0.0, 1.0 + s.level[0] * (p.fastest - 1.0))
     if lw.uniform(rng, 0.0, 1.0) < p.dt:
         s.qvel[0] += p.push * lw.normal(rng)
 
 
 @wp.func
 def substep(s: World, p: Params):
-    touching = s.sensordata[p.feet] + s.sensordata[p.feet + 1] > 0.0
-    s.memory[1] = wp.where(touching, 0.0, s.memory[1] + p.substep_dt)
+    touching = s.sensordata[p.feet[0]] + s.sensordata[p.feet[1]] > 0.0
+    s.air_time[0] = wp.where(touching, 0.0, s.air_time[0] + p.substep_dt)
 
 
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
     well = terms(s0, action, s1, p)[0] > 0.7 * p.weights[0]  # the level, and with it the commands, rises
-    s1.lasting_memory[0] = wp.clamp(s0.lasting_memory[0] + wp.where(well, 1e-3, -1e-3), 0.0, 1.0)
+    s1.level[0] = wp.clamp(s0.level[0] + wp.where(well, 1e-3, -1e-3), 0.0, 1.0)
 
 
 @lw.register
 class CommandedSpeed(lw.Task):
     model, frame_skip, horizon, keyframe, settle = staticmethod(cheetah), 5, 400, "crouch", 20
-    obs = {"policy": {"posture": 17, "command": 1, "phase": 2}, "critic": {"posture": 17, "dynamics": 9}}
-    metrics, memory, lasting_memory = ("tracking", "gait", "effort", "flight", "level"), 2, 1
+    metrics = ("tracking", "gait", "effort", "flight", "level")
 
 
 if __name__ == "__main__":

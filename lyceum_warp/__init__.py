@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 # isort: off
 if TYPE_CHECKING:
     import lyceum_warp.terms  # noqa: F401
-    from lyceum_warp.actuators import follow_velocity
+    from lyceum_warp.model_actuators import follow_velocity
     from lyceum_warp.algos.evaluation import Episodes, evaluate
     from lyceum_warp.algos.learner import Iteration, Learner
     from lyceum_warp.algos.mppi_config import MPPIConfig
@@ -48,8 +48,9 @@ if TYPE_CHECKING:
     from lyceum_warp.options import EnvOptions, PhysicsOptions
     from lyceum_warp.runs.folder import load, load_value
     from lyceum_warp.task import (
-        Planning, Row, Task, act, actuator, body, camera, ctrl, dof, equality, from_model, geom, joint, mocap, qpos,
-        sensor, site, tendon)
+        Planning, Row, Task, act, actuator, actuators, bodies, body, camera, ctrl, dof, dofs, equality, from_model,
+        geom, geoms, joint, joints, lasting_memory, memory, mocap, part, qpos, qposes, sensor, sensors, site, sites,
+        tendon)
     from lyceum_warp.training import train
     from lyceum_warp.viewer.follow import RunViewer
     from lyceum_warp.viewer.show import view
@@ -59,17 +60,18 @@ __all__ = [
     "Episodes", "GaussianPolicy", "Iteration", "Learner", "MPPIConfig", "ModelFile", "NPGConfig", "OpenLoop",
     "PPOConfig", "PhysicsOptions", "PlanSamples", "PlanUpdate", "Planner", "Planning", "PlanningController",
     "PredictiveSampling", "Rollout", "Row", "RunViewer", "Sigmoid", "Task", "Trajectory", "ValueFunction", "act",
-    "actuator", "all_inside", "angle_between", "body", "body_velocity", "camera", "control", "control_async",
-    "control_report", "ctrl", "dof", "equality", "evaluate", "export_policy", "follow_velocity", "from_model", "geom",
-    "grasp_terms", "gymnasium_model", "gymnasium_robotics_model", "inside", "joint", "load", "load_value",
-    "local_velocity", "make", "menagerie_model", "mocap", "normal", "package_model", "put", "put_upright", "qpos",
-    "quat", "quat_angle", "quat_difference", "quat_from_axis_angle", "quat_from_euler", "quat_from_mat",
-    "quat_from_rotvec", "quat_inverse", "quat_mul", "quat_random", "quat_rotate", "quat_rotate_inverse",
-    "quat_to_euler", "quat_to_mat", "quat_to_rotvec", "register", "sensor", "site", "sum_squares", "task_names",
-    "tendon", "tolerance", "train", "uniform", "vec10", "view"]
+    "actuator", "actuators", "all_inside", "angle_between", "bodies", "body", "body_velocity", "camera", "control",
+    "control_async", "control_report", "ctrl", "dof", "dofs", "equality", "evaluate", "export_policy",
+    "follow_velocity", "from_model", "geom", "geoms", "grasp_terms", "gymnasium_model", "gymnasium_robotics_model",
+    "inside", "joint", "joints", "lasting_memory", "load", "load_value", "local_velocity", "make", "memory",
+    "menagerie_model", "mocap", "normal", "package_model", "part", "put", "put_upright", "qpos", "qposes", "quat",
+    "quat_angle", "quat_difference", "quat_from_axis_angle", "quat_from_euler", "quat_from_mat", "quat_from_rotvec",
+    "quat_inverse", "quat_mul", "quat_random", "quat_rotate", "quat_rotate_inverse", "quat_to_euler", "quat_to_mat",
+    "quat_to_rotvec", "register", "sensor", "sensors", "site", "sites", "sum_squares", "task_names", "tendon",
+    "tolerance", "train", "uniform", "vec10", "view"]
 
 _NAMES = {
-    "actuators": "follow_velocity",
+    "model_actuators": "follow_velocity",
     "algos.evaluation": "Episodes evaluate",
     "algos.learner": "Iteration Learner",
     "algos.mppi_config": "MPPIConfig",
@@ -105,8 +107,8 @@ _NAMES = {
     "options": "EnvOptions PhysicsOptions",
     "runs.folder": "load load_value",
     "task":
-        "Planning Row Task act actuator body camera ctrl dof equality from_model geom joint mocap qpos sensor site "
-        "tendon",
+        "Planning Row Task act actuator actuators bodies body camera ctrl dof dofs equality from_model geom geoms "
+        "joint joints lasting_memory memory mocap part qpos qposes sensor sensors site sites tendon",
     "training": "train",
     "viewer.follow": "RunViewer",
     "viewer.show": "view",

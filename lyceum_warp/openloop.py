@@ -23,7 +23,7 @@ from lyceum_warp.support.arrays import (
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_kind, whole_number
 from lyceum_warp.task import MEMORIES
-from lyceum_warp.world_arrays import own_parts
+from lyceum_warp.world_arrays import memory_columns, own_parts
 
 
 @document_attributes
@@ -194,7 +194,7 @@ class OpenLoop:
         if self._keys is not None:
             wp.copy(worlds.counters.key, self._keys)
         for name, buffer in self._memories.items():
-            columns = worlds.state[:, self.env.state_space.parts[name]]
+            columns = worlds.state[:, memory_columns(self.env.task, self.env.state_space)[name]]
             launch_rows(state.narrow, worlds.everyone, columns, getattr(worlds, name))
             wp.copy(buffer[0], getattr(worlds, name))
         for name, buffer in self._dynamics.items():

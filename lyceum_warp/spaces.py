@@ -66,6 +66,9 @@ class Space:
 COUNTERS = ("step", "key", "episode", "done_reason")
 """Counters in a state: steps since the reset, key of the random streams, number of the episode, bits of ``Done``."""
 
+OWN_PARTS = (*COUNTERS, "metrics", "success_steps")
+"""Parts of a state that an environment adds to MuJoCo's and to the task's memory."""
+
 
 def action_space(
     model: mujoco.MjModel, action_range: tuple[float, float] | None, actions: Mapping[str, int] | None = None

@@ -11,6 +11,9 @@ import mujoco
 import warp as wp
 
 from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.upstream import extend_structs
+
+extend_structs()
 
 if TYPE_CHECKING:
     T = TypeVar("T")
@@ -80,13 +83,13 @@ FUNCTIONS = {
     function.name: function
     for function in (
         TaskFunction("observe", "s: World, p: Params, obs: Row[float]", None,
-                     "Writes the observation. Every task needs this function. With ``rng`` as a last argument it may "
-                     "draw noise.", optional=_RNG),
+                     "Writes the observation, into a row or into a struct of named parts. Every task needs it. With "
+                     "``rng`` as a last argument it may draw noise.", optional=_RNG),
         TaskFunction("control", "s: World, action: Row[float], p: Params, ctrl: Row[float]", None,
                      "Turns an action into controls, and writes further inputs. Default: copies it, or scales it (see "
                      "``action_range``).", "pass", writes={"s": "inputs"}),
         TaskFunction("reward", _TRANSITION, float,
-                     "Reward of one transition. ``advance`` has already written ``s1.memory``. Default: 0.",
+                     "Reward of one transition. ``advance`` has already written the memory of ``s1``. Default: 0.",
                      "return 0.0"),
         TaskFunction("measure", f"{_TRANSITION}, metrics: Row[float]", None,
                      "Writes the metrics of one transition, in the order of the attribute ``metrics``. Default: none.",
@@ -116,8 +119,8 @@ FUNCTIONS = {
         TaskFunction("substep", "s: World, p: Params", None,
                      "Writes task memory after each substep. Default: keeps it.", "pass", writes={"s": "memory"}),
         TaskFunction("advance", f"{_TRANSITION}, {_RNG}", None,
-                     "Writes task memory, ``s1.memory``, after each step and before ``reward``. Default: keeps it.",
-                     "pass", writes={"s1": "memory"}),
+                     "Writes task memory of ``s1`` after each step and before ``reward``. Default: keeps it.", "pass",
+                     writes={"s1": "memory"}),
     )
 }  # fmt: skip
 """The functions of a task, by name. Checks, kernels, error messages and ``help(lw.Task)`` are made from this table."""
@@ -127,7 +130,7 @@ RESULTS = ("obs", "ctrl", "metrics", "rng")
 """Arguments that are rows for results, which a function may write."""
 
 MEMORIES = ("memory", "lasting_memory")
-"""Fields of World for a task's memory. The class attributes of the same names are their sizes."""
+"""The rows of numbers, one of each for every world, of which the memory in World is parts."""
 
 GROUP_PREFIX = "observe_"
 """``observe_critic`` writes the group ``critic`` of the observations."""
@@ -148,6 +151,48 @@ def _document_functions(cls: type["Task"]) -> type["Task"]:
     return cls
 
 
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """A part of a world's memory or of an observation. ``memory``, ``lasting_memory`` and ``part`` make it."""
+
+    kind: str
+    """One of ``MEMORIES``, or "obs"."""
+    size: int | str
+    """Number of elements, or the name of a table in Params, which has as many."""
+
+
+def memory(size: int | str = 1) -> Any:
+    """As a default in World: a row that the task writes in ``advance`` or ``substep``, and that a reset clears.
+
+    It belongs to the state. Its type is ``Row[float]``, ``Row[wp.vec3]`` or another row of numbers.
+
+    Args:
+        size: Number of elements, or the name of a table in Params: one element for each of its rows.
+    """
+    return Part("memory", size)
+
+
+def lasting_memory(size: int | str = 1) -> Any:
+    """As a default in World: memory that outlives episodes, for instance the level of a curriculum.
+
+    It is cleared only when a world's random stream starts, by ``rand_reset(seed=...)``, and ``startup`` may write it
+    then.
+
+    Args:
+        size: Number of elements, or the name of a table in Params: one element for each of its rows.
+    """
+    return Part("lasting_memory", size)
+
+
+def part(size: int | str = 1) -> Any:
+    """As a default in the struct of a group of observations: a part of the observation.
+
+    Args:
+        size: Number of elements, or the name of a table in Params: one element for each of its rows.
+    """
+    return Part("obs", size)
+
+
 class Element(int):
     """A named element of the model, whose index is looked up in the compiled model. ``site`` and others make it."""
 
@@ -166,14 +211,29 @@ def site(name: str) -> int:
     return Element("site_xpos", name)
 
 
+def sites(*names: str) -> Any:
+    """As a default of a ``wp.array[int]`` in Params: the indices of sites."""
+    return [site(name) for name in names]
+
+
 def body(name: str) -> int:
     """As a default in Params: the index of a body, in ``xpos`` and the other fields of bodies."""
     return Element("xpos", name)
 
 
+def bodies(*names: str) -> Any:
+    """As a default of a ``wp.array[int]`` in Params: the indices of bodies."""
+    return [body(name) for name in names]
+
+
 def geom(name: str) -> int:
     """As a default in Params: the index of a geom, in ``geom_xpos`` and the other ``geom_`` fields."""
     return Element("geom_xpos", name)
+
+
+def geoms(*names: str) -> Any:
+    """As a default of a ``wp.array[int]`` in Params: the indices of geoms."""
+    return [geom(name) for name in names]
 
 
 def camera(name: str) -> int:
@@ -196,6 +256,11 @@ def actuator(name: str) -> int:
     return Element("actuator_force", name)
 
 
+def actuators(*names: str) -> Any:
+    """As a default of a ``wp.array[int]`` in Params: the indices of actuators."""
+    return [actuator(name) for name in names]
+
+
 def ctrl(actuator: str) -> int:
     """As a default in Params: the index of an actuator's first control in ``ctrl``. Most actuators have one."""
     return Element("ctrl", actuator)
@@ -211,9 +276,19 @@ def joint(name: str) -> int:
     return Element("xanchor", name)
 
 
+def joints(*names: str) -> Any:
+    """As a default of a ``wp.array[int]`` in Params: the indices of joints."""
+    return [joint(name) for name in names]
+
+
 def qpos(joint: str) -> int:
     """As a default in Params: the index of a joint's first coordinate in ``qpos``."""
     return Element("qpos", joint)
+
+
+def qposes(*joints: str) -> Any:
+    """As a default of a ``wp.array[int]`` in Params: the indices of the first coordinates of joints in ``qpos``."""
+    return [qpos(name) for name in joints]
 
 
 def dof(joint: str) -> int:
@@ -221,9 +296,19 @@ def dof(joint: str) -> int:
     return Element("qvel", joint)
 
 
+def dofs(*joints: str) -> Any:
+    """As a default of a ``wp.array[int]`` in Params: the indices of the first degrees of freedom of joints."""
+    return [dof(name) for name in joints]
+
+
 def sensor(name: str) -> int:
     """As a default in Params: the index of a sensor's first number in ``sensordata``."""
     return Element("sensordata", name)
+
+
+def sensors(*names: str) -> Any:
+    """As a default of a ``wp.array[int]`` in Params: the indices of the first numbers of sensors in ``sensordata``."""
+    return [sensor(name) for name in names]
 
 
 def mocap(body: str) -> int:
@@ -288,12 +373,16 @@ class Task:
     ``World`` lists fields of MjData, such as ``qpos`` and ``site_xpos``, and fields of MjModel, such as ``body_mass``
     and ``geom_friction``, under MuJoCo's names. Model fields that ``startup``, ``initialize``, ``randomize`` or
     ``event`` write differ between worlds and belong to the state; all other model fields are the same in all worlds.
+    ``World`` also names the task's memory: ``air_time: Row[float] = lw.memory(4)``, or ``lw.lasting_memory(4)``.
 
     A default in ``Params`` may name an element of the model, such as ``tip: int = lw.site("tip")``: the functions get
     its index. ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``, ``lw.actuator``,
     ``lw.ctrl``, ``lw.act``, ``lw.tendon``, ``lw.equality``, ``lw.sensor`` and ``lw.mocap`` work likewise. A field of
     type ``wp.array[float]``, ``wp.array2d[wp.vec3]`` or the like is a table that all worlds share, such as a motion to
-    follow; its default is a nested list or an array. ``lw.from_model`` computes a default from the compiled model.
+    follow; its default is a nested list or an array. A table of named elements is written
+    ``feet: wp.array[int] = lw.sites("left_foot", "right_foot")``, or with ``lw.bodies``, ``lw.geoms``, ``lw.joints``,
+    ``lw.qposes``, ``lw.dofs``, ``lw.actuators`` or ``lw.sensors``. ``lw.from_model`` computes a default from the
+    compiled model.
 
     Functions:
     {functions}
@@ -307,12 +396,12 @@ class Task:
 
     - ``control``: the inputs xfrc_applied, qfrc_applied, mocap_pos, mocap_quat and userdata. An input keeps its value
       until it is written again; a reset clears it.
-    - ``initialize``, ``randomize`` and ``event``: qpos, qvel, act, ctrl, eq_active, the inputs, memory, lasting_memory
+    - ``initialize``, ``randomize`` and ``event``: qpos, qvel, act, ctrl, eq_active, the inputs, memory, lasting memory
       and model fields. Every reset restores the nominal values of these model fields before ``initialize`` runs, so
       that draws never add up. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
       ``sensordata``), which are computed afterwards.
-    - ``startup``: model fields and lasting_memory, which resets then do not change.
-    - ``substep``: memory and lasting_memory. ``advance``: memory and lasting_memory of ``s1``.
+    - ``startup``: model fields and lasting memory, which resets then do not change.
+    - ``substep``: memory and lasting memory. ``advance``: memory and lasting memory of ``s1``.
 
     ``reject`` sees an initial state before it settles. While a new episode settles, no ``substep`` runs.
 
@@ -332,7 +421,8 @@ class Task:
     """The observation's parts and their sizes, in order, such as ``{"position": 5, "velocity": 6}``; or a static method
     of the Params that returns them. A task may have several groups of observations, such as
     ``{"policy": {"position": 5}, "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy``,
-    which is ``env.obs``, and ``observe_critic``, with the same arguments, writes the group ``critic``."""
+    which is ``env.obs``, and ``observe_critic``, with the same arguments, writes the group ``critic``. A task leaves
+    ``obs`` out if the last argument of these functions is a Warp struct, whose fields ``lw.part`` gives sizes."""
     metrics: ClassVar[tuple[str, ...]] = ()
     """Names of the metrics that ``measure`` writes, such as the terms of the reward."""
     horizon: ClassVar[int] = 1000
@@ -345,13 +435,6 @@ class Task:
     cleared: ClassVar[tuple[str, ...]] = ()
     """Fields left by the last substep, such as contact forces, to zero at the start of an episode. Otherwise they are
     computed then, which takes a forward pass of the worlds that restart. A reset clears them before ``initialize``."""
-    memory: ClassVar[int] = 0
-    """Number of floats in the field ``memory``, which the task writes in ``advance`` and which belongs to the state.
-    ``World`` must list it as ``memory: Row[float]``. A reset clears it."""
-    lasting_memory: ClassVar[int] = 0
-    """Number of floats in the field ``lasting_memory``, which outlives episodes, for instance the level of a
-    curriculum. It is cleared only when a world's random stream starts, by ``rand_reset(seed=...)``, and ``startup``
-    may write it then."""
     actions: ClassVar[Mapping[str, int] | None] = None
     """The parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls;
     ``control`` then turns them into inputs. None: an action has one number for each control."""

@@ -8,10 +8,11 @@ import torch
 import warp as wp
 
 from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.parts import sizes
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.kernels import state, steps
-from lyceum_warp.spaces import Space, action_space, control_ranges, control_scale, state_space
+from lyceum_warp.spaces import OWN_PARTS, Space, action_space, control_ranges, control_scale, state_space
 from lyceum_warp.support.arrays import flat, launch_rows, shared_rows, torch_view, with_memory
 from lyceum_warp.support.validate import check_tensor
 from lyceum_warp.task import MEMORIES
@@ -28,10 +29,17 @@ def own_bytes_per_world(task: BoundTask) -> int:
 
 def own_parts(task: BoundTask) -> dict[str, int]:
     """The sizes of the parts that ``Worlds`` adds to a state beside the counters."""
-    form = task.task
-    sizes = {name: getattr(form, name) for name in MEMORIES}
-    sizes |= {"metrics": len(form.metrics), "success_steps": int(form.success_steps > 1)}
-    return {name: size for name, size in sizes.items() if size}
+    form, found = task.task, dict[str, int]()
+    for layout in task.memory.values():
+        found |= sizes(layout)
+    own = {"metrics": len(form.metrics), "success_steps": int(form.success_steps > 1)}
+    return found | {name: size for name, size in own.items() if size}
+
+
+def memory_columns(task: BoundTask, space: Space) -> dict[str, slice]:
+    """The columns of the rows ``memory`` and ``lasting_memory`` in a state, without those that the task lacks."""
+    ends = {name: [space.parts[part] for part in layout] for name, layout in task.memory.items() if layout}
+    return {name: slice(parts[0].start, parts[-1].stop) for name, parts in ends.items()}
 
 
 class WorldArrays:
@@ -56,9 +64,10 @@ class WorldArrays:
     def _allocate_fields(self) -> None:
         """The fields of the states after and before a step, and the task's memory."""
         n, model, task, kernels = self.nworld, self.task.model, self.task.task, self.task.kernels
-        self.memory = wp.zeros((n, task.memory), dtype=float)
-        self.lasting_memory = wp.zeros((n, task.lasting_memory), dtype=float)
-        self._lasting_before = wp.zeros((n, task.lasting_memory), dtype=float)
+        self.memory, self.lasting_memory, self._lasting_before = (
+            wp.zeros((n, sum(sizes(self.task.memory[name]).values())), dtype=float)
+            for name in ("memory", "lasting_memory", "lasting_memory")
+        )
         self.metric_sums = wp.zeros((n, len(task.metrics)), dtype=float)
         """Sums of the metrics over the episode so far."""
         self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
@@ -189,10 +198,11 @@ class WorldArrays:
 
     def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
         """The arrays of ``own_parts``, with their columns of the state."""
-        arrays = {name: getattr(self, name) for name in MEMORIES}
-        arrays |= {"metrics": self.metric_sums, "success_steps": self.success_counts}
-        for name in own_parts(self.task):
-            yield arrays[name], self.state[:, self.state_space.parts[name]]
+        columns = memory_columns(self.task, self.state_space)
+        columns |= {name: self.state_space.parts[name] for name in own_parts(self.task) if name in OWN_PARTS}
+        arrays = {"metrics": self.metric_sums, "success_steps": self.success_counts}
+        for name, place in columns.items():
+            yield arrays[name] if name in arrays else getattr(self, name), self.state[:, place]
 
     def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
         """Set the masked worlds' counters from columns of states."""

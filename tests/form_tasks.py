@@ -165,23 +165,23 @@ class Weighed(Drawn):
 @wp.struct
 class PracticedWorld:
     qpos: Row[float]
-    lasting_memory: Row[float]
+    practice: Row[float] = lw.lasting_memory()
 
 
 @wp.func
 def observe_practice(s: PracticedWorld, p: PuckParams, obs: Row[float]):
     obs[0] = s.qpos[0]
-    obs[1] = s.lasting_memory[0]
+    obs[1] = s.practice[0]
 
 
 @wp.func
 def start_further(s: PracticedWorld, p: PuckParams):
-    s.qpos[0] = 0.001 * s.lasting_memory[0]
+    s.qpos[0] = 0.001 * s.practice[0]
 
 
 @wp.func
 def count_steps(s0: PracticedWorld, action: Row[float], s1: PracticedWorld, p: PuckParams, rng: Row[wp.uint32]):
-    s1.lasting_memory[0] = s0.lasting_memory[0] + lw.uniform(rng, 0.0, 2.0)
+    s1.practice[0] = s0.practice[0] + lw.uniform(rng, 0.0, 2.0)
 
 
 class Practiced(lw.Task):
@@ -190,7 +190,6 @@ class Practiced(lw.Task):
     model = Drawn.model
     frame_skip = 3
     obs = {"position": 1, "practice": 1}
-    lasting_memory = 1
     horizon = 25
     World = PracticedWorld
     Params = PuckParams
@@ -199,7 +198,7 @@ class Practiced(lw.Task):
 
 @wp.func
 def draw_practice(s: PracticedWorld, p: PuckParams, rng: Row[wp.uint32]):
-    s.lasting_memory[0] = lw.uniform(rng, 1.0, 2.0)
+    s.practice[0] = lw.uniform(rng, 1.0, 2.0)
 
 
 class Gifted(Practiced):

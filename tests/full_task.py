@@ -1,5 +1,7 @@
 """A task that uses every feature of the task form on a small model: a puck on the floor, and a paddle that is moved."""
 
+from typing import Any
+
 import mujoco
 import warp as wp
 
@@ -39,8 +41,9 @@ class World:
     gravity: Row[float]
     dof_damping: Row[float]
     geom_size: Row[wp.vec3]
-    memory: Row[float]
-    lasting_memory: Row[float]
+    travel: Row[float] = lw.memory()
+    smooth: Row[float] = lw.memory()
+    draws: Row[float] = lw.lasting_memory()
 
 
 @wp.struct
@@ -54,27 +57,48 @@ class Params:
     puck: int = lw.body("puck")
     geom: int = lw.geom("puck")
     top: int = lw.site("top")
+    joints: wp.array[int] = lw.qposes("x", "z")
+
+
+@wp.struct
+class Policy:
+    position: Row[float] = lw.part("joints")
+    top: Row[float] = lw.part()
+
+
+@wp.struct
+class Critic(Policy):
+    velocity: Row[float] = lw.part()
+    dynamics: Row[wp.vec4] = lw.part()
+    memory: Row[float] = lw.part(3)
+    paddle: Row[wp.vec3] = lw.part()
+    userdata: Row[float] = lw.part()
 
 
 @wp.func
-def observe(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):
-    for i in range(2):
-        obs[i] = s.qpos[i] + p.noise * lw.normal(rng)
-    obs[2] = s.site_xpos[p.top][0]
+def observe_body(s: World, p: Params, obs: Any):  # for both groups
+    for i in range(p.joints.shape[0]):
+        obs.position[i] = s.qpos[p.joints[i]]
+    obs.top[0] = s.site_xpos[p.top][0]
 
 
 @wp.func
-def observe_critic(s: World, p: Params, obs: Row[float]):
-    obs[0] = s.qvel[0]
-    obs[1] = s.body_mass[p.puck]
-    obs[2] = s.geom_friction[p.geom][0]
-    obs[3] = s.gravity[2]
-    obs[4] = s.dof_damping[0]
-    obs[5] = s.memory[0]
-    obs[6] = s.memory[1]
-    obs[7] = s.lasting_memory[0]
-    obs[8] = s.mocap_pos[0][0]
-    obs[9] = s.userdata[0]
+def observe(s: World, p: Params, obs: Policy, rng: Row[wp.uint32]):
+    observe_body(s, p, obs)
+    for i in range(p.joints.shape[0]):
+        obs.position[i] += p.noise * lw.normal(rng)
+
+
+@wp.func
+def observe_critic(s: World, p: Params, obs: Critic):
+    observe_body(s, p, obs)
+    obs.velocity[0] = s.qvel[0]
+    obs.dynamics[0] = wp.vec4(s.body_mass[p.puck], s.geom_friction[p.geom][0], s.gravity[2], s.dof_damping[0])
+    obs.memory[0] = s.travel[0]
+    obs.memory[1] = s.smooth[0]
+    obs.memory[2] = s.draws[0]
+    obs.paddle[0] = s.mocap_pos[0]
+    obs.userdata[0] = s.userdata[0]
 
 
 @wp.func
@@ -87,7 +111,7 @@ def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
 
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    return s1.qpos[0] - s0.qpos[0] - p.cost * action[0] * action[0] + 0.01 * s1.memory[1]
+    return s1.qpos[0] - s0.qpos[0] - p.cost * action[0] * action[0] + 0.01 * s1.smooth[0]
 
 
 @wp.func
@@ -118,7 +142,7 @@ def startup(s: World, p: Params, rng: Row[wp.uint32]):
 
 @wp.func
 def initialize(s: World, p: Params):
-    s.memory[1] = 0.5
+    s.smooth[0] = 0.5
 
 
 @wp.func
@@ -126,7 +150,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     s.qpos[0] = s.qpos[0] + lw.uniform(rng, -0.2, 0.2)
     s.body_mass[p.puck] = s.body_mass[p.puck] * lw.uniform(rng, 0.5, 2.0)
     s.geom_friction[p.geom][0] = s.geom_friction[p.geom][0] * lw.uniform(rng, 0.2, 1.5)
-    s.lasting_memory[0] = s.lasting_memory[0] + 1.0
+    s.draws[0] = s.draws[0] + 1.0
 
 
 @wp.func
@@ -144,12 +168,12 @@ def event(s: World, p: Params, rng: Row[wp.uint32]):
 
 @wp.func
 def substep(s: World, p: Params):
-    s.memory[0] = s.memory[0] + p.substep_dt * s.qvel[0]
+    s.travel[0] = s.travel[0] + p.substep_dt * s.qvel[0]
 
 
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
-    s1.memory[1] = 0.9 * s0.memory[1] + 0.1 * lw.normal(rng)
+    s1.smooth[0] = 0.9 * s0.smooth[0] + 0.1 * lw.normal(rng)
 
 
 class Full(lw.Task):
@@ -157,14 +181,9 @@ class Full(lw.Task):
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))
     frame_skip = 3
-    obs = {
-        "policy": {"position": 2, "top": 1},
-        "critic": {"velocity": 1, "dynamics": 4, "memory": 3, "inputs": 2},
-    }
     metrics = ("speed", "cost")
     actions = {"push": 1, "wind": 1, "paddle": 1}
     action_range = (-1.0, 1.0)
-    memory, lasting_memory = 2, 1
     keyframe = "start"
     horizon = 20
     success_steps = 3

@@ -120,7 +120,7 @@ def test_torch_loop_learns_to_approach_the_target(run) -> None:
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
 def test_examples_are_short_and_use_public_names_only(path: Path) -> None:
     source = path.read_text()
-    most = {"commanded_speed.py": 150, "random_search.py": 80}
+    most = {"commanded_speed.py": 175, "random_search.py": 80}
     assert len(source.splitlines()) < most.get(path.name, 60)
     modules = set(re.findall(r"^(?:from|import) (lyceum_warp[\w.]*)", source, re.MULTILINE))
     assert modules <= {"lyceum_warp", "lyceum_warp.testing"}

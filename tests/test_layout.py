@@ -19,7 +19,7 @@ TESTS = Path(__file__).parent
 LEVELS = {
     "support": -1, "done": 0,
     "model_files": 0,
-    "actuators": 1, "fields": 1, "kernels": 1, "model_fields": 1, "options": 1, "task": 1,
+    "fields": 1, "kernels": 1, "model_actuators": 1, "model_fields": 1, "options": 1, "task": 1,
     "graphs": 2, "spaces": 2, "terms": 2,
     "binding": 3, "engines": 3,
     "world_arrays": 4,

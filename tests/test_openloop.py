@@ -54,7 +54,7 @@ class Arm:
     qvel: Row[float]
     ctrl: Row[float]
     site_xpos: Row[wp.vec3]
-    memory: Row[float]  # a sum over the steps, and the last step's draw
+    kept: Row[float] = lw.memory(2)  # a sum over the steps, and the last step's draw
 
 
 @wp.struct
@@ -77,7 +77,7 @@ def observe_arm(s: Arm, p: ArmParams, obs: Row[float]):
     for i in range(2):
         obs[i] = s.qpos[i]
         obs[2 + i] = s.qvel[i]
-        obs[4 + i] = s.memory[i]
+        obs[4 + i] = s.kept[i]
     for i in range(3):
         obs[6 + i] = s.site_xpos[p.tip][i]
 
@@ -86,7 +86,7 @@ def observe_arm(s: Arm, p: ArmParams, obs: Row[float]):
 def reward_of_arm(s0: Arm, action: Row[float], s1: Arm, p: ArmParams) -> float:
     r = s1.site_xpos[p.tip][2] - s0.site_xpos[p.tip][2] - p.cost * action[0] * action[1]
     r += 0.1 * s0.ctrl[0] - 0.2 * s1.ctrl[0] * s1.ctrl[1]
-    return r + s1.memory[0] * s0.memory[0] + p.gain * s1.memory[1]
+    return r + s1.kept[0] * s0.kept[0] + p.gain * s1.kept[1]
 
 
 @wp.func
@@ -97,14 +97,14 @@ def swung_out(s: Arm, p: ArmParams) -> bool:
 @wp.func
 def remember_draws(s0: Arm, action: Row[float], s1: Arm, p: ArmParams, rng: Row[wp.uint32]):
     first = lw.uniform(rng, 0.0, 1.0)
-    s1.memory[0] = 0.5 * s0.memory[0] + s1.site_xpos[p.tip][0] - action[0] * first
-    s1.memory[1] = lw.normal(rng)
+    s1.kept[0] = 0.5 * s0.kept[0] + s1.site_xpos[p.tip][0] - action[0] * first
+    s1.kept[1] = lw.normal(rng)
 
 
 @wp.func
 def remember_once(s: Arm, p: ArmParams, rng: Row[wp.uint32]):
     for i in range(2):
-        s.memory[i] = lw.normal(rng)
+        s.kept[i] = lw.normal(rng)
 
 
 @wp.func
@@ -130,7 +130,6 @@ class Forgetful(lw.Task):
     model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
     frame_skip = 3
     obs = {"joints": 4, "memory": 2, "tip": 3}
-    memory = 2
     World = Arm
     Params = ArmParams
     observe, reward, terminated, advance = observe_arm, reward_of_arm, swung_out, remember_draws
@@ -139,7 +138,7 @@ class Forgetful(lw.Task):
 class Keepsake(lw.Task):
     """Its memory is written at a reset and stays as it is."""
 
-    model, frame_skip, obs, memory = Forgetful.model, 3, Forgetful.obs, 2
+    model, frame_skip, obs = Forgetful.model, 3, Forgetful.obs
     World = Arm
     Params = ArmParams
     observe, reward, randomize = observe_arm, reward_of_arm, remember_once

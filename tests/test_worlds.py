@@ -38,8 +38,8 @@ def outcomes_with_faults(
         if i == 5:
             env.action[1, 0] = torch.nan
         for step, part, bad in (
-            (8, "lasting_memory", torch.nan),
-            (12, "memory", torch.nan),
+            (8, "draws", torch.nan),
+            (12, "smooth", torch.nan),
             (16, "geom_friction", -1.0),
         ):
             if i == step:

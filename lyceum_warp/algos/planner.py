@@ -53,6 +53,7 @@ from lyceum_warp.support.arrays import flat, torch_view
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import described, whole_number
 from lyceum_warp.task import Task
+from lyceum_warp.world_arrays import memory_columns
 
 _BUFFERS = (
     "actions", "nominal", "knot_actions", "standard_noise", "adapted_noise", "sampled", "model_returns", "returns",
@@ -166,7 +167,7 @@ class Planner:
         for name, row in self.env.engine.nominal.items():  # a robot has the nominal model, not one that startup drew
             self._initial[self.env.state_space.parts[name]] = torch_view(flat(row))[0].double()
         if "lasting_memory" in self.env.task.writes.get("startup", ()):
-            self._initial[self.env.state_space.parts["lasting_memory"]] = 0.0
+            self._initial[memory_columns(self.env.task, self.env.state_space)["lasting_memory"]] = 0.0
         with wp.ScopedDevice(self.env.device):
             self._keys = wp.zeros(nworld, dtype=wp.uint32)
             shapes = {name: (self.config.models, self.env.state_space.parts[name]) for name in drawn}

@@ -11,17 +11,19 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from lyceum_warp.binding import models
+from lyceum_warp.binding import models, parts
 from lyceum_warp.binding.codegen import kernels_of
 from lyceum_warp.binding.functions import TaskSource, draws_noise
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
+from lyceum_warp.binding.sources import is_struct
 from lyceum_warp.binding.writes import Rights, check_writes, written_fields
 from lyceum_warp.fields import INITIAL, INPUTS, Field, describe, is_data_field, similar_data_fields, vec10
 from lyceum_warp.model_fields import describe_model_field, is_model_field, similar_model_fields
 from lyceum_warp.options import ModelSource, PhysicsOptions
+from lyceum_warp.spaces import OWN_PARTS
 from lyceum_warp.support.validate import whole_number
-from lyceum_warp.task import FUNCTIONS, MEMORIES, RESULTS, Task, TaskFunction, observer_name
+from lyceum_warp.task import FUNCTIONS, MEMORIES, RESULTS, Row, Task, TaskFunction, observer_name
 
 _SPELLED = {
     "float32": "float", "int32": "int", "vec3f": "wp.vec3", "vec4f": "lw.quat", "mat33f": "wp.mat33",
@@ -80,13 +82,15 @@ def check_field_name(name: str) -> None:
     raise ValueError(f"there is no field {name!r}: {hint}")
 
 
-def obs_layouts(task: type[Task], params: Mapping[str, Any]) -> dict[str, dict[str, int]]:
+def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict[str, int]]:
     """The parts of each group of a task's observations and their sizes, for given values of its parameters.
 
     Raises:
-        ValueError: ``obs`` of the task is not a dict of sizes, or a dict of groups of them.
+        ValueError: ``obs`` of the task is not a dict of sizes, or a dict of groups of them; or a struct has no parts.
     """
-    name = task_name(task)
+    task, name = source.task, source.name
+    if not hasattr(task, "obs"):
+        return {group: parts.sizes(slices) for group, slices in obs_slices(source, params).items()}
     given = task.obs(SimpleNamespace(**params)) if callable(task.obs) else task.obs
     if not isinstance(given, Mapping) or not given:
         raise ValueError(f"obs of the task {name!r} is {given!r}: add {_PARTS}")
@@ -105,6 +109,31 @@ def obs_layouts(task: type[Task], params: Mapping[str, Any]) -> dict[str, dict[s
                 "'critic', which observe_critic writes"
             )
     return {group: _layout(name, layout) for group, layout in given.items()}
+
+
+def obs_slices(source: TaskSource, params: Mapping[str, Any]) -> dict[str, parts.Layout]:
+    """The layouts of the groups of observations that a task writes into structs; without groups if it has ``obs``.
+
+    Raises:
+        ValueError: ``observe`` takes no struct, or a struct has no parts or fields that are no parts.
+    """
+    if hasattr(source.task, "obs"):
+        return {}
+    found = {}
+    for group, struct in source.group_structs().items():
+        if not is_struct(struct):
+            raise ValueError(
+                f"the task {source.name!r} has no obs: add {_PARTS} to its class, or let {observer_name(group)} take a "
+                "struct of parts"
+            )
+        found[group] = parts.layout(struct, "obs", params, struct.key)
+        if others := [name for name in struct.vars if name not in found[group]]:
+            raise ValueError(f"{struct.key}.{others[0]} of the task {source.name!r} needs a size, as lw.part(3)")
+        if not found[group]:
+            raise ValueError(
+                f"the struct {struct.key} of the task {source.name!r} has no parts, such as x: Row[float] = lw.part()"
+            )
+    return found
 
 
 def _layout(task: str, layout: Mapping[str, Any]) -> dict[str, int]:
@@ -146,13 +175,16 @@ class BoundTask:
         self.name = task_name(task)
         self.source = TaskSource(task, self.name)
         self.functions = self.source.functions
-        self.types = {name: variable.type for name, variable in self.source.world.vars.items()}
         self._check_class()
-        named = [name for name in dict.fromkeys([*self.types, *fields]) if name not in MEMORIES]
+        memory = self.source.memory
+        named = [name for name in dict.fromkeys([*self.source.world.vars, *fields]) if name not in memory]
         for name in named:
             check_field_name(name)
+        self.types = {name: v.type for name, v in self.source.world.vars.items() if name not in memory}
+        """The types of a world's fields and of its rows of memory, as a batch of worlds has them."""
+        self.types |= {name: Row[float] for name in MEMORIES if any(part.kind == name for part in memory.values())}
         self.writes = self._checked_writes()
-        """The fields of World that each function writes, by the functions' names."""
+        """The fields of World and the rows of memory that each function writes, by the functions' names."""
         own = [name for name in named if is_data_field(name)]
         of_model = [name for name in named if name not in own]
         self.spec = _read_spec(task, model)
@@ -174,13 +206,15 @@ class BoundTask:
         self.parameters = Parameters(
             self.source.params, self.name, self.model, nworld=nworld, timestep=self.timestep, given=params or {}
         )
-        self.obs_layouts = obs_layouts(task, self.params)
+        self.memory = self._memory_layouts()
+        """The layouts of the rows ``memory`` and ``lasting_memory``."""
+        self.obs_layouts = obs_layouts(self.source, self.params)
         """The parts of each group of observations and their sizes."""
         self.observers = self.source.group_functions(self.obs_layouts)
         """The functions that write the groups of observations, by the groups' names."""
         observers = {observer_name(group): function for group, function in self.observers.items()}
         check_writes(self.name, observers, dict.fromkeys(observers, self._rights(FUNCTIONS["observe"])))
-        self.kernels = kernels_of(self.source, self.observers)
+        self.kernels = kernels_of(self.source, self.observers, self.memory, obs_slices(self.source, self.params))
 
     @property
     def params(self) -> dict[str, Any]:
@@ -195,13 +229,21 @@ class BoundTask:
     def _checked_writes(self) -> dict[str, frozenset[str]]:
         written = {name: function for name, function in self.functions.items() if function is not None}
         check_writes(self.name, written, {name: self._rights(function) for name, function in FUNCTIONS.items()})
-        return {name: written_fields(function) for name, function in written.items()}
+        memory = self.source.memory
+        return {
+            name: frozenset(memory[field].kind if field in memory else field for field in written_fields(function))
+            for name, function in written.items()
+        }
+
+    def _memory_layouts(self) -> dict[str, parts.Layout]:
+        return {name: parts.layout(self.source.world, name, self.params, "World") for name in MEMORIES}
 
     def _rights(self, function: TaskFunction) -> Rights:
         """The fields that a function may write, by the names of its arguments."""
         model = [name for name in self.types if is_model_field(name)]
-        lasting = ("lasting_memory", *model)
-        groups = {"inputs": INPUTS, "memory": MEMORIES, "lasting": lasting, "start": (*INITIAL, *MEMORIES, *model)}
+        memory = tuple(self.source.memory)
+        lasting = (*(name for name, part in self.source.memory.items() if part.kind == "lasting_memory"), *model)
+        groups = {"inputs": INPUTS, "memory": memory, "lasting": lasting, "start": (*INITIAL, *memory, *model)}
         return {
             name: None if name in RESULTS else groups.get(function.writes.get(name, ""), ())
             for name in function.argument_names
@@ -239,19 +281,22 @@ class BoundTask:
         """
         previous, self.parameters = self.parameters, self.parameters.changed(params)
         try:
-            same = obs_layouts(self.task, self.params) == self.obs_layouts
+            changed = "the observation's" if obs_layouts(self.source, self.params) != self.obs_layouts else ""
         except ValueError:  # one value per world for a parameter that sets a size
-            same = False
-        if not same:
+            changed = "the observation's"
+        changed = changed or ("the memory's" if self._memory_layouts() != self.memory else "")
+        if changed:
             self.parameters = previous
-            raise ValueError(f"{', '.join(params)} would change the observation's parts: make a new environment")
+            raise ValueError(f"{', '.join(params)} would change {changed} parts: make a new environment")
 
     def _check_class(self) -> None:
         task = self.task
-        for name in MEMORIES:
-            size = whole_number(f"{name} of the task {self.name!r}", getattr(task, name), low=0)
-            if (name in self.types) != (size > 0):
-                raise ValueError(f"the task {self.name!r} needs both {name} = ... in its class and {name} in World")
+        for name in self.source.memory:
+            if is_data_field(name) or is_model_field(name) or name in OWN_PARTS:
+                raise ValueError(
+                    f"World.{name} of the task {self.name!r} is memory, but {name} is already the name of a field or "
+                    "of a part of the state: rename it"
+                )
         whole_number(f"draws of the task {self.name!r}", task.draws, low=1)
         whole_number(f"settle of the task {self.name!r}", task.settle, low=0)
         if not isinstance(task.keyframe, str | None):
@@ -262,10 +307,8 @@ class BoundTask:
         self._check_metrics()
         for kind in ("lagged", "cleared"):
             for name in getattr(task, kind):
-                if name not in self.types:
+                if name not in self.source.world.vars:
                     raise ValueError(f"{kind} of the task {self.name!r} has {name!r}: list it in World, too")
-        if not hasattr(task, "obs"):
-            raise ValueError(f"the task {self.name!r} has no obs: add {_PARTS} to its class")
         whole_number(f"horizon of the task {self.name!r}", task.horizon, low=0)
         self._check_success_steps()
         if task.action_range is not None:

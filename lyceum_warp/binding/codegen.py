@@ -13,13 +13,14 @@ import numpy as np
 import warp as wp
 
 from lyceum_warp.binding.functions import TaskSource, draws_noise
+from lyceum_warp.binding.parts import Layout, view_lines
 from lyceum_warp.binding.sources import free_module_name, run_source
 from lyceum_warp.binding.writes import written_fields
 from lyceum_warp.fields import is_data_field
 from lyceum_warp.kernels import random, steps
 from lyceum_warp.kernels import rows as kernel_rows
 from lyceum_warp.model_fields import NOT_NEGATIVE
-from lyceum_warp.task import FUNCTIONS, MEMORIES, Row, TaskFunction
+from lyceum_warp.task import FUNCTIONS, Row, TaskFunction
 
 _BATCH = """
 @wp.struct
@@ -62,7 +63,7 @@ def copy_observations(source: Observations, target: Observations, w: int, lane: 
 
 
 @wp.func
-def finite_memory(s0: World, s1: World, lane: int, lanes: int) -> bool:
+def finite_memory(before: Batch, after: Batch, w: int, lane: int, lanes: int) -> bool:
     finite = bool(True)
 {memory}
     return finite
@@ -75,19 +76,46 @@ def valid_model(s: World, lane: int, lanes: int) -> bool:
     return valid
 """
 
+_GROUP_VIEW = """
+@wp.func
+def view_{number}(row: Row[float]) -> Group{number}:
+    group_{number} = Group{number}()
+{lines}
+    return group_{number}
+
+"""
+
+_MEMORY_CHECKS = {
+    "memory": "    if not finite_row(after.memory[w], lane, lanes):\n        finite = False",
+    "lasting_memory":
+        "    if not restored_row(before.lasting_memory[w], after.lasting_memory[w], lane, lanes):\n"
+        "        finite = False",
+}  # fmt: skip
+"""Lines that find memory that is not finite, and restore lasting memory to its value before the step."""
+
 _kernels: dict[Any, steps.Kernels] = {}
 _MAKING = threading.RLock()
 
 
-def kernels_of(source: TaskSource, groups: Mapping[str, wp.Function]) -> steps.Kernels:
-    """The kernels of a task, made once for the same functions and structs; see ``kernels.steps.make_kernels``.
+def kernels_of(
+    source: TaskSource,
+    groups: Mapping[str, wp.Function],
+    memory: Mapping[str, Layout],
+    observations: Mapping[str, Layout],
+) -> steps.Kernels:
+    """The kernels of a task, made once for the same functions, structs and sizes; see ``kernels.steps.make_kernels``.
 
-    ``groups`` has the functions that write its groups of observations.
+    Args:
+        source: The task.
+        groups: The functions that write its groups of observations.
+        memory: The layouts of its rows of memory.
+        observations: The layouts of the groups of observations that are structs.
     """
-    key = (source.world, source.params, tuple(source.functions.values()), tuple(groups.items()))
+    layouts = tuple((name, *layout.items()) for name, layout in (*memory.items(), *observations.items()))
+    key = (source.world, source.params, tuple(source.functions.values()), tuple(groups.items()), layouts)
     with _MAKING:
         if key not in _kernels:
-            scope = _generated(source, groups)
+            scope = _generated(source, groups, memory, observations)
             functions = {name: function or scope[f"no_{name}"] for name, function in source.functions.items()}
             written = [name for name, function in source.functions.items() if function is not None]
             module = free_module_name(f"lyceum_warp.generated.{source.path}")
@@ -97,31 +125,46 @@ def kernels_of(source: TaskSource, groups: Mapping[str, wp.Function]) -> steps.K
         return _kernels[key]
 
 
-def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[str, Any]:
+def _generated(
+    source: TaskSource,
+    groups: Mapping[str, wp.Function],
+    memory: Mapping[str, Layout],
+    observations: Mapping[str, Layout],
+) -> dict[str, Any]:
     """The names that the generated source defines: structs, functions that call the task's, and defaults."""
     scope: dict[str, Any] = {"wp": wp, "Row": Row, "World": source.world, "Params": source.params}
     batch, rows, state = [], [], []
-    for name, variable in source.world.vars.items():
-        kind = variable.type
+    fields = {name: variable.type for name, variable in source.world.vars.items() if name not in source.memory}
+    fields |= {name: Row[float] for name, layout in memory.items() if layout}
+    for name, kind in fields.items():
         ndim, dtype = (kind.ndim + 1, kind.dtype) if hasattr(kind, "ndim") else (1, kind)
         scope[f"type_{name}"] = wp.array(dtype=dtype, ndim=ndim)
         batch.append(f"    {name}: type_{name}")
-        rows.append(f"    s.{name} = batch.{name}[w]")
-        if name in MEMORIES or is_data_field(name):  # no step changes the model
+        if name in memory:
+            rows += [f"{name} = batch.{name}[w]", *view_lines(memory[name], "s", name, scope)]
+        else:
+            rows.append(f"s.{name} = batch.{name}[w]")
+        if name in memory or is_data_field(name):  # no step changes the model
             state += _copy(name, ndim)
     scope |= {"substream": random.substream, "finite_row": kernel_rows.finite_row, "copy_row": kernel_rows.copy_row}
     scope["restored_row"] = kernel_rows.restored_row
-    observe = []
+    observe, views = [], []
     for number, (group, function) in enumerate(groups.items()):
         scope[f"observe_{number}"] = function
         noisy = draws_noise(function)
         observe.append(f"if group == {number}:")
         if noisy:  # a stream for each group, so that no group's draws depend on another's
             observe.append(f"    rng[0] = substream(base, {number})")
-        observe.append(f"    observe_{number}(s, p, out.{group}[w]{', rng' if noisy else ''})")
+        row = f"out.{group}[w]"
+        if group in observations:
+            scope[f"Group{number}"] = list(function.input_types.values())[2]
+            lines = view_lines(observations[group], f"group_{number}", "row", scope)
+            views.append(_GROUP_VIEW.format(number=number, lines="\n".join(f"    {line}" for line in lines)))
+            row = f"view_{number}({row})"
+        observe.append(f"    observe_{number}(s, p, {row}{', rng' if noisy else ''})")
     blocks = {
         "batch": batch,
-        "rows": rows,
+        "rows": [f"    {line}" for line in rows],
         "state": state or ["    pass"],
         "groups": [f"    {group}: type_group" for group in groups],
         "observe": [f"    {line}" for line in observe],
@@ -131,14 +174,17 @@ def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[st
         ],
         "copy": [f"    copy_row(source.{group}[w], target.{group}[w], lane, lanes)" for group in groups],
     }
-    blocks["memory"], blocks["model"] = _memory_checks(source), _model_checks(source)
+    blocks["memory"] = [line for name, line in _MEMORY_CHECKS.items() if name in fields]
+    blocks["model"] = _model_checks(source)
     scope["type_group"] = wp.array2d(dtype=float)
     scope |= {"has_memory": bool(blocks["memory"]), "checks_model": bool(blocks["model"]), "has_state": bool(state)}
     parts = [_BATCH.format(**{name: "\n".join(lines) for name, lines in blocks.items()})]
     parts += [_default(function) for function in FUNCTIONS.values() if function.default is not None]
-    text = "\n".join(parts)
+    text = "\n".join([*views, *parts])
     scope["__name__"] = f"lyceum_warp.generated.{source.name}"
     run_source(text, f"<lyceum_warp {source.path}>", scope)
+    scope["views"] = {source.world: scope["view"]}
+    scope["views"] |= {scope[f"Group{i}"]: scope[f"view_{i}"] for i in range(len(groups)) if f"Group{i}" in scope}
     return scope
 
 
@@ -151,16 +197,6 @@ def _copy(name: str, ndim: int) -> list[str]:
         lines.append("    " * axis + f"for i{axis} in range(source.{name}.shape[{axis}]):")
     place = ", ".join(["w", *(f"i{axis}" for axis in range(1, ndim))])
     return [*lines, "    " * ndim + f"target.{name}[{place}] = source.{name}[{place}]"]
-
-
-def _memory_checks(source: TaskSource) -> list[str]:
-    """Lines that find memory that is not finite, and restore lasting memory to its value before the step."""
-    checks = {
-        "memory": "finite_row(s1.memory, lane, lanes)",
-        "lasting_memory": "restored_row(s0.lasting_memory, s1.lasting_memory, lane, lanes)",
-    }
-    found = [check for name, check in checks.items() if name in source.world.vars]
-    return [f"    if not {check}:\n        finite = False" for check in found]
 
 
 def _model_checks(source: TaskSource) -> list[str]:

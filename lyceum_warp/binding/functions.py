@@ -9,8 +9,9 @@ from typing import Any
 
 import warp as wp
 
-from lyceum_warp.binding.sources import FunctionSource
-from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, Task, TaskFunction, observer_name
+from lyceum_warp.binding.parts import parts_of
+from lyceum_warp.binding.sources import FunctionSource, is_struct
+from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, MEMORIES, Part, Task, TaskFunction, observer_name
 
 
 class TaskSource:
@@ -28,8 +29,11 @@ class TaskSource:
     def __init__(self, task: type[Task], name: str) -> None:
         self.task, self.name = task, name
         self.path = f"{task.__module__}.{task.__qualname__}"
+        self._owners: Any = task.__mro__[: task.__mro__.index(Task)]
         self.world: Any = self._struct("World")
         self.params: Any = self._struct("Params")
+        self.memory: dict[str, Part] = self._memory()
+        """The fields of World that are the task's memory, by name."""
         self.functions: dict[str, wp.Function | None] = {
             name: self._function(wanted) for name, wanted in FUNCTIONS.items()
         }
@@ -54,37 +58,48 @@ class TaskSource:
                     f"{wanted.signature}"
                 )
             found[group] = function
-        for name in self._observers():
+        for name in self._observers(self.task):
             if (group := name.removeprefix(GROUP_PREFIX)) not in groups:
                 raise ValueError(f"obs of the task {self.name!r} has no group {group!r}, which {name} writes")
         return found
 
-    def _observers(self) -> list[str]:
-        """Names of functions for groups: those in the class, and those in the module that nothing there uses."""
-        module = vars(sys.modules[self.task.__module__])
+    def group_structs(self) -> dict[str, Any]:
+        """The structs of the groups of observations that functions write, by the groups' names."""
+        names = [name for owner in reversed(self._owners) for name in self._observers(owner)]
+        groups = dict.fromkeys(["policy", *(name.removeprefix(GROUP_PREFIX) for name in names)])
+        functions = self.group_functions(groups)
+        return {group: list(function.input_types.values())[2] for group, function in functions.items()}
+
+    def _observers(self, owner: type[Task]) -> list[str]:
+        """Names of functions for groups: those in a class, and those in its module that nothing there uses."""
+        module = vars(sys.modules[owner.__module__])
         functions = {name: value for name, value in module.items() if isinstance(value, wp.Function)}
-        tasks = [kind for kind in (self.task, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
+        tasks = [kind for kind in (owner, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
         used = {id(value) for task in tasks for value in vars(task).values()}
         called = {name for f in functions.values() if f.func is not None for name in f.func.__code__.co_names}
         forms = (FUNCTIONS["observe"].kinds, FUNCTIONS["observe"].all_kinds)
-        own = [name for name, value in vars(self.task).items() if isinstance(value, wp.Function | staticmethod)]
+        own = [name for name, value in vars(owner).items() if isinstance(value, wp.Function | staticmethod)]
         unused = [
             name
             for name, function in functions.items()
             if name not in called and id(function) not in used
             and tuple(map(self._kind, function.input_types.values())) in forms  # not another task's
-            and not any(_may_list(task, name.removeprefix(GROUP_PREFIX)) for task in tasks)
+            and (self._has_structs or not any(_may_list(task, name.removeprefix(GROUP_PREFIX)) for task in tasks))
         ]  # fmt: skip
         return [name for name in (*own, *unused) if name.startswith(GROUP_PREFIX)]
 
     def _written(self, name: str) -> Any:
         """The value of a name in the class, in its module, or in a base class or its module."""
-        owners: Any = self.task.__mro__[: self.task.__mro__.index(Task)]
-        for owner in owners:
+        for owner in self._owners:
             found = vars(owner).get(name, owner.scope.get(name, vars(sys.modules[owner.__module__]).get(name)))
             if found is not None:
                 return found.__func__ if isinstance(found, staticmethod) else found
         return None
+
+    @property
+    def _has_structs(self) -> bool:
+        """Whether structs, not the task's ``obs``, lay out the observations."""
+        return not hasattr(self.task, "obs")
 
     def _struct(self, name: str) -> Any:
         struct = self._written(name)
@@ -94,6 +109,19 @@ class TaskSource:
             raise ValueError(f"the task {self.name!r} needs a @wp.struct named {name} in its module")
         return struct
 
+    def _memory(self) -> dict[str, Part]:
+        """The parts of memory in World; a task that gives only their number is refused."""
+        counted = [name for name in MEMORIES if hasattr(self.task, name)]
+        parts = parts_of(self.world, "World")
+        if old := [*counted, *(name for name in MEMORIES if name in self.world.vars and name not in parts)]:
+            raise ValueError(
+                f"{old[0]} of the task {self.name!r} has no names: name its parts in World in place of {old[0]}, as "
+                f"air_time: Row[float] = lw.{old[0]}(4), and use them as s.air_time[0]"
+            )
+        if wrong := [name for name, part in parts.items() if part.kind not in MEMORIES]:
+            raise ValueError(f"World.{wrong[0]} of the task {self.name!r} is lw.part(...): write lw.memory(...)")
+        return parts
+
     def _function(self, wanted: TaskFunction) -> wp.Function | None:
         name = wanted.name
         function = self._written(name)
@@ -102,7 +130,7 @@ class TaskSource:
         if not isinstance(function, wp.Function):
             raise ValueError(f"{name} of the task {self.name!r} must be a @wp.func, not {function!r}")
         types = list(function.input_types.values())
-        structs = [kind for kind in types if hasattr(kind, "vars") and hasattr(kind, "cls")]
+        structs = [kind for kind in types if is_struct(kind)]
         foreign = structs and self.world not in structs and self.params not in structs
         if foreign and function.func.__module__ in {owner.__module__ for owner in self.task.__mro__}:
             return None  # it belongs to another task of the module
@@ -124,6 +152,8 @@ class TaskSource:
         kinds = tuple(map(self._kind, types))
         if kinds not in (wanted.kinds, wanted.all_kinds) or (returned is not None and returned is not wanted.result):
             more = f", with or without a last argument {wanted.optional}" if wanted.optional else ""
+            if wanted.name.startswith("observe") and len(structs) == 3:
+                more = f"{more}; to write the struct {structs[2].key}, remove obs from the class"
             raise ValueError(f"{name} of the task {self.name!r} must be written as {wanted.signature}{more}")
         return function
 
@@ -144,6 +174,8 @@ class TaskSource:
             return "World"
         if argument is self.params:
             return "Params"
+        if self._has_structs and is_struct(argument):
+            return "Row[float]"
         element: Any = getattr(argument, "dtype", None) if getattr(argument, "ndim", 0) == 1 else None
         return {wp.float32: "Row[float]", wp.uint32: "Row[wp.uint32]"}.get(element, "?")
 

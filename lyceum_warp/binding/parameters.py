@@ -193,6 +193,8 @@ class Parameters:
         kind, what = self.tables[name], f"the parameter {name} of {self._task_name!r}"
         element = tuple(getattr(kind.dtype, "_shape_", ()))
         whole = getattr(kind.dtype, "_wp_scalar_type_", kind.dtype) is wp.int32
+        field = _element_field(getattr(self._struct.cls, name, None))
+        value = self._indices(what, value, field)
         if isinstance(value, (str, Path)):
             what += f" from {str(value)!r}"
             value = _loaded(what, value)
@@ -207,6 +209,8 @@ class Parameters:
         if table.ndim != axes or table.shape[kind.ndim :] != element or not table.size:
             last = f", the last {element}" if element else ""
             raise ValueError(f"{what} has shape {table.shape}: it takes {axes} axes{last}, none of length 0")
+        if field:
+            self._check_index(what, given, field)
         bad = table != given if whole else ~np.isfinite(table)
         if bad.any():
             place = np.argwhere(bad)[0].tolist()
@@ -214,6 +218,16 @@ class Parameters:
             raise ValueError(f"{what} has {given[tuple(place)]} at {place}: it must be {wanted}")
         table.flags.writeable = False
         return table
+
+    def _indices(self, what: str, value: Any, field: str | None) -> Any:
+        """A table in which the model's elements and, with a field, names are replaced by indices."""
+        if isinstance(value, list | tuple):
+            return [self._indices(what, entry, field) for entry in value]
+        if isinstance(value, Element):
+            if field and value.field != field:
+                raise ValueError(f"{what} can't have an element of {value.field!r}: it has elements of {field!r}")
+            return elements(self._model, value.field, value.name).start
+        return elements(self._model, field, value).start if field and isinstance(value, str) else value
 
     def _check_index(self, given: str, array: np.ndarray, field: str) -> None:
         if field not in self._sizes:
@@ -235,6 +249,13 @@ class Parameters:
                 value = kind(*value[world].ravel()) if getattr(kind, "_shape_", ()) else kind(value[world])
             setattr(instance, name, value)
         return instance
+
+
+def _element_field(default: Any) -> str | None:
+    """The field of the elements in the default of a table, such as "site_xpos"; None if it has other numbers."""
+    while isinstance(default, list | tuple) and default:
+        default = default[0]
+    return default.field if isinstance(default, Element) else None
 
 
 def _loaded(what: str, path: str | Path) -> np.ndarray:

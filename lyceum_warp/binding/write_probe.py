@@ -1,16 +1,18 @@
 """Run a task's functions once in one world, on rows with guard memory around them, to find faulty writes."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.parts import Layout
 from lyceum_warp.kernels import steps
+from lyceum_warp.spaces import Space
 from lyceum_warp.support.arrays import launch_parts, launch_worlds
-from lyceum_warp.task import MEMORIES, observer_name
+from lyceum_warp.task import observer_name
 
 _ROOM = 2**18
 """Bytes of guard memory before and after every row. Writes out of range land there and do no damage."""
@@ -67,6 +69,8 @@ class Probe:
 
     def __init__(self, task: BoundTask, batch: Any, params: wp.array, device: wp.Device) -> None:
         self._name, self._kernels, self._writes, self._params = task.name, task.kernels, task.writes, params
+        self._layouts = task.obs_layouts
+        self._memory: Mapping[str, Layout] = task.memory
         self._metrics, self._device = list(task.task.metrics), device
         kernels, nu = task.kernels, task.model.nu
         self._world, self._fields = kernels.Batch(), {}
@@ -122,16 +126,20 @@ class Probe:
         for group, rows in self._groups.items():
             written, bad = rows.written(), np.isnan(rows.array.numpy()[0])
             if not written.all():
-                places = np.flatnonzero(~written).tolist()
                 raise ValueError(
-                    f"{observer_name(group)} of the task {self._name!r} leaves the places {places} of obs unwritten"
+                    f"{observer_name(group)} of the task {self._name!r} leaves {self._named(group, ~written)} of obs "
+                    "unwritten"
                 )
             if bad.any():
-                places = np.flatnonzero(bad).tolist()
                 raise ValueError(
-                    f"{observer_name(group)} of the task {self._name!r} writes not-a-number into the places {places} "
-                    "of obs"
+                    f"{observer_name(group)} of the task {self._name!r} writes not-a-number into "
+                    f"{self._named(group, bad)} of obs"
                 )
+
+    def _named(self, group: str, chosen: np.ndarray) -> str:
+        """The names of chosen numbers of an observation."""
+        columns = Space.of(self._layouts[group]).columns
+        return ", ".join(columns[i] for i in np.flatnonzero(chosen))
 
     def _observe(self) -> None:
         finite = wp.zeros((len(self._groups), 1), dtype=bool, device=self._device)
@@ -148,16 +156,28 @@ class Probe:
     def _check_fields(self, function: str) -> None:
         """Raise a ValueError if a function wrote beyond a field or beyond its random stream."""
         for name in sorted(self._writes.get(function, ())):
-            owner = "task declares" if name in MEMORIES else "model has"
-            self._check(function, self._fields[name], name, f"the {owner} {self._fields[name].size}")
+            rows, parts = self._fields[name], self._memory.get(name)
+            if parts:  # a write within the row may be one into a neighbour, which only check_task finds
+                self._check_memory(function, rows, parts)
+            else:
+                self._check(function, rows, name, f"the model has {rows.size}")
         self._check(function, self._streams, "rng", "a stream has 1")
 
-    def _check(self, function: str, rows: GuardedRows, target: str, declared: str) -> None:
-        if not (outside := rows.outside()).size:
+    def _check_memory(self, function: str, rows: GuardedRows, layout: Layout) -> None:
+        """Raise a ValueError if a function wrote before the first part of a row of memory, or behind the last."""
+        name = next(iter(layout) if (rows.outside() < 0).all() else reversed(layout))
+        start, size = layout[name].start, layout[name].size
+        self._check(function, rows, name, f"World declares {size}", start, size)
+
+    def _check(
+        self, function: str, rows: GuardedRows, target: str, declared: str, start: int = 0, size: int | None = None
+    ) -> None:
+        size = rows.size if size is None else size
+        if not (outside := rows.outside() - start).size:
             return
         last = int(outside[-1]) + 1
-        if last > rows.size:
+        if last > size:
             text = f"{last} numbers{target and f' into {target}'}"
         else:  # Warp counts negative indices from the end
-            text = f"at index {int(outside[0]) - rows.size}{target and f' of {target}'}"
+            text = f"at index {int(outside[0]) - size}{target and f' of {target}'}"
         raise ValueError(f"{function} of the task {self._name!r} writes {text}, but {declared}")

@@ -70,7 +70,7 @@ def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mappin
         allowed = list(rights[name].values())
         for write in find_writes(function):
             fields = allowed[write.position]
-            if fields is None or (write.field in fields and not write.replaced):
+            if (fields is None or write.field in fields) and not write.replaced:
                 continue
             within = "" if write.function == name_of(function) else f" in {write.function}"
             place = f"{within} ({write.place})"
@@ -90,15 +90,16 @@ def _advice(write: Write, name: str, rights: Mapping[str, Rights]) -> str:
     own = f"{name} may write {', '.join(dict.fromkeys([*results, *may])) or 'nothing'}"
     if write.field is None:
         return own
-    if list(rights[name])[write.position] == "p":
+    argument = list(rights[name])[write.position]
+    if argument == "p":
         return "parameters are changed with env.set_params"
     writers = [
         other for other, row in rights.items() if any(write.field in fields for fields in row.values() if fields)
     ]
+    if write.replaced and (writers or rights[name][argument] is None):
+        return f"write its elements, as {write.target}[0] = ..."
     if not writers:
         return f"{own}, and no function may write {write.field}"
-    if write.replaced:
-        return f"write its elements, as {write.target}[0] = ..."
     if name in writers:
         written = [argument for argument, fields in rights[name].items() if fields and write.field in fields]
         return f"{name} may write {write.field} of {', '.join(written)} only"

@@ -111,7 +111,8 @@ def _cells(entry: _Entry) -> tuple[str, ...]:
     obs = actions = timestep = _UNKNOWN
     try:
         actions = _UNKNOWN if task.actions is None else str(sum(task.actions.values()))
-        obs = str(sum(obs_layouts(task, defaults(TaskSource(task, entry.name).params))["policy"].values()))
+        source = TaskSource(task, entry.name)
+        obs = str(sum(obs_layouts(source, defaults(source.params))["policy"].values()))
         spec = task_spec(task)
         actions = str(_controls(spec)) if task.actions is None else actions
         timestep = f"{spec.option.timestep * task.frame_skip:g} s"

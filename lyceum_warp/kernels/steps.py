@@ -122,6 +122,7 @@ class TaskCode:
     Batch: Any  # struct of the task's fields in all worlds
     Observations: Any  # struct of the observation groups
     view: wp.Function  # (batch, world) -> World
+    views: Mapping[Any, wp.Function]  # ``Kernels.views``
     copy_state: wp.Function  # copies the fields that steps change
     observe_group: wp.Function
     finite_group: wp.Function
@@ -281,7 +282,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         """Find faults in the task's memory, in the masked worlds; launched over (nworld, lanes)."""
         k, lane = wp.tid()
         w = first + k
-        if mask_in[w] and not finite_memory(view(before, w), view(after, w), lane, lanes):
+        if mask_in[w] and not finite_memory(before, after, w, lane, lanes):
             fault_inout[w] = fault_inout[w] | NAN
 
     @task.kernel()
@@ -635,6 +636,9 @@ def rollout_kernels(task: TaskCode) -> RolloutKernels:
 class Kernels(ActKernels, JudgeKernels, BeginKernels, RolloutKernels):
     """The kernels of a step, and the structs of their arrays. Kernels that the task does not need are None."""
 
+    views: Mapping[Any, wp.Function]
+    """By the task's structs, the functions that make them: World of a batch and a world's index, and the structs of
+    observations of a row."""
     Batch: Any
     Observations: Any
 
@@ -643,4 +647,4 @@ def make_kernels(task: TaskCode) -> Kernels:
     """Make all kernels of a task."""
     parts = (make(task) for make in (act_kernels, judge_kernels, begin_kernels, rollout_kernels))
     kernels = {name: kernel for part in parts for name, kernel in vars(part).items()}
-    return Kernels(**kernels, Batch=task.Batch, Observations=task.Observations)
+    return Kernels(**kernels, views=task.views, Batch=task.Batch, Observations=task.Observations)

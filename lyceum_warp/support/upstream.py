@@ -19,6 +19,28 @@ def builtin_functions() -> Mapping[str, Any]:
     return functions
 
 
+def extend_structs() -> None:
+    """Let Python classes extend a ``wp.struct``: ``class World(go1.World)`` under ``@wp.struct`` has its fields, too.
+
+    Warp refuses such a class, because a struct is not a type. A class that extends the struct's own class would have
+    only its own fields.
+    """
+    codegen: Any = wp._src.codegen
+
+    def merge(cls: Any, /, **keywords: Any) -> None:
+        if not issubclass(cls, codegen.StructInstance):  # Warp derives a class for the instances, too
+            inherited: dict[str, Any] = {}
+            for base in reversed(cls.__mro__[1:]):
+                inherited |= vars(base).get("__annotations__", {})
+            cls.__annotations__ = inherited | vars(cls).get("__annotations__", {})
+
+    def bases(struct: Any, given: tuple[Any, ...]) -> tuple[type, ...]:
+        struct.cls.__init_subclass__ = classmethod(merge)
+        return (struct.cls,)
+
+    codegen.Struct.__mro_entries__ = bases
+
+
 def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
     """Whether a module of kernels is loaded or in Warp's cache, for a block size.
 

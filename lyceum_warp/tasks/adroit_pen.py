@@ -20,7 +20,7 @@ class World:
     xpos: Row[wp.vec3]
     site_xpos: Row[wp.vec3]
     mocap_quat: Row[lw.quat]
-    memory: Row[float]  # number of steps at the goal in this episode
+    steps_at_goal: Row[float] = lw.memory()  # in this episode
 
 
 @wp.struct
@@ -80,12 +80,12 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
 
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
-    s1.memory[0] = s0.memory[0] + float(held(s1, p, p.goal_similarity))
+    s1.steps_at_goal[0] = s0.steps_at_goal[0] + float(held(s1, p, p.goal_similarity))
 
 
 @wp.func
 def success(s: World, p: Params) -> bool:
-    return s.memory[0] > p.goal_steps
+    return s.steps_at_goal[0] > p.goal_steps
 
 
 @wp.func
@@ -99,7 +99,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class AdroitPen(lw.Task):
     model = lw.gymnasium_robotics_model("adroit_hand/adroit_pen.xml")
     gymnasium = "AdroitHandPen-v1"
-    frame_skip, horizon, memory = 5, 200, 1
+    frame_skip, horizon = 5, 200
     obs = {
         "joints": 24, "position": 3, "velocity": 6, "axis": 3, "target_axis": 3, "position_error": 3, "axis_error": 3,
     }  # fmt: skip

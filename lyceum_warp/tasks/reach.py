@@ -23,7 +23,7 @@ class World:
     site_xpos: Row[wp.vec3]
     mocap_pos: Row[wp.vec3]
     jnt_range: Row[wp.vec2]
-    memory: Row[float]  # the last distances, the latest at the end
+    distances: Row[float] = lw.memory(REMEMBERED)  # m, the latest at the end
 
 
 @wp.struct
@@ -63,22 +63,22 @@ def evaluate(s: World, p: Params) -> float:
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
     for i in range(REMEMBERED - 1):
-        s1.memory[i] = s0.memory[i + 1]
-    s1.memory[REMEMBERED - 1] = wp.length(error(s1, p))
+        s1.distances[i] = s0.distances[i + 1]
+    s1.distances[REMEMBERED - 1] = wp.length(error(s1, p))
 
 
 @wp.func
 def success(s: World, p: Params) -> bool:
     total = float(0.0)
     for i in range(REMEMBERED):
-        total += s.memory[i]
+        total += s.distances[i]
     return total / float(REMEMBERED) < p.success_distance
 
 
 @wp.func
 def initialize(s: World, p: Params):
     for i in range(REMEMBERED):
-        s.memory[i] = FAR
+        s.distances[i] = FAR
 
 
 @wp.func
@@ -95,6 +95,5 @@ class Reach(lw.Task):
     frame_skip = 2
     obs = {"position": 7, "velocity": 7, "hand": 3, "error": 3}
     horizon = 75
-    memory = REMEMBERED
     # the paper's settings; its inverse temperature is 5
     planning = lw.Planning(settings={"horizon": 16, "samples": 30, "temperature": 0.2, "noise": 1.0})

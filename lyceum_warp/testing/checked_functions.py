@@ -65,8 +65,8 @@ class CheckedFunctions:
         Unchecked: A function can't be copied.
     """
 
-    def __init__(self, module: str, functions: Mapping[str, wp.Function], world: Any, batch: Any) -> None:
-        self._module, self._world, self._batch = module, world, batch
+    def __init__(self, module: str, functions: Mapping[str, wp.Function], views: Mapping[Any, wp.Function]) -> None:
+        self._module, self._views = module, views
         self.places: list[Place] = []
         self._numbers: dict[wp.Function, int] = {}
         self._copies: dict[int, wp.Function] = {}
@@ -140,20 +140,17 @@ class CheckedFunctions:
     def _kernel(self, name: str, function: wp.Function) -> wp.Kernel:
         """The kernel that runs a function's copy in every world."""
         number = self.number(function)
-        scope: dict[str, Any] = {
-            "wp": wp, "World": self._world, "Batch": self._batch, "copy": self._copies[number],
-        }  # fmt: skip
+        scope: dict[str, Any] = {"wp": wp, "copy": self._copies[number]}
         arguments, lines, values = ["report: wp.array2d[int]"], ["w = wp.tid()"], ["report"]
         for i, kind in enumerate(function.input_types.values()):
-            if kind is self._world:
-                arguments.append(f"batch_{i}: Batch")
-                lines.append(f"s_{i} = World()")
-                lines += [f"s_{i}.{field} = batch_{i}.{field}[w % batch_{i}.{field}.shape[0]]" for field in kind.vars]
-                values.append(f"s_{i}")
+            if view := self._views.get(kind):
+                scope[f"view_{i}"], source = view, next(iter(view.input_types.values()))
+                scope[f"type_{i}"] = wp.array2d(dtype=float) if is_row(source) else source
+                values.append(f"view_{i}(values_{i}[w])" if is_row(source) else f"view_{i}(values_{i}, w)")
             else:
                 scope[f"type_{i}"] = wp.array2d(dtype=kind.dtype) if is_row(kind) else wp.array(dtype=kind)
-                arguments.append(f"values_{i}: type_{i}")
                 values.append(f"values_{i}[w % values_{i}.shape[0]]")
+            arguments.append(f"values_{i}: type_{i}")
         lines.append(f"copy({', '.join(values)})")
         text = f"def run_{name}({', '.join(arguments)}):\n" + "\n".join(f"    {line}" for line in lines) + "\n"
         self._run(text, scope, name)
@@ -302,18 +299,18 @@ _made: dict[Any, CheckedFunctions] = {}
 
 
 def checked_functions(
-    name: str, functions: Mapping[str, wp.Function], world: Any, batch: Any, device: wp.Device
+    name: str, functions: Mapping[str, wp.Function], views: Mapping[Any, wp.Function], device: wp.Device
 ) -> CheckedFunctions:
     """The copies of a task's functions, compiled for a device and made once for the same functions.
 
-    ``name`` is for their Warp module, ``batch`` the struct of the task's fields for all worlds.
+    ``name`` is for their Warp module; ``views`` are those of the task's kernels.
 
     Raises:
         Unchecked: A function can't be checked.
     """
-    key = (world, batch, *functions.items())
+    key = (*views.values(), *functions.items())
     if key not in _made:
         module = sources.free_module_name(f"lyceum_warp.checked.{name}")
-        _made[key] = CheckedFunctions(module, functions, world, batch)
+        _made[key] = CheckedFunctions(module, functions, views)
     _made[key].load(device)
     return _made[key]

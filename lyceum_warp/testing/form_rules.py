@@ -5,6 +5,7 @@ import torch
 from lyceum_warp.kernels import steps
 from lyceum_warp.support.arrays import launch_worlds, torch_view
 from lyceum_warp.testing.context import SHORT, Context
+from lyceum_warp.world_arrays import memory_columns
 
 
 def check_groups(ctx: Context) -> None:
@@ -164,8 +165,7 @@ def check_substep(ctx: Context) -> None:
         return
     with ctx.changed(a, b, horizon=0, autoreset=False):
         ctx.restart()
-        parts = a.state_space.parts
-        memory = [parts[name] for name in ("memory", "lasting_memory") if name in parts]
+        memory = memory_columns(a.task, a.state_space)
 
         def start(state: torch.Tensor, action: torch.Tensor) -> None:
             b.set_state(state)
@@ -182,8 +182,8 @@ def check_substep(ctx: Context) -> None:
                 launch_worlds(substep, b.nworld, [b.worlds.after, b.worlds.params], b.device)
             b.worlds.advance_memory()
             found = b.get_state()
-            for columns in memory:
-                ctx.equal(wanted[calm][:, columns], found[calm][:, columns], f"the memory of step {i}, by substeps")
+            for name, columns in memory.items():
+                ctx.equal(wanted[calm][:, columns], found[calm][:, columns], f"the {name} of step {i}, by substeps")
             start(state, action)
             b.engine.step(a.task.frame_skip)
             found = b.get_state()[:, : a.engine.integration_size]
@@ -192,11 +192,10 @@ def check_substep(ctx: Context) -> None:
 
 
 def check_lasting_memory(ctx: Context) -> None:
-    """``lasting_memory`` outlives resets; ``rand_reset(seed)`` clears it."""
+    """Lasting memory outlives resets; ``rand_reset(seed)`` clears it."""
     a, b = ctx.a, ctx.b
-    if a.task.task.lasting_memory == 0:
+    if (columns := memory_columns(a.task, a.state_space).get("lasting_memory")) is None:
         return
-    columns = a.state_space.parts["lasting_memory"]
     ctx.restart()
     state = a.get_state()
     state[:, columns] = 3.25

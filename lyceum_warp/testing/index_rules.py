@@ -48,7 +48,7 @@ class _Run:
         self.functions |= {observer_name(group): function for group, function in task.observers.items()}
         try:
             self.checked: CheckedFunctions = checked_functions(
-                task.source.path, self.functions, task.source.world, task.kernels.Batch, self.env.device
+                task.source.path, self.functions, task.kernels.views, self.env.device
             )
         except Unchecked as error:
             ctx.fail(f"the functions could not be checked: {error}")

@@ -13,6 +13,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.fields import INPUTS
 from lyceum_warp.support.arrays import flat, torch_view
 from lyceum_warp.testing.context import SHORT, Context
+from lyceum_warp.world_arrays import memory_columns
 
 _SMALLEST = 1e-4
 """Numbers are compared only if inputs or model fields move a coordinate by at least this much."""
@@ -148,8 +149,8 @@ def check_dynamics(ctx: Context) -> None:
     late = a.get_state()
     early = first.clone()
     early[:, parts["episode"]] = late[:, parts["episode"]]
-    if "lasting_memory" in parts:
-        early[:, parts["lasting_memory"]] = late[:, parts["lasting_memory"]]
+    if (lasting := memory_columns(a.task, a.state_space).get("lasting_memory")) is not None:
+        early[:, lasting] = late[:, lasting]
     b.set_state(early)
     a.rand_reset()
     b.rand_reset()

@@ -133,7 +133,7 @@ def check_determinism(ctx: Context) -> None:
 
 def _physics(env: Env, state: torch.Tensor) -> torch.Tensor:
     """The parts of a state that do not depend on earlier episodes when an episode starts."""
-    names = [name for name in env.state_space.parts if name not in (*COUNTERS, "lasting_memory")]
+    names = [n for n in env.state_space.parts if n not in (*COUNTERS, *env.task.memory["lasting_memory"])]
     return torch.cat([state[:, env.state_space.parts[name]] for name in names], dim=1)
 
 
@@ -141,7 +141,7 @@ def _lasting_columns(env: Env) -> list[slice]:
     """The columns of a state that resets keep: lasting memory, and model fields that no reset draws."""
     names = [field.name for field in env.task.dynamics if field.name not in env.task.reset_dynamics]
     parts = env.state_space.parts
-    return [parts[name] for name in ("lasting_memory", *names) if name in parts]
+    return [parts[name] for name in (*env.task.memory["lasting_memory"], *names)]
 
 
 def check_reset(ctx: Context) -> None:

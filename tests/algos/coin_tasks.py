@@ -10,7 +10,7 @@ from lyceum_warp import Row
 @wp.struct
 class Coin:
     qpos: Row[float]
-    memory: Row[float]  # the coin
+    coin: Row[float] = lw.memory()
 
 
 @wp.struct
@@ -25,27 +25,27 @@ def toss(rng: Row[wp.uint32]) -> float:
 
 @wp.func
 def toss_at_reset(s: Coin, p: CoinParams, rng: Row[wp.uint32]):
-    s.memory[0] = toss(rng)
+    s.coin[0] = toss(rng)
 
 
 @wp.func
 def toss_in_step(s0: Coin, action: Row[float], s1: Coin, p: CoinParams, rng: Row[wp.uint32]):
-    s1.memory[0] = toss(rng)
+    s1.coin[0] = toss(rng)
 
 
 @wp.func
 def observe_coin(s: Coin, p: CoinParams, obs: Row[float]):
-    obs[0] = s.memory[0]
+    obs[0] = s.coin[0]
 
 
 @wp.func
 def paid_by_coin_after_action(s0: Coin, action: Row[float], s1: Coin, p: CoinParams) -> float:
-    return action[0] * s1.memory[0]
+    return action[0] * s1.coin[0]
 
 
 @wp.func
 def paid_by_coin_before_action(s0: Coin, action: Row[float], s1: Coin, p: CoinParams) -> float:
-    return action[0] * s0.memory[0]
+    return action[0] * s0.coin[0]
 
 
 @wp.func
@@ -58,7 +58,6 @@ class TossedAfter(lw.Task):
 
     model = staticmethod(lambda: rail(limits='ctrllimited="true" ctrlrange="-1 1"'))
     obs = {"coin": 1}
-    memory = 1
     horizon = 100
     World = Coin
     Params = CoinParams

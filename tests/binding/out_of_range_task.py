@@ -11,8 +11,8 @@ class World:
     qpos: Row[float]
     qfrc_applied: Row[float]
     body_mass: Row[float]
-    memory: Row[float]
-    lasting_memory: Row[float]
+    counts: Row[float] = lw.memory(2)
+    level: Row[float] = lw.lasting_memory(3)
 
 
 @wp.struct
@@ -57,19 +57,19 @@ def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
 @wp.func
 def substep(s: World, p: Params):
     if p.function == 6:
-        s.memory[p.index] = 1.0
+        s.counts[p.index] = 1.0
 
 
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
     if p.function == 7:
-        s1.memory[p.index] = 1.0
+        s1.counts[p.index] = 1.0
 
 
 @wp.func
 def event(s: World, p: Params, rng: Row[wp.uint32]):
     if p.function == 8:
-        s.lasting_memory[p.index] = 1.0
+        s.level[p.index] = 1.0
 
 
 @wp.func
@@ -96,5 +96,3 @@ class OutOfRange(lw.Task):
     model = "hopper.xml"
     obs = {"policy": {"x": 1}, "critic": {"x": 2}}
     metrics = ("x",)
-    memory = 2
-    lasting_memory = 3

@@ -25,7 +25,7 @@ def bound(file: Path, **options: Any) -> BoundTask:
     ("line", "message"),
     [
         ("obs = 10", "obs of the task 'tiny' is 10: add the parts of its observation"),
-        ("memory = 1", "the task 'tiny' needs both memory = ... in its class and memory in World"),
+        ("memory = 1", r"memory of the task 'tiny' has no names: .*, as air_time: Row\[float\] = lw\.memory\(4\)"),
         ("del model", "the task 'tiny' has no model: add a model, as model = \"robot.xml\""),
         ("lagged = ('qvel',)", "lagged of the task 'tiny' has 'qvel': list it in World, too"),
         ("cleared = ('qacc',)", "cleared of the task 'tiny' has 'qacc': list it in World, too"),
@@ -59,8 +59,8 @@ def test_a_field_of_another_type_is_refused_with_the_type_to_write(fields: str, 
 
 
 OBSERVATIONS = {
-    "unwritten": ("pass", r"leaves the places \[0\] of obs unwritten"),
-    "not-a-number": ("obs[0] = wp.sqrt(s.qpos[0] - 100.0)", r"writes not-a-number into the places \[0\] of obs"),
+    "unwritten": ("pass", r"leaves x of obs unwritten"),
+    "not-a-number": ("obs[0] = wp.sqrt(s.qpos[0] - 100.0)", r"writes not-a-number into x of obs"),
 }
 
 

@@ -5,21 +5,14 @@ from typing import Any
 
 import tiny_task
 
-from lyceum_warp.binding.codegen import kernels_of
-from lyceum_warp.binding.functions import TaskSource
-from lyceum_warp.binding.registry import find_task, task_name
+from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.registry import find_task
 
 EVALUATE = "def evaluate(s: World, p: Params) -> float:\n    return s.qpos[1]"
 
 
-def source_of(file: Path | str) -> TaskSource:
-    task = find_task(file)
-    return TaskSource(task, task_name(task))
-
-
 def kernels(file: Path | str) -> Any:
-    source = source_of(file)
-    return kernels_of(source, source.group_functions(["policy"]))
+    return BoundTask(find_task(file)).kernels
 
 
 def test_the_same_functions_share_their_kernels(tmp_path: Path) -> None:

@@ -189,6 +189,45 @@ def test_a_table_of_another_type_is_refused(model: mujoco.MjModel) -> None:
         parameters(model, struct)
 
 
+@wp.struct
+class Named:
+    dt: float
+    joints: wp.array[int] = lw.dofs("elbow", "shoulder")
+    chains: wp.array2d[int] = [lw.bodies("upper", "lower"), [lw.body("lower"), 0]]
+
+
+def test_a_table_of_named_elements_has_their_indices(model: mujoco.MjModel) -> None:
+    found = parameters(model, Named).values
+    assert (found["joints"].tolist(), found["chains"].tolist()) == ([1, 0], [[1, 2], [2, 0]])
+    assert parameters(model, Named, joints=["shoulder"]).values["joints"].tolist() == [0]
+    assert parameters(model, Named, joints=[1, 1, 0]).values["joints"].tolist() == [1, 1, 0]
+
+
+@pytest.mark.parametrize(
+    ("joints", "message"),
+    [
+        (["knee"], "the model has no joint 'knee'; it has: elbow, shoulder"),
+        ([0, 2], "joints of 'arm' is an index of 'qvel', of which the model has 2: give one from 0 to 1, or a name"),
+        (lw.sites("tip"), "joints of 'arm' can't have an element of 'site_xpos': it has elements of 'qvel'"),
+    ],
+)
+def test_a_table_of_other_elements_is_refused(joints: list[Any], message: str, model: mujoco.MjModel) -> None:
+    with pytest.raises(ValueError, match=message):
+        parameters(model, Named, joints=joints)
+
+
+def test_each_kind_of_element_has_a_table(model: mujoco.MjModel) -> None:
+    kinds = {
+        "sites": "site_xpos", "bodies": "xpos", "geoms": "geom_xpos", "joints": "xanchor", "qposes": "qpos",
+        "dofs": "qvel", "actuators": "actuator_force", "sensors": "sensordata",
+    }  # fmt: skip
+    for kind, field in kinds.items():
+        assert [(element.field, element.name) for element in getattr(lw, kind)("a", "b")] == [
+            (field, "a"),
+            (field, "b"),
+        ]
+
+
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_functions_read_tables_which_change_in_place(engine: str) -> None:
     """After graphs were captured: with the same shape, another shape, and with one value per world."""

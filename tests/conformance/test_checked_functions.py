@@ -41,6 +41,20 @@ class Batch:
     sensordata: wp.array2d[float]
 
 
+@wp.func
+def view(batch: Batch, w: int) -> World:
+    s = World()
+    s.time = batch.time[w]
+    s.qpos = batch.qpos[w]
+    s.site_xpos = batch.site_xpos[w]
+    s.xmat = batch.xmat[w]
+    s.sensordata = batch.sensordata[w]
+    return s
+
+
+VIEWS = {World: view}
+
+
 # functions without mistakes, in every form that Warp supports
 
 ORDER = wp.constant(wp.vec3i(2, 1, 0))
@@ -173,17 +187,11 @@ def batch() -> Any:
 @wp.kernel(module="unique")
 def run_right(batch: Batch, params: wp.array[Params], obs: wp.array2d[float], rng: wp.array2d[wp.uint32]):
     w = wp.tid()
-    s = World()
-    s.time = batch.time[w]
-    s.qpos = batch.qpos[w]
-    s.site_xpos = batch.site_xpos[w]
-    s.xmat = batch.xmat[w]
-    s.sensordata = batch.sensordata[w]
-    right(s, params[0], obs[w], rng[w])
+    right(view(batch, w), params[0], obs[w], rng[w])
 
 
 def test_a_checked_copy_computes_the_same_numbers_and_finds_nothing(params: wp.array) -> None:
-    checked = checked_functions("test.right", {"right": right}, World, Batch, DEVICE)
+    checked = checked_functions("test.right", {"right": right}, VIEWS, DEVICE)
     report = checked.report(DEVICE)
     results = []
     for kernel, first in ((checked.kernels["right"], [report]), (run_right, [])):
@@ -193,11 +201,11 @@ def test_a_checked_copy_computes_the_same_numbers_and_finds_nothing(params: wp.a
     for found, wanted in zip(*results, strict=True):
         np.testing.assert_array_equal(found, wanted)
     assert checked.problems(report) == []
-    assert checked_functions("test.right", {"right": right}, World, Batch, DEVICE) is checked
+    assert checked_functions("test.right", {"right": right}, VIEWS, DEVICE) is checked
 
 
 def test_indices_out_of_range_and_endless_loops_are_named(params: wp.array) -> None:
-    checked = checked_functions("test.wrong", {"wrong": wrong}, World, Batch, DEVICE)
+    checked = checked_functions("test.wrong", {"wrong": wrong}, VIEWS, DEVICE)
     report = checked.report(DEVICE)
     wp.launch(checked.kernels["wrong"], 2, [report, batch(), params, wp.zeros((2, 1), dtype=float)], device=DEVICE)
     problems = checked.problems(report)
@@ -233,4 +241,4 @@ def function_as_a_value(s: World, p: Params) -> float:
 )
 def test_a_function_that_cannot_be_checked_is_named(function: Any, message: str) -> None:
     with pytest.raises(Unchecked, match=message):
-        checked_functions("test.unchecked", {"function": function}, World, Batch, DEVICE)
+        checked_functions("test.unchecked", {"function": function}, VIEWS, DEVICE)

@@ -14,24 +14,27 @@ ENGINES = ["mujoco", "warp"]
 MISTAKES = [
     r"observe reads s\.qpos\[60\] out of range \(wrong\.py, line \d+\): the index is 60, and there are 6 elements, 0",
     r"observe writes obs\[2\] out of range \(wrong\.py, line \d+\): the index is 2, and there are 2 elements",
-    r"reward reads s1\.memory\[3\] out of range \(wrong\.py, line \d+\): the index is 3, and there are 1 elements",
+    r"reward reads s1\.count\[1\] out of range \(wrong\.py, line \d+\): the index is 1, and there are 1 elements",
     r"height reads s\.xpos\[p\.tip\] out of range \(wrong\.py, line \d+\): the index is 7, and there are 5 elements",
     r"terminated reads s\.qpos\[p\.joint - 1\] out of range \(wrong\.py, line \d+\): the index is -1, ",
     r"control reads action\[3\] out of range ",
-    r"initialize reads s\.memory\[1\] out of range ",
-    r"advance reads s0\.memory\[int\(s0\.memory\[0\]\)\] out of range .*: the index is 2, ",
+    r"initialize reads s\.count\[1\] out of range ",
+    r"advance reads s0\.count\[int\(s0\.count\[0\]\)\] out of range .*: the index is 2, ",
 ]
 
 FIELDS = "    qpos: Row[float]"
 WRONG = tiny_task.changed(
-    (FIELDS, f"{FIELDS}\n    xpos: Row[wp.vec3]\n    memory: Row[float]"),
+    (
+        FIELDS,
+        f"{FIELDS}\n    xpos: Row[wp.vec3]\n    count: Row[float] = lw.memory()\n    more: Row[float] = lw.memory(9)",
+    ),
     ("    dt: float", "    dt: float\n    tip: int = 7\n    joint: int = 0"),
     (
         "    obs[0] = s.qpos[0]",
         "    obs[0] = wp.clamp(s.qpos[60], -1.0, 1.0)\n    obs[1] = 0.0\n"
-        "    if s.memory[0] > 1.0:\n        obs[2] = 1.0",
+        "    if s.count[0] > 1.0:\n        obs[2] = 1.0",
     ),
-    ('obs = {"x": 1}', 'obs = {"x": 2}\n    memory = 1\n    horizon = 5'),
+    ('obs = {"x": 1}', 'obs = {"x": 2}\n    horizon = 5'),
     (
         "class Tiny",
         """@wp.func
@@ -44,13 +47,13 @@ def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
 
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
-    s1.memory[0] = s0.memory[0] + 1.0
-    if s0.memory[0] == 2.0:
-        s1.memory[0] += s0.memory[int(s0.memory[0])]
+    s1.count[0] = s0.count[0] + 1.0
+    if s0.count[0] == 2.0:
+        s1.count[0] += s0.count[int(s0.count[0])]
 
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    return wp.clamp(s1.memory[3], 0.0, 1.0)
+    return wp.clamp(s1.count[1], 0.0, 1.0)
 
 @wp.func
 def evaluate(s: World, p: Params) -> float:
@@ -62,8 +65,8 @@ def terminated(s: World, p: Params) -> bool:
 
 @wp.func
 def initialize(s: World, p: Params):
-    if s.memory[1] > 1.0e30:
-        s.memory[0] = 0.0
+    if s.count[1] > 1.0e30:
+        s.count[0] = 0.0
 
 class Tiny""",
     ),

@@ -20,8 +20,6 @@ MODEL = [name.removeprefix("model/") for name in STORED if name.startswith("mode
 OPTIONS = [name.removeprefix("option/") for name in STORED if name.startswith("option/")]
 TERMS = [name.removeprefix("weight/") for name in STORED if name.startswith("weight/")]
 NWORLD = len(STORED["env/qpos"])
-LAST_ACTION, CONTACT_TIME, AIR_TIME = slice(8, 20), slice(20, 24), slice(24, 28)  # in memory
-ENCODER_BIAS, PEAK_HEIGHT = slice(0, 12), slice(12, 16)  # in lasting memory
 
 
 # the model
@@ -87,16 +85,15 @@ def mjlabs_states(env: lw.Env, *, heading: bool) -> torch.Tensor:
     parts["qpos"].copy_(stored("qpos"))
     parts["qvel"].copy_(stored("qvel"))
     parts["sensordata"].copy_(stored("force").reshape(NWORLD, 12))
-    memory, lasting = parts["memory"], parts["lasting_memory"]
-    memory[:, :3] = stored("command")
-    memory[:, 3] = stored("heading")
-    memory[:, 4:6] = 0.0
+    parts["drawn_velocity"].copy_(stored("command"))
+    parts["heading_target"][:, 0] = stored("heading")
+    parts["heading_controlled"][:], parts["standing"][:] = 0.0, 0.0
     if heading:
-        memory[:, 2] = (1.0 - stored("heading_controlled")) * stored("command")[:, 2]
-        memory[:, 4], memory[:, 5] = stored("heading_controlled"), stored("standing")
-    memory[:, LAST_ACTION] = stored("action")
-    memory[:, CONTACT_TIME], memory[:, AIR_TIME] = stored("contact_time"), stored("air_time")
-    lasting[:, ENCODER_BIAS], lasting[:, PEAK_HEIGHT] = stored("encoder_bias"), stored("peak_height")
+        parts["drawn_velocity"][:, 2] = (1.0 - stored("heading_controlled")) * stored("command")[:, 2]
+        parts["heading_controlled"][:, 0], parts["standing"][:, 0] = stored("heading_controlled"), stored("standing")
+    parts["last_action"].copy_(stored("action"))
+    for name in ("contact_time", "air_time", "encoder_bias", "peak_height"):
+        parts[name].copy_(stored(name))
     return state
 
 
@@ -119,9 +116,9 @@ def test_terms_of_the_reward_equal_mjlabs(env: lw.Env, term: str) -> None:
     """Each term separately, with mjlab's weight and all other weights zero."""
     after = mjlabs_states(env, heading=False)
     before = after.clone()
-    env.state_space.split(before)["memory"][:, LAST_ACTION] = stored("previous_action")
+    env.state_space.split(before)["last_action"][:] = stored("previous_action")
     if term == "soft_landing":  # mjlab's forces are current, ours are one substep late
-        times = env.state_space.split(after)["memory"][:, CONTACT_TIME]
+        times = env.state_space.split(after)["contact_time"]
         times += 0.005 * (times > 0)
     weight = float(STORED[f"weight/{term}"])
     try:

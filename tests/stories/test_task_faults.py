@@ -20,8 +20,9 @@ class World:
     time: float
     qpos: Row[float]
     qvel: Row[float]
-    memory: Row[float]
-    lasting_memory: Row[float]
+    events: Row[float] = lw.memory()
+    remembered: Row[float] = lw.memory()
+    steps: Row[float] = lw.lasting_memory()
     body_mass: Row[float]
     dof_damping: Row[float]
 
@@ -61,19 +62,19 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 @wp.func
 def event(s: World, p: Params, rng: Row[wp.uint32]):
-    s.memory[0] += 1.0
+    s.events[0] += 1.0
 
 
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
-    s1.memory[1] = p.remembered
-    s1.lasting_memory[0] = s0.lasting_memory[0] + p.lasting
+    s1.remembered[0] = p.remembered
+    s1.steps[0] = s0.steps[0] + p.lasting
 
 
 class Faulty(lw.Task):
     model, horizon = staticmethod(lambda: mujoco.MjSpec.from_string(XML)), 20
     obs = {"position": 1, "mass": 1}
-    metrics, memory, lasting_memory = ("number", "early"), 2, 1
+    metrics = ("number", "early")
 
 
 ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
@@ -110,7 +111,7 @@ def test_memory_that_is_not_finite_is_a_fault_of_its_world(name: str, engine: st
     env.set_params(**{name: [1.0, float("inf"), 1.0]})
     env.step()
     assert [lw.Done(reason) for reason in env.done_reason.tolist()] == [0, lw.Done.NAN, 0]
-    columns = env.state_space.parts["lasting_memory"]
+    columns = env.state_space.parts["steps"]
     assert env.get_state()[:, columns].flatten().tolist() == [2.0, 1.0 if name == "lasting" else 2.0, 2.0]
     env.set_state(env.get_state())
 

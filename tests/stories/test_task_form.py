@@ -211,7 +211,7 @@ def test_a_rejected_draw_changes_no_lasting_memory() -> None:
     for count in range(2, 12):
         env.rand_reset()
         assert (tip >= 0.2).all()  # half of the draws are rejected
-        assert (env.obs_groups["critic"][:, 7] == count).all()
+        assert (env.obs_groups["critic"][:, 10] == count).all()
 
 
 def test_startup_draws_lasting_memory_once_for_each_world() -> None:
@@ -228,7 +228,7 @@ def test_startup_draws_lasting_memory_once_for_each_world() -> None:
 
 def test_a_planner_leaves_out_what_startup_drew_where_a_robot_is_known_by_its_measurements() -> None:
     plan = lw.MPPI(Gifted, samples=4, horizon=2)
-    columns = plan.env.state_space.parts["lasting_memory"]
+    columns = plan.env.state_space.parts["practice"]
     assert plan.env.get_state()[0, columns].item() >= 1
     assert plan.state_of()[columns].tolist() == [0.0]
 
@@ -486,8 +486,24 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     "actions without sizes": (
         [line('actions = ("speed",)')], r"must be a dict of names and sizes, such as \{'speed': 1\}",
     ),
-    "lasting memory that World does not list": (
-        [line("lasting_memory = 1")], "needs both lasting_memory = ... in its class and lasting_memory in World",
+    "memory that is counted": (
+        [line("lasting_memory = 1")],
+        r"lasting_memory of the task 'tiny' has no names: .*, as air_time: Row\[float\] = lw\.lasting_memory\(4\)",
+    ),
+    "memory without a size": ([field("memory: Row[float]")], "memory of the task 'tiny' has no names"),
+    "memory of no numbers": (
+        [field("level: Row[wp.uint32] = lw.memory()")], r"World\.level has a size, .*: .* as level: Row\[float\]",
+    ),
+    "memory that is a number": (
+        [field("level: float = lw.memory()")], r"World\.level has a size, .*: declare it as level: Row\[float\]",
+    ),
+    "memory with the name of a field": (
+        [field("qvel: Row[float] = lw.memory()")], r"World\.qvel of the task 'tiny' is memory, but qvel is already",
+    ),
+    "memory with the name of a counter": ([field("step: Row[float] = lw.memory()")], "step is already the name"),
+    "memory of size 0": ([field("level: Row[float] = lw.memory(0)")], r"size of World\.level must be a whole number"),
+    "memory with the size of no table": (
+        [field('level: Row[float] = lw.memory("dt")')], r"size of World\.level is 'dt', which is not a table of Params",
     ),
     "no draw": ([line("draws = 0")], "draws of the task 'tiny' must be a whole number from 1"),
     "a reward that writes": (

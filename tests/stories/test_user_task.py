@@ -67,7 +67,8 @@ class World:
     sensordata: Row[float]
     mocap_pos: Row[wp.vec3]
     userdata: Row[float]
-    memory: Row[float]
+    total: Row[float] = lw.memory()
+    drawn: Row[float] = lw.memory()
 
 
 @wp.struct
@@ -103,8 +104,8 @@ def observe(s: World, p: Params, obs: Row[float]):
         obs[10 + i] = s.cvel[p.lower][i]
         obs[13 + i] = s.xmat[p.lower][0, i]
     obs[16] = s.userdata[0]
-    obs[17] = s.memory[0]
-    obs[18] = s.memory[1]
+    obs[17] = s.total[0]
+    obs[18] = s.drawn[0]
     obs[19] = s.qpos[p.elbow] + s.xpos[p.lower][0]
     obs[20] = 1.0e-3 * s.sensordata[p.shock]
 
@@ -112,7 +113,7 @@ def observe(s: World, p: Params, obs: Row[float]):
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
     effort = action[0] * action[0] + action[1] * action[1]
-    return distance(s0, p) - distance(s1, p) - p.cost * effort + s1.memory[1] - s0.memory[1]
+    return distance(s0, p) - distance(s1, p) - p.cost * effort + s1.drawn[0] - s0.drawn[0]
 
 
 @wp.func
@@ -148,13 +149,13 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
         s.qpos[i] += 0.1 * lw.normal(rng)
     s.mocap_pos[p.target] += wp.vec3(lw.uniform(rng, -0.1, 0.1), 0.0, lw.uniform(rng, -0.1, 0.1))
     s.userdata[0] = lw.uniform(rng, 1.0, 2.0)
-    s.memory[0] = -1.0
+    s.total[0] = -1.0
 
 
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
-    s1.memory[0] = s0.memory[0] + action[0]
-    s1.memory[1] = lw.uniform(rng, 0.0, 1.0)
+    s1.total[0] = s0.total[0] + action[0]
+    s1.drawn[0] = lw.uniform(rng, 0.0, 1.0)
 
 
 PARTS = {"joints": 4, "gap": 3, "speed": 3, "turn": 3, "axis": 3, "rest": 5}
@@ -166,7 +167,6 @@ class FollowTarget(lw.Task):
     frame_skip = 4
     obs = PARTS
     horizon = 50
-    memory = 2
     control = servo
 
 
@@ -174,7 +174,6 @@ class ScaledActions(lw.Task):
     model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))
     frame_skip = 2
     obs = PARTS
-    memory = 2
     action_range = (-1.0, 1.0)
 '''
 

@@ -29,14 +29,20 @@ class State:
     def __init__(self, env: lw.Env, state: torch.Tensor | None = None) -> None:
         parts = env.state_space.split(env.get_state() if state is None else state)
         self.parts = {name: part.numpy().copy() for name, part in parts.items()}
-        self.qpos, self.qvel, memory = self.parts["qpos"], self.parts["qvel"], self.parts["memory"]
+        self.qpos, self.qvel = self.parts["qpos"], self.parts["qvel"]
         self.force = self.parts["sensordata"].reshape(-1, 4, 3)
-        self.drawn, self.heading_target = memory[:, :3], memory[:, 3]
-        self.heading_controlled, self.standing = memory[:, 4] > 0, memory[:, 5] > 0
-        self.command_timer, self.push_timer = memory[:, 6], memory[:, 7]
-        self.last_action, self.contact_time, self.air_time = memory[:, 8:20], memory[:, 20:24], memory[:, 24:28]
-        lasting = self.parts["lasting_memory"]
-        self.bias, self.peak, self.env_steps = lasting[:, :12], lasting[:, 12:16], lasting[:, 16]
+        self.drawn, self.bias, self.peak = (
+            self.parts[name] for name in ("drawn_velocity", "encoder_bias", "peak_height")
+        )
+        self.heading_target, self.command_timer, self.push_timer, self.env_steps = (
+            self.parts[name][:, 0] for name in ("heading_target", "command_timer", "push_timer", "env_steps")
+        )
+        self.heading_controlled, self.standing = (
+            self.parts[name][:, 0] > 0 for name in ("heading_controlled", "standing")
+        )
+        self.last_action, self.contact_time, self.air_time = (
+            self.parts[name] for name in ("last_action", "contact_time", "air_time")
+        )
         self._kinematics(env.model)
 
     def _kinematics(self, own: mujoco.MjModel) -> None:

@@ -54,7 +54,7 @@ def test_success_needs_more_than_20_steps_at_the_goal() -> None:
         env.step(still)
         assert env.success.tolist() == 3 * [i >= 20]
     state = env.get_state()
-    assert env.state_space.split(state)["memory"].tolist() == 3 * [[25.0]]
+    assert env.state_space.split(state)["steps_at_goal"].tolist() == 3 * [[25.0]]
     env.rand_reset(mask=torch.tensor([True, False, False]))
     assert env.success.tolist() == [False, True, True]
     for _ in range(20):

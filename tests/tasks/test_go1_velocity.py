@@ -152,32 +152,39 @@ def test_peak_heights_grow_in_the_air_and_end_at_landings_not_at_resets(shared_e
 @pytest.mark.usefixtures("freed")
 def test_commands_have_mjlabs_distribution() -> None:
     env = lw.make("go1_velocity", nworld=4000, seed=0)
-    memory = env.state_space.split(env.get_state())["memory"].numpy()
-    vx, vy, yaw = memory[:, :3].T
+    s = State(env)
+    vx, vy, yaw = s.drawn.T
     forward = (vy == 0) & (yaw == 0)
-    for share, wanted in ((forward, 0.2), (memory[:, 4] == 1, 0.3), (memory[:, 5] == 1, 0.1)):
+    for share, wanted in ((forward, 0.2), (s.heading_controlled, 0.3), (s.standing, 0.1)):
         assert abs(share.mean() - wanted) < 4 * np.sqrt(wanted * (1 - wanted) / 4000)
-    drawn = np.stack([vx, vy, 2 * yaw, memory[:, 3] / np.pi, (memory[:, 6] - 5.5) / 2.5, memory[:, 7] - 2], axis=1)
+    timers = (s.command_timer - 5.5) / 2.5, s.push_timer - 2
+    drawn = np.stack([vx, vy, 2 * yaw, s.heading_target / np.pi, *timers], axis=1)
     check_uniform(drawn[~forward] / (1 + 1e-6))
     assert vx[forward].min() == np.float32(0.3) and vx[forward].max() <= 1
     assert abs((vx[forward] == np.float32(0.3)).mean() - 0.3) < 0.07
-    flags = np.stack([forward, memory[:, 4] == 1, memory[:, 5] == 1], axis=1)
+    flags = np.stack([forward, s.heading_controlled, s.standing], axis=1)
     assert np.abs(np.corrcoef(flags.T) - np.eye(3)).max() < 5.5 / np.sqrt(4000)
+
+
+def command_of(env: lw.Env) -> torch.Tensor:
+    """The drawn velocity, the heading and the timer of each world's command, (nworld, 5)."""
+    parts = env.state_space.split(env.get_state())
+    return torch.cat([parts[name] for name in ("drawn_velocity", "heading_target", "command_timer")], dim=1)
 
 
 def test_commands_change_when_their_time_is_over(shared_env: SharedEnv) -> None:
     env = shared_env("go1_velocity", nworld=NWORLD, autoreset=False, **NOISELESS, push_seconds=NEVER)
     action = torch.zeros(NWORLD, 12)
-    changes, before = 0, env.state_space.split(env.get_state())["memory"].clone()
+    changes, before = 0, command_of(env)
     for _ in range(300):
         env.step(action)
-        memory = env.state_space.split(env.get_state())["memory"].clone()
-        due = before[:, 6] - DT <= 1e-9
-        changed = (memory[:, :4] != before[:, :4]).any(dim=1)
+        command = command_of(env)
+        due = before[:, 4] - DT <= 1e-9
+        changed = (command[:, :4] != before[:, :4]).any(dim=1)
         assert torch.equal(changed, due)
-        torch.testing.assert_close(memory[~due, 6], before[~due, 6] - DT, atol=1e-6, rtol=0)
-        assert (memory[due, 6] >= 3).all() and (memory[due, 6] <= 8).all()
-        changes, before = changes + int(due.sum()), memory
+        torch.testing.assert_close(command[~due, 4], before[~due, 4] - DT, atol=1e-6, rtol=0)
+        assert (command[due, 4] >= 3).all() and (command[due, 4] <= 8).all()
+        changes, before = changes + int(due.sum()), command
     assert 0.4 * NWORLD < changes < 0.8 * NWORLD  # within 6 s, of 3 to 8
 
 
@@ -187,14 +194,14 @@ def test_headings_determine_the_yaw_rate_of_their_worlds(shared_env: SharedEnv) 
     state = env.get_state()
     parts = env.state_space.split(state)
     parts["qpos"][:, 3:7] = torch.tensor([np.cos(1.5), 0.0, 0.0, np.sin(1.5)])  # a heading of 3 rad
-    parts["memory"][:, :3] = torch.tensor([0.5, 0.2, 0.3])
-    parts["memory"][:, 3] = torch.tensor([-3.0, 2.8, 0.0, -3.0])
-    parts["memory"][:, 4] = torch.tensor([1.0, 1.0, 1.0, 0.0])
-    parts["memory"][:, 5] = 0.0
+    parts["drawn_velocity"][:] = torch.tensor([0.5, 0.2, 0.3])
+    parts["heading_target"][:, 0] = torch.tensor([-3.0, 2.8, 0.0, -3.0])
+    parts["heading_controlled"][:, 0] = torch.tensor([1.0, 1.0, 1.0, 0.0])
+    parts["standing"][:] = 0.0
     env.set_state(state)
     yaw = [0.5 * (2 * np.pi - 6.0), -0.1, -0.5, 0.3]
     np.testing.assert_allclose(env.obs[:, 45:].numpy(), np.stack([[0.5] * 4, [0.2] * 4, yaw], axis=1), atol=1e-5)
-    parts["memory"][:, 5] = 1.0
+    parts["standing"][:] = 1.0
     env.set_state(state)
     assert not env.obs[:, 45:].any()
 
@@ -204,14 +211,14 @@ def test_the_curriculum_widens_commands_at_each_stage() -> None:
     for steps, low, high, yaw in ((119_998, -1, 1, 0.5), (119_999, -1.5, 2, 0.7), (239_999, -2, 3, 0.7)):
         state = env.get_state()
         parts = env.state_space.split(state)
-        parts["lasting_memory"][:, 16] = steps
-        parts["memory"][:, 6] = 0.0
+        parts["env_steps"][:] = steps
+        parts["command_timer"][:] = 0.0
         env.set_state(state)
         env.step(torch.zeros(1000, 12))
-        memory = env.state_space.split(env.get_state())["memory"].numpy()
-        free = memory[:, 1] != 0
+        drawn = State(env).drawn
+        free = drawn[:, 1] != 0
         for column, bounds in ((0, (low, high)), (2, (-yaw, yaw))):
-            values, width = memory[free, column], bounds[1] - bounds[0]
+            values, width = drawn[free, column], bounds[1] - bounds[0]
             assert bounds[0] <= values.min() < bounds[0] + 0.02 * width
             assert bounds[1] >= values.max() > bounds[1] - 0.02 * width
 
@@ -225,7 +232,7 @@ def test_pushes_add_velocity_in_the_worlds_axes(shared_env: SharedEnv) -> None:
     still = shared_env("go1_velocity", nworld=1000, autoreset=False, **NOISELESS, command_seconds=NEVER, **weak)
     state = pushed.get_state()
     parts = pushed.state_space.split(state)
-    parts["memory"][:, 7] = torch.where(torch.arange(1000) < 900, 0.02, 0.5)
+    parts["push_timer"][:, 0] = torch.where(torch.arange(1000) < 900, 0.02, 0.5)
     still.set_state(state)
     pushed.set_state(state)
     action = torch.zeros(1000, 12)
@@ -242,7 +249,7 @@ def test_pushes_add_velocity_in_the_worlds_axes(shared_env: SharedEnv) -> None:
     spin = np.einsum("nij,nj->ni", axes.reshape(-1, 3, 3), change[:, 3:6])
     sizes = np.array([0.5, 0.5, 0.4, 0.52, 0.52, 0.78])
     check_uniform(np.hstack([change[:, :3], spin])[:900] / (sizes * (1 + 1e-4)))
-    timers = one["memory"][:, 7].numpy()
+    timers = one["push_timer"][:, 0].numpy()
     check_uniform((timers[:900, None] - 2) / (1 + 1e-6))
     np.testing.assert_allclose(timers[900:], 0.48, atol=1e-6)
 
@@ -258,13 +265,13 @@ def test_robots_differ_in_friction_centre_of_mass_and_encoders() -> None:
     drawn[:, 1:] = np.log(drawn[:, 1:])
     bounds = np.array([[0.3, 1.5], np.log([1e-4, 2e-2]), np.log([1e-5, 5e-3])]).T
     offset = env.field("body_ipos").numpy()[:, 1] - env.model.body_ipos[1]
-    bias = env.state_space.split(env.get_state())["lasting_memory"].numpy()[:, :12] / 0.015
+    bias = env.state_space.split(env.get_state())["encoder_bias"].numpy() / 0.015
     scaled = (2 * drawn - bounds.sum(axis=0)) / (bounds[1] - bounds[0])
     samples = np.hstack([scaled, offset / [0.025, 0.025, 0.03], bias])
     check_uniform(samples / (1 + 1e-4))
     env.rand_reset()
     assert np.array_equal(env.field("geom_friction").numpy(), friction)
-    again = env.state_space.split(env.get_state())["lasting_memory"].numpy()[:, :12] / 0.015
+    again = env.state_space.split(env.get_state())["encoder_bias"].numpy() / 0.015
     assert np.array_equal(again, bias)
 
 
@@ -318,5 +325,6 @@ def test_both_engines_agree_over_a_step(shared_env: SharedEnv) -> None:
         torch.testing.assert_close(mine.reward, theirs.reward, rtol=1e-3, atol=1e-4)
         going = ~mine.done
         torch.testing.assert_close(mine.obs[going], theirs.obs[going], rtol=1e-3, atol=2e-3)
-        states = [env.state_space.split(env.get_state())["memory"][going] for env in (mine, theirs)]
-        torch.testing.assert_close(*states, rtol=1e-5, atol=1e-5)
+        states = [env.state_space.split(env.get_state()) for env in (mine, theirs)]
+        for name in mine.task.memory["memory"]:
+            torch.testing.assert_close(*(parts[name][going] for parts in states), rtol=1e-5, atol=1e-5)

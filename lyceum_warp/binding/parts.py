@@ -1,0 +1,95 @@
+"""Lay out the named parts of memory and observations: rows of a struct that are slices of one row of floats."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from lyceum_warp.binding.sources import is_row
+from lyceum_warp.support.validate import whole_number
+from lyceum_warp.task import Part
+
+
+@dataclasses.dataclass(frozen=True)
+class Slice:
+    """The place of a part in its row of floats."""
+
+    start: int
+    """Index of the first float."""
+    count: int
+    """Number of elements."""
+    dtype: Any
+    """Type of an element: float, or a vector or matrix of float."""
+
+    @property
+    def size(self) -> int:
+        """Number of floats."""
+        return self.count * _floats(self.dtype)
+
+
+Layout = dict[str, Slice]
+"""The parts of one row of floats by name, in order."""
+
+
+def parts_of(struct: Any, owner: str) -> dict[str, Part]:
+    """The fields of a struct whose defaults are parts, by name; ``owner`` names the struct in messages.
+
+    Raises:
+        ValueError: The type of such a field is not a row of numbers.
+    """
+    found = {name: getattr(struct.cls, name, None) for name in struct.vars}
+    parts = {name: part for name, part in found.items() if isinstance(part, Part)}
+    for name in parts:
+        kind = struct.vars[name].type
+        if not is_row(kind) or kind.ndim != 1 or getattr(kind.dtype, "_wp_scalar_type_", kind.dtype) is not wp.float32:
+            raise ValueError(
+                f"{owner}.{name} has a size, so it must be a row of floats or of vectors of them: declare it as "
+                f"{name}: Row[float]"
+            )
+    return parts
+
+
+def layout(struct: Any, kind: str, params: Mapping[str, Any], owner: str) -> Layout:
+    """Lay out the parts of a kind in a struct; ``params`` has the tables that give sizes.
+
+    Raises:
+        ValueError: A size is not a positive number, or names no table of Params.
+    """
+    slices, start = dict[str, Slice](), 0
+    for name, part in parts_of(struct, owner).items():
+        if part.kind == kind:
+            count = _length(f"the size of {owner}.{name}", part.size, params)
+            slices[name] = Slice(start, count, struct.vars[name].type.dtype)
+            start += slices[name].size
+    return slices
+
+
+def sizes(layout: Layout) -> dict[str, int]:
+    """The number of floats of each part."""
+    return {name: part.size for name, part in layout.items()}
+
+
+def view_lines(layout: Layout, struct: str, row: str, scope: dict[str, Any]) -> list[str]:
+    """Lines of Warp source that set a struct's fields to slices of a row; adds the types they need to ``scope``."""
+    lines = []
+    for name, part in layout.items():
+        scope[f"dtype_{struct}_{name}"] = part.dtype
+        # by pointer: compilers handle a constant size better than a slice
+        pointer = f"{row}.ptr + wp.uint64({4 * part.start})"
+        lines.append(f"{struct}.{name} = wp.array(ptr={pointer}, shape=({part.count},), dtype=dtype_{struct}_{name})")
+    return lines
+
+
+def _floats(dtype: Any) -> int:
+    return int(np.prod(getattr(dtype, "_shape_", ()), dtype=int))
+
+
+def _length(what: str, size: int | str, params: Mapping[str, Any]) -> int:
+    if not isinstance(size, str):
+        return whole_number(what, size, low=1)
+    table = params.get(size)
+    if not isinstance(table, list | tuple | np.ndarray):
+        raise ValueError(f"{what} is {size!r}, which is not a table of Params: give a number, or the name of a table")
+    return len(table)
