@@ -435,9 +435,10 @@ class Task:
     cleared: ClassVar[tuple[str, ...]] = ()
     """Fields left by the last substep, such as contact forces, to zero at the start of an episode. Otherwise they are
     computed then, which takes a forward pass of the worlds that restart. A reset clears them before ``initialize``."""
-    actions: ClassVar[Mapping[str, int] | None] = None
+    actions: ClassVar[Mapping[str, int | str] | None] = None
     """The parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls;
-    ``control`` then turns them into inputs. None: an action has one number for each control."""
+    ``control`` then turns them into inputs. A size may be the name of a table in Params: one number for each of its
+    rows. None: an action has one number for each control."""
     action_range: ClassVar[tuple[float, float] | None] = None
     """The range of an action, which the default ``control`` scales to the model's control ranges; None: actions are
     controls, or, with ``actions``, have no bounds."""

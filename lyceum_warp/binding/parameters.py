@@ -18,11 +18,13 @@ _FILLED_IN = ("dt", "substep_dt")
 """Fields of ``Params`` that are filled in: seconds in a step and in a substep."""
 
 
-def defaults(struct: Any) -> dict[str, Any]:
-    """The defaults in a task's ``Params``, by name, without fields that are filled in."""
-    # Warp's structs ignore defaults; the decorated class still has them
-    names = [name for name in struct.vars if name not in _FILLED_IN and hasattr(struct.cls, name)]
-    return {name: getattr(struct.cls, name) for name in names}
+def defaults(struct: Any, owner: type) -> dict[str, Any]:
+    """The defaults of a task's parameters, by name, without fields that are filled in.
+
+    ``struct`` is the struct that the functions take, ``owner`` the class with the defaults, which Warp's structs ignore.
+    """
+    names = [name for name in struct.vars if name not in _FILLED_IN and hasattr(owner, name)]
+    return {name: getattr(owner, name) for name in names}
 
 
 class Parameters:
@@ -31,7 +33,8 @@ class Parameters:
     A table is a field that is itself an array, such as ``motion: wp.array2d[float]``. All worlds share it.
 
     Args:
-        struct: The task's ``Params``.
+        struct: The task's ``Params``, which the functions take.
+        owner: The class with the defaults as attributes.
         task_name: The task's name, for messages.
         model: The compiled model, which gives the indices of named elements.
         nworld: Number of worlds.
@@ -45,6 +48,7 @@ class Parameters:
     def __init__(
         self,
         struct: Any,
+        owner: type,
         task_name: str,
         model: mujoco.MjModel,
         *,
@@ -52,7 +56,8 @@ class Parameters:
         timestep: float,
         given: Mapping[str, Any],
     ) -> None:
-        self._struct, self._task_name, self._model, self._nworld = struct, task_name, model, nworld
+        self._struct, self._owner = struct, owner
+        self._task_name, self._model, self._nworld = task_name, model, nworld
         self._sizes: dict[str, int] = {}
         self.tables = {name: field.type for name, field in struct.vars.items() if hasattr(field.type, "ndim")}
         """The types of the fields that are tables, by name."""
@@ -63,7 +68,7 @@ class Parameters:
                 f"the parameter {taken[0]!r} of the task {task_name!r} has the name of an option of make(), which "
                 "would get its value: rename it in Params"
             )
-        found = defaults(struct) | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
+        found = defaults(struct, owner) | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
         self._computed = {name for name, value in found.items() if isinstance(value, FromModel)}
         """Names of the values that are computed from the model."""
         self.values: dict[str, Any] = {name: found[name] for name in struct.vars if name in found}
@@ -109,7 +114,7 @@ class Parameters:
     def _compute(self, name: str, values: Mapping[str, Any]) -> Any:
         """The value of a default that is computed from the model; the previous table if it has not changed."""
         try:
-            found = getattr(self._struct.cls, name).function(self._model, SimpleNamespace(**values))
+            found = getattr(self._owner, name).function(self._model, SimpleNamespace(**values))
         except Exception as error:  # a function of the task may raise any
             message = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
             raise ValueError(
@@ -152,7 +157,7 @@ class Parameters:
         kind = self._struct.vars[name].type
         if name in self.tables:
             return self._table(name, value)
-        default = getattr(self._struct.cls, name, None)
+        default = getattr(self._owner, name, None)
         what = f"the parameter {name} of {self._task_name!r}"
         given = f"the parameter {name}={value!r} of {self._task_name!r}"
         if isinstance(value, Element):
@@ -193,7 +198,7 @@ class Parameters:
         kind, what = self.tables[name], f"the parameter {name} of {self._task_name!r}"
         element = tuple(getattr(kind.dtype, "_shape_", ()))
         whole = getattr(kind.dtype, "_wp_scalar_type_", kind.dtype) is wp.int32
-        field = _element_field(getattr(self._struct.cls, name, None))
+        field = _element_field(getattr(self._owner, name, None))
         value = self._indices(what, value, field)
         if isinstance(value, (str, Path)):
             what += f" from {str(value)!r}"

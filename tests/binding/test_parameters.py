@@ -50,7 +50,7 @@ def model() -> mujoco.MjModel:
 
 
 def parameters(model: mujoco.MjModel, struct: Any = Params, nworld: int = 2, **given: Any) -> Parameters:
-    return Parameters(struct, "arm", model, nworld=nworld, timestep=0.02, given=given)
+    return Parameters(struct, struct.cls, "arm", model, nworld=nworld, timestep=0.02, given=given)
 
 
 def test_defaults_come_from_the_struct_and_dt_from_the_timestep(model: mujoco.MjModel) -> None:

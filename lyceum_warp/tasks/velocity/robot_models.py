@@ -11,6 +11,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+import lyceum_warp as lw
+
 _JOINT, _SENSOR = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_SENSOR
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 _FORCE, _NET = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3  # parameters of a contact sensor
@@ -251,8 +253,22 @@ def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
 # models
 
 
+def playground_model(file: str) -> lw.ModelFile:
+    """A scene of MuJoCo Playground's locomotion tasks, such as "h1/xmls/scene_mjx_feetonly.xml" (extra "menagerie")."""
+    package = "large" if file.startswith(("go1/", "spot/", "barkour/")) else "playground_humanoid"
+    return lw.package_model(
+        f"envpool_assets_mujoco_{package}",
+        f"mujoco/playground/assets/mujoco_playground/_src/locomotion/{file}",
+        install="lyceum-warp[menagerie]",
+    )
+
+
 def prepare_walker(
-    spec: mujoco.MjSpec, feet: Sequence[str], *, timestep: float | None = None, iterations: tuple[int, int] | None = None
+    spec: mujoco.MjSpec,
+    feet: Sequence[str],
+    *,
+    timestep: float | None = None,
+    iterations: tuple[int, int] | None = None,
 ) -> None:
     """Prepare a model for a velocity task: forces on its feet are sensed, and their friction decides.
 

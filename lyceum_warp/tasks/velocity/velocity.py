@@ -19,6 +19,27 @@ import lyceum_warp as lw
 from lyceum_warp import Row, terms
 from lyceum_warp.tasks.velocity import robot_models as models
 
+# terms and their arguments
+from lyceum_warp.terms import (  # noqa: F401
+    action_rate_l2,
+    active,
+    angular_velocity,
+    base_height,
+    fell_over,
+    foot_swing_height,
+    gravity,
+    linear_velocity,
+    pose,
+    roll_pitch_rate_l2,
+    soft_landing,
+    too_low,
+    track_angular_velocity,
+    track_linear_velocity,
+    upright,
+    velocity_error,
+    yaw_rate_error,
+)
+
 
 @wp.struct
 class World:
@@ -72,6 +93,7 @@ class Params:
     walking_pose_std: wp.array[float] = lw.from_model(lambda model, p: len(p.joints) * [0.3])
     soft_limit: float = 0.9  # share of a joint's range
     swing_target: float = 0.1  # height of a foot's site in a swing, m
+    longest_step: float = 0.4  # seconds in single stance from which the term is constant
     least_command: float = 0.05  # below it, the gait terms are 0 and the pose term uses standing_pose_std
     fall_angle: float = math.radians(70.0)
     least_height: float = 0.0  # of the base, m
@@ -199,11 +221,11 @@ def stage(s: World, p: Params) -> int:  # of the curriculum
 
 
 @wp.func
-def command(s: World, p: Params) -> wp.vec3:
+def command(s0: World, p: Params) -> wp.vec3:
     """Commanded forward and lateral velocity, m/s, and yaw rate, rad/s, in the base's axes."""
     return terms.velocity_command(
-        s.drawn_velocity, s.heading_target, s.heading_controlled, s.standing, terms.heading(s.qpos), p.heading_gain,
-        p.stages[stage(s, p), 3],
+        s0.drawn_velocity, s0.heading_target, s0.heading_controlled, s0.standing, terms.heading(s0.qpos),
+        p.heading_gain, p.stages[stage(s0, p), 3],
     )  # fmt: skip
 
 
@@ -293,9 +315,7 @@ def event(s: World, p: Params, rng: Row[wp.uint32]):
 
 @wp.func
 def startup(s: World, p: Params, rng: Row[wp.uint32]):
-    terms.draw_friction(
-        s.geom_friction, p.foot_geoms, p.sliding_friction, p.spinning_friction, p.rolling_friction, rng
-    )
+    terms.draw_friction(s.geom_friction, p.foot_geoms, p.sliding_friction, p.spinning_friction, p.rolling_friction, rng)
     terms.shift_center_of_mass(s.body_ipos, p.trunk, p.trunk_offset, rng)
     terms.draw_row(s.encoder_bias, -p.encoder_bias, p.encoder_bias, rng)
 
@@ -315,7 +335,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     draw_command(s, p, rng)
 
 
-# the reward; c is the command in the state before the step
+# terms of the reward, which find their arguments by name; the command is that of the state before the step
 
 
 @wp.func
@@ -331,68 +351,70 @@ def foot_clearance_and_slip(active: float, s: World, p: Params) -> wp.vec2:
 
 
 @wp.func
-def weighted(s0: World, action: Row[float], s1: World, p: Params) -> lw.vec10:
-    c = command(s0, p)
-    active = terms.active(c, p.least_command)
-    v, w = terms.linear_velocity(s1.qpos, s1.qvel), terms.angular_velocity(s1.qvel)
-    feet = foot_clearance_and_slip(active, s1, p)
-    return p.dt * lw.vec10(
-        2.0 * terms.track_linear_velocity(c, v, p.linear_velocity_variance),
-        2.0 * terms.track_angular_velocity(c, w, p.angular_velocity_variance),
-        1.0 * terms.upright(terms.gravity(s1.qpos), p.tilt_variance),
-        1.0
-        * terms.pose(
-            c,
-            s1.qpos,
-            p.joint_qpos,
-            p.default_pose,
-            p.standing_pose_std,
-            p.walking_pose_std,
-            p.least_command,
-        ),
-        -1.0 * terms.joint_limits(s1.qpos, p.joint_qpos, s1.jnt_range, p.joints, p.soft_limit),
-        -0.1 * terms.action_rate_l2(action, s1.previous_action),
-        -2.0 * feet[0],
-        -0.25 * terms.foot_swing_height(s1.contact_time, s1.swing_height, p.swing_target, p.dt, active),
-        -0.1 * feet[1],
-        -1e-5 * terms.soft_landing(s1.contact_time, s1.sensordata, p.foot_forces, p.dt, p.substep_dt, active),
-    )
+def foot_clearance(foot_clearance_and_slip: wp.vec2) -> float:
+    return foot_clearance_and_slip[0]
 
 
 @wp.func
-def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    return wp.dot(weighted(s0, action, s1, p), lw.vec10(1.0))
+def foot_slip(foot_clearance_and_slip: wp.vec2) -> float:
+    return foot_clearance_and_slip[1]
 
 
 @wp.func
-def velocity_error(c: wp.vec3, s: World) -> float:
-    return terms.velocity_error(c, terms.linear_velocity(s.qpos, s.qvel))
+def single_stance(contact_time: Row[float], air_time: Row[float], longest_step: float, active: float) -> float:
+    """The least contact or air time of the feet, at most ``longest_step``, while exactly one foot is in contact, s.
+
+    Isaac Lab, ``feet_air_time_positive_biped``.
+    """
+    down, least = int(0), float(longest_step)
+    for foot in range(contact_time.shape[0]):
+        if contact_time[foot] > 0.0:
+            down += 1
+        least = wp.min(least, wp.max(contact_time[foot], air_time[foot]))
+    return wp.where(down == 1, active * least, 0.0)
 
 
-@wp.func
-def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float]):
-    c = command(s0, p)
-    k = lw.put(metrics, 0, weighted(s0, action, s1, p))
-    k = lw.put(metrics, k, velocity_error(c, s1))
-    lw.put(metrics, k, terms.yaw_rate_error(c, terms.angular_velocity(s1.qvel)))
+dof_pos_limits = terms.joint_limits
 
 
 @wp.func
 def evaluate(s: World, p: Params) -> float:  # velocity error, m/s
-    return velocity_error(command(s, p), s)
-
-
-@wp.func
-def terminated(s: World, p: Params) -> bool:
-    return terms.fell_over(terms.gravity(s.qpos), p.fall_angle) or terms.too_low(
-        terms.base_height(s.qpos), p.least_height
-    )
+    return terms.velocity_error(command(s, p), terms.linear_velocity(s.qpos, s.qvel))
 
 
 class Velocity(lw.Task):
+    """A robot that follows velocity commands, with any number of legs."""
+
     frame_skip, horizon = 4, 1000
-    metrics = (
-        "track_linear_velocity", "track_angular_velocity", "upright", "pose", "dof_pos_limits", "action_rate_l2",
-        "foot_clearance", "foot_swing_height", "foot_slip", "soft_landing", "velocity_error", "yaw_rate_error",
-    )  # fmt: skip
+    actions = {"joint_position": "joints"}
+    rewards = {
+        "track_linear_velocity": 2.0,
+        "track_angular_velocity": 2.0,
+        "upright": 1.0,
+        "pose": 1.0,
+        "dof_pos_limits": -1.0,
+        "action_rate_l2": -0.1,
+        "foot_clearance": -2.0,
+        "foot_swing_height": -0.25,
+        "foot_slip": -0.1,
+        "soft_landing": -1e-5,
+    }
+    metrics = ("velocity_error", "yaw_rate_error")
+    terminations = ("fell_over", "too_low")
     cleared = ("sensordata",)  # zero before the first substep; mjlab computes it for the first state
+
+
+@wp.struct
+class BipedParams(Params):
+    stages: wp.array2d[float] = [[0.0, -0.6, 1.0, 1.0]]
+    lateral_velocity: float = 0.5
+    push_seconds: wp.vec2 = wp.vec2(5.0, 10.0)
+    fall_angle: float = math.acos(0.6)
+    swing_target: float = 0.1
+
+
+class Biped(Velocity):
+    """A robot with two legs, which is rewarded for steps and for a calm trunk; its feet are the two sites."""
+
+    frame_skip, keyframe = 5, "home"
+    rewards = Velocity.rewards | {"action_rate_l2": -0.05, "single_stance": 2.0, "roll_pitch_rate_l2": -0.05}
