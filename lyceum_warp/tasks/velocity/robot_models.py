@@ -5,7 +5,9 @@ indices of joints and of sites. The base is the body of the first joint, which m
 """
 
 import itertools
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -98,8 +100,8 @@ def home_height(model: mujoco.MjModel, p: Any) -> float:
 
 # legs
 #
-# With all joints at 0, the base's axes are the axes of every body of a leg, up to a constant rotation. In these axes each
-# joint has a constant axis, and a constant position relative to the joint before it.
+# With all joints at 0, every joint of a leg has a constant axis in the base's axes, and a constant position relative to
+# the joint before it. A joint turns all that is behind it.
 
 
 def leg_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
@@ -108,7 +110,7 @@ def leg_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
     Raises:
         ValueError: A foot is not connected to the base by hinges.
     """
-    chains = [_chain(model, foot) for foot in p.feet]
+    chains = [leg_of(model, int(model.site_bodyid[foot])) for foot in p.feet]
     longest = max(map(len, chains))
     return np.array([chain + (longest - len(chain)) * [-1] for chain in chains])
 
@@ -140,14 +142,14 @@ def leg_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
 def foot_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
     """The position of each foot's site relative to its last joint, m, (feet, 3)."""
     data = _straight(model)
-    return np.array([data.site_xpos[foot] - data.xanchor[_chain(model, foot)[-1]] for foot in p.feet])
+    return np.array([data.site_xpos[foot] - data.xanchor[_last_joint(model, foot)] for foot in p.feet])
 
 
 def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
     """Spheres that touch a plane if and only if the foot does, (feet, most spheres, 4): centre and radius, m.
 
-    Centres are relative to the foot's last joint. A sphere is itself, a capsule its ends, a box its corners; other geoms
-    are the corners of their bounding boxes.
+    Centres are relative to the foot's last joint. A sphere is itself, a capsule its ends, a box its corners; other
+    geoms are the corners of their bounding boxes.
 
     Raises:
         ValueError: A foot has no geom in ``foot_geoms``.
@@ -158,8 +160,8 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
         geoms = [geom for geom in p.foot_geoms if model.geom_bodyid[geom] == model.site_bodyid[foot]]
         if not geoms:
             raise ValueError(f"none of foot_geoms belongs to the body of the foot {model.site(foot).name!r}")
-        found = np.concatenate([_spheres(model, data, geom) for geom in geoms])
-        found[:, :3] -= data.xanchor[_chain(model, foot)[-1]]
+        found = np.concatenate([spheres_of(model, data, geom) for geom in geoms])
+        found[:, :3] -= data.xanchor[_last_joint(model, foot)]
         spheres.append(found)
     most = max(map(len, spheres))
     return np.array([np.resize(found, (most, 4)) for found in spheres])  # repeats the spheres of a foot with fewer
@@ -171,16 +173,21 @@ def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
     Raises:
         ValueError: A foot has none.
     """
-    ground = np.flatnonzero(model.geom_bodyid == 0).tolist()
-    pairs = {frozenset(pair) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
     found = []
     for foot in p.feet:
-        geoms = np.flatnonzero(model.geom_bodyid == model.site_bodyid[foot]).tolist()
-        touching = [geom for geom in geoms if any(_collide(model, geom, other, pairs) for other in ground)]
+        touching = contact_geoms(model, int(model.site_bodyid[foot]))
         if not touching:
             raise ValueError(f"the foot {model.site(foot).name!r} has no geom that can touch the ground")
         found += touching
     return found
+
+
+def contact_geoms(model: mujoco.MjModel, body: int) -> list[int]:
+    """The geoms of a body that can touch a geom of the world."""
+    ground = np.flatnonzero(model.geom_bodyid == 0).tolist()
+    pairs = {frozenset(pair) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
+    geoms = np.flatnonzero(model.geom_bodyid == body).tolist()
+    return [geom for geom in geoms if any(_collide(model, geom, other, pairs) for other in ground)]
 
 
 def foot_forces(model: mujoco.MjModel, p: Any) -> list[int]:
@@ -199,20 +206,28 @@ def foot_forces(model: mujoco.MjModel, p: Any) -> list[int]:
     return found
 
 
-def _chain(model: mujoco.MjModel, foot: int) -> list[int]:
-    """The joints from the base to a foot's site."""
+def leg_of(model: mujoco.MjModel, body: int) -> list[int]:
+    """The joints from the base to a body.
+
+    Raises:
+        ValueError: The body is not connected to the base by hinges.
+    """
     joints: list[int] = []
-    body, trunk = int(model.site_bodyid[foot]), base(model)
+    trunk, name = base(model), _name(model, mujoco.mjtObj.mjOBJ_BODY, body)
     while body not in (0, trunk):
         first = int(model.body_jntadr[body])
         joints = [*range(first, first + int(model.body_jntnum[body])), *joints]
         body = int(model.body_parentid[body])
     if body == 0 or not joints:
-        raise ValueError(f"no joint connects the foot {model.site(foot).name!r} to the base {model.body(trunk).name!r}")
+        raise ValueError(f"no joint connects the body {name} of a foot to the base {model.body(trunk).name!r}")
     for joint in joints:
         if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
             raise ValueError(f"the joint {_name(model, _JOINT, joint)} of a leg is not a hinge")
     return joints
+
+
+def _last_joint(model: mujoco.MjModel, foot: int) -> int:
+    return leg_of(model, int(model.site_bodyid[foot]))[-1]
 
 
 def _straight(model: mujoco.MjModel) -> mujoco.MjData:
@@ -230,7 +245,7 @@ def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[
     return bool(bits | (model.geom_contype[other] & model.geom_conaffinity[geom])) or frozenset((geom, other)) in pairs
 
 
-def _spheres(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
+def spheres_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
     """The spheres of ``soles`` for a geom, in the world's axes, (spheres, 4)."""
     size, kind = model.geom_size[geom], mujoco.mjtGeom
     radius, middle = 0.0, np.zeros(3)
@@ -303,6 +318,7 @@ def prepare_walker(
         site = spec.site(name)
         if site is None:
             raise ValueError(f"the model has no site {name!r} for a foot")
+        site.parent.name = site.parent.name or f"{name}_body"
         for geom in site.parent.geoms:
             if geom.contype or geom.conaffinity:
                 geom.priority, geom.condim = 1, max(3, geom.condim)
@@ -310,3 +326,59 @@ def prepare_walker(
             name=f"{name}_force", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=mujoco.mjtObj.mjOBJ_BODY,
             objname=site.parent.name, intprm=[_FORCE, _NET, 1],
         )  # fmt: skip
+
+
+def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]]) -> None:
+    """Add sites of feet to a model, changed in place.
+
+    Args:
+        spec: The model.
+        feet: By the names of the sites, the body of each, or a joint or geom of this body, and the position in it, m.
+
+    Raises:
+        ValueError: There is no such element.
+    """
+    for name, (element, position) in feet.items():
+        owner = spec.joint(element) or spec.geom(element)
+        body = spec.body(element) or (owner and owner.parent)
+        if body is None:
+            raise ValueError(f"the model has no body, joint or geom {element!r} for the foot {name!r}")
+        body.add_site(name=name, pos=position)
+
+
+def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0) -> None:
+    """Turn the motors of joints into position servos, in place; servos stay as they are.
+
+    The force limit stays. A servo reaches it at an error of ``reach`` rad: kp = limit / reach. Its damping is critical
+    for the inertia that the joint has in ``qpos0``: kp + kd s + M s^2 has a double root.
+
+    Args:
+        spec: The model.
+        joints: Names of the joints, with one actuator each.
+        reach: Error at which a servo's force reaches its limit, rad.
+
+    Raises:
+        ValueError: A joint has no actuator, or its force has no limit.
+    """
+    model = spec.copy().compile()
+    p = SimpleNamespace(joints=[model.joint(name).id for name in joints])
+    for name, joint, actuator in zip(joints, p.joints, servos(model, p), strict=True):
+        if model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_NONE:
+            continue
+        gear, gain = abs(float(model.actuator_gear[actuator, 0])), float(model.actuator_gainprm[actuator, 0])
+        limits = [math.inf]
+        if model.actuator_forcelimited[actuator]:
+            limits.append(gear * float(model.actuator_forcerange[actuator, 1]))
+        if model.actuator_ctrllimited[actuator]:
+            limits.append(gear * abs(gain * float(model.actuator_ctrlrange[actuator, 1])))
+        if model.jnt_actfrclimited[joint]:
+            limits.append(float(model.jnt_actfrcrange[joint, 1]))
+        if not math.isfinite(limit := min(limits)):
+            raise ValueError(f"the motor of the joint {name!r} has no limit: give it a ctrlrange or a forcerange")
+        kp, dof = limit / reach, int(model.jnt_dofadr[joint])
+        kd = max(2.0 * math.sqrt(kp * model.dof_M0[dof]) - model.dof_damping[dof].sum(), 0.0)
+        servo = spec.actuators[actuator]
+        servo.set_to_position(kp=kp, kv=kd)
+        servo.gear = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+        servo.forcelimited, servo.forcerange = True, (-limit, limit)
+        servo.ctrllimited, servo.inheritrange = False, 0.0

@@ -1,4 +1,4 @@
-"""T1Velocity: a Booster T1 walks at a commanded velocity with its twelve leg joints; head, waist and arms keep still."""
+"""T1Velocity: a Booster T1 walks at a commanded velocity with its twelve leg joints; its upper body keeps still."""
 
 import mujoco
 import warp as wp

@@ -4,10 +4,10 @@ Actions are offsets of the joints' servo targets from the default pose. A robot'
 act and the feet, and gives its numbers; other tables follow from the model. Observations, rewards, commands, pushes and
 resets are those of mjlab 1.6.0's velocity tasks.
 
-The base is the body of the first joint, which is free. Functions read the state after the last substep. Only the forces
-on the feet are from the beginning of that substep, and 0 at the start of an episode. Positions and velocities of the feet
-are computed from the joints, which saves a forward pass. A foot is in contact if a sphere of its sole, see ``soles``,
-reaches the ground; ``ground`` is the only function that knows its shape.
+The base is the body of the first joint, which is free. Functions read the state after the last substep. Only the
+forces on the feet are from the beginning of that substep, and 0 at the start of an episode. Positions and velocities of
+the feet are computed from the joints, which saves a forward pass. A foot is in contact if a sphere of its sole, see
+``soles``, reaches the ground; ``ground`` is the only function that knows its shape.
 """
 
 import math
