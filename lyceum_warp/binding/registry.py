@@ -77,7 +77,7 @@ def _package_modules() -> dict[str, str]:
     which of its modules has which task.
     """
     found: dict[str, str] = {}
-    package = importlib.import_module(_PACKAGE.rstrip("."))
+    package = importlib.import_module("lyceum_warp.tasks")
     for module in pkgutil.iter_modules(package.__path__, _PACKAGE):
         if module.ispkg:
             declared: dict[str, str] = importlib.import_module(module.name).TASKS

@@ -18,7 +18,7 @@ from lyceum_warp.binding.parameters import defaults
 from lyceum_warp.binding.parts import length
 from lyceum_warp.binding.registry import find_task, task_names
 from lyceum_warp.cli.display import make_console
-from lyceum_warp.model_files import ModelFile, PackageFile
+from lyceum_warp.model_files import ModelFile
 from lyceum_warp.options import PhysicsOptions
 from lyceum_warp.task import Task
 
@@ -140,7 +140,7 @@ def _source(task: type[Task]) -> str:
     found = model if isinstance(model, ModelFile) else find_model(model, task)
     if not isinstance(found, ModelFile):
         return found.name
-    extra = found.install.partition("[")[2].partition("]")[0] if isinstance(found, PackageFile) else ""
+    extra = getattr(found, "install", "").partition("[")[2].partition("]")[0]
     return f"{found.source} [{extra}]" if extra else f"{found.source}: {Path(found.file).name}"
 
 

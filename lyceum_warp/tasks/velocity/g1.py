@@ -4,7 +4,8 @@ import mujoco
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp.tasks.velocity import robot_models, velocity
+from lyceum_warp import walkers
+from lyceum_warp.tasks.velocity import walking
 
 SIDES, FEET = ("left", "right"), ("left_foot", "right_foot")
 LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
@@ -17,7 +18,7 @@ OTHER_STD = [0.2, 0.08, 0.1, *2 * [0.15, 0.15, 0.1, 0.15, 0.3, 0.3, 0.3]]
 
 
 @wp.struct
-class Params(velocity.BipedParams):
+class Params(walking.BipedParams):
     joints: wp.array[int] = lw.joints(*LEGS)
     feet: wp.array[int] = lw.sites(*FEET)
     imu: wp.vec3 = wp.vec3(0.04525, 0.0, -0.08339)
@@ -35,13 +36,13 @@ class FullParams(Params):
 
 
 @lw.register
-class G1Velocity(velocity.Biped):
-    model = robot_models.playground_model("g1/xmls/scene_mjx_feetonly_flat_terrain.xml")
+class G1Velocity(walking.Biped):
+    model = lw.playground_model("locomotion/g1/xmls/scene_mjx_feetonly_flat_terrain.xml")
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Sense forces on the feet, and let their friction decide."""
-        robot_models.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))
+        walkers.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))
 
 
 @lw.register

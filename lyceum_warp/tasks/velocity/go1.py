@@ -6,14 +6,14 @@ Joints and feet are in the order FR, FL, RR, RL, with hip, thigh and calf for ea
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp.tasks.velocity import velocity
+from lyceum_warp.tasks.velocity import walking
 
 LEGS = ("FR", "FL", "RR", "RL")
 FEET = [f"{leg}_foot" for leg in LEGS]
 
 
 @wp.struct
-class Params(velocity.Params):
+class Params(walking.Params):
     joints: wp.array[int] = lw.joints(*(f"{leg}_{joint}" for leg in LEGS for joint in ("hip", "thigh", "calf")))
     feet: wp.array[int] = lw.sites(*FEET)
     foot_geoms: wp.array[int] = lw.geoms(*FEET)
@@ -25,5 +25,5 @@ class Params(velocity.Params):
 
 
 @lw.register
-class Go1Velocity(velocity.Velocity):
+class Go1Velocity(walking.Velocity):
     model = "go1.xml"

@@ -4,13 +4,14 @@ import mujoco
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp.tasks.velocity import robot_models, velocity
+from lyceum_warp import walkers
+from lyceum_warp.tasks.velocity import walking
 
 LEGS, FEET = ("fl", "fr", "hl", "hr"), ("FL", "FR", "HL", "HR")
 
 
 @wp.struct
-class Params(velocity.Params):
+class Params(walking.Params):
     joints: wp.array[int] = lw.joints(*(f"{leg}_{joint}" for leg in LEGS for joint in ("hx", "hy", "kn")))
     feet: wp.array[int] = lw.sites(*FEET)
     standing_pose_std: wp.array[float] = 4 * [0.05, 0.05, 0.1]
@@ -22,9 +23,9 @@ class Params(velocity.Params):
 
 
 @lw.register
-class SpotVelocity(velocity.Velocity):
+class SpotVelocity(walking.Velocity):
     model, keyframe, frame_skip = (
-        robot_models.playground_model("spot/xmls/scene_mjx_feetonly_flat_terrain.xml"),
+        lw.playground_model("locomotion/spot/xmls/scene_mjx_feetonly_flat_terrain.xml"),
         "home",
         5,
     )
@@ -32,4 +33,4 @@ class SpotVelocity(velocity.Velocity):
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Let friction of the feet decide, and take the physics of the humanoids."""
-        robot_models.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))
+        walkers.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))

@@ -4,14 +4,15 @@ import mujoco
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp.tasks.velocity import robot_models, velocity
+from lyceum_warp import walkers
+from lyceum_warp.tasks.velocity import walking
 
 FEET = ("left_foot", "right_foot")
 LEG = ("Hip_Pitch", "Hip_Roll", "Hip_Yaw", "Knee_Pitch", "Ankle_Pitch", "Ankle_Roll")
 
 
 @wp.struct
-class Params(velocity.BipedParams):
+class Params(walking.BipedParams):
     joints: wp.array[int] = lw.joints(*(f"{side}_{joint}" for side in ("Left", "Right") for joint in LEG))
     feet: wp.array[int] = lw.sites(*FEET)
     walking_pose_std: wp.array[float] = 2 * [0.3, 0.15, 0.15, 0.35, 0.25, 0.1]
@@ -20,10 +21,10 @@ class Params(velocity.BipedParams):
 
 
 @lw.register
-class T1Velocity(velocity.Biped):
-    model = robot_models.playground_model("t1/xmls/scene_mjx_feetonly_flat_terrain.xml")
+class T1Velocity(walking.Biped):
+    model = lw.playground_model("locomotion/t1/xmls/scene_mjx_feetonly_flat_terrain.xml")
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Sense forces on the feet, and let their friction decide."""
-        robot_models.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))
+        walkers.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))

@@ -13,8 +13,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-import lyceum_warp as lw
-
 _JOINT, _SENSOR = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_SENSOR
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 _FORCE, _NET = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3  # parameters of a contact sensor
@@ -149,7 +147,7 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
     """Spheres that touch a plane if and only if the foot does, (feet, most spheres, 4): centre and radius, m.
 
     Centres are relative to the foot's last joint. A sphere is itself, a capsule its ends, a box its corners; other
-    geoms are the corners of their bounding boxes.
+    geoms are the corners of their bounding boxes. Radii include the margin from which a contact has a force.
 
     Raises:
         ValueError: A foot has no geom in ``foot_geoms``.
@@ -160,7 +158,7 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
         geoms = [geom for geom in p.foot_geoms if model.geom_bodyid[geom] == model.site_bodyid[foot]]
         if not geoms:
             raise ValueError(f"none of foot_geoms belongs to the body of the foot {model.site(foot).name!r}")
-        found = np.concatenate([spheres_of(model, data, geom) for geom in geoms])
+        found = np.concatenate([_with_margin(model, geom, spheres_of(model, data, geom)) for geom in geoms])
         found[:, :3] -= data.xanchor[_last_joint(model, foot)]
         spheres.append(found)
     most = max(map(len, spheres))
@@ -245,6 +243,14 @@ def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[
     return bool(bits | (model.geom_contype[other] & model.geom_conaffinity[geom])) or frozenset((geom, other)) in pairs
 
 
+def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.ndarray:
+    """Spheres of a geom, enlarged by the margin of its contacts with the ground, less their gap."""
+    ground = np.flatnonzero(model.geom_bodyid == 0)
+    margin = max(model.geom_margin[geom], model.geom_margin[ground].max())
+    gap = max(model.geom_gap[geom], model.geom_gap[ground].max())
+    return spheres + np.array([0.0, 0.0, 0.0, margin - gap])
+
+
 def spheres_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
     """The spheres of ``soles`` for a geom, in the world's axes, (spheres, 4)."""
     size, kind = model.geom_size[geom], mujoco.mjtGeom
@@ -266,16 +272,6 @@ def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
 
 
 # models
-
-
-def playground_model(file: str) -> lw.ModelFile:
-    """A scene of MuJoCo Playground's locomotion tasks, such as "h1/xmls/scene_mjx_feetonly.xml" (extra "menagerie")."""
-    package = "large" if file.startswith(("go1/", "spot/", "barkour/")) else "playground_humanoid"
-    return lw.package_model(
-        f"envpool_assets_mujoco_{package}",
-        f"mujoco/playground/assets/mujoco_playground/_src/locomotion/{file}",
-        install="lyceum-warp[menagerie]",
-    )
 
 
 def prepare_walker(

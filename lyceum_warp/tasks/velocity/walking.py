@@ -1,4 +1,4 @@
-"""Velocity: what all robots of the family share. A robot follows commands of velocity and yaw rate on flat ground.
+"""Define velocity tasks for any walking robot: it follows commands of velocity and yaw rate on flat ground.
 
 Actions are offsets of the joints' servo targets from the default pose. A robot's file names the model, the joints that
 act and the feet, and gives its numbers; other tables follow from the model. Observations, rewards, commands, pushes and
@@ -16,8 +16,7 @@ from typing import Any
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp import Row, terms
-from lyceum_warp.tasks.velocity import robot_models as models
+from lyceum_warp import Row, terms, walkers
 
 # terms and their arguments
 from lyceum_warp.terms import (  # noqa: F401
@@ -72,19 +71,19 @@ class Params:
     # the robot: joints that act, sites of the feet, and what follows from them
     joints: wp.array[int] = lw.joints()
     feet: wp.array[int] = lw.sites()
-    trunk: int = lw.from_model(models.base)
+    trunk: int = lw.from_model(walkers.base)
     imu: wp.vec3 = wp.vec3(0.0)  # position of the velocimeter on the base, m
-    joint_qpos: wp.array[int] = lw.from_model(models.joint_qpos)
-    joint_dof: wp.array[int] = lw.from_model(models.joint_dof)
-    controls: wp.array[int] = lw.from_model(models.controls)
-    leg_qpos: wp.array2d[int] = lw.from_model(models.leg_qpos)
-    leg_dof: wp.array2d[int] = lw.from_model(models.leg_dof)
-    leg_axes: wp.array2d[wp.vec3] = lw.from_model(models.leg_axes)
-    leg_offsets: wp.array2d[wp.vec3] = lw.from_model(models.leg_offsets)
-    foot_offsets: wp.array[wp.vec3] = lw.from_model(models.foot_offsets)
-    foot_geoms: wp.array[int] = lw.from_model(models.foot_geoms)
-    foot_forces: wp.array[int] = lw.from_model(models.foot_forces)
-    soles: wp.array2d[wp.vec4] = lw.from_model(models.soles)
+    joint_qpos: wp.array[int] = lw.from_model(walkers.joint_qpos)
+    joint_dof: wp.array[int] = lw.from_model(walkers.joint_dof)
+    controls: wp.array[int] = lw.from_model(walkers.controls)
+    leg_qpos: wp.array2d[int] = lw.from_model(walkers.leg_qpos)
+    leg_dof: wp.array2d[int] = lw.from_model(walkers.leg_dof)
+    leg_axes: wp.array2d[wp.vec3] = lw.from_model(walkers.leg_axes)
+    leg_offsets: wp.array2d[wp.vec3] = lw.from_model(walkers.leg_offsets)
+    foot_offsets: wp.array[wp.vec3] = lw.from_model(walkers.foot_offsets)
+    foot_geoms: wp.array[int] = lw.from_model(walkers.foot_geoms)
+    foot_forces: wp.array[int] = lw.from_model(walkers.foot_forces)
+    soles: wp.array2d[wp.vec4] = lw.from_model(walkers.soles)
     # numbers of the reward terms
     linear_velocity_variance: float = 0.25  # (m/s)^2
     angular_velocity_variance: float = 0.5  # (rad/s)^2
@@ -98,8 +97,8 @@ class Params:
     fall_angle: float = math.radians(70.0)
     least_height: float = 0.0  # of the base, m
     # actions
-    default_pose: wp.array[float] = lw.from_model(models.home_pose)  # rad
-    action_scale: wp.array[float] = lw.from_model(models.quarter_of_force)  # rad
+    default_pose: wp.array[float] = lw.from_model(walkers.home_pose)  # rad
+    action_scale: wp.array[float] = lw.from_model(walkers.quarter_of_force)  # rad
     # commands: first step of the stage, minimum and maximum forward velocity (m/s), maximum yaw rate (rad/s)
     stages: wp.array2d[float] = [[0.0, -1.0, 1.0, 0.5], [120e3, -1.5, 2.0, 0.7], [240e3, -2.0, 3.0, 0.7]]
     lateral_velocity: float = 1.0
@@ -126,7 +125,7 @@ class Params:
     spinning_friction: wp.vec2 = wp.vec2(1e-4, 2e-2)  # log-uniform, like the rolling friction
     rolling_friction: wp.vec2 = wp.vec2(1e-5, 5e-3)
     # resets
-    start_height: float = lw.from_model(models.home_height)
+    start_height: float = lw.from_model(walkers.home_height)
     start_low: wp.vec3 = wp.vec3(-0.5, -0.5, 0.01)  # offset of the base, m
     start_high: wp.vec3 = wp.vec3(0.5, 0.5, 0.05)
     start_yaw: float = 3.14  # +-
