@@ -1,6 +1,7 @@
 """Find tasks by name, by file or by class, and register those of users."""
 
 import difflib
+import functools
 import importlib
 import importlib.util
 import io
@@ -48,8 +49,8 @@ def register(task: type[Task]) -> type[Task]:
         raise ValueError(f"@lw.register takes a subclass of lw.Task, not {name}: write class {name}(lw.Task)")
     name = task_name(task)
     known = _tasks.get(name)
-    if known is None and not task.__module__.startswith(_PACKAGE) and name in package_task_names():
-        owner = f"{_PACKAGE}{name}"
+    if known is None and not task.__module__.startswith(_PACKAGE) and name in _package_modules():
+        owner = _package_modules()[name]
     elif known is not None and not _may_replace(task, known):
         owner = f"{known.__module__}.{known.__qualname__}"
     else:
@@ -65,8 +66,25 @@ def _may_replace(task: type[Task], known: type[Task]) -> bool:
 
 def package_task_names() -> list[str]:
     """Names of the tasks that come with the package."""
+    return list(_package_modules())
+
+
+@functools.cache
+def _package_modules() -> dict[str, str]:
+    """The modules of the package's tasks, by the tasks' names; none of them is imported.
+
+    A module has the task of its name. A folder, a family of tasks, declares in the ``TASKS`` of its ``__init__.py``
+    which of its modules has which task.
+    """
+    found: dict[str, str] = {}
     package = importlib.import_module("lyceum_warp.tasks")
-    return [module.name for module in pkgutil.iter_modules(package.__path__)]
+    for module in pkgutil.iter_modules(package.__path__, _PACKAGE):
+        if module.ispkg:
+            declared: dict[str, str] = importlib.import_module(module.name).TASKS
+            found |= {task: f"{module.name}.{file}" for task, file in declared.items()}
+        else:
+            found[module.name.removeprefix(_PACKAGE)] = module.name
+    return found
 
 
 def _file(task: type[Task]) -> str | None:
@@ -117,8 +135,8 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
     path, _, attribute = task.partition(":")
     if path.endswith(".py"):
         return _task_of_file(Path(path), attribute)
-    if task not in _tasks and task in package_task_names():
-        importlib.import_module(f"lyceum_warp.tasks.{task}")
+    if task not in _tasks and (module := _package_modules().get(task)) is not None:
+        importlib.import_module(module)
     if task not in _tasks:
         close = difflib.get_close_matches(task, task_names(), 3)
         hint = f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(task_names())}"

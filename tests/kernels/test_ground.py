@@ -6,7 +6,7 @@ import pytest
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp.terrain import HeightField
+from lyceum_warp.terrain import height_table
 
 NROW, NCOL, SIZE = 6, 9, (2.0, 1.25, 0.8, 0.3)
 OFFSET = (0.5, -0.25, 0.125)
@@ -24,7 +24,7 @@ def model() -> mujoco.MjModel:
 
 @pytest.fixture(scope="module")
 def ground(model: mujoco.MjModel) -> wp.array:
-    return wp.array(HeightField("field").table(model), dtype=float, device="cpu")
+    return wp.array(height_table(model, "field"), dtype=float, device="cpu")
 
 
 def ray_heights(model: mujoco.MjModel, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,6 @@ These tests use elliptic cones, which do not depend on the contact frame.
 """
 
 import dataclasses
-import pkgutil
 from collections.abc import Iterator
 
 import numpy as np
@@ -16,11 +15,11 @@ from conftest import SharedEnv
 from form_tasks import Drawn, Pushed
 
 import lyceum_warp as lw
-import lyceum_warp.tasks
+from lyceum_warp.binding.registry import package_task_names
 from lyceum_warp.support.arrays import torch_view
 
 NWORLD = 32
-TASKS = [module.name for module in pkgutil.iter_modules(lyceum_warp.tasks.__path__)]
+TASKS = package_task_names()
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 FORCE_PARTS = ("contact_force",)
