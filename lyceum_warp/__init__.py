@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from lyceum_warp.env import Env, make
     from lyceum_warp.fields import quat, vec10
     from lyceum_warp.kernels.ground import (
-        follow_walk, ground_height, ground_normal, height_scan, next_level, on_ground, start_on_terrain)
+        follow_walk, ground_distance, ground_height, ground_normal, height_scan, next_level, on_ground,
+        start_on_terrain)
     from lyceum_warp.kernels.random import normal, uniform
     from lyceum_warp.kernels.rotations import (
         quat_angle, quat_difference, quat_from_axis_angle, quat_from_euler, quat_from_mat, quat_from_rotvec,
@@ -66,9 +67,9 @@ __all__ = [
     "PredictiveSampling", "Rollout", "Row", "RunViewer", "Sigmoid", "Task", "Terrain", "Trajectory", "ValueFunction",
     "act", "actuator", "actuators", "all_inside", "angle_between", "bodies", "body", "body_velocity", "camera",
     "control", "control_async", "control_report", "ctrl", "dof", "dofs", "equality", "evaluate", "export_policy",
-    "follow_velocity", "follow_walk", "from_model", "geom", "geoms", "grasp_terms", "ground_height", "ground_normal",
-    "gymnasium_model", "gymnasium_robotics_model", "height_field", "height_scan", "inside", "joint", "joints",
-    "lasting_memory", "load", "load_value", "local_velocity", "make", "memory", "menagerie_model", "mocap",
+    "follow_velocity", "follow_walk", "from_model", "geom", "geoms", "grasp_terms", "ground_distance", "ground_height",
+    "ground_normal", "gymnasium_model", "gymnasium_robotics_model", "height_field", "height_scan", "inside", "joint",
+    "joints", "lasting_memory", "load", "load_value", "local_velocity", "make", "memory", "menagerie_model", "mocap",
     "next_level", "normal", "on_ground", "package_model", "part", "playground_model", "put", "put_upright", "qpos",
     "qposes", "quat", "quat_angle", "quat_difference", "quat_from_axis_angle", "quat_from_euler", "quat_from_mat",
     "quat_from_rotvec", "quat_inverse", "quat_mul", "quat_random", "quat_rotate", "quat_rotate_inverse",
@@ -100,7 +101,8 @@ _NAMES = {
     "done": "Done",
     "env": "Env make",
     "fields": "quat vec10",
-    "kernels.ground": "follow_walk ground_height ground_normal height_scan next_level on_ground start_on_terrain",
+    "kernels.ground":
+        "follow_walk ground_distance ground_height ground_normal height_scan next_level on_ground start_on_terrain",
     "kernels.random": "normal uniform",
     "kernels.rotations":
         "quat_angle quat_difference quat_from_axis_angle quat_from_euler quat_from_mat quat_from_rotvec quat_inverse "
