@@ -246,8 +246,8 @@ def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[
 def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.ndarray:
     """Spheres of a geom, enlarged by the margin of its contacts with the ground, less their gap."""
     ground = np.flatnonzero(model.geom_bodyid == 0)
-    margin = max(model.geom_margin[geom], model.geom_margin[ground].max())
-    gap = max(model.geom_gap[geom], model.geom_gap[ground].max())
+    margin = model.geom_margin[geom] + model.geom_margin[ground].max()
+    gap = model.geom_gap[geom] + model.geom_gap[ground].max()
     return spheres + np.array([0.0, 0.0, 0.0, margin - gap])
 
 

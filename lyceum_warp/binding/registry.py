@@ -1,5 +1,6 @@
 """Find tasks by name, by file or by class, and register those of users."""
 
+import ast
 import difflib
 import functools
 import importlib
@@ -73,18 +74,26 @@ def package_task_names() -> list[str]:
 def _package_modules() -> dict[str, str]:
     """The modules of the package's tasks, by the tasks' names; none of them is imported.
 
-    A module has the task of its name. A folder, a family of tasks, declares in the ``TASKS`` of its ``__init__.py``
-    which of its modules has which task.
+    A module has the task of its name. A folder, a family of tasks, declares which of its modules has which task.
     """
     found: dict[str, str] = {}
-    package = importlib.import_module("lyceum_warp.tasks")
-    for module in pkgutil.iter_modules(package.__path__, _PACKAGE):
-        if module.ispkg:
-            declared: dict[str, str] = importlib.import_module(module.name).TASKS
-            found |= {task: f"{module.name}.{file}" for task, file in declared.items()}
-        else:
-            found[module.name.removeprefix(_PACKAGE)] = module.name
+    for folder in map(Path, importlib.import_module("lyceum_warp.tasks").__path__):
+        for module in pkgutil.iter_modules([str(folder)]):
+            if module.ispkg:
+                declared = _declared(folder / module.name / "__init__.py").items()
+                found |= {task: f"{_PACKAGE}{module.name}.{file}" for task, file in declared}
+            else:
+                found[module.name] = f"{_PACKAGE}{module.name}"
     return found
+
+
+def _declared(file: Path) -> dict[str, str]:
+    """The dict ``TASKS`` in a file, which is not run: modules by the names of their tasks."""
+    for node in ast.parse(file.read_bytes()).body:
+        if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["TASKS"]:
+            declared: dict[str, str] = ast.literal_eval(node.value)
+            return declared
+    raise ValueError(f"{file} declares no TASKS")
 
 
 def _file(task: type[Task]) -> str | None:

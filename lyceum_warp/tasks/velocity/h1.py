@@ -16,7 +16,7 @@ class Params(walking.BipedParams):
     joints: wp.array[int] = lw.joints(*(f"{side}_{joint}" for side in ("left", "right") for joint in LEG))
     feet: wp.array[int] = lw.sites(*FEET)
     walking_pose_std: wp.array[float] = 2 * [0.15, 0.15, 0.3, 0.35, 0.25]
-    action_scale: wp.array[float] = 10 * [0.25]
+    action_scale: wp.array[float] = 10 * [0.5]
     least_height: float = 0.5
 
 
