@@ -11,6 +11,7 @@ import warp as wp
 
 from lyceum_warp.binding.parts import parts_of
 from lyceum_warp.binding.sources import FunctionSource, is_struct
+from lyceum_warp.binding.task_terms import Terms
 from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, MEMORIES, Part, Task, TaskFunction, observer_name
 
 
@@ -38,6 +39,7 @@ class TaskSource:
             name: self._function(wanted) for name, wanted in FUNCTIONS.items()
         }
         """The task's functions by their names in the table; None for a function that the task lacks."""
+        self.terms = Terms(task, name, self._term, self.functions, self.world, self.params)
         if self.functions["observe"] is None:
             raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), which every task needs")
         self._check_names()
@@ -100,6 +102,16 @@ class TaskSource:
     def _has_structs(self) -> bool:
         """Whether structs, not the task's ``obs``, lay out the observations."""
         return not hasattr(self.task, "obs")
+
+    def _term(self, name: str) -> wp.Function | None:
+        """A Warp function of the task by any name, or None."""
+        for owner in self._owners:
+            for names in (vars(owner), owner.scope, vars(sys.modules[owner.__module__])):
+                found = names.get(name)
+                found = found.__func__ if isinstance(found, staticmethod) else found
+                if isinstance(found, wp.Function) and found.func is not None:
+                    return found
+        return None
 
     def _struct(self, name: str) -> Any:
         struct = self._written(name)
@@ -188,7 +200,8 @@ class TaskSource:
             if close := difflib.get_close_matches(name, (*attributes, *FUNCTIONS), 1, 0.75):
                 raise ValueError(f"the task {self.name!r} has {name!r} in its class: did you mean {close[0]}?")
         for name, value in vars(sys.modules[self.task.__module__]).items():
-            if isinstance(value, wp.Function) and name not in FUNCTIONS and not name.startswith(GROUP_PREFIX):
+            known = (*FUNCTIONS, *self.terms.functions)
+            if isinstance(value, wp.Function) and name not in known and not name.startswith(GROUP_PREFIX):
                 own = self._kind(next(iter(value.input_types.values()), None)) == "World"
                 close = difflib.get_close_matches(name, [f for f in FUNCTIONS if self.functions[f] is None], 1, 0.85)
                 if own and close:
