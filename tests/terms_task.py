@@ -52,8 +52,13 @@ def effort(action: Row[float]) -> float:
 
 
 @wp.func
+def pushed(s: World) -> float:
+    return s.pushes[0]
+
+
+@wp.func
 def change(s0: World, s1: World, p: Params) -> float:
-    return (s1.pushes[0] - s0.pushes[0]) * p.target
+    return (pushed(s1) - pushed(s0)) * p.target
 
 
 @wp.func

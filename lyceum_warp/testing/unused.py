@@ -32,7 +32,10 @@ def _functions(task: BoundTask) -> list[str]:
     return [
         f"nothing calls {name}: name it in rewards, terminations or metrics, call it, or remove it"
         for name, function in own.items()
-        if name not in used and function.func.__module__ == task.task.__module__ and not name.startswith(GROUP_PREFIX)
+        if name not in used
+        and not hasattr(function, "replaces")
+        and function.func.__module__ == task.task.__module__
+        and not name.startswith(GROUP_PREFIX)
     ]
 
 
