@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 # fmt: off
 # isort: off
 if TYPE_CHECKING:
+    import lyceum_warp.terms
+    import lyceum_warp.walkers  # noqa: F401
     from lyceum_warp.model_actuators import follow_velocity
     from lyceum_warp.algos.evaluation import Episodes, evaluate
     from lyceum_warp.algos.learner import Iteration, Learner
@@ -38,17 +40,18 @@ if TYPE_CHECKING:
         quat_angle, quat_difference, quat_from_axis_angle, quat_from_euler, quat_from_mat, quat_from_rotvec,
         quat_inverse, quat_mul, quat_random, quat_rotate, quat_rotate_inverse, quat_to_euler, quat_to_mat,
         quat_to_rotvec)
-    from lyceum_warp.kernels.terms import (
+    from lyceum_warp.kernels.task_helpers import (
         Sigmoid, all_inside, angle_between, body_velocity, grasp_terms, inside, local_velocity, put, put_upright,
         sum_squares, tolerance)
     from lyceum_warp.model_files import (
-        ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, package_model)
+        ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, package_model, playground_model)
     from lyceum_warp.openloop import OpenLoop
     from lyceum_warp.options import EnvOptions, PhysicsOptions
     from lyceum_warp.runs.folder import load, load_value
     from lyceum_warp.task import (
-        Planning, Row, Task, act, actuator, actuators, bodies, body, camera, ctrl, dof, dofs, equality, geom, geoms,
-        joint, joints, lasting_memory, memory, mocap, part, qpos, qposes, sensor, sensors, site, sites, tendon)
+        Planning, Row, Task, act, actuator, actuators, bodies, body, camera, ctrl, dof, dofs, equality, from_model,
+        geom, geoms, joint, joints, lasting_memory, memory, mocap, part, qpos, qposes, sensor, sensors, site, sites,
+        tendon)
     from lyceum_warp.training import train
     from lyceum_warp.viewer.follow import RunViewer
     from lyceum_warp.viewer.show import view
@@ -60,13 +63,13 @@ __all__ = [
     "PredictiveSampling", "Rollout", "Row", "RunViewer", "Sigmoid", "Task", "Trajectory", "ValueFunction", "act",
     "actuator", "actuators", "all_inside", "angle_between", "bodies", "body", "body_velocity", "camera", "control",
     "control_async", "control_report", "ctrl", "dof", "dofs", "equality", "evaluate", "export_policy",
-    "follow_velocity", "geom", "geoms", "grasp_terms", "gymnasium_model", "gymnasium_robotics_model", "inside", "joint",
-    "joints", "lasting_memory", "load", "load_value", "local_velocity", "make", "memory", "menagerie_model", "mocap",
-    "normal", "package_model", "part", "put", "put_upright", "qpos", "qposes", "quat", "quat_angle", "quat_difference",
-    "quat_from_axis_angle", "quat_from_euler", "quat_from_mat", "quat_from_rotvec", "quat_inverse", "quat_mul",
-    "quat_random", "quat_rotate", "quat_rotate_inverse", "quat_to_euler", "quat_to_mat", "quat_to_rotvec", "register",
-    "sensor", "sensors", "site", "sites", "sum_squares", "task_names", "tendon", "tolerance", "train", "uniform",
-    "vec10", "view"]
+    "follow_velocity", "from_model", "geom", "geoms", "grasp_terms", "gymnasium_model", "gymnasium_robotics_model",
+    "inside", "joint", "joints", "lasting_memory", "load", "load_value", "local_velocity", "make", "memory",
+    "menagerie_model", "mocap", "normal", "package_model", "part", "playground_model", "put", "put_upright", "qpos",
+    "qposes", "quat", "quat_angle", "quat_difference", "quat_from_axis_angle", "quat_from_euler", "quat_from_mat",
+    "quat_from_rotvec", "quat_inverse", "quat_mul", "quat_random", "quat_rotate", "quat_rotate_inverse",
+    "quat_to_euler", "quat_to_mat", "quat_to_rotvec", "register", "sensor", "sensors", "site", "sites", "sum_squares",
+    "task_names", "tendon", "tolerance", "train", "uniform", "vec10", "view"]
 
 _NAMES = {
     "model_actuators": "follow_velocity",
@@ -97,16 +100,18 @@ _NAMES = {
     "kernels.rotations":
         "quat_angle quat_difference quat_from_axis_angle quat_from_euler quat_from_mat quat_from_rotvec quat_inverse "
         "quat_mul quat_random quat_rotate quat_rotate_inverse quat_to_euler quat_to_mat quat_to_rotvec",
-    "kernels.terms":
+    "kernels.task_helpers":
         "Sigmoid all_inside angle_between body_velocity grasp_terms inside local_velocity put put_upright sum_squares "
         "tolerance",
-    "model_files": "ModelFile gymnasium_model gymnasium_robotics_model menagerie_model package_model",
+    "model_files":
+        "ModelFile gymnasium_model gymnasium_robotics_model menagerie_model package_model "
+        "playground_model",
     "openloop": "OpenLoop",
     "options": "EnvOptions PhysicsOptions",
     "runs.folder": "load load_value",
     "task":
-        "Planning Row Task act actuator actuators bodies body camera ctrl dof dofs equality geom geoms joint joints "
-        "lasting_memory memory mocap part qpos qposes sensor sensors site sites tendon",
+        "Planning Row Task act actuator actuators bodies body camera ctrl dof dofs equality from_model geom geoms "
+        "joint joints lasting_memory memory mocap part qpos qposes sensor sensors site sites tendon",
     "training": "train",
     "viewer.follow": "RunViewer",
     "viewer.show": "view",
@@ -121,6 +126,8 @@ _MODULES = {name: module for module, names in _NAMES.items() for name in names.s
 
 def __getattr__(name: str) -> Any:
     """Load a public name."""
+    if name in ("terms", "walkers"):  # modules whose functions have no names in this one
+        return importlib.import_module(f"{__name__}.{name}")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
@@ -129,4 +136,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, "terms", "walkers"})

@@ -4,7 +4,7 @@ import dataclasses
 import inspect
 import sys
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import mujoco
@@ -316,6 +316,26 @@ def mocap(body: str) -> int:
     return Element("mocap_pos", body)
 
 
+@dataclasses.dataclass(frozen=True)
+class FromModel:
+    """A parameter that is computed from the compiled model. ``from_model`` makes it."""
+
+    function: Callable[[mujoco.MjModel, Any], Any]
+
+
+def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
+    """As a default in Params: a value that a function computes from the compiled model and from other parameters.
+
+    ``mass: float = lw.from_model(lambda model, p: model.body_subtreemass[p.trunk])`` is the mass of the robot. It is
+    computed again if another parameter changes, unless it was given itself.
+
+    Args:
+        function: A function of the MjModel and of an object with the parameters as attributes: those with other
+            defaults, and those computed before this one, in the order of Params.
+    """
+    return FromModel(function)
+
+
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Planning:
@@ -361,7 +381,8 @@ class Task:
     type ``wp.array[float]``, ``wp.array2d[wp.vec3]`` or the like is a table that all worlds share, such as a motion to
     follow; its default is a nested list or an array. A table of named elements is written
     ``feet: wp.array[int] = lw.sites("left_foot", "right_foot")``, or with ``lw.bodies``, ``lw.geoms``, ``lw.joints``,
-    ``lw.qposes``, ``lw.dofs``, ``lw.actuators`` or ``lw.sensors``.
+    ``lw.qposes``, ``lw.dofs``, ``lw.actuators`` or ``lw.sensors``. ``lw.from_model`` computes a default from the
+    compiled model.
 
     Functions:
     {functions}
@@ -424,9 +445,10 @@ class Task:
     cleared: ClassVar[tuple[str, ...]] = ()
     """Fields left by the last substep, such as contact forces, to zero at the start of an episode. Otherwise they are
     computed then, which takes a forward pass of the worlds that restart. A reset clears them before ``initialize``."""
-    actions: ClassVar[Mapping[str, int] | None] = None
+    actions: ClassVar[Mapping[str, int | str] | None] = None
     """The parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls;
-    ``control`` then turns them into inputs. None: an action has one number for each control."""
+    ``control`` then turns them into inputs. A size may be the name of a table in Params: one number for each of its
+    rows. None: an action has one number for each control."""
     action_range: ClassVar[tuple[float, float] | None] = None
     """The range of an action, which the default ``control`` scales to the model's control ranges; None: actions are
     controls, or, with ``actions``, have no bounds."""

@@ -95,7 +95,7 @@ class WorldArrays:
         self._model_copies = {name: wp.zeros_like(self.engine.arrays[name]) for name in drawn}
         self.params = self.task.parameters.array(self.device)
         self.weights = self.task.parameters.weights(self.device)
-        self.action_space = action_space(model, task.action_range, task.actions)
+        self.action_space = action_space(model, task.action_range, self.task.actions)
         self.obs_spaces = {group: Space.of(layout) for group, layout in self.task.obs_layouts.items()}
         self.state_space = state_space(model, self.engine.snapshots, self.task.dynamics, own_parts(self.task))
 

@@ -192,6 +192,12 @@ def test_the_map_of_the_rooms_is_current() -> None:
     assert runpy.run_path(str(ROOT / "docs" / "rooms.py"))["written"](page) == page
 
 
+def test_the_tables_of_terms_are_current() -> None:
+    """``python docs/terms_table.py`` writes them from the docstrings."""
+    page = (ROOT / "docs" / "terms.md").read_text()
+    assert runpy.run_path(str(ROOT / "docs" / "terms_table.py"))["written"](page) == page
+
+
 def test_the_workflow_runs_the_checks_on_every_supported_python() -> None:
     yaml = pytest.importorskip("yaml")
     workflow = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())

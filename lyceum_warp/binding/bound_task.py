@@ -192,7 +192,6 @@ class BoundTask:
         self.spec = _read_spec(task, model)
         """The model before ``edit_model``. Replicas are made from it, because its source may have changed."""
         self.model = models.compile_model(_edited(task, self.spec), own, physics, varied={*of_model, *dynamics})
-        self._check_actions()
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.frame_skip = whole_number(f"frame_skip of the task {self.name!r}", skip, low=1)
         self.timestep: float = self.model.opt.timestep * self.frame_skip
@@ -206,9 +205,11 @@ class BoundTask:
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)
         """The integration state at which a reset starts, (integration_size,) float64; None for the model's default."""
         self.parameters = Parameters(
-            self.source.params, self.name, self.model, nworld=nworld, timestep=self.timestep, given=params or {},
-            weights=self.source.terms.weights,
+            self.source.params, self.source.defaults, self.name, self.model, nworld=nworld, timestep=self.timestep,
+            given=params or {}, weights=self.source.terms.weights,
         )  # fmt: skip
+        self.actions = self._checked_actions()
+        """The sizes of the parts of an action, by name; None if actions are controls."""
         self.memory = self._memory_layouts()
         """The layouts of the rows ``memory`` and ``lasting_memory``."""
         self.obs_layouts = obs_layouts(self.source, self.params)
@@ -291,15 +292,14 @@ class BoundTask:
         Raises:
             ValueError: There is no such parameter, or the observation would change its size.
         """
-        previous = self.parameters.values
-        self.parameters.values = self.parameters.checked(params)
+        previous, self.parameters = self.parameters, self.parameters.changed(params)
         try:
             changed = "the observation's" if obs_layouts(self.source, self.params) != self.obs_layouts else ""
         except ValueError:  # one value per world for a parameter that sets a size
             changed = "the observation's"
         changed = changed or ("the memory's" if self._memory_layouts() != self.memory else "")
         if changed:
-            self.parameters.values = previous
+            self.parameters = previous
             raise ValueError(f"{', '.join(params)} would change {changed} parts: make a new environment")
 
     def _check_class(self) -> None:
@@ -362,7 +362,7 @@ class BoundTask:
                 "writes: add metrics = (...)"
             )
 
-    def _check_actions(self) -> None:
+    def _checked_actions(self) -> dict[str, int] | None:
         actions = self.task.actions
         if actions is None:
             if self.model.nu == 0:
@@ -370,18 +370,20 @@ class BoundTask:
                     f"the model of the task {self.name!r} has no actuators: add some, or give the task "
                     "actions = {...} and a control that writes inputs"
                 )
-            return
+            return None
         if not isinstance(actions, Mapping) or not actions:
             raise ValueError(
                 f"actions of the task {self.name!r} must be a dict of names and sizes, such as {{'speed': 1}}, not "
                 f"{actions!r}"
             )
-        for name, size in actions.items():
-            whole_number(f"the size of the action {name!r} of the task {self.name!r}", size, low=1)
         if self.functions["control"] is None:
             raise ValueError(
                 f"the task {self.name!r} has actions of its own, so it needs {FUNCTIONS['control'].signature}"
             )
+        return {
+            name: parts.length(f"the size of the action {name!r} of the task {self.name!r}", size, self.params)
+            for name, size in actions.items()
+        }
 
     def check_field(self, name: str, array: wp.array) -> None:
         """Compare the type of a field in World with its array, (nworld, ...).

@@ -34,8 +34,11 @@ class TaskSource:
         self._owners: Any = task.__mro__[: task.__mro__.index(Task)]
         self._variant: Variant | None = None
         self.world: Any = self._struct("World")
-        self.params: Any = self._struct("Params")
-        self._variant = variant_of(name, self._owners, self.world, self.params)
+        own: Any = self._struct("Params")
+        self.defaults: type = own.cls
+        """The class whose attributes are the defaults of the parameters."""
+        self.params: Any = self._with_functions(own)
+        self._variant = variant_of(name, self._owners, self.world, self.params, own)
         self.memory: dict[str, Part] = self._memory()
         """The fields of World that are the task's memory, by name."""
         self.functions: dict[str, wp.Function | None] = {
@@ -128,6 +131,19 @@ class TaskSource:
         if not hasattr(struct, "vars"):
             raise ValueError(f"the task {self.name!r} needs a @wp.struct named {name} in its module")
         return struct
+
+    def _with_functions(self, own: Any) -> Any:
+        """The struct of the parameters that functions take: a base task's, if the task's own only has other defaults.
+
+        Tasks that differ in defaults then share functions and kernels.
+        """
+        fields = {name: wp.types.type_repr(field.type) for name, field in own.vars.items()}
+        for owner in reversed(self._owners):
+            struct = vars(owner).get("Params", owner.scope.get("Params"))
+            known = struct.vars.items() if is_struct(struct) and issubclass(own.cls, struct.cls) else ()
+            if {name: wp.types.type_repr(field.type) for name, field in known} == fields:
+                return struct
+        return own
 
     def _memory(self) -> dict[str, Part]:
         """The parts of memory in World; a task that gives only their number is refused."""

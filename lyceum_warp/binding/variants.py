@@ -85,7 +85,7 @@ class Variant:
 _made: dict[Any, Variant] = {}
 
 
-def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any) -> Variant | None:
+def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any, own: Any) -> Variant | None:
     """The variant that a task is of its family; None if it has its parents' structs and replaces no function.
 
     Tasks with the same structs and replacements share it, and with it their compiled kernels.
@@ -94,43 +94,44 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any)
         task: The task's name, for messages.
         owners: Its class and its base classes, without ``Task``.
         world: Its World.
-        params: Its Params.
+        params: Its Params, which its functions take.
+        own: The struct with the defaults of its Params, which may be another one with the same fields.
 
     Raises:
         ValueError: A function replaces one that takes other arguments.
     """
     modules = list(dict.fromkeys(sys.modules[owner.__module__] for owner in owners))
     values = [list(_values(module, owners)) for module in modules]
-    structs = dict[Any, Any]()
+    structs = {own: params} if own is not params else {}
     for i, parents in enumerate(values):
         for parent in filter(is_struct, parents):
+            if parent in (world, params, own):
+                continue
             new = [world, params, *(v for own in values[:i] for v in own if is_struct(v) and v.key == parent.key)]
-            if found := [struct for struct in new if struct is not parent and issubclass(struct.cls, parent.cls)]:
-                structs[parent] = found[0]
+            if extended := [struct for struct in new if struct is not parent and issubclass(struct.cls, parent.cls)]:
+                structs[parent] = extended[0]
     replaced = {
         value.replaces: value
         for own in reversed(values)
         for value in own
         if isinstance(value, wp.Function) and hasattr(value, "replaces")
     }
-    if not structs and not replaced:
-        return None
     named = {*structs, *structs.values(), world, params}
-    functions = dict[wp.Function, None]()
     for module in modules:  # the list grows
         for value in _values(module, owners):
-            if isinstance(value, wp.Function) and has_source(value):
-                home = sys.modules.get(_home(value))
-                functions |= {value: None} if home in modules else {}
-            else:
-                home = value if isinstance(value, types.ModuleType) else None
-            if home is not None and home not in modules and _names(home, named):
+            home = sys.modules.get(_home(value)) if isinstance(value, wp.Function) else value
+            if isinstance(home, types.ModuleType) and home not in modules and _names(home, named):
                 modules.append(home)
-                functions |= {f: None for f in _values(home, owners) if isinstance(f, wp.Function) and has_source(f)}
-    functions = {f: None for f in functions if sys.modules.get(_home(f)) in modules}
+    found = dict.fromkeys(v for module in modules for v in _values(module, owners) if isinstance(v, wp.Function))
+    functions = [f for f in found if has_source(f) and sys.modules.get(_home(f)) in modules]
+    taken = {kind for f in functions for overload in overloads(f) for kind in overload.input_types.values()
+             if is_struct(kind)}  # fmt: skip
+    structs = {struct: new for struct, new in structs.items() if struct in taken}
+    if not structs and not replaced:  # such as a robot that gives other defaults only
+        return None
     key = (tuple(modules), tuple(functions), tuple(structs.items()), tuple(replaced.items()))
     if key not in _made:
-        made = _made[key] = Variant(modules, list(functions), structs, replaced)
+        made = _made[key] = Variant(modules, functions, structs, replaced)
         for before, after in replaced.items():
             _check_replacement(task, made, before, after)
     return _made[key]

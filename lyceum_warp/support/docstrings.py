@@ -10,6 +10,7 @@ import enum
 import inspect
 import itertools
 import textwrap
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 Class = TypeVar("Class", bound=type)
@@ -58,3 +59,17 @@ def document_overloads(function: Any) -> None:
     found = [overload.func for overload in (*function.user_overloads.values(), *function.user_templates.values())]
     signatures = dict.fromkeys(f"{function.key}({', '.join(inspect.signature(each).parameters)})" for each in found)
     function.__doc__ = "\n".join([*signatures, "", inspect.cleandoc(found[0].__doc__)])
+
+
+def document_arguments(function: Any, meanings: Mapping[str, str]) -> None:
+    """Append the meanings of a Warp function's arguments, those of all its overloads, to its docstring.
+
+    Args:
+        function: The function.
+        meanings: A meaning for each argument, by name; it may have further names.
+    """
+    overloads = (*function.user_overloads.values(), *function.user_templates.values())
+    names = dict.fromkeys(name for overload in overloads for name in overload.input_types)
+    if names:
+        text = listed({name: meanings[name] for name in names})
+        function.__doc__ = f"{inspect.cleandoc(function.__doc__)}\n\nArgs:\n{text}\n"

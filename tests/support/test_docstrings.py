@@ -43,6 +43,7 @@ def test_help_of_every_public_function_shows_its_arguments() -> None:
         name: value for name in lw.__all__ if callable(value := getattr(lw, name)) and not isinstance(value, type)
     }
     assert len(functions) > 40
+    functions |= {name: getattr(lw.terms, name) for name in lw.terms.__all__}
     for name, function in functions.items():
         text = page(function)
         assert f"{name}(" in text and "class Function(" not in text, name

@@ -1,0 +1,51 @@
+"""Write the tables of terms.md from lyceum_warp.terms: python docs/terms_table.py."""
+
+import ast
+import inspect
+import re
+from pathlib import Path
+
+from lyceum_warp import terms
+
+PAGE = Path(__file__).resolve().parent / "terms.md"
+PLACE = re.compile(r"(<!-- (functions|arguments) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def cell(text: str) -> str:
+    """A docstring as a cell of a table."""
+    return re.sub(r"``(.+?)``", r"`\1`", " ".join(text.split())).replace("|", "\\|")
+
+
+def functions() -> list[str]:
+    """A table for each module, with a row for each function in the order of the source."""
+    lines = []
+    for path in sorted(Path(terms.__file__).parent.glob("[!_]*.py")):
+        tree = ast.parse(path.read_text())
+        lines += [f"### {path.stem}", "", cell((ast.get_docstring(tree) or "").split("\n\n")[0]), ""]
+        lines += ["| function | value |", "|---|---|"]
+        for name in dict.fromkeys(node.name for node in tree.body if isinstance(node, ast.FunctionDef)):
+            function = getattr(terms, name)
+            text, _, _ = inspect.getdoc(function).partition("\n\nArgs:")
+            signatures = [f"`{name}({', '.join(function.input_types)})`"]
+            if text.startswith(f"{name}("):  # one line for each overload
+                head, _, text = text.partition("\n\n")
+                signatures = [f"`{line}`" for line in head.splitlines()]
+            lines.append(f"| {'<br>'.join(signatures)} | {cell(text)} |")
+        lines.append("")
+    return lines[:-1]
+
+
+def arguments() -> list[str]:
+    """A table of all arguments."""
+    rows = [f"| `{name}` | {cell(meaning)} |" for name, meaning in terms.ARGUMENTS.items()]
+    return ["| argument | meaning |", "|---|---|", *rows]
+
+
+def written(page: str) -> str:
+    """The page with current tables."""
+    tables = {"functions": functions(), "arguments": arguments()}
+    return PLACE.sub(lambda found: "\n".join([found[1], *tables[found[2]], "", found[3]]), page)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(written(PAGE.read_text()))

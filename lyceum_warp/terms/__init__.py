@@ -1,0 +1,182 @@
+"""Offer reward terms, commands, contact clocks, noise, random draws and motors as functions of values and rows.
+
+Every function is a ``wp.func`` of numbers, vectors, rows of ``World`` and tables of ``Params``, so it works in any
+task. A name of an argument means the same in all functions; ``ARGUMENTS`` explains it.
+"""
+
+from lyceum_warp.support.docstrings import document_arguments
+
+# fmt: off
+# isort: off
+from lyceum_warp.terms.action_changes import action_acceleration_l2, action_rate_l2
+from lyceum_warp.terms.base_motion import (
+    alive, angular_momentum_l2, angular_velocity, base_height, base_height_l2, fell_over, gravity, heading,
+    linear_velocity, orientation, roll_pitch_rate_l2, tilt_l2, too_low, track_angular_velocity,
+    track_linear_velocity, track_planar_velocity, track_yaw_rate, upright, velocity_error, vertical_velocity_l2,
+    yaw_rate_error)
+from lyceum_warp.terms.draws import (
+    chosen, draw_delay, draw_friction, draw_row, log_uniform, scale_elements, scale_gains, scale_mass,
+    shift_center_of_mass, uniform_int)
+from lyceum_warp.terms.feet import (
+    clearance, feet_in_air, follow_swing, foot_clearance, foot_slip, foot_swing_height, ground_speed, landed,
+    long_swings, run_clocks, run_contact_clocks, sensor_vector, soft_landing)
+from lyceum_warp.terms.histories import delayed_action, history_length, push_history, put_history, read_history
+from lyceum_warp.terms.inertia import change_inertia, draw_inertia, symmetric_eigenvectors
+from lyceum_warp.terms.joints import (
+    absolute_power, gait_pose, joint_acceleration_l2, joint_limits, joint_velocity_l2, pose, pose_l1, posture,
+    power, sum_squares_at, torque_l2)
+from lyceum_warp.terms.motors import dc_motor_torque, servo_torque
+from lyceum_warp.terms.observations import add_normal_noise, add_uniform_noise, gather, gather_positions
+from lyceum_warp.terms.pushes import push
+from lyceum_warp.terms.velocity_commands import (
+    active, command_size, draw_flag, draw_forward_only, draw_heading, draw_timer, draw_velocity, heading_yaw_rate,
+    is_due, run_timer, velocity_command)
+
+__all__ = [
+    "absolute_power", "action_acceleration_l2", "action_rate_l2", "active", "add_normal_noise", "add_uniform_noise",
+    "alive", "angular_momentum_l2", "angular_velocity", "base_height", "base_height_l2", "change_inertia", "chosen",
+    "clearance", "command_size", "dc_motor_torque", "delayed_action", "draw_delay", "draw_flag",
+    "draw_forward_only", "draw_friction", "draw_heading", "draw_inertia", "draw_row", "draw_timer", "draw_velocity",
+    "feet_in_air", "fell_over", "follow_swing", "foot_clearance", "foot_slip", "foot_swing_height", "gait_pose",
+    "gather", "gather_positions", "gravity", "ground_speed", "heading", "heading_yaw_rate", "history_length",
+    "is_due", "joint_acceleration_l2", "joint_limits", "joint_velocity_l2", "landed", "linear_velocity",
+    "log_uniform", "long_swings", "orientation", "pose", "pose_l1", "posture", "power", "push", "push_history",
+    "put_history", "read_history", "roll_pitch_rate_l2", "run_clocks", "run_contact_clocks", "run_timer",
+    "scale_elements", "scale_gains", "scale_mass", "sensor_vector", "servo_torque", "shift_center_of_mass",
+    "soft_landing", "sum_squares_at", "symmetric_eigenvectors", "tilt_l2", "too_low", "torque_l2",
+    "track_angular_velocity", "track_linear_velocity", "track_planar_velocity", "track_yaw_rate", "uniform_int",
+    "upright", "velocity_command", "velocity_error", "vertical_velocity_l2", "yaw_rate_error"]
+# isort: on
+# fmt: on
+
+ARGUMENTS = {
+    "action": "the action of the step",
+    "active": "1 if the command is to move, from ``active``",
+    "actuator_biasprm": "the model field",
+    "actuator_gainprm": "the model field",
+    "actuators": "table: indices of actuators",
+    "age": "number of later values in the history",
+    "air_time": "memory: for each foot the seconds since it left the ground, 0 in contact",
+    "angular_velocity": "of the base, in the base's axes, rad/s",
+    "angular_velocity_variance": "squared error at which the term is 1 / e, (rad/s)^2",
+    "at": "index of the first number",
+    "base": "index of the body of the base",
+    "base_height": "of the base's origin in the world, m",
+    "bodies": "table: indices of bodies",
+    "body": "index of a body",
+    "body_inertia": "the model field",
+    "body_ipos": "the model field",
+    "body_iquat": "the model field",
+    "body_mass": "the model field",
+    "command": "forward and lateral velocity, m/s, and yaw rate, rad/s, in the base's axes",
+    "command_high": "greatest forward and lateral velocity, m/s, and yaw rate, rad/s",
+    "command_low": "least forward and lateral velocity, m/s, and yaw rate, rad/s",
+    "contact_seconds": "the ``contact_time`` of one foot",
+    "contact_time": "memory: for each foot the seconds since it touched the ground, 0 in the air",
+    "default_pose": "table: default position of each joint, rad",
+    "delay": "memory: 1 element, a delay in steps",
+    "density": "logarithm of the scale of the density, halved",
+    "drawn_velocity": "memory: 1 vector, the command as drawn",
+    "dt": "seconds in a step",
+    "earlier_action": "memory: the action two steps ago",
+    "effort_limit": "greatest continuous torque of a motor, N m",
+    "encoder_bias": "memory: error of each joint's encoder, rad",
+    "fall_angle": "greatest tilt, rad",
+    "fastest_yaw_rate": "greatest yaw rate, rad/s",
+    "feet": "table: indices of the sites of the feet",
+    "flag": "memory: 1 element, 1 or 0",
+    "foot": "number of a foot, from 0",
+    "foot_contacts": "table: indices in ``sensordata`` of a contact or touch sensor of each foot",
+    "foot_forces": "table: indices in ``sensordata`` of the contact force on each foot, N",
+    "foot_height": "of one foot above the ground, m",
+    "foot_velocities": "table: indices in ``sensordata`` of the velocity of each foot in the world's axes, m/s",
+    "foot_velocity": "of one foot in the world's axes, m/s",
+    "forward_share": "probability of a command that is forward only",
+    "geom_friction": "the model field",
+    "geoms": "table: indices of geoms",
+    "gravity": "direction of gravity in the base's axes, a unit vector",
+    "heading": "angle of the base about the world's z axis, rad",
+    "heading_controlled": "memory: 1 element, 1 if the heading determines the yaw rate",
+    "heading_gain": "yaw rate for an error of the heading of 1 rad, 1/s",
+    "heading_share": "probability that the heading determines the yaw rate",
+    "heading_target": "memory: 1 element, the commanded heading, rad",
+    "high": "upper end of the range",
+    "history": "memory: 1 + n * width elements, the last n values",
+    "i": "index in a value",
+    "indices": "table: indices of elements",
+    "jnt_range": "the model field",
+    "joint_dof": "table: index of each joint in ``qvel``",
+    "joint_position": "of one joint, rad",
+    "joint_qpos": "table: index of each joint in ``qpos``",
+    "joint_target": "target of one joint, rad",
+    "joint_velocity": "of one joint, rad/s",
+    "joints": "table: index of each joint in the ``jnt_`` fields",
+    "kd": "damping of a servo, N m s/rad",
+    "kd_scale": "range of the factors of kd",
+    "kp": "stiffness of a servo, N m/rad",
+    "kp_scale": "range of the factors of kp",
+    "least": "least integer",
+    "least_air_time": "seconds in the air from which a foot counts",
+    "least_command": "size of a command, from ``command_size``, up to which it is to stand",
+    "least_forward_velocity": "of a command that is forward only, m/s",
+    "least_height": "least height of the base, m",
+    "linear_velocity": "of the base's origin, in the base's axes, m/s",
+    "linear_velocity_variance": "squared error at which the term is 1 / e, (m/s)^2",
+    "low": "lower end of the range",
+    "matrix": "symmetric, 3 x 3",
+    "most": "greatest integer",
+    "most_air_time": "seconds in the air up to which a foot counts",
+    "noise": "bound of uniform noise, standard deviation of normal noise",
+    "offset": "bounds of the offset, m",
+    "peak_height": "memory: for each foot the greatest height since its last landing, m",
+    "pose_std": "table: standard deviation of each joint, rad",
+    "previous_action": "memory: the action one step ago",
+    "push_spin": "bounds of the change of angular velocity, in the world's axes, rad/s",
+    "push_velocity": "bounds of the change of velocity, in the world's axes, m/s",
+    "qacc": "the field, as the last substep left it",
+    "qfrc_actuator": "the field, as the last substep left it",
+    "qpos": "the field",
+    "qvel": "the field",
+    "rng": "the world's random stream",
+    "rolling_friction": "range of the rolling friction",
+    "row": "the row",
+    "running_command": "size of a command, from ``command_size``, from which it is to run",
+    "running_pose_std": "table: standard deviation of each joint while running, rad",
+    "saturation_torque": "torque of a motor at rest, N m",
+    "scale": "range of the factors",
+    "seconds": "range of the duration, s",
+    "sensordata": "the field",
+    "share": "probability",
+    "shear": "s12, s13 and s23 of the matrix D",
+    "shift": "offset of the body's mass in the body's axes, m",
+    "site_xpos": "the field",
+    "sliding_friction": "range of the sliding friction",
+    "soft_limit": "share of a joint's range, about its middle, without a cost",
+    "source": "the row to read",
+    "spinning_friction": "range of the spinning friction",
+    "standing": "memory: 1 element, 1 if the command is to stand",
+    "standing_pose_std": "table: standard deviation of each joint while standing, rad",
+    "stretch": "logarithms of the diagonal of the matrix D",
+    "substep_dt": "seconds in a substep",
+    "subtree_angmom": "the field",
+    "swing_height": "memory: for each foot the greatest height of its last swing, m",
+    "swing_target": "wanted height of a foot in its swing, m",
+    "swing_time": "memory: for each foot the seconds of its last swing",
+    "target": "the row to write",
+    "target_heading": "the commanded heading, rad",
+    "target_height": "wanted height of the base, m",
+    "tilt_variance": "squared sine of the tilt at which the term is 1 / e",
+    "timer": "memory: 1 element, the seconds left",
+    "torque": "wanted torque, N m",
+    "touching": "whether the foot touches the ground",
+    "value": "the row to append",
+    "velocity": "in the world's axes, m/s",
+    "velocity_limit": "no-load speed of a motor, rad/s",
+    "walking_pose_std": "table: standard deviation of each joint while walking, rad",
+    "wanted_air_time": "least seconds of a swing that is rewarded",
+    "width": "numbers in one value of a history",
+}
+"""The meanings of the functions' arguments. "memory" is a row of the task's memory, "table" an array of Params."""
+
+for _name in __all__:
+    document_arguments(globals()[_name], ARGUMENTS)

@@ -1,0 +1,104 @@
+"""Draw numbers, and model fields that differ between worlds.
+
+Functions that scale or shift a model field start from its present value: its nominal value in ``startup`` and, because
+every reset restores it, in ``randomize``.
+"""
+
+import warp as wp
+
+from lyceum_warp.fields import vec10
+from lyceum_warp.kernels.random import uniform
+from lyceum_warp.task import Row
+
+
+@wp.func
+def log_uniform(rng: Row[wp.uint32], low: float, high: float) -> float:
+    """Draw exp(U(log low, log high)): each order of magnitude is as likely as any other."""
+    return wp.exp(uniform(rng, wp.log(low), wp.log(high)))
+
+
+@wp.func
+def uniform_int(rng: Row[wp.uint32], least: int, most: int) -> int:
+    """Draw an integer with least <= n <= most."""
+    return least + wp.min(int(uniform(rng, 0.0, float(most - least + 1))), most - least)
+
+
+@wp.func
+def chosen(rng: Row[wp.uint32], share: float) -> bool:
+    """Draw True with a probability."""
+    return uniform(rng, 0.0, 1.0) < share
+
+
+@wp.func
+def draw_row(row: Row[float], low: float, high: float, rng: Row[wp.uint32]):
+    """Draw every element of a row from U(low, high), such as the biases of encoders."""
+    for i in range(row.shape[0]):
+        row[i] = uniform(rng, low, high)
+
+
+@wp.func
+def draw_delay(delay: Row[float], least: int, most: int, rng: Row[wp.uint32]):
+    """Draw a whole number of steps, least <= n <= most; ``delayed_action`` applies it."""
+    delay[0] = float(uniform_int(rng, least, most))
+
+
+@wp.func
+def scale_elements(row: Row[float], indices: wp.array[int], scale: wp.vec2, rng: Row[wp.uint32]):
+    """Multiply each listed element by a factor of its own from U(scale[0], scale[1]), such as ``dof_armature``."""
+    for i in range(indices.shape[0]):
+        row[indices[i]] = row[indices[i]] * uniform(rng, scale[0], scale[1])
+
+
+@wp.func
+def draw_friction(
+    geom_friction: Row[wp.vec3],
+    geoms: wp.array[int],
+    sliding_friction: wp.vec2,
+    spinning_friction: wp.vec2,
+    rolling_friction: wp.vec2,
+    rng: Row[wp.uint32],
+):
+    """Draw one friction for all listed geoms: sliding uniform, spinning and rolling ``log_uniform``."""
+    sliding = uniform(rng, sliding_friction[0], sliding_friction[1])
+    spinning = log_uniform(rng, spinning_friction[0], spinning_friction[1])
+    rolling = log_uniform(rng, rolling_friction[0], rolling_friction[1])
+    for i in range(geoms.shape[0]):
+        geom_friction[geoms[i]] = wp.vec3(sliding, spinning, rolling)
+
+
+@wp.func
+def scale_mass(
+    body_mass: Row[float], body_inertia: Row[wp.vec3], bodies: wp.array[int], scale: wp.vec2, rng: Row[wp.uint32]
+):
+    """Multiply mass and inertia of each listed body by a factor of its own from U(scale[0], scale[1])."""
+    for i in range(bodies.shape[0]):
+        factor = uniform(rng, scale[0], scale[1])
+        body_mass[bodies[i]] = factor * body_mass[bodies[i]]
+        body_inertia[bodies[i]] = factor * body_inertia[bodies[i]]
+
+
+@wp.func
+def shift_center_of_mass(body_ipos: Row[wp.vec3], body: int, offset: wp.vec3, rng: Row[wp.uint32]):
+    """Add U(-offset, offset) to the centre of mass of a body, in the body's axes, m."""
+    body_ipos[body] = body_ipos[body] + uniform(rng, -offset, offset)
+
+
+@wp.func
+def scale_gains(
+    actuator_gainprm: Row[vec10],
+    actuator_biasprm: Row[vec10],
+    actuators: wp.array[int],
+    kp_scale: wp.vec2,
+    kd_scale: wp.vec2,
+    rng: Row[wp.uint32],
+):
+    """Multiply kp and kd of each listed position servo by factors of its own, from the two ranges."""
+    for i in range(actuators.shape[0]):
+        kp = uniform(rng, kp_scale[0], kp_scale[1])
+        kd = uniform(rng, kd_scale[0], kd_scale[1])
+        gain, bias = actuator_gainprm[actuators[i]], actuator_biasprm[actuators[i]]
+        gain[0] = kp * gain[0]
+        bias[1] = kp * bias[1]
+        bias[2] = kd * bias[2]
+        actuator_gainprm[actuators[i]] = gain
+        actuator_biasprm[actuators[i]] = bias

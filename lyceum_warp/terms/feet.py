@@ -1,0 +1,189 @@
+"""Time the contacts of feet, and judge their swings, slips and landings.
+
+The tables of feet list them in one order: ``feet`` (sites), ``foot_velocities``, ``foot_forces`` and ``foot_contacts``
+(sensors), and the rows of memory, which have one element for each foot. Clocks run in ``substep``, swings are followed
+in ``advance``. Heights are above the plane z = 0; on other ground, add up ``clearance`` over the feet.
+"""
+
+import warp as wp
+
+from lyceum_warp.support.docstrings import document_overloads
+from lyceum_warp.task import Row
+
+
+@wp.func
+def sensor_vector(sensordata: Row[float], at: int) -> wp.vec3:
+    """The three numbers of a sensor that start at an index, from ``lw.sensor``."""
+    return wp.vec3(sensordata[at], sensordata[at + 1], sensordata[at + 2])
+
+
+@wp.func
+def ground_speed(velocity: wp.vec3) -> float:
+    """The horizontal speed |v_xy|, m/s."""
+    return wp.length(wp.vec2(velocity[0], velocity[1]))
+
+
+@wp.func
+def run_clocks(foot: int, touching: bool, contact_time: Row[float], air_time: Row[float], substep_dt: float):
+    """Let a substep pass on the clocks of a foot: one runs, the other is 0.
+
+    With ``swing_time``, a landing writes the seconds of the swing that it ends. mjlab 1.6.0, ``ContactSensor``.
+    """
+    contact_time[foot] = wp.where(touching, contact_time[foot] + substep_dt, 0.0)
+    air_time[foot] = wp.where(touching, 0.0, air_time[foot] + substep_dt)
+
+
+@wp.func
+def run_clocks(
+    foot: int, touching: bool, contact_time: Row[float], air_time: Row[float], swing_time: Row[float], substep_dt: float
+):
+    if touching and air_time[foot] > 0.0:
+        swing_time[foot] = air_time[foot] + substep_dt
+    run_clocks(foot, touching, contact_time, air_time, substep_dt)
+
+
+@wp.func
+def run_contact_clocks(
+    sensordata: Row[float],
+    foot_contacts: wp.array[int],
+    contact_time: Row[float],
+    air_time: Row[float],
+    substep_dt: float,
+):
+    """``run_clocks`` of every foot, which touches if its contact or touch sensor is above 0."""
+    for foot in range(foot_contacts.shape[0]):
+        run_clocks(foot, sensordata[foot_contacts[foot]] > 0.0, contact_time, air_time, substep_dt)
+
+
+@wp.func
+def landed(contact_seconds: float, dt: float) -> bool:
+    """Whether a contact began in the last step: 0 < seconds < dt, up to 1e-6 s.
+
+    mjlab 1.6.0, ``compute_first_contact``.
+    """
+    return contact_seconds > 0.0 and contact_seconds < dt + 1e-6
+
+
+@wp.func
+def follow_swing(
+    foot: int,
+    foot_height: float,
+    contact_time: Row[float],
+    peak_height: Row[float],
+    swing_height: Row[float],
+    dt: float,
+):
+    """Keep the greatest height of a foot in its swing; a landing moves it from ``peak_height`` to ``swing_height``."""
+    if landed(contact_time[foot], dt):
+        swing_height[foot] = peak_height[foot]
+        peak_height[foot] = 0.0
+    elif contact_time[foot] == 0.0:
+        peak_height[foot] = wp.max(peak_height[foot], foot_height)
+
+
+@wp.func
+def clearance(foot_height: float, foot_velocity: wp.vec3, swing_target: float) -> float:
+    """|height - target| |v_xy| of one foot: the faster a foot moves, the nearer to its target height it should be."""
+    return wp.abs(foot_height - swing_target) * ground_speed(foot_velocity)
+
+
+@wp.func
+def foot_clearance(
+    site_xpos: Row[wp.vec3],
+    feet: wp.array[int],
+    sensordata: Row[float],
+    foot_velocities: wp.array[int],
+    swing_target: float,
+    active: float,
+) -> float:
+    """The sum of ``clearance`` over the feet, times ``active``, m^2/s.
+
+    mjlab 1.6.0, ``feet_clearance``.
+    """
+    total = float(0.0)
+    for foot in range(feet.shape[0]):
+        velocity = sensor_vector(sensordata, foot_velocities[foot])
+        total += clearance(site_xpos[feet[foot]][2], velocity, swing_target)
+    return active * total
+
+
+@wp.func
+def foot_slip(sensordata: Row[float], foot_velocities: wp.array[int], contact_time: Row[float], active: float) -> float:
+    """The sum of |v_xy|^2 over the feet in contact, times ``active``, (m/s)^2.
+
+    mjlab 1.6.0, ``feet_slip``.
+    """
+    total = float(0.0)
+    for foot in range(foot_velocities.shape[0]):
+        if contact_time[foot] > 0.0:
+            speed = ground_speed(sensor_vector(sensordata, foot_velocities[foot]))
+            total += speed * speed
+    return active * total
+
+
+@wp.func
+def foot_swing_height(
+    contact_time: Row[float], swing_height: Row[float], swing_target: float, dt: float, active: float
+) -> float:
+    """The sum of (height / target - 1)^2 over the feet that ``landed``, times ``active``.
+
+    The heights are those of the swings that ended. mjlab 1.6.0, ``feet_swing_height``.
+    """
+    total = float(0.0)
+    for foot in range(contact_time.shape[0]):
+        if landed(contact_time[foot], dt):
+            error = swing_height[foot] / swing_target - 1.0
+            total += error * error
+    return active * total
+
+
+@wp.func
+def soft_landing(
+    contact_time: Row[float],
+    sensordata: Row[float],
+    foot_forces: wp.array[int],
+    dt: float,
+    substep_dt: float,
+    active: float,
+) -> float:
+    """The sum of |force| over the feet that ``landed`` a substep ago, times ``active``, N.
+
+    The forces are from the beginning of the last substep, when a contact was one substep younger. mjlab 1.6.0,
+    ``soft_landing``.
+    """
+    total = float(0.0)
+    for foot in range(foot_forces.shape[0]):
+        if landed(contact_time[foot] - substep_dt, dt):
+            total += wp.length(sensor_vector(sensordata, foot_forces[foot]))
+    return active * total
+
+
+@wp.func
+def feet_in_air(air_time: Row[float], least_air_time: float, most_air_time: float, active: float) -> float:
+    """The number of feet with least < air time < most, times ``active``.
+
+    mjlab 1.6.0, ``feet_air_time``.
+    """
+    total = float(0.0)
+    for foot in range(air_time.shape[0]):
+        if air_time[foot] > least_air_time and air_time[foot] < most_air_time:
+            total += 1.0
+    return active * total
+
+
+@wp.func
+def long_swings(
+    contact_time: Row[float], swing_time: Row[float], wanted_air_time: float, dt: float, active: float
+) -> float:
+    """The sum of (swing time - wanted) over the feet that ``landed``, times ``active``, s.
+
+    legged_gym (Rudin et al. 2022), ``feet_air_time``.
+    """
+    total = float(0.0)
+    for foot in range(contact_time.shape[0]):
+        if landed(contact_time[foot], dt):
+            total += swing_time[foot] - wanted_air_time
+    return active * total
+
+
+document_overloads(run_clocks)

@@ -1,0 +1,62 @@
+"""Keep the last values of a row in a ring, for observation histories and delays.
+
+The last n values of ``width`` numbers take ``history: Row[float] = lw.memory(1 + n * width)``: a counter, and the ring.
+Memory is 0 at the start of an episode, which is the empty history.
+"""
+
+import warp as wp
+
+from lyceum_warp.task import Row
+
+
+@wp.func
+def history_length(history: Row[float], width: int) -> int:
+    """The number of values that a history can hold."""
+    return (history.shape[0] - 1) // width
+
+
+@wp.func
+def push_history(history: Row[float], value: Row[float]):
+    """Append a value, in place of the oldest if the history is full."""
+    width = value.shape[0]
+    length = history_length(history, width)
+    pushes = int(history[0])
+    for i in range(width):
+        history[1 + pushes % length * width + i] = value[i]
+    # counts up to 2 n - 1, so that the number of values is known and the float is exact
+    history[0] = float(wp.where(pushes + 1 < 2 * length, pushes + 1, length))
+
+
+@wp.func
+def read_history(history: Row[float], width: int, age: int, i: int) -> float:
+    """Element i of the value that was appended ``age`` values before the last one.
+
+    In a shorter history it is the first value, as if that had always been there; in an empty one it is 0.
+    """
+    pushes = int(history[0])
+    if pushes == 0:
+        return 0.0
+    length = history_length(history, width)
+    back = wp.min(age, wp.min(pushes, length) - 1)
+    return history[1 + (pushes - 1 - back) % length * width + i]
+
+
+@wp.func
+def put_history(target: Row[float], history: Row[float], width: int):
+    """Write all values of a history into a row of n * width numbers, the oldest first."""
+    length = history_length(history, width)
+    for k in range(length):
+        for i in range(width):
+            target[k * width + i] = read_history(history, width, length - 1 - k, i)
+
+
+@wp.func
+def delayed_action(action: Row[float], history: Row[float], delay: Row[float], i: int) -> float:
+    """Element i of the action of ``delay`` steps ago, for ``control``; the first action of a younger episode.
+
+    ``advance`` appends every action: ``terms.push_history(s1.history, action)``.
+    """
+    age = int(delay[0])
+    if age == 0 or history[0] == 0.0:
+        return action[i]
+    return read_history(history, action.shape[0], age - 1, i)

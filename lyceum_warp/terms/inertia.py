@@ -1,0 +1,100 @@
+"""Draw mass, centre of mass and inertia of a body together, so that they stay physically consistent.
+
+A body with these three numbers exists exactly if its pseudo-inertia matrix J (4 x 4) is positive definite. Multiplying
+its Cholesky factor by an upper triangular matrix U with a positive diagonal, J' = U J U^T, keeps it so (Rucker and
+Wensing 2022, "Smooth parameterization of rigid-body inertia", whose log-Cholesky parameters make up U). U is an affine
+map of the body's mass: x -> D x + t, with the density scaled.
+"""
+
+import warp as wp
+
+from lyceum_warp.kernels.random import uniform
+from lyceum_warp.kernels.rotations import quat_from_mat, quat_mul, quat_to_mat
+from lyceum_warp.task import Row
+
+
+@wp.func
+def symmetric_eigenvectors(matrix: wp.mat33) -> wp.mat33:
+    """The eigenvectors of a symmetric matrix, the columns of a rotation, by Jacobi's method.
+
+    Golub and Van Loan, "Matrix computations", 8.5. A matrix that is nearly diagonal has nearly the identity.
+    """
+    a = matrix
+    vectors = wp.identity(n=3, dtype=float)
+    for turn in range(int(15)):  # five sweeps over three planes converge to float32's precision
+        i = turn % 3
+        k = (i + 1) % 3
+        difference = a[i, i] - a[k, k]
+        # at most 45 degrees
+        angle = 0.5 * wp.atan2(wp.where(difference < 0.0, -2.0, 2.0) * a[i, k], wp.abs(difference))
+        rotation = wp.identity(n=3, dtype=float)
+        rotation[i, i] = wp.cos(angle)
+        rotation[k, k] = wp.cos(angle)
+        rotation[i, k] = -wp.sin(angle)
+        rotation[k, i] = wp.sin(angle)
+        a = wp.transpose(rotation) * a * rotation
+        vectors = vectors * rotation
+    return vectors
+
+
+@wp.func
+def change_inertia(
+    body_mass: Row[float],
+    body_ipos: Row[wp.vec3],
+    body_inertia: Row[wp.vec3],
+    body_iquat: Row[wp.vec4],
+    body: int,
+    density: float,
+    stretch: wp.vec3,
+    shear: wp.vec3,
+    shift: wp.vec3,
+):
+    """Map the mass of a body by x -> D x + t in the body's frame, and multiply it by exp(2 density).
+
+    D = [[exp d1, s12, s13], [0, exp d2, s23], [0, 0, exp d3]] with (d1, d2, d3) = stretch, (s12, s13, s23) = shear and
+    t = shift; zeros leave the body unchanged. Rucker and Wensing 2022; the parameters of mjlab 1.6.0's
+    ``pseudo_inertia``, with density = alpha.
+    """
+    d = wp.mat33(
+        wp.exp(stretch[0]), shear[0], shear[1], 0.0, wp.exp(stretch[1]), shear[2], 0.0, 0.0, wp.exp(stretch[2])
+    )
+    factor = wp.exp(2.0 * density)
+    # second moments about the centre of mass, in the principal axes, where D = frame^T D frame
+    inertia = body_inertia[body]
+    moments = wp.vec3(0.5 * (inertia[0] + inertia[1] + inertia[2])) - inertia
+    frame = quat_to_mat(body_iquat[body])
+    local = wp.transpose(frame) * d * frame
+    changed = factor * (local * wp.diag(moments) * wp.transpose(local))
+    axes = symmetric_eigenvectors(changed)
+    principal = wp.get_diag(wp.transpose(axes) * changed * axes)
+    body_mass[body] = factor * body_mass[body]
+    body_ipos[body] = d * body_ipos[body] + shift
+    body_inertia[body] = wp.vec3(principal[1] + principal[2], principal[2] + principal[0], principal[0] + principal[1])
+    body_iquat[body] = quat_mul(body_iquat[body], quat_from_mat(axes))
+
+
+@wp.func
+def draw_inertia(
+    body_mass: Row[float],
+    body_ipos: Row[wp.vec3],
+    body_inertia: Row[wp.vec3],
+    body_iquat: Row[wp.vec4],
+    body: int,
+    density: float,
+    stretch: wp.vec3,
+    shear: wp.vec3,
+    shift: wp.vec3,
+    rng: Row[wp.uint32],
+):
+    """``change_inertia`` by parameters from U(-density, density), U(-stretch, stretch), and so on."""
+    change_inertia(
+        body_mass,
+        body_ipos,
+        body_inertia,
+        body_iquat,
+        body,
+        uniform(rng, -density, density),
+        uniform(rng, -stretch, stretch),
+        uniform(rng, -shear, shear),
+        uniform(rng, -shift, shift),
+    )

@@ -1,0 +1,152 @@
+"""Judge a robot's joints: their pose, limits, velocities, accelerations, torques and power.
+
+The tables of joints list them in one order: ``joints``, ``joint_qpos``, ``joint_dof``, the default pose and the
+standard deviations.
+"""
+
+import warp as wp
+
+from lyceum_warp.task import Row
+from lyceum_warp.terms.velocity_commands import command_size
+
+
+@wp.func
+def posture(
+    qpos: Row[float], joint_qpos: wp.array[int], default_pose: wp.array[float], pose_std: wp.array[float]
+) -> float:
+    """exp(-mean(((q - q_0) / std)^2)) over the joints.
+
+    mjlab 1.6.0, ``posture``.
+    """
+    total = float(0.0)
+    for j in range(joint_qpos.shape[0]):
+        error = (qpos[joint_qpos[j]] - default_pose[j]) / pose_std[j]
+        total += error * error
+    return wp.exp(-total / float(joint_qpos.shape[0]))
+
+
+@wp.func
+def pose(
+    command: wp.vec3,
+    qpos: Row[float],
+    joint_qpos: wp.array[int],
+    default_pose: wp.array[float],
+    standing_pose_std: wp.array[float],
+    walking_pose_std: wp.array[float],
+    least_command: float,
+) -> float:
+    """``posture`` with one standard deviation of each joint for standing and one for walking.
+
+    Standing is a ``command_size`` below the least. mjlab 1.6.0, ``variable_posture``, with the same values for walking
+    and running.
+    """
+    standing = command_size(command) < least_command
+    total = float(0.0)
+    for j in range(joint_qpos.shape[0]):
+        std = wp.where(standing, standing_pose_std[j], walking_pose_std[j])
+        error = (qpos[joint_qpos[j]] - default_pose[j]) / std
+        total += error * error
+    return wp.exp(-total / float(joint_qpos.shape[0]))
+
+
+@wp.func
+def gait_pose(
+    command: wp.vec3,
+    qpos: Row[float],
+    joint_qpos: wp.array[int],
+    default_pose: wp.array[float],
+    standing_pose_std: wp.array[float],
+    walking_pose_std: wp.array[float],
+    running_pose_std: wp.array[float],
+    least_command: float,
+    running_command: float,
+) -> float:
+    """``pose`` with further standard deviations for running, a ``command_size`` from ``running_command`` on.
+
+    mjlab 1.6.0, ``variable_posture``.
+    """
+    size = command_size(command)
+    total = float(0.0)
+    for j in range(joint_qpos.shape[0]):
+        moving_std = wp.where(size < running_command, walking_pose_std[j], running_pose_std[j])
+        error = (qpos[joint_qpos[j]] - default_pose[j]) / wp.where(
+            size < least_command, standing_pose_std[j], moving_std
+        )
+        total += error * error
+    return wp.exp(-total / float(joint_qpos.shape[0]))
+
+
+@wp.func
+def pose_l1(qpos: Row[float], joint_qpos: wp.array[int], default_pose: wp.array[float]) -> float:
+    """The sum of |q - q_0| over the joints, rad."""
+    total = float(0.0)
+    for j in range(joint_qpos.shape[0]):
+        total += wp.abs(qpos[joint_qpos[j]] - default_pose[j])
+    return total
+
+
+@wp.func
+def joint_limits(
+    qpos: Row[float], joint_qpos: wp.array[int], jnt_range: Row[wp.vec2], joints: wp.array[int], soft_limit: float
+) -> float:
+    """The sum of max(|q - middle| - soft_limit * half range, 0): the distances of the joints outside soft limits, rad.
+
+    mjlab 1.6.0, ``joint_pos_limits``.
+    """
+    outside = float(0.0)
+    for j in range(joint_qpos.shape[0]):
+        limits = jnt_range[joints[j]]
+        middle, half = 0.5 * (limits[0] + limits[1]), 0.5 * (limits[1] - limits[0])
+        outside += wp.max(wp.abs(qpos[joint_qpos[j]] - middle) - soft_limit * half, 0.0)
+    return outside
+
+
+@wp.func
+def sum_squares_at(row: Row[float], indices: wp.array[int]) -> float:
+    """The sum of x^2 over the listed elements of a row."""
+    total = float(0.0)
+    for j in range(indices.shape[0]):
+        total += row[indices[j]] * row[indices[j]]
+    return total
+
+
+@wp.func
+def joint_velocity_l2(qvel: Row[float], joint_dof: wp.array[int]) -> float:
+    """The sum of qdot^2 over the joints, (rad/s)^2."""
+    return sum_squares_at(qvel, joint_dof)
+
+
+@wp.func
+def joint_acceleration_l2(qacc: Row[float], joint_dof: wp.array[int]) -> float:
+    """The sum of qddot^2 over the joints, (rad/s^2)^2."""
+    return sum_squares_at(qacc, joint_dof)
+
+
+@wp.func
+def torque_l2(qfrc_actuator: Row[float], joint_dof: wp.array[int]) -> float:
+    """The sum of torque^2 over the joints, (N m)^2."""
+    return sum_squares_at(qfrc_actuator, joint_dof)
+
+
+@wp.func
+def power(qfrc_actuator: Row[float], qvel: Row[float], joint_dof: wp.array[int]) -> float:
+    """The sum of max(torque qdot, 0) over the joints: mechanical power without recovery, W.
+
+    mjlab 1.6.0, ``electrical_power_cost``.
+    """
+    total = float(0.0)
+    for j in range(joint_dof.shape[0]):
+        total += wp.max(qfrc_actuator[joint_dof[j]] * qvel[joint_dof[j]], 0.0)
+    return total
+
+
+@wp.func
+def absolute_power(qfrc_actuator: Row[float], qvel: Row[float], joint_dof: wp.array[int]) -> float:
+    """The sum of |torque qdot| over the joints: mechanical power if braking costs as much as driving, W.
+
+    Fu et al. 2021, "Minimizing energy consumption leads to the emergence of gaits in legged robots".
+    """
+    total = float(0.0)
+    for j in range(joint_dof.shape[0]):
+        total += wp.abs(qfrc_actuator[joint_dof[j]] * qvel[joint_dof[j]])
+    return total

@@ -1,0 +1,67 @@
+"""Write observations of joints, and add noise."""
+
+import warp as wp
+
+from lyceum_warp.kernels.random import normal, uniform
+from lyceum_warp.support.docstrings import document_overloads
+from lyceum_warp.task import Row
+
+
+@wp.func
+def gather(target: Row[float], source: Row[float], indices: wp.array[int]):
+    """Copy listed elements, target[i] = source[indices[i]], such as the velocities of joints."""
+    for i in range(indices.shape[0]):
+        target[i] = source[indices[i]]
+
+
+@wp.func
+def gather_positions(
+    target: Row[float],
+    qpos: Row[float],
+    joint_qpos: wp.array[int],
+    default_pose: wp.array[float],
+    encoder_bias: Row[float],
+):
+    """The positions of joints relative to the default pose, as encoders measure them: q + bias - q_0.
+
+    Without ``encoder_bias``, q - q_0. mjlab 1.6.0, ``joint_pos_rel``.
+    """
+    for j in range(joint_qpos.shape[0]):
+        target[j] = qpos[joint_qpos[j]] + encoder_bias[j] - default_pose[j]
+
+
+@wp.func
+def gather_positions(target: Row[float], qpos: Row[float], joint_qpos: wp.array[int], default_pose: wp.array[float]):
+    for j in range(joint_qpos.shape[0]):
+        target[j] = qpos[joint_qpos[j]] - default_pose[j]
+
+
+@wp.func
+def add_uniform_noise(row: Row[float], noise: float, rng: Row[wp.uint32]):
+    """Add U(-noise, noise) to every number of a row of numbers or vectors."""
+    for i in range(row.shape[0]):
+        row[i] = row[i] + uniform(rng, -noise, noise)
+
+
+@wp.func
+def add_uniform_noise(row: Row[wp.vec3], noise: float, rng: Row[wp.uint32]):
+    for i in range(row.shape[0]):
+        row[i] = row[i] + uniform(rng, wp.vec3(-noise), wp.vec3(noise))
+
+
+@wp.func
+def add_normal_noise(row: Row[float], noise: float, rng: Row[wp.uint32]):
+    """Add N(0, noise^2) to every number of a row of numbers or vectors."""
+    for i in range(row.shape[0]):
+        row[i] = row[i] + noise * normal(rng)
+
+
+@wp.func
+def add_normal_noise(row: Row[wp.vec3], noise: float, rng: Row[wp.uint32]):
+    for i in range(row.shape[0]):
+        x, y, z = normal(rng), normal(rng), normal(rng)
+        row[i] = row[i] + noise * wp.vec3(x, y, z)
+
+
+for _overloaded in (gather_positions, add_uniform_noise, add_normal_noise):
+    document_overloads(_overloaded)

@@ -1,0 +1,21 @@
+"""Push a robot in mid-episode."""
+
+import warp as wp
+
+from lyceum_warp.kernels.random import uniform
+from lyceum_warp.kernels.rotations import quat_rotate_inverse
+from lyceum_warp.task import Row
+from lyceum_warp.terms.base_motion import orientation
+
+
+@wp.func
+def push(qpos: Row[float], qvel: Row[float], push_velocity: wp.vec3, push_spin: wp.vec3, rng: Row[wp.uint32]):
+    """Add U(-push, push) to the velocity and the angular velocity of the base, in the world's axes; for ``event``.
+
+    mjlab 1.6.0, ``push_by_setting_velocity``. The free joint of the base is the first joint.
+    """
+    velocity = uniform(rng, -push_velocity, push_velocity)
+    spin = quat_rotate_inverse(orientation(qpos), uniform(rng, -push_spin, push_spin))
+    for i in range(3):
+        qvel[i] = qvel[i] + velocity[i]
+        qvel[3 + i] = qvel[3 + i] + spin[i]

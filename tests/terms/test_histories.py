@@ -1,0 +1,37 @@
+"""A ring in memory against a list."""
+
+import numpy as np
+import pytest
+from term_calls import N, call
+
+WIDTH = 3
+
+
+@pytest.mark.parametrize("length", [1, 2, 4])
+def test_a_history_has_the_last_values_and_repeats_the_first(length: int) -> None:
+    rng, values = np.random.default_rng(0), []
+    history = np.zeros((N, 1 + length * WIDTH))
+    assert call("history_length", history=history, width=WIDTH).result[0] == length
+    assert not call("put_history", target=np.ones(length * WIDTH), history=history, width=WIDTH).after["target"].any()
+    for _ in range(3 * length + 2):  # beyond the counter's wrap
+        values.append(rng.standard_normal((N, WIDTH)).astype(np.float32))
+        history = call("push_history", history=history, value=values[-1]).after["history"]
+        kept = [values[max(len(values) - 1 - age, max(len(values) - length, 0))] for age in range(length + 1)]
+        for age, i in ((0, 0), (length - 1, 1), (length, 2)):
+            found = call("read_history", history=history, width=WIDTH, age=age, i=i).result
+            np.testing.assert_array_equal(found, kept[age][:, i])
+        written = call("put_history", target=np.zeros(length * WIDTH), history=history, width=WIDTH).after["target"]
+        np.testing.assert_array_equal(written, np.hstack(kept[length - 1 :: -1]))
+
+
+def test_an_action_is_delayed_by_each_worlds_steps() -> None:
+    rng = np.random.default_rng(0)
+    delay = call("draw_delay", delay=[0.0], least=0, most=3).after["delay"]
+    assert {*delay.ravel()} == {0.0, 1.0, 2.0, 3.0}
+    actions, history = rng.standard_normal((9, N, 2)), np.zeros((N, 1 + 3 * 2))
+    for step, action in enumerate(actions):
+        source = np.maximum(step - delay[:, 0].astype(int), 0)
+        for i in range(2):
+            found = call("delayed_action", action=action, history=history, delay=delay, i=i).result
+            np.testing.assert_allclose(found, actions[source, np.arange(N), i], rtol=1e-6)
+        history = call("push_history", history=history, value=action).after["history"]

@@ -1,0 +1,198 @@
+"""The library as a whole: its arguments, and its use in a task."""
+
+from collections import defaultdict
+
+import numpy as np
+import pytest
+import warp as wp
+from conftest import TaskFile
+from term_calls import KERNELS
+
+import lyceum_warp as lw
+from lyceum_warp import Row, terms
+from lyceum_warp.binding.writes import find_writes, written_fields
+
+
+def test_an_argument_has_one_type_and_a_meaning_in_all_functions() -> None:
+    kinds = defaultdict(set)
+    for overloads in KERNELS.values():
+        for function, _ in overloads:
+            for argument, kind in function.input_types.items():
+                kinds[argument].add(str(kind))
+    assert {argument for argument, found in kinds.items() if len(found) > 1} == {"row"}  # of numbers or of vectors
+    assert {*kinds} == {*terms.ARGUMENTS}
+
+
+# writes are those of the fields that a call passes
+
+
+@wp.struct
+class World:
+    qpos: Row[float]
+    qvel: Row[float]
+    sensordata: Row[float]
+    body_mass: Row[float]
+    body_ipos: Row[wp.vec3]
+    body_inertia: Row[wp.vec3]
+    body_iquat: Row[lw.quat]
+    contact_time: Row[float]
+    air_time: Row[float]
+    swing_time: Row[float]
+    peak_height: Row[float]
+    swing_height: Row[float]
+    history: Row[float]
+    delay: Row[float]
+    drawn_velocity: Row[wp.vec3]
+    heading_target: Row[float]
+    heading_controlled: Row[float]
+    standing: Row[float]
+    command_timer: Row[float]
+    encoder_bias: Row[float]
+
+
+@wp.func
+def reads_only(s: World, action: Row[float], joint_qpos: wp.array[int], obs: Row[float]):
+    obs[0] = terms.upright(terms.gravity(s.qpos), 0.2)
+    obs[1] = terms.foot_slip(s.sensordata, joint_qpos, s.contact_time, 1.0)
+    obs[2] = terms.read_history(s.history, 2, 1, 0) + terms.delayed_action(action, s.history, s.delay, 0)
+    obs[3] = terms.velocity_command(
+        s.drawn_velocity, s.heading_target, s.heading_controlled, s.standing, terms.heading(s.qpos), 0.5, 1.0
+    )[0]
+    terms.gather(obs, s.qvel, joint_qpos)
+
+
+@wp.func
+def clocks(s: World, contacts: wp.array[int]):
+    terms.run_contact_clocks(s.sensordata, contacts, s.contact_time, s.air_time, 0.005)
+    terms.run_clocks(0, True, s.contact_time, s.air_time, s.swing_time, 0.005)
+
+
+@wp.func
+def swings(s: World, action: Row[float]):
+    terms.follow_swing(0, s.qpos[2], s.contact_time, s.peak_height, s.swing_height, 0.02)
+    terms.push_history(s.history, action)
+    terms.run_timer(s.command_timer, 0.02)
+
+
+@wp.func
+def draws(s: World, rng: Row[wp.uint32]):
+    if terms.is_due(s.command_timer):
+        terms.draw_velocity(s.drawn_velocity, wp.vec3(-1.0), wp.vec3(1.0), rng)
+        terms.draw_heading(s.heading_target, s.heading_controlled, 0.3, rng)
+        terms.draw_flag(s.standing, 0.1, rng)
+        terms.draw_forward_only(s.drawn_velocity, 0.2, 0.3, rng)
+        terms.draw_timer(s.command_timer, wp.vec2(3.0, 8.0), rng)
+    terms.push(s.qpos, s.qvel, wp.vec3(0.5), wp.vec3(0.5), rng)
+
+
+@wp.func
+def robots(s: World, rng: Row[wp.uint32]):
+    terms.draw_row(s.encoder_bias, -0.1, 0.1, rng)
+    terms.draw_inertia(
+        s.body_mass, s.body_ipos, s.body_inertia, s.body_iquat, 1, 0.1, wp.vec3(0.1), wp.vec3(0.1), wp.vec3(0.1), rng
+    )
+
+
+@pytest.mark.parametrize(
+    ("function", "fields"),
+    [
+        (reads_only, ""),
+        (clocks, "contact_time air_time swing_time"),
+        (swings, "peak_height swing_height history command_timer"),
+        (draws, "drawn_velocity heading_target heading_controlled standing command_timer qvel"),
+        (robots, "encoder_bias body_mass body_ipos body_inertia body_iquat"),
+    ],
+)
+def test_a_function_writes_the_fields_that_it_passes(function: wp.Function, fields: str) -> None:
+    assert written_fields(function) == {*fields.split()}
+    assert {write.use for write in find_writes(function)} <= {None}
+
+
+TASK = """
+import mujoco
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row, terms
+from lyceum_warp.terms import gravity, upright
+
+
+@wp.struct
+class World:
+    qpos: Row[float]
+    qvel: Row[float]
+    geom_friction: Row[wp.vec3]
+    body_mass: Row[float]
+    body_ipos: Row[wp.vec3]
+    body_inertia: Row[wp.vec3]
+    body_iquat: Row[lw.quat]
+
+
+@wp.struct
+class Params:
+    geoms: wp.array[int] = [2, 1]
+    box: int = lw.body("box")
+    shape: wp.vec3 = wp.vec3(0.1, 0.1, 0.1)
+    shift: wp.vec3 = wp.vec3(0.0, 0.01, 0.02)
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):
+    lw.put(obs, 0, terms.linear_velocity(s.qpos, s.qvel))
+    {further}
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    return upright(gravity(s1.qpos), 0.2)
+
+
+@wp.func
+def startup(s: World, p: Params, rng: Row[wp.uint32]):
+    terms.draw_friction(s.geom_friction, p.geoms, wp.vec2(0.3, 0.5), wp.vec2(0.001, 0.01), wp.vec2(1e-4, 1e-3), rng)
+    terms.draw_inertia(
+        s.body_mass, s.body_ipos, s.body_inertia, s.body_iquat, p.box, 0.1, p.shape, p.shape, p.shift, rng
+    )
+
+
+@wp.func
+def event(s: World, p: Params, rng: Row[wp.uint32]):
+    terms.push(s.qpos, s.qvel, wp.vec3(0.5), wp.vec3(0.5), rng)
+
+
+class Box(lw.Task):
+    obs = {"velocity": 3}
+
+    @staticmethod
+    def model() -> mujoco.MjSpec:
+        return mujoco.MjSpec.from_string(
+            "<mujoco><option gravity='0 0 0'/><worldbody><geom name='floor' type='plane' size='1 1 1' pos='0 0 -5'/>"
+            "<body name='box' pos='0 0 1' simple='false'><freejoint name='free'/><geom size='.1 .2 .3' type='box'/>"
+            "<geom size='.1' pos='.1 .2 .3'/></body></worldbody>"
+            "<actuator><motor joint='free' gear='1'/></actuator></mujoco>"
+        )
+"""
+
+
+def test_a_task_draws_robots_and_pushes_them_with_library_functions(task_file: TaskFile) -> None:
+    source = TASK.replace("{further}", "terms.add_uniform_noise(obs, 0.01, rng)")
+    env = lw.make(str(task_file("library_box.py", source)), nworld=16, horizon=0)
+    env.rand_reset(seed=0)
+    state = {name: part.numpy().copy() for name, part in env.state_space.split(env.get_state()).items()}
+    friction = state["geom_friction"].reshape(16, 3, 3)
+    assert (friction[:, 1] == friction[:, 2]).all() and len(np.unique(friction[:, 1, 0])) == 16
+    np.testing.assert_allclose(friction[:, 0], np.tile(env.model.geom_friction[0], (16, 1)))
+    assert len(np.unique(state["body_mass"][:, 1])) == 16
+    velocity = np.zeros((16, 6))
+    for _ in range(3):
+        env.step()
+        now = env.state_space.split(env.get_state())["qvel"].numpy().copy()
+        assert (np.abs(now - velocity).max(axis=1) > 0.05).all()
+        velocity = now
+    assert np.isfinite(env.reward.numpy()).all()
+
+
+def test_a_library_function_may_not_write_what_its_caller_may_not(task_file: TaskFile) -> None:
+    source = TASK.replace("{further}", "terms.push(s.qpos, s.qvel, wp.vec3(0.5), wp.vec3(0.5), rng)")
+    with pytest.raises(ValueError, match=r"observe of the task .* writes s\.qvel in push \(pushes\.py, line \d+\)"):
+        lw.make(str(task_file("library_push.py", source)), nworld=1)
