@@ -121,6 +121,21 @@ def test_a_variant_in_a_file_replaces_a_helper_of_its_parents_functions(tmp_path
     assert (env.obs.item(), parent.obs.item()) == (1.25, 0.25)
 
 
+def test_a_variant_in_another_folder_has_its_parents_model_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ball = "<body><freejoint/><geom size='.1'/></body>"
+    (tmp_path / "robot.xml").write_text(f"<mujoco><worldbody>{ball}</worldbody></mujoco>")
+    far = PARENT.replace("hopper.xml", "robot.xml").replace("class Parent", "class Far")
+    (tmp_path / "far_parent.py").write_text(f"{far}    actions = {{'x': 1}}\n\n"
+        "@wp.func\ndef control(s: World, action: Row[float], p: Params, ctrl: Row[float]):\n    pass\n")  # fmt: skip
+    monkeypatch.syspath_prepend(tmp_path)
+    folder = tmp_path / "variants"
+    folder.mkdir()
+    file = tiny_task.write(folder, "import far_parent\n\nclass Near(far_parent.Far):\n    horizon = 5\n", "near.py")
+    assert lw.make(file).model.nq == 7
+
+
 MISTAKES = {
     "other arguments": (
         [("def tripled(x: float, s: World)", "def tripled(x: float)"), ("parent.scaled(x, s) + s.qvel[0]", "x")],
