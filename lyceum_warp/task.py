@@ -423,8 +423,18 @@ class Task:
     ``{"policy": {"position": 5}, "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy``,
     which is ``env.obs``, and ``observe_critic``, with the same arguments, writes the group ``critic``. A task leaves
     ``obs`` out if the last argument of these functions is a Warp struct, whose fields ``lw.part`` gives sizes."""
+    rewards: ClassVar[Mapping[str, float]] = {}
+    """The terms of the reward and their weights per second, such as ``{"upright": 1.0, "effort": -0.1}``, in place of
+    ``reward``. A term is a function of the module that returns a float; its arguments are found by name: ``s0``,
+    ``action``, ``s1`` (or ``s``), ``p``, or the result of another function of that name, a parameter, a field of
+    World. The reward is dt times the sum of weight times term. ``lw.make(task, upright=2.0)`` and ``set_params`` change
+    weights, and each term is a metric, with its weight and dt. ``env.task.reward_text`` shows the generated source."""
+    terminations: ClassVar[tuple[str, ...]] = ()
+    """Names of functions that end the episode if one returns True, in place of ``terminated``. They may take ``s``,
+    ``p`` and what a term may take by name. Each is a metric: 1 if it holds after the step, otherwise 0."""
     metrics: ClassVar[tuple[str, ...]] = ()
-    """Names of the metrics that ``measure`` writes, such as the terms of the reward."""
+    """Names of the metrics that ``measure`` writes. Without ``measure``, they are functions that return a float or a
+    bool and take what terms take."""
     horizon: ClassVar[int] = 1000
     """Steps after which an episode is truncated; 0 for never."""
     success_steps: ClassVar[int] = 1
@@ -458,7 +468,7 @@ class Task:
     planning: ClassVar[Planning] = Planning()
     """The task's settings for MPPI, such as ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
 
-    # World, Params and functions of the module at the time of the class's definition
+    # World, Params and Warp functions of the module at the time of the class's definition
     scope: ClassVar[dict[str, Any]]
 
     @staticmethod
@@ -474,5 +484,5 @@ class Task:
         cls.scope = {
             name: value
             for name, value in module.items()
-            if name in ("World", "Params", *FUNCTIONS) or name.startswith(GROUP_PREFIX)
+            if name in ("World", "Params") or isinstance(value, wp.Function)
         }

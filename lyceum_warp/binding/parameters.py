@@ -40,6 +40,7 @@ class Parameters:
         nworld: Number of worlds.
         timestep: Seconds in a step, the value of ``dt``.
         given: Values that replace defaults.
+        weights: The weights of the task's terms, by name, which are set and given as parameters are.
 
     Raises:
         ValueError: A field has the name of an option, a name is unknown, or a value is missing or does not fit.
@@ -55,23 +56,24 @@ class Parameters:
         nworld: int,
         timestep: float,
         given: Mapping[str, Any],
+        weights: Mapping[str, float] | None = None,
     ) -> None:
-        self._struct, self._owner = struct, owner
+        self._struct, self._owner, self._weights = struct, owner, dict(weights or {})
         self._task_name, self._model, self._nworld = task_name, model, nworld
         self._sizes: dict[str, int] = {}
         self.tables = {name: field.type for name, field in struct.vars.items() if hasattr(field.type, "ndim")}
         """The types of the fields that are tables, by name."""
         self._arrays: dict[str, tuple[np.ndarray, wp.array]] = {}
         self._check_tables()
-        if taken := [name for name in struct.vars if name in (*OPTIONS, "task", "options")]:
+        if taken := [name for name in (*struct.vars, *self._weights) if name in (*OPTIONS, "task", "options")]:
             raise ValueError(
                 f"the parameter {taken[0]!r} of the task {task_name!r} has the name of an option of make(), which "
                 "would get its value: rename it in Params"
             )
-        found = defaults(struct, owner) | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
+        found = defaults(struct, owner) | self._weights | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
         self._computed = {name for name, value in found.items() if isinstance(value, FromModel)}
         """Names of the values that are computed from the model."""
-        self.values: dict[str, Any] = {name: found[name] for name in struct.vars if name in found}
+        self.values: dict[str, Any] = {name: found[name] for name in (*struct.vars, *self._weights) if name in found}
         self.values = self.changed(given).values
         self._computed -= set(given)
 
@@ -86,7 +88,7 @@ class Parameters:
         Raises:
             ValueError: A name is unknown, a value is missing or does not fit its field.
         """
-        known = self._struct.vars
+        known = (*self._struct.vars, *self._weights)
         for name in given:
             if name not in known or name in _FILLED_IN:
                 names = sorted(set(known) - set(_FILLED_IN))
@@ -131,8 +133,16 @@ class Parameters:
         """
         for name, kind in self.tables.items():
             self._upload(name, kind.dtype, device)
-        instances = [self._instance(w) for w in range(self._nworld if self.per_world else 1)]
+        differ = any(name in self._struct.vars for name in self.per_world)
+        instances = [self._instance(w) for w in range(self._nworld if differ else 1)]
         return wp.array(instances, dtype=self._struct, device=device)
+
+    def weights(self, device: wp.Device) -> wp.array:
+        """The weights of the task's terms: a row for all worlds, or one per world, (1 or nworld, terms)."""
+        count = self._nworld if any(name in self._weights for name in self.per_world) else 1
+        rows = [np.broadcast_to(self.values[name], count) for name in self._weights]
+        table: wp.array = wp.array(np.reshape(rows, (len(rows), count)).T, dtype=float, device=device)
+        return table
 
     def _upload(self, name: str, dtype: type, device: wp.Device) -> None:
         value = self.values[name]
@@ -154,7 +164,7 @@ class Parameters:
 
     def _converted(self, name: str, value: Any) -> Any:
         """A value in the type of its field: a scalar, a vector, a table, or an array with one value per world."""
-        kind = self._struct.vars[name].type
+        kind = self._struct.vars[name].type if name in self._struct.vars else wp.float32
         if name in self.tables:
             return self._table(name, value)
         default = getattr(self._owner, name, None)
@@ -246,8 +256,8 @@ class Parameters:
 
     def _instance(self, world: int) -> Any:
         instance = self._struct()
-        for name, value in self.values.items():
-            kind = self._struct.vars[name].type
+        for name, variable in self._struct.vars.items():
+            kind, value = variable.type, self.values[name]
             if name in self.tables:
                 _, value = self._arrays[name]
             elif isinstance(value, np.ndarray):

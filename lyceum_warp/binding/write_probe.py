@@ -71,7 +71,7 @@ class Probe:
         self._name, self._kernels, self._writes, self._params = task.name, task.kernels, task.writes, params
         self._layouts = task.obs_layouts
         self._memory: Mapping[str, Layout] = task.memory
-        self._metrics, self._device = list(task.task.metrics), device
+        self._metrics, self._device = list(task.metrics), device
         kernels, nu = task.kernels, task.model.nu
         self._world, self._fields = kernels.Batch(), {}
         written = frozenset[str]().union(*task.writes.values())
