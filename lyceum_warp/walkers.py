@@ -378,3 +378,38 @@ def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0
         servo.gear = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
         servo.forcelimited, servo.forcerange = True, (-limit, limit)
         servo.ctrllimited, servo.inheritrange = False, 0.0
+
+
+def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.015) -> None:
+    """Let two capsules collide in place of each box of a foot, along its longer side; for height fields.
+
+    MuJoCo Warp 4.0 finds contacts of boxes and height fields with wrong normals and depths, which throw a robot away.
+    The capsules lie within the outline of the sole and have its lowest plane; masses stay.
+
+    Args:
+        spec: The model, changed in place, after ``prepare_walker``.
+        feet: Names of the sites of the feet.
+        radius: Radius of the capsules, m.
+
+    Raises:
+        ValueError: A box is narrower than a capsule.
+    """
+    box_type = mujoco.mjtGeom.mjGEOM_BOX
+    for name in feet:
+        for box in [g for g in spec.site(name).parent.geoms if g.type == box_type and (g.contype or g.conaffinity)]:
+            long, short = (0, 1) if box.size[0] >= box.size[1] else (1, 0)
+            if box.size[short] < radius:
+                raise ValueError(f"the box of the foot {name!r} is {2 * box.size[short]} m wide: give a smaller radius")
+            for side in (-1.0, 1.0):
+                offset, position, turn, quat = np.zeros(3), np.zeros(3), np.zeros(4), np.zeros(4)
+                offset[short], offset[2] = side * (box.size[short] - radius), radius - box.size[2]
+                mujoco.mju_rotVecQuat(position, offset, box.quat)
+                mujoco.mju_axisAngle2Quat(turn, np.eye(3)[1 - long], math.pi / 2)
+                mujoco.mju_mulQuat(quat, box.quat, turn)
+                spec.site(name).parent.add_geom(
+                    type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[radius, box.size[long] - radius, 0.0], mass=0.0,
+                    pos=box.pos + position, quat=quat, group=box.group, contype=box.contype,
+                    conaffinity=box.conaffinity, condim=box.condim, priority=box.priority, friction=box.friction,
+                    solref=box.solref, solimp=box.solimp, margin=box.margin, gap=box.gap,
+                )  # fmt: skip
+            box.contype = box.conaffinity = 0

@@ -7,7 +7,7 @@ resets are those of mjlab 1.6.0's velocity tasks.
 The base is the body of the first joint, which is free. Functions read the state after the last substep. Only the
 forces on the feet are from the beginning of that substep, and 0 at the start of an episode. Positions and velocities of
 the feet are computed from the joints, which saves a forward pass. A foot is in contact if a sphere of its sole, see
-``soles``, reaches the ground; ``ground`` is the only function that knows its shape.
+``soles``, reaches the ground; only ``ground`` and ``distance`` know its shape.
 """
 
 import math
@@ -160,6 +160,12 @@ def ground(x: wp.vec3, s: World, p: Params) -> float:
 
 
 @wp.func
+def distance(x: wp.vec3, s: World, p: Params) -> float:
+    """The distance of a point of the world from the ground."""
+    return x[2] - ground(x, s, p)
+
+
+@wp.func
 def last_joint(s: World, p: Params, foot: int) -> tuple[wp.vec3, lw.quat, wp.vec3, wp.vec3]:
     """The last joint before a foot: position, rotation from the base's axes at rest, velocity, angular velocity."""
     turn = terms.orientation(s.qpos)
@@ -196,7 +202,7 @@ def touches(s: World, p: Params, foot: int) -> bool:
     for i in range(p.soles.shape[1]):
         sphere = p.soles[foot, i]
         centre = x + lw.quat_rotate(turn, wp.vec3(sphere[0], sphere[1], sphere[2]))
-        if centre[2] - ground(centre, s, p) <= sphere[3]:
+        if distance(centre, s, p) <= sphere[3]:
             touching = True
     return touching
 
