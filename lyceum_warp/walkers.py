@@ -400,16 +400,17 @@ def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.01
             long, short = (0, 1) if box.size[0] >= box.size[1] else (1, 0)
             if box.size[short] < radius:
                 raise ValueError(f"the box of the foot {name!r} is {2 * box.size[short]} m wide: give a smaller radius")
+            frame = spec.site(name).parent.add_frame(pos=box.pos, quat=box.quat)
+            for kind in ("type", "axisangle", "xyaxes", "zaxis", "euler"):
+                setattr(frame.alt, kind, getattr(box.alt, kind))
             for side in (-1.0, 1.0):
-                offset, position, turn, quat = np.zeros(3), np.zeros(3), np.zeros(4), np.zeros(4)
-                offset[short], offset[2] = side * (box.size[short] - radius), radius - box.size[2]
-                mujoco.mju_rotVecQuat(position, offset, box.quat)
-                mujoco.mju_axisAngle2Quat(turn, np.eye(3)[1 - long], math.pi / 2)
-                mujoco.mju_mulQuat(quat, box.quat, turn)
-                spec.site(name).parent.add_geom(
+                position = np.zeros(3)
+                position[short], position[2] = side * (box.size[short] - radius), radius - box.size[2]
+                capsule = spec.site(name).parent.add_geom(
                     type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[radius, box.size[long] - radius, 0.0], mass=0.0,
-                    pos=box.pos + position, quat=quat, group=box.group, contype=box.contype,
-                    conaffinity=box.conaffinity, condim=box.condim, priority=box.priority, friction=box.friction,
-                    solref=box.solref, solimp=box.solimp, margin=box.margin, gap=box.gap,
+                    pos=position, quat=[1.0, 0.0, 1.0, 0.0] if long == 0 else [1.0, 1.0, 0.0, 0.0], group=box.group,
+                    contype=box.contype, conaffinity=box.conaffinity, condim=box.condim, priority=box.priority,
+                    friction=box.friction, solref=box.solref, solimp=box.solimp, margin=box.margin, gap=box.gap,
                 )  # fmt: skip
+                capsule.set_frame(frame)
             box.contype = box.conaffinity = 0

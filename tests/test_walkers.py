@@ -181,3 +181,25 @@ def test_feet_are_added_where_an_element_of_their_body_says() -> None:
     assert bodies == ["shin", "peg", "peg"] and model.site("a").pos.tolist() == [0.0, 0.0, -0.1]
     with pytest.raises(ValueError, match="no body, joint or geom 'toe' for the foot 'd'"):
         walkers.add_feet(spec, {"d": ("toe", (0.0, 0.0, 0.0))})
+
+
+def test_round_feet_have_the_lowest_plane_and_the_friction_of_their_boxes() -> None:
+    spec = mujoco.MjSpec.from_string(XML.format(shape="box"))
+    before = spec.copy().compile()
+    walkers.prepare_walker(spec, ["ankle", "peg_end"])
+    walkers.round_feet(spec, ["ankle", "peg_end"], radius=0.01)
+    model = spec.compile()
+    np.testing.assert_allclose(model.body_inertia, before.body_inertia)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    box, geoms = model.geom("ball").id, walkers.contact_geoms(model, model.body("shin").id)
+    assert len(geoms) == 2 and (model.geom_type[geoms] == int(mujoco.mjtGeom.mjGEOM_CAPSULE)).all()
+    assert (model.geom_friction[geoms] == model.geom_friction[box]).all() and (model.geom_priority[geoms] == 1).all()
+    place = [walkers.spheres_of(model, data, geom) for geom in geoms]
+    inside = (np.concatenate(place)[:, :3] - data.geom_xpos[box]) @ data.geom_xmat[box].reshape(3, 3)
+    # the ends of the capsules touch the sides and the lowest face of the box, 0.03 x 0.04 x 0.02
+    np.testing.assert_allclose(sorted(map(tuple, abs(inside).round(9))), 4 * [(0.02, 0.03, 0.01)], atol=1e-9)
+    assert (inside[:, 2] < 0.0).all()
+    with pytest.raises(ValueError, match=r"'ankle' is 0\.06 m wide: give a smaller radius"):
+        spec.geom("ball").contype = 1
+        walkers.round_feet(spec, ["ankle"], radius=0.05)

@@ -67,6 +67,9 @@ ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median
     "h1_velocity": Bounds(2.4e-7, 7e-7, 1.7e-5, 1.8e-4),  # 5.9e-8, 1.7e-7; 4.3e-6, 4.5e-5
     "spot_velocity": Bounds(2.4e-7, 8e-7, 8e-6, 2e-4),  # 6.0e-8, 1.9e-7; 2.0e-6, 5.1e-5
     "t1_velocity": Bounds(2.5e-7, 1.4e-6, 4.4e-5, 3.4e-4),  # 6.2e-8, 3.5e-7; 1.1e-5, 8.6e-5
+    # on a height field C makes a contact with each triangle, MuJoCo Warp at most four for a pair of geoms
+    "g1_rough_velocity": Bounds(3e-4, 8e-3, 8e-2, 2.2),  # 8.5e-5, 2.2e-3; 2.1e-2, 5.6e-1
+    "go1_rough_velocity": Bounds(1.2e-5, 1.4e-3, 2e-3, 3e-1),  # 3.0e-6, 3.7e-4; 5.1e-4, 7.5e-2
     "go1_velocity": Bounds(4e-7, 1.5e-6, 4e-5, 3e-4),  # 9.8e-8, 4.4e-7; 1.1e-5, 8.7e-5
     "half_cheetah": Bounds(1e-7, 1e-6, 1e-5, 1e-4),  # 3.2e-8, 2.9e-7; 3.0e-6, 2.9e-5
     # contacts of arms and fingers are rare; MuJoCo Warp finds fewer points than C where two boxes touch

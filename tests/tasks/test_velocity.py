@@ -10,7 +10,7 @@ import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task, package_task_names
 from lyceum_warp.tasks.velocity import TASKS
 
-ROBOTS = [task for task in TASKS if task != "go1_velocity"]
+ROBOTS = [task for task in TASKS if task != "go1_velocity" and "rough" not in task]
 NWORLD = 16
 
 
