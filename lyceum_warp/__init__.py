@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 # fmt: off
 # isort: off
 if TYPE_CHECKING:
-    import lyceum_warp.terms  # noqa: F401
+    import lyceum_warp.terms
+    import lyceum_warp.walkers  # noqa: F401
     from lyceum_warp.model_actuators import follow_velocity
     from lyceum_warp.algos.evaluation import Episodes, evaluate
     from lyceum_warp.algos.learner import Iteration, Learner
@@ -35,7 +36,8 @@ if TYPE_CHECKING:
     from lyceum_warp.env import Env, make
     from lyceum_warp.fields import quat, vec10
     from lyceum_warp.kernels.ground import (
-        follow_walk, ground_height, ground_normal, height_scan, next_level, on_ground, start_on_terrain)
+        follow_walk, ground_distance, ground_height, ground_normal, height_scan, next_level, on_ground,
+        start_on_terrain)
     from lyceum_warp.kernels.random import normal, uniform
     from lyceum_warp.kernels.rotations import (
         quat_angle, quat_difference, quat_from_axis_angle, quat_from_euler, quat_from_mat, quat_from_rotvec,
@@ -45,13 +47,14 @@ if TYPE_CHECKING:
         Sigmoid, all_inside, angle_between, body_velocity, grasp_terms, inside, local_velocity, put, put_upright,
         sum_squares, tolerance)
     from lyceum_warp.model_files import (
-        ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, package_model)
+        ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, package_model, playground_model)
     from lyceum_warp.openloop import OpenLoop
     from lyceum_warp.options import EnvOptions, PhysicsOptions
     from lyceum_warp.runs.folder import load, load_value
     from lyceum_warp.task import (
-        Planning, Row, Task, act, actuator, actuators, bodies, body, camera, ctrl, dof, dofs, equality, geom, geoms,
-        joint, joints, lasting_memory, memory, mocap, part, qpos, qposes, sensor, sensors, site, sites, tendon)
+        Planning, Row, Task, act, actuator, actuators, bodies, body, camera, ctrl, dof, dofs, equality, from_model,
+        geom, geoms, joint, joints, lasting_memory, memory, mocap, part, qpos, qposes, sensor, sensors, site, sites,
+        tendon)
     from lyceum_warp.terrain import Terrain, height_field, scan_grid
     from lyceum_warp.training import train
     from lyceum_warp.viewer.follow import RunViewer
@@ -64,14 +67,14 @@ __all__ = [
     "PredictiveSampling", "Rollout", "Row", "RunViewer", "Sigmoid", "Task", "Terrain", "Trajectory", "ValueFunction",
     "act", "actuator", "actuators", "all_inside", "angle_between", "bodies", "body", "body_velocity", "camera",
     "control", "control_async", "control_report", "ctrl", "dof", "dofs", "equality", "evaluate", "export_policy",
-    "follow_velocity", "follow_walk", "geom", "geoms", "grasp_terms", "ground_height", "ground_normal",
-    "gymnasium_model", "gymnasium_robotics_model", "height_field", "height_scan", "inside", "joint", "joints",
-    "lasting_memory", "load", "load_value", "local_velocity", "make", "memory", "menagerie_model", "mocap",
-    "next_level", "normal", "on_ground", "package_model", "part", "put", "put_upright", "qpos", "qposes", "quat",
-    "quat_angle", "quat_difference", "quat_from_axis_angle", "quat_from_euler", "quat_from_mat", "quat_from_rotvec",
-    "quat_inverse", "quat_mul", "quat_random", "quat_rotate", "quat_rotate_inverse", "quat_to_euler", "quat_to_mat",
-    "quat_to_rotvec", "register", "scan_grid", "sensor", "sensors", "site", "sites", "start_on_terrain", "sum_squares",
-    "task_names", "tendon", "tolerance", "train", "uniform", "vec10", "view"]
+    "follow_velocity", "follow_walk", "from_model", "geom", "geoms", "grasp_terms", "ground_distance", "ground_height",
+    "ground_normal", "gymnasium_model", "gymnasium_robotics_model", "height_field", "height_scan", "inside", "joint",
+    "joints", "lasting_memory", "load", "load_value", "local_velocity", "make", "memory", "menagerie_model", "mocap",
+    "next_level", "normal", "on_ground", "package_model", "part", "playground_model", "put", "put_upright", "qpos",
+    "qposes", "quat", "quat_angle", "quat_difference", "quat_from_axis_angle", "quat_from_euler", "quat_from_mat",
+    "quat_from_rotvec", "quat_inverse", "quat_mul", "quat_random", "quat_rotate", "quat_rotate_inverse",
+    "quat_to_euler", "quat_to_mat", "quat_to_rotvec", "register", "scan_grid", "sensor", "sensors", "site", "sites",
+    "start_on_terrain", "sum_squares", "task_names", "tendon", "tolerance", "train", "uniform", "vec10", "view"]
 
 _NAMES = {
     "model_actuators": "follow_velocity",
@@ -98,7 +101,8 @@ _NAMES = {
     "done": "Done",
     "env": "Env make",
     "fields": "quat vec10",
-    "kernels.ground": "follow_walk ground_height ground_normal height_scan next_level on_ground start_on_terrain",
+    "kernels.ground":
+        "follow_walk ground_distance ground_height ground_normal height_scan next_level on_ground start_on_terrain",
     "kernels.random": "normal uniform",
     "kernels.rotations":
         "quat_angle quat_difference quat_from_axis_angle quat_from_euler quat_from_mat quat_from_rotvec quat_inverse "
@@ -106,13 +110,15 @@ _NAMES = {
     "kernels.task_helpers":
         "Sigmoid all_inside angle_between body_velocity grasp_terms inside local_velocity put put_upright sum_squares "
         "tolerance",
-    "model_files": "ModelFile gymnasium_model gymnasium_robotics_model menagerie_model package_model",
+    "model_files":
+        "ModelFile gymnasium_model gymnasium_robotics_model menagerie_model package_model "
+        "playground_model",
     "openloop": "OpenLoop",
     "options": "EnvOptions PhysicsOptions",
     "runs.folder": "load load_value",
     "task":
-        "Planning Row Task act actuator actuators bodies body camera ctrl dof dofs equality geom geoms joint joints "
-        "lasting_memory memory mocap part qpos qposes sensor sensors site sites tendon",
+        "Planning Row Task act actuator actuators bodies body camera ctrl dof dofs equality from_model geom geoms "
+        "joint joints lasting_memory memory mocap part qpos qposes sensor sensors site sites tendon",
     "terrain": "Terrain height_field scan_grid",
     "training": "train",
     "viewer.follow": "RunViewer",
@@ -128,8 +134,8 @@ _MODULES = {name: module for module, names in _NAMES.items() for name in names.s
 
 def __getattr__(name: str) -> Any:
     """Load a public name."""
-    if name == "terms":  # a room whose functions have no names in this module
-        return importlib.import_module(f"{__name__}.terms")
+    if name in ("terms", "walkers"):  # modules whose functions have no names in this one
+        return importlib.import_module(f"{__name__}.{name}")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
@@ -138,4 +144,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, "terms"})
+    return sorted({*globals(), *__all__, "terms", "walkers"})

@@ -174,7 +174,7 @@ class Env:
             self.obs_spaces, self.obs_space = worlds.obs_spaces, worlds.obs_spaces["policy"]
             self.action_space, self.state_space = worlds.action_space, worlds.state_space
             self.metrics, self.episode_metrics = (
-                dict(zip(self.task.task.metrics, torch_view(array).unbind(1), strict=True))
+                dict(zip(self.task.metrics, torch_view(array).unbind(1), strict=True))
                 for array in (worlds.metrics, worlds.episode_metrics)
             )
             self.episode_metric_sums = torch_view(worlds.episode_metrics)

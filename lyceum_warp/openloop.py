@@ -219,7 +219,7 @@ class OpenLoop:
             wp.launch(planning.overwrite, (states.shape[0], row.shape[1]), args, device=self.env.device)
 
     def _transitions(self) -> list[Any]:
-        """The first arguments of kernels that process all transitions of the horizon."""
+        """The batches, the parameters and the actions of the transitions of the whole horizon."""
         actions = self._actions.reshape((-1, self._actions.shape[2]))
         return [self._before, self._after, self.worlds.params, actions]
 
@@ -240,8 +240,9 @@ class OpenLoop:
                     wp.copy(buffer[t + 1], buffer[0])
 
     def _judge_rows(self) -> None:
-        """Evaluate all transitions of the horizon in one launch."""
-        rows, args = self.horizon * self.env.nworld, [*self._transitions(), self._reward, self._terminated]
+        """Judge all transitions of the horizon at once."""
+        rows, (*batches, actions) = self.horizon * self.env.nworld, self._transitions()
+        args = [*batches, self.worlds.weights, actions, self._reward, self._terminated]
         launch_worlds(self.env.task.kernels.judge_rows, rows, args, self.env.device)
 
     def _end_of_horizon(self) -> None:
@@ -256,11 +257,11 @@ class OpenLoop:
     def _judge_step(self, t: int) -> None:
         worlds, n, device = self.worlds, self.env.nworld, self.env.device
         kernels = self.env.task.kernels
-        transition = [worlds.before, worlds.after, worlds.params, self._actions[t]]
+        batches, action = [worlds.before, worlds.after, worlds.params], self._actions[t]
         if kernels.advance_memory is not None:
-            launch_worlds(kernels.advance_memory, n, [*transition, worlds.counters], device)
+            launch_worlds(kernels.advance_memory, n, [*batches, action, worlds.counters], device)
         rows = slice(t * n, (t + 1) * n)
-        args = [*transition, self._reward[rows], self._terminated[rows]]
+        args = [*batches, worlds.weights, action, self._reward[rows], self._terminated[rows]]
         launch_worlds(kernels.judge_rows, n, args, device)
 
     def _end(self, batch: object) -> None:

@@ -4,7 +4,7 @@ import dataclasses
 import inspect
 import sys
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import mujoco
@@ -322,6 +322,26 @@ def mocap(body: str) -> int:
     return Element("mocap_pos", body)
 
 
+@dataclasses.dataclass(frozen=True)
+class FromModel:
+    """A parameter that is computed from the compiled model. ``from_model`` makes it."""
+
+    function: Callable[[mujoco.MjModel, Any], Any]
+
+
+def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
+    """As a default in Params: a value that a function computes from the compiled model and from other parameters.
+
+    ``mass: float = lw.from_model(lambda model, p: model.body_subtreemass[p.trunk])`` is the mass of the robot. It is
+    computed again if another parameter changes, unless it was given itself.
+
+    Args:
+        function: A function of the MjModel and of an object with the parameters as attributes: those with other
+            defaults, and those computed before this one, in the order of Params.
+    """
+    return FromModel(function)
+
+
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Planning:
@@ -367,7 +387,8 @@ class Task:
     type ``wp.array[float]``, ``wp.array2d[wp.vec3]`` or the like is a table that all worlds share, such as a motion to
     follow; its default is a nested list or an array. A table of named elements is written
     ``feet: wp.array[int] = lw.sites("left_foot", "right_foot")``, or with ``lw.bodies``, ``lw.geoms``, ``lw.joints``,
-    ``lw.qposes``, ``lw.dofs``, ``lw.actuators`` or ``lw.sensors``.
+    ``lw.qposes``, ``lw.dofs``, ``lw.actuators`` or ``lw.sensors``. ``lw.from_model`` computes a default from the
+    compiled model.
 
     Functions:
     {functions}
@@ -408,8 +429,18 @@ class Task:
     ``{"policy": {"position": 5}, "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy``,
     which is ``env.obs``, and ``observe_critic``, with the same arguments, writes the group ``critic``. A task leaves
     ``obs`` out if the last argument of these functions is a Warp struct, whose fields ``lw.part`` gives sizes."""
+    rewards: ClassVar[Mapping[str, float]] = {}
+    """The terms of the reward and their weights per second, such as ``{"upright": 1.0, "effort": -0.1}``, in place of
+    ``reward``. A term is a function of the module that returns a float; its arguments are found by name: ``s0``,
+    ``action``, ``s1`` (or ``s``), ``p``, or the result of another function of that name, a parameter, a field of
+    World. The reward is dt times the sum of weight times term. ``lw.make(task, upright=2.0)`` and ``set_params`` change
+    weights, and each term is a metric, with its weight and dt. ``env.task.reward_text`` shows the generated source."""
+    terminations: ClassVar[tuple[str, ...]] = ()
+    """Names of functions that end the episode if one returns True, in place of ``terminated``. They may take ``s``,
+    ``p`` and what a term may take by name. Each is a metric: 1 if it holds after the step, otherwise 0."""
     metrics: ClassVar[tuple[str, ...]] = ()
-    """Names of the metrics that ``measure`` writes, such as the terms of the reward."""
+    """Names of the metrics that ``measure`` writes. Without ``measure``, they are functions that return a float or a
+    bool and take what terms take."""
     horizon: ClassVar[int] = 1000
     """Steps after which an episode is truncated; 0 for never."""
     success_steps: ClassVar[int] = 1
@@ -420,9 +451,10 @@ class Task:
     cleared: ClassVar[tuple[str, ...]] = ()
     """Fields left by the last substep, such as contact forces, to zero at the start of an episode. Otherwise they are
     computed then, which takes a forward pass of the worlds that restart. A reset clears them before ``initialize``."""
-    actions: ClassVar[Mapping[str, int] | None] = None
+    actions: ClassVar[Mapping[str, int | str] | None] = None
     """The parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls;
-    ``control`` then turns them into inputs. None: an action has one number for each control."""
+    ``control`` then turns them into inputs. A size may be the name of a table in Params: one number for each of its
+    rows. None: an action has one number for each control."""
     action_range: ClassVar[tuple[float, float] | None] = None
     """The range of an action, which the default ``control`` scales to the model's control ranges; None: actions are
     controls, or, with ``actions``, have no bounds."""
@@ -442,7 +474,7 @@ class Task:
     planning: ClassVar[Planning] = Planning()
     """The task's settings for MPPI, such as ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
 
-    # World, Params and functions of the module at the time of the class's definition
+    # World, Params and Warp functions of the module at the time of the class's definition
     scope: ClassVar[dict[str, Any]]
 
     @staticmethod
@@ -458,5 +490,5 @@ class Task:
         cls.scope = {
             name: value
             for name, value in module.items()
-            if name in ("World", "Params", *FUNCTIONS) or name.startswith(GROUP_PREFIX)
+            if name in ("World", "Params") or isinstance(value, wp.Function)
         }

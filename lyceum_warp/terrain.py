@@ -9,6 +9,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from lyceum_warp.task import from_model
+
 Shape = Callable[[np.ndarray, np.ndarray, float, np.random.Generator], np.ndarray]
 """``shape(x, y, amount, rng)``: the heights of a square patch, m, (n, n), from the coordinates of its points relative
 to its middle, m, (n, n) each. The outline of a patch is then set to 0, so that patches meet without a step."""
@@ -233,53 +235,47 @@ class Terrain:
         return default if given is None else float(np.copysign(given, default))
 
 
-@dataclasses.dataclass(frozen=True)
-class HeightField:
-    """A table of a model's height field, which is filled in from the compiled model. ``height_field`` makes it."""
+def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """The table of a model's height field, m, (1 + points along y, 1 + points along x); see ``height_field``.
 
-    name: str
-
-    def table(self, model: mujoco.MjModel) -> np.ndarray:
-        """Heights with their coordinates, m, (1 + points along y, 1 + points along x).
-
-        Raises:
-            ValueError: The model has no such height field, or not exactly one geom of the world has it, upright.
-        """
-        number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_HFIELD, self.name)
-        if number < 0:
-            names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_HFIELD, i) for i in range(model.nhfield)]
-            raise ValueError(f"the model has no height field {self.name!r}; it has: {', '.join(names) or 'none'}")
-        (geoms,) = np.nonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD) & (model.geom_dataid == number))
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-        fixed = [g for g in geoms if model.body_weldid[model.geom_bodyid[g]] == 0]
-        if len(geoms) != 1 or not fixed or not np.allclose(data.geom_xmat[geoms[0]], np.eye(3).ravel(), atol=1e-9):
-            raise ValueError(
-                f"the height field {self.name!r} must be the shape of one geom, which is fixed and not turned: "
-                f"{len(geoms)} geoms have it"
-            )
-        position, (along_x, along_y, height, _) = data.geom_xpos[geoms[0]], model.hfield_size[number]
-        nrow, ncol = int(model.hfield_nrow[number]), int(model.hfield_ncol[number])
-        start = model.hfield_adr[number]
-        found = np.zeros((1 + nrow, 1 + ncol))
-        found[0, 1:] = position[0] + np.linspace(-along_x, along_x, ncol)
-        found[1:, 0] = position[1] + np.linspace(-along_y, along_y, nrow)
-        heights = model.hfield_data[start : start + nrow * ncol].reshape(nrow, ncol)
-        found[1:, 1:] = position[2] + height * heights.astype(float)
-        return found
+    Raises:
+        ValueError: The model has no such height field, or not exactly one fixed and upright geom has it.
+    """
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_HFIELD, name)
+    if number < 0:
+        names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_HFIELD, i) for i in range(model.nhfield)]
+        raise ValueError(f"the model has no height field {name!r}; it has: {', '.join(names) or 'none'}")
+    (geoms,) = np.nonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD) & (model.geom_dataid == number))
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    fixed = (model.body_weldid[model.geom_bodyid[geoms]] == 0).all()
+    if len(geoms) != 1 or not fixed or not np.allclose(data.geom_xmat[geoms[0]], np.eye(3).ravel(), atol=1e-9):
+        raise ValueError(
+            f"the height field {name!r} must be the shape of one geom, which is fixed and not turned: "
+            f"{len(geoms)} geoms have it"
+        )
+    position, (along_x, along_y, height, _) = data.geom_xpos[geoms[0]], model.hfield_size[number]
+    nrow, ncol = int(model.hfield_nrow[number]), int(model.hfield_ncol[number])
+    start = model.hfield_adr[number]
+    found = np.zeros((1 + nrow, 1 + ncol))
+    found[0, 1:] = position[0] + np.linspace(-along_x, along_x, ncol)
+    found[1:, 0] = position[1] + np.linspace(-along_y, along_y, nrow)
+    heights = model.hfield_data[start : start + nrow * ncol].reshape(nrow, ncol)
+    found[1:, 1:] = position[2] + height * heights.astype(float)
+    return found
 
 
 def height_field(name: str) -> Any:
     """As a default in Params: the table of a height field of the model, for ``lw.ground_height`` and ``height_scan``.
 
-    The table is filled in from the compiled model. Its first row has the coordinates x of the points, its first column
-    their y, the rest their heights z in the world's frame, m, (1 + points along y, 1 + points along x). All worlds
-    share it. Declare it as ``ground: wp.array2d[float] = lw.height_field("terrain")``.
+    The first row of the table has the coordinates x of the points, its first column their y, the rest their heights z
+    in the world's frame, m, (1 + points along y, 1 + points along x). All worlds share it. Declare it as
+    ``ground: wp.array2d[float] = lw.height_field("terrain")``.
 
     Args:
         name: The name of the height field, as in the model; ``lw.Terrain.add_to`` names it "terrain".
     """
-    return HeightField(name)
+    return from_model(lambda model, _: height_table(model, name))
 
 
 def scan_grid(length: float, width: float, *, spacing: float = 0.1) -> np.ndarray:

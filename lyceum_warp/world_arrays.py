@@ -32,7 +32,7 @@ def own_parts(task: BoundTask) -> dict[str, int]:
     form, found = task.task, dict[str, int]()
     for layout in task.memory.values():
         found |= sizes(layout)
-    own = {"metrics": len(form.metrics), "success_steps": int(form.success_steps > 1)}
+    own = {"metrics": len(task.metrics), "success_steps": int(form.success_steps > 1)}
     return found | {name: size for name, size in own.items() if size}
 
 
@@ -68,7 +68,7 @@ class WorldArrays:
             wp.zeros((n, sum(sizes(self.task.memory[name]).values())), dtype=float)
             for name in ("memory", "lasting_memory", "lasting_memory")
         )
-        self.metric_sums = wp.zeros((n, len(task.metrics)), dtype=float)
+        self.metric_sums = wp.zeros((n, len(self.task.metrics)), dtype=float)
         """Sums of the metrics over the episode so far."""
         self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
         """Successful steps in a row, up to ``success_steps``; has no columns if one step is enough."""
@@ -95,7 +95,8 @@ class WorldArrays:
         drawn = [f.name for f in self.task.dynamics if f.name in self.task.writes.get("event", ())]
         self._model_copies = {name: wp.zeros_like(self.engine.arrays[name]) for name in drawn}
         self.params = self.task.parameters.array(self.device)
-        self.action_space = action_space(model, task.action_range, task.actions)
+        self.weights = self.task.parameters.weights(self.device)
+        self.action_space = action_space(model, task.action_range, self.task.actions)
         self.obs_spaces = {group: Space.of(layout) for group, layout in self.task.obs_layouts.items()}
         self.state_space = state_space(model, self.engine.snapshots, self.task.dynamics, own_parts(self.task))
 
@@ -111,14 +112,14 @@ class WorldArrays:
                 batch.shared = self.shared
 
     def _allocate_outcome(self) -> None:
-        """Allocate rewards, terminations, metrics and observations."""
-        n, task, kernels = self.nworld, self.task.task, self.task.kernels
+        """Rewards, ends, metrics and observations."""
+        n, kernels = self.nworld, self.task.kernels
         self.outcome = steps.Outcome()
         self.buffers: dict[str, torch.Tensor] = {}
         for name, dtype in steps.OUTCOMES.items():
             setattr(self.outcome, name, wp.zeros(n, dtype=dtype))
             self.buffers[name] = torch_view(getattr(self.outcome, name))
-        self.metrics: wp.array = wp.zeros((n, len(task.metrics)), dtype=float)
+        self.metrics: wp.array = wp.zeros((n, len(self.task.metrics)), dtype=float)
         """The metrics of the last step, (nworld, number of metrics)."""
         self.episode_metrics: wp.array = wp.zeros_like(self.metrics)
         """The sums of the metrics over the last step's episode."""

@@ -264,8 +264,8 @@ class Worlds(WorldArrays):
         if kernels.check_memory is not None:
             launch_lanes(kernels.check_memory, self.nworld, [mask, self.before, self.after, fault], self.device)
         launch_parts(kernels.judge, self._judging, self.nworld, [
-            mask, self.before, self.after, self.params, self.safe_action, self.counters, transition, fault,
-            action_fault, self._found, self.metrics, self.final_obs, self._judging,
+            mask, self.before, self.after, self.params, self.weights, self.safe_action, self.counters, transition,
+            fault, action_fault, self._found, self.metrics, self.final_obs, self._judging,
         ], self.device)  # fmt: skip
         launch_lanes(kernels.conclude, self.nworld, [
             mask, self.before, self.params, self._found, self.counters.step, self.horizon, transition, keep_reason,
@@ -387,11 +387,13 @@ class Worlds(WorldArrays):
             self._observe(self.everyone)
 
     def update_params(self) -> None:
-        """Copy the task's parameters into the array that kernels read."""
-        changed = self.task.parameters.array(self.device)
-        if changed.shape == self.params.shape:
-            wp.copy(self.params, changed)
-            return
-        self.params = changed
-        for programs in self._programs.values():
-            programs.graphs.forget()
+        """Copy the task's parameters and weights into the arrays that kernels read."""
+        parameters = self.task.parameters
+        changed = {"params": parameters.array(self.device), "weights": parameters.weights(self.device)}
+        for name, array in changed.items():
+            if array.shape == getattr(self, name).shape:
+                wp.copy(getattr(self, name), array)
+                continue
+            setattr(self, name, array)
+            for programs in self._programs.values():
+                programs.graphs.forget()

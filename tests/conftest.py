@@ -2,7 +2,6 @@
 
 import functools
 import gc
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -107,7 +106,7 @@ def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip tests marked ``gpu`` without a GPU, and tests of tasks whose model cannot be installed."""
+    """Skip tests marked ``gpu`` without a GPU, and tests of tasks whose model is not installed."""
     for item in items:
         if (missing := _missing_model(_task(item))) is not None:
             item.add_marker(pytest.mark.skip(reason=missing))
@@ -129,8 +128,8 @@ def _task(item: pytest.Item) -> str | None:
 
 @functools.cache
 def _missing_model(task: str | None) -> str | None:
-    """Return why a task's model is missing: its package may have no wheel for this version of Python."""
-    if task is None or sys.version_info < (3, 13):
+    """Why a task's model is missing, and how to install it; None if it is there."""
+    if task is None:
         return None
     try:
         find_task(task).model.path()

@@ -49,6 +49,20 @@ def test_python_of_a_page_runs_in_order(page: Path, task_file: TaskFile) -> None
     runpy.run_path(str(task_file(f"page_{page.stem}.py", source)), run_name=f"page_{page.stem}")
 
 
+WRONG = re.compile(r"^```py\n(.*?)^```\n\n```\n(.*?)\n```$", re.MULTILINE | re.DOTALL)
+MISTAKES = WRONG.findall((ROOT / "docs" / "warp_for_python.md").read_text())
+
+
+@pytest.mark.parametrize("number", range(len(MISTAKES)))
+def test_a_mistake_of_the_page_about_warp_has_the_message_there(number: int, task_file: TaskFile) -> None:
+    function, message = MISTAKES[number]
+    task = python_of(ROOT / "docs" / "warp_for_python.md")
+    assert task.count("class Measured") == 1
+    file = task_file(f"wrong_{number}.py", task.replace("class Measured", f"{function}\n\nclass Measured"))
+    with pytest.raises(ValueError, match=re.escape(message)):
+        lw.make(file)
+
+
 BLOCK = re.compile(r"^```(\w+)(?: title=(\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 QUICK = {

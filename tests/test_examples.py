@@ -95,17 +95,17 @@ def test_commanded_speed_keeps_the_rules_on_both_engines() -> None:
         assert f"commanded_speed on the {engine} engine" in done.stdout
     reward, terms = re.fullmatch(r"reward (\S+) of (.*)", done.stdout.splitlines()[-1]).groups()
     terms = ast.literal_eval(terms)
-    assert list(terms) == ["tracking", "gait", "effort", "flight", "level"]
-    assert float(reward) == pytest.approx(sum(terms.values()) - terms["level"], abs=1e-5)
+    assert list(terms) == ["tracking", "imitation", "effort", "flight", "difficulty"]
+    assert float(reward) == pytest.approx(sum(terms.values()) - terms["difficulty"], abs=1e-5)
 
 
 def test_commanded_speed_trains_with_its_terms_as_curves(tmp_path: Path) -> None:
     options = ["--iterations", "2", "--samples", "8000", "--nworld", "16"]
     assert train(tmp_path / "run", *options, task=str(EXAMPLES / "commanded_speed.py")) == 0
     for row in Run.open(tmp_path / "run").rows():
-        terms = [row[f"metrics/{name}"] for name in ("tracking", "gait", "effort", "flight")]
+        terms = [row[f"metrics/{name}"] for name in ("tracking", "imitation", "effort", "flight")]
         assert row["return_mean"] == pytest.approx(sum(terms), rel=1e-4)
-        assert 0 < terms[0] < 400 and 0 < terms[1] < 120 and terms[2] < 0 and terms[3] <= 0
+        assert 0 < terms[0] < 20 and 0 < terms[1] < 6 and terms[2] < 0 and terms[3] <= 0
 
 
 def test_torch_loop_learns_to_approach_the_target(run) -> None:
@@ -118,7 +118,7 @@ def test_torch_loop_learns_to_approach_the_target(run) -> None:
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
 def test_examples_are_short_and_use_public_names_only(path: Path) -> None:
     source = path.read_text()
-    most = {"commanded_speed.py": 175, "random_search.py": 80}
+    most = {"commanded_speed.py": 180, "random_search.py": 80}
     assert len(source.splitlines()) < most.get(path.name, 60)
     modules = set(re.findall(r"^(?:from|import) (lyceum_warp[\w.]*)", source, re.MULTILINE))
     assert modules <= {"lyceum_warp", "lyceum_warp.testing"}

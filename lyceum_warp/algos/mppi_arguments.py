@@ -166,7 +166,8 @@ def _hint(word: str, known: Sequence[str]) -> str:
 
 
 def _parameter_names(task: type[Task]) -> list[str]:
-    return [name for name in TaskSource(task, task_name(task)).params.vars if name != "dt"]
+    source = TaskSource(task, task_name(task))
+    return [name for name in (*source.params.vars, *source.terms.weights) if name != "dt"]
 
 
 def _planning(task: type[Task]) -> Planning:

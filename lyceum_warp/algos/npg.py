@@ -179,7 +179,7 @@ class NPG(OnPolicyLearner):
         # 7. Every few iterations, evaluate the mean policy in whole episodes.
         self.iteration += 1
         self.samples += self.count
-        statistics = self._with_mean_policy(summary(processes, len(obs), self.env.task.task.metrics))
+        statistics = self._with_mean_policy(summary(processes, len(obs), self.env.task.metrics))
         timer.mark()
 
         time_sample, time_gradient, time_solve, time_value, time_mean = timer.seconds()

@@ -16,7 +16,7 @@ from lyceum_warp.binding.codegen import kernels_of
 from lyceum_warp.binding.functions import TaskSource, draws_noise
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
-from lyceum_warp.binding.sources import is_struct
+from lyceum_warp.binding.sources import is_struct, overloads
 from lyceum_warp.binding.writes import Rights, check_writes, written_fields
 from lyceum_warp.fields import INITIAL, INPUTS, Field, describe, is_data_field, similar_data_fields, vec10
 from lyceum_warp.model_fields import describe_model_field, is_model_field, similar_model_fields
@@ -175,6 +175,8 @@ class BoundTask:
         self.name = task_name(task)
         self.source = TaskSource(task, self.name)
         self.functions = self.source.functions
+        self.metrics = self.source.terms.metrics
+        """The names of the metrics: terms of the reward, those in the attribute ``metrics``, and terminations."""
         self._check_class()
         memory = self.source.memory
         own_names = [*memory, *(["shared"] if self.source.shared is not None else [])]
@@ -191,7 +193,6 @@ class BoundTask:
         self.spec = _read_spec(task, model)
         """The model before ``edit_model``. Replicas are made from it, because its source may have changed."""
         self.model = models.compile_model(_edited(task, self.spec), own, physics, varied={*of_model, *dynamics})
-        self._check_actions()
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.frame_skip = whole_number(f"frame_skip of the task {self.name!r}", skip, low=1)
         self.timestep: float = self.model.opt.timestep * self.frame_skip
@@ -205,8 +206,11 @@ class BoundTask:
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)
         """The integration state at which a reset starts, (integration_size,) float64; None for the model's default."""
         self.parameters = Parameters(
-            self.source.params, self.name, self.model, nworld=nworld, timestep=self.timestep, given=params or {}
-        )
+            self.source.params, self.source.defaults, self.name, self.model, nworld=nworld, timestep=self.timestep,
+            given=params or {}, weights=self.source.terms.weights,
+        )  # fmt: skip
+        self.actions = self._checked_actions()
+        """The sizes of the parts of an action, by name; None if actions are controls."""
         self.memory = self._memory_layouts()
         """The layouts of the rows ``memory`` and ``lasting_memory``."""
         self.obs_layouts = obs_layouts(self.source, self.params)
@@ -226,13 +230,22 @@ class BoundTask:
         return self.parameters.values
 
     @property
+    def reward_text(self) -> str:
+        """The generated source of the reward, metrics and terminations of a task with terms; otherwise empty."""
+        return self.source.terms.text
+
+    @property
     def noisy_groups(self) -> list[str]:
         """The groups of observations whose functions draw random numbers."""
         return [group for group, function in self.observers.items() if draws_noise(function)]
 
     def _checked_writes(self) -> dict[str, frozenset[str]]:
         written = {name: function for name, function in self.functions.items() if function is not None}
-        check_writes(self.name, written, {name: self._rights(function) for name, function in FUNCTIONS.items()})
+        rights: dict[str, Rights] = {name: self._rights(function) for name, function in FUNCTIONS.items()}
+        check_writes(self.name, written, rights)
+        for name, function in self.source.terms.functions.items():
+            for overload in overloads(function):  # a term may write nothing
+                check_writes(self.name, {name: overload}, rights | {name: dict.fromkeys(overload.input_types, ())})
         memory = self.source.memory
         return {
             name: frozenset(memory[field].kind if field in memory else field for field in written_fields(function))
@@ -291,8 +304,7 @@ class BoundTask:
         Raises:
             ValueError: There is no such parameter, or the observation would change its size.
         """
-        previous = self.parameters.values
-        self.parameters.values = self.parameters.checked(params)
+        previous, self.parameters = self.parameters, self.parameters.changed(params)
         try:
             changed = "the observation's" if obs_layouts(self.source, self.params) != self.obs_layouts else ""
         except ValueError:  # one value per world for a parameter that sets a size
@@ -300,7 +312,7 @@ class BoundTask:
         layouts = (self._memory_layouts(), self._shared_layouts())
         changed = changed or ("the memory's" if layouts != (self.memory, self.shared) else "")
         if changed:
-            self.parameters.values = previous
+            self.parameters = previous
             raise ValueError(f"{', '.join(params)} would change {changed} parts: make a new environment")
 
     def _check_class(self) -> None:
@@ -349,24 +361,21 @@ class BoundTask:
             )
 
     def _check_metrics(self) -> None:
-        metrics: Any = self.task.metrics
-        if not isinstance(metrics, tuple | list) or not all(isinstance(name, str) and name for name in metrics):
-            raise ValueError(
-                f"metrics of the task {self.name!r} must be names, such as ('forward', 'cost'), not {metrics!r}"
-            )
+        metrics = self.metrics
         if bad := [name for name in metrics if not name.isprintable() or not set(name).isdisjoint(",'\"")]:
             raise ValueError(
                 f"the task {self.name!r} has the metric {bad[0]!r}: a metric's name, which is a column of metrics.csv, "
                 "must have no comma, quote or line break"
             )
-        if twice := [name for name in metrics if list(metrics).count(name) > 1]:
+        if twice := [name for name in metrics if metrics.count(name) > 1]:
             raise ValueError(f"the task {self.name!r} names the metric {twice[0]!r} twice: give each one name")
-        if bool(metrics) != (self.functions["measure"] is not None):
+        if self.functions["measure"] is not None and not self.task.metrics:
             raise ValueError(
-                f"the task {self.name!r} needs both metrics = (...) in its class and {FUNCTIONS['measure'].signature}"
+                f"the task {self.name!r} has {FUNCTIONS['measure'].signature}, but its class does not name what it "
+                "writes: add metrics = (...)"
             )
 
-    def _check_actions(self) -> None:
+    def _checked_actions(self) -> dict[str, int] | None:
         actions = self.task.actions
         if actions is None:
             if self.model.nu == 0:
@@ -374,18 +383,20 @@ class BoundTask:
                     f"the model of the task {self.name!r} has no actuators: add some, or give the task "
                     "actions = {...} and a control that writes inputs"
                 )
-            return
+            return None
         if not isinstance(actions, Mapping) or not actions:
             raise ValueError(
                 f"actions of the task {self.name!r} must be a dict of names and sizes, such as {{'speed': 1}}, not "
                 f"{actions!r}"
             )
-        for name, size in actions.items():
-            whole_number(f"the size of the action {name!r} of the task {self.name!r}", size, low=1)
         if self.functions["control"] is None:
             raise ValueError(
                 f"the task {self.name!r} has actions of its own, so it needs {FUNCTIONS['control'].signature}"
             )
+        return {
+            name: parts.length(f"the size of the action {name!r} of the task {self.name!r}", size, self.params)
+            for name, size in actions.items()
+        }
 
     def check_field(self, name: str, array: wp.array) -> None:
         """Compare the type of a field in World with its array, (nworld, ...).

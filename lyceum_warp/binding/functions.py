@@ -11,6 +11,8 @@ import warp as wp
 
 from lyceum_warp.binding.parts import parts_of
 from lyceum_warp.binding.sources import FunctionSource, is_struct
+from lyceum_warp.binding.task_terms import Terms
+from lyceum_warp.binding.variants import Variant, variant_of
 from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, MEMORIES, Part, Task, TaskFunction, observer_name
 
 
@@ -30,8 +32,13 @@ class TaskSource:
         self.task, self.name = task, name
         self.path = f"{task.__module__}.{task.__qualname__}"
         self._owners: Any = task.__mro__[: task.__mro__.index(Task)]
+        self._variant: Variant | None = None
         self.world: Any = self._struct("World")
-        self.params: Any = self._struct("Params")
+        own: Any = self._struct("Params")
+        self.defaults: type = own.cls
+        """The class whose attributes are the defaults of the parameters."""
+        self.params: Any = self._with_functions(own)
+        self._variant = variant_of(name, self._owners, self.world, self.params, own)
         self.memory: dict[str, Part] = self._memory()
         """The fields of World that are the task's memory, by name."""
         self.shared, self.sums = self._shared_structs()
@@ -40,6 +47,7 @@ class TaskSource:
             name: self._function(wanted) for name, wanted in FUNCTIONS.items()
         }
         """The task's functions by their names in the table; None for a function that the task lacks."""
+        self.terms = Terms(task, name, self._term, self.functions, self.world, self.params)
         if self.functions["observe"] is None:
             raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), which every task needs")
         self._check_names()
@@ -75,9 +83,9 @@ class TaskSource:
     def _observers(self, owner: type[Task]) -> list[str]:
         """Names of functions for groups: those in a class, and those in its module that nothing there uses."""
         module = vars(sys.modules[owner.__module__])
-        functions = {name: value for name, value in module.items() if isinstance(value, wp.Function)}
+        functions = {name: self._seen(value) for name, value in module.items() if isinstance(value, wp.Function)}
         tasks = [kind for kind in (owner, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
-        used = {id(value) for task in tasks for value in vars(task).values()}
+        used = {id(self._seen(value)) for task in tasks for value in vars(task).values()}
         called = {name for f in functions.values() if f.func is not None for name in f.func.__code__.co_names}
         forms = (FUNCTIONS["observe"].kinds, FUNCTIONS["observe"].all_kinds)
         own = [name for name, value in vars(owner).items() if isinstance(value, wp.Function | staticmethod)]
@@ -95,13 +103,28 @@ class TaskSource:
         for owner in self._owners:
             found = vars(owner).get(name, owner.scope.get(name, vars(sys.modules[owner.__module__]).get(name)))
             if found is not None:
-                return found.__func__ if isinstance(found, staticmethod) else found
+                return self._seen(found.__func__ if isinstance(found, staticmethod) else found)
         return None
+
+    def _seen(self, value: Any) -> Any:
+        """A value of the task's family over the task's own structs; see ``variants``."""
+        return value if self._variant is None else self._variant.seen(value)
 
     @property
     def _has_structs(self) -> bool:
         """Whether structs, not the task's ``obs``, lay out the observations."""
         return not hasattr(self.task, "obs")
+
+    def _term(self, name: str) -> wp.Function | None:
+        """A Warp function of the task by any name, or None."""
+        for owner in self._owners:
+            for names in (vars(owner), owner.scope, vars(sys.modules[owner.__module__])):
+                found = names.get(name)
+                found = found.__func__ if isinstance(found, staticmethod) else found
+                if isinstance(found, wp.Function) and found.func is not None:
+                    function: wp.Function = self._seen(found)
+                    return function
+        return None
 
     def _struct(self, name: str) -> Any:
         struct = self._written(name)
@@ -110,6 +133,19 @@ class TaskSource:
         if not hasattr(struct, "vars"):
             raise ValueError(f"the task {self.name!r} needs a @wp.struct named {name} in its module")
         return struct
+
+    def _with_functions(self, own: Any) -> Any:
+        """The struct of the parameters that functions take: a base task's, if the task's own only has other defaults.
+
+        Tasks that differ in defaults then share functions and kernels.
+        """
+        fields = {name: wp.types.type_repr(field.type) for name, field in own.vars.items()}
+        for owner in reversed(self._owners):
+            struct = vars(owner).get("Params", owner.scope.get("Params"))
+            known = struct.vars.items() if is_struct(struct) and issubclass(own.cls, struct.cls) else ()
+            if {name: wp.types.type_repr(field.type) for name, field in known} == fields:
+                return struct
+        return own
 
     def _memory(self) -> dict[str, Part]:
         """The parts of memory in World; a task that gives only their number is refused."""
@@ -185,8 +221,8 @@ class TaskSource:
                 if kind is not own and kind.key.rpartition(".")[2] == own_name:
                     raise ValueError(
                         f"{name} of the task {self.name!r} takes the {own_name} of {_origin(kind)}, but the task has "
-                        f"the {own_name} of {_origin(own)}: import both structs from one module, or write {name} for "
-                        "the task's own"
+                        f"the {own_name} of {_origin(own)}: import both structs from one module, extend the first by "
+                        f"@wp.struct class {own_name}(module.{own_name}), or write {name} for the task's own"
                     )
 
     def _kind(self, argument: Any) -> str:
@@ -212,7 +248,8 @@ class TaskSource:
             if close := difflib.get_close_matches(name, (*attributes, *FUNCTIONS), 1, 0.75):
                 raise ValueError(f"the task {self.name!r} has {name!r} in its class: did you mean {close[0]}?")
         for name, value in vars(sys.modules[self.task.__module__]).items():
-            if isinstance(value, wp.Function) and name not in FUNCTIONS and not name.startswith(GROUP_PREFIX):
+            known = (*FUNCTIONS, *self.terms.functions)
+            if isinstance(value, wp.Function) and name not in known and not name.startswith(GROUP_PREFIX):
                 own = self._kind(next(iter(value.input_types.values()), None)) == "World"
                 close = difflib.get_close_matches(name, [f for f in FUNCTIONS if self.functions[f] is None], 1, 0.85)
                 if own and close:

@@ -25,7 +25,7 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
 
     Args:
         source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec, which is copied. A path
-            is relative to the file that defines ``owner``, or else to the current folder.
+            is relative to the file in which ``owner`` or a base class gives it, or else to the current folder.
         owner: The task class whose own model it is.
 
     Raises:
@@ -55,6 +55,8 @@ def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFil
         start = textwrap.shorten(source, 24, placeholder=" ...")
         raise ValueError(f"the model {start!r} is XML, not a file: give mujoco.MjSpec.from_string(...) of it")
     folder = Path()
+    if owner is not None:  # a subclass in another folder inherits the path
+        owner = next((kind for kind in owner.__mro__ if "model" in vars(kind)), owner)
     if owner is not None and (file := getattr(sys.modules.get(owner.__module__), "__file__", None)):
         folder = Path(file).parent
     path = (folder / Path(source).expanduser()).absolute()

@@ -1,7 +1,9 @@
 """Check the values of a task's parameters, the fields of its ``Params``, and make the array for its kernels."""
 
+import copy
 from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -10,18 +12,19 @@ import warp as wp
 
 from lyceum_warp.fields import elements, rows
 from lyceum_warp.options import OPTIONS, suggestion
-from lyceum_warp.task import Element
-from lyceum_warp.terrain import HeightField
+from lyceum_warp.task import Element, FromModel
 
 _FILLED_IN = ("dt", "substep_dt")
 """Fields of ``Params`` that are filled in: seconds in a step and in a substep."""
 
 
-def defaults(struct: Any) -> dict[str, Any]:
-    """The defaults in a task's ``Params``, by name, without fields that are filled in."""
-    # Warp's structs ignore defaults; the decorated class still has them
-    names = [name for name in struct.vars if name not in _FILLED_IN and hasattr(struct.cls, name)]
-    return {name: getattr(struct.cls, name) for name in names}
+def defaults(struct: Any, owner: type) -> dict[str, Any]:
+    """The defaults of a task's parameters, by name, without fields that are filled in.
+
+    ``struct`` is the struct that the functions take, ``owner`` the class with the defaults.
+    """
+    names = [name for name in struct.vars if name not in _FILLED_IN and hasattr(owner, name)]
+    return {name: getattr(owner, name) for name in names}
 
 
 class Parameters:
@@ -30,12 +33,14 @@ class Parameters:
     A table is a field that is itself an array, such as ``motion: wp.array2d[float]``. All worlds share it.
 
     Args:
-        struct: The task's ``Params``.
+        struct: The task's ``Params``, which the functions take.
+        owner: The class with the defaults as attributes.
         task_name: The task's name, for messages.
         model: The compiled model, which gives the indices of named elements.
         nworld: Number of worlds.
         timestep: Seconds in a step, the value of ``dt``.
         given: Values that replace defaults.
+        weights: The weights of the task's terms, by name, which are set and given as parameters are.
 
     Raises:
         ValueError: A field has the name of an option, a name is unknown, or a value is missing or does not fit.
@@ -44,40 +49,46 @@ class Parameters:
     def __init__(
         self,
         struct: Any,
+        owner: type,
         task_name: str,
         model: mujoco.MjModel,
         *,
         nworld: int,
         timestep: float,
         given: Mapping[str, Any],
+        weights: Mapping[str, float] | None = None,
     ) -> None:
-        self._struct, self._task_name, self._model, self._nworld = struct, task_name, model, nworld
+        self._struct, self._owner, self._weights = struct, owner, dict(weights or {})
+        self._task_name, self._model, self._nworld = task_name, model, nworld
         self._sizes: dict[str, int] = {}
         self.tables = {name: field.type for name, field in struct.vars.items() if hasattr(field.type, "ndim")}
         """The types of the fields that are tables, by name."""
         self._arrays: dict[str, tuple[np.ndarray, wp.array]] = {}
         self._check_tables()
-        if taken := [name for name in struct.vars if name in (*OPTIONS, "task", "options")]:
+        if taken := [name for name in (*struct.vars, *self._weights) if name in (*OPTIONS, "task", "options")]:
             raise ValueError(
                 f"the parameter {taken[0]!r} of the task {task_name!r} has the name of an option of make(), which "
                 "would get its value: rename it in Params"
             )
-        found = defaults(struct) | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
-        self.values: dict[str, Any] = {name: found[name] for name in struct.vars if name in found}
-        self.values = self.checked(given)
+        found = defaults(struct, owner) | self._weights | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
+        self._computed = {name for name, value in found.items() if isinstance(value, FromModel)}
+        """Names of the values that are computed from the model."""
+        self.values: dict[str, Any] = {name: found[name] for name in (*struct.vars, *self._weights) if name in found}
+        self.values = self.changed(given).values
+        self._computed -= set(given)
 
     @property
     def per_world(self) -> dict[str, np.ndarray]:
         """The values that differ between worlds, by name, (nworld, ...)."""
         return {name: v for name, v in self.values.items() if isinstance(v, np.ndarray) and name not in self.tables}
 
-    def checked(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """The values with some replaced, each converted to the type of its field.
+    def changed(self, given: Mapping[str, Any]) -> "Parameters":
+        """A copy with some values replaced, each converted to the type of its field. Both use the same arrays.
 
         Raises:
             ValueError: A name is unknown, a value is missing or does not fit its field.
         """
-        known = self._struct.vars
+        known = (*self._struct.vars, *self._weights)
         for name in given:
             if name not in known or name in _FILLED_IN:
                 names = sorted(set(known) - set(_FILLED_IN))
@@ -90,7 +101,29 @@ class Parameters:
                 raise ValueError(f"the task {self._task_name!r} has no parameter {name!r}: {hint}")
         if missing := [name for name in known if name not in self.values and name not in given]:
             raise ValueError(f"the task {self._task_name!r} needs values for {', '.join(missing)}")
-        return {name: self._converted(name, value) for name, value in {**self.values, **given}.items()}
+        other = copy.copy(self)
+        other._computed = self._computed - set(given)
+        other.values = {
+            name: self._converted(name, value)
+            for name, value in {**self.values, **given}.items()
+            if name not in other._computed
+        }
+        for name in known:
+            if name in other._computed:
+                other.values[name] = self._compute(name, other.values)
+        return other
+
+    def _compute(self, name: str, values: Mapping[str, Any]) -> Any:
+        """The value of a default that is computed from the model; the previous table if it has not changed."""
+        try:
+            found = getattr(self._owner, name).function(self._model, SimpleNamespace(**values))
+        except Exception as error:  # a function of the task may raise any
+            message = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+            raise ValueError(
+                f"the parameter {name} of {self._task_name!r} can't be computed from the model: {message}"
+            ) from error
+        value, before = self._converted(name, found), self.values[name]
+        return before if name in self.tables and np.array_equal(before, value) else value
 
     def array(self, device: wp.Device) -> wp.array:
         """The values for the kernels: one entry for all worlds, or one per world if any value differs.
@@ -100,8 +133,16 @@ class Parameters:
         """
         for name, kind in self.tables.items():
             self._upload(name, kind.dtype, device)
-        instances = [self._instance(w) for w in range(self._nworld if self.per_world else 1)]
+        differ = any(name in self._struct.vars for name in self.per_world)
+        instances = [self._instance(w) for w in range(self._nworld if differ else 1)]
         return wp.array(instances, dtype=self._struct, device=device)
+
+    def weights(self, device: wp.Device) -> wp.array:
+        """The weights of the task's terms: a row for all worlds, or one per world, (1 or nworld, terms)."""
+        count = self._nworld if any(name in self._weights for name in self.per_world) else 1
+        rows = [np.broadcast_to(self.values[name], count) for name in self._weights]
+        table: wp.array = wp.array(np.reshape(rows, (len(rows), count)).T, dtype=float, device=device)
+        return table
 
     def _upload(self, name: str, dtype: type, device: wp.Device) -> None:
         value = self.values[name]
@@ -123,10 +164,10 @@ class Parameters:
 
     def _converted(self, name: str, value: Any) -> Any:
         """A value in the type of its field: a scalar, a vector, a table, or an array with one value per world."""
-        kind = self._struct.vars[name].type
+        kind = self._struct.vars[name].type if name in self._struct.vars else wp.float32
         if name in self.tables:
             return self._table(name, value)
-        default = getattr(self._struct.cls, name, None)
+        default = getattr(self._owner, name, None)
         what = f"the parameter {name} of {self._task_name!r}"
         given = f"the parameter {name}={value!r} of {self._task_name!r}"
         if isinstance(value, Element):
@@ -167,13 +208,11 @@ class Parameters:
         kind, what = self.tables[name], f"the parameter {name} of {self._task_name!r}"
         element = tuple(getattr(kind.dtype, "_shape_", ()))
         whole = getattr(kind.dtype, "_wp_scalar_type_", kind.dtype) is wp.int32
-        field = _element_field(getattr(self._struct.cls, name, None))
+        field = _element_field(getattr(self._owner, name, None))
         value = self._indices(what, value, field)
         if isinstance(value, (str, Path)):
             what += f" from {str(value)!r}"
             value = _loaded(what, value)
-        if isinstance(value, HeightField):
-            value = value.table(self._model)
         try:
             given = value.detach().cpu() if hasattr(value, "detach") else value
             given = np.asarray(given.numpy() if isinstance(given, wp.array) else given, dtype=np.float64)
@@ -217,8 +256,8 @@ class Parameters:
 
     def _instance(self, world: int) -> Any:
         instance = self._struct()
-        for name, value in self.values.items():
-            kind = self._struct.vars[name].type
+        for name, variable in self._struct.vars.items():
+            kind, value = variable.type, self.values[name]
             if name in self.tables:
                 _, value = self._arrays[name]
             elif isinstance(value, np.ndarray):

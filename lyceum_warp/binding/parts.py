@@ -60,7 +60,7 @@ def layout(struct: Any, kind: str, params: Mapping[str, Any], owner: str) -> Lay
     slices, start = dict[str, Slice](), 0
     for name, part in parts_of(struct, owner).items():
         if part.kind == kind:
-            count = _length(f"the size of {owner}.{name}", part.size, params)
+            count = length(f"the size of {owner}.{name}", part.size, params)
             slices[name] = Slice(start, count, struct.vars[name].type.dtype)
             start += slices[name].size
     return slices
@@ -86,7 +86,12 @@ def _floats(dtype: Any) -> int:
     return int(np.prod(getattr(dtype, "_shape_", ()), dtype=int))
 
 
-def _length(what: str, size: int | str, params: Mapping[str, Any]) -> int:
+def length(what: str, size: int | str, params: Mapping[str, Any]) -> int:
+    """A size, which may be given as the name of a table in ``params`` with as many rows; ``what`` is for messages.
+
+    Raises:
+        ValueError: The size is not a positive number, or names no table.
+    """
     if not isinstance(size, str):
         return whole_number(what, size, low=1)
     table = params.get(size)

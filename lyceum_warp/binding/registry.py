@@ -1,6 +1,8 @@
 """Find tasks by name, by file or by class, and register those of users."""
 
+import ast
 import difflib
+import functools
 import importlib
 import importlib.util
 import io
@@ -48,8 +50,8 @@ def register(task: type[Task]) -> type[Task]:
         raise ValueError(f"@lw.register takes a subclass of lw.Task, not {name}: write class {name}(lw.Task)")
     name = task_name(task)
     known = _tasks.get(name)
-    if known is None and not task.__module__.startswith(_PACKAGE) and name in package_task_names():
-        owner = f"{_PACKAGE}{name}"
+    if known is None and not task.__module__.startswith(_PACKAGE) and name in _package_modules():
+        owner = _package_modules()[name]
     elif known is not None and not _may_replace(task, known):
         owner = f"{known.__module__}.{known.__qualname__}"
     else:
@@ -65,8 +67,33 @@ def _may_replace(task: type[Task], known: type[Task]) -> bool:
 
 def package_task_names() -> list[str]:
     """Names of the tasks that come with the package."""
-    package = importlib.import_module("lyceum_warp.tasks")
-    return [module.name for module in pkgutil.iter_modules(package.__path__)]
+    return list(_package_modules())
+
+
+@functools.cache
+def _package_modules() -> dict[str, str]:
+    """The modules of the package's tasks, by the tasks' names; none of them is imported.
+
+    A module has the task of its name. A folder, a family of tasks, declares which of its modules has which task.
+    """
+    found: dict[str, str] = {}
+    for folder in map(Path, importlib.import_module("lyceum_warp.tasks").__path__):
+        for module in pkgutil.iter_modules([str(folder)]):
+            if module.ispkg:
+                declared = _declared(folder / module.name / "__init__.py").items()
+                found |= {task: f"{_PACKAGE}{module.name}.{file}" for task, file in declared}
+            else:
+                found[module.name] = f"{_PACKAGE}{module.name}"
+    return found
+
+
+def _declared(file: Path) -> dict[str, str]:
+    """The dict ``TASKS`` in a file, which is not run: modules by the names of their tasks."""
+    for node in ast.parse(file.read_bytes()).body:
+        if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["TASKS"]:
+            declared: dict[str, str] = ast.literal_eval(node.value)
+            return declared
+    raise ValueError(f"{file} declares no TASKS")
 
 
 def _file(task: type[Task]) -> str | None:
@@ -117,8 +144,8 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
     path, _, attribute = task.partition(":")
     if path.endswith(".py"):
         return _task_of_file(Path(path), attribute)
-    if task not in _tasks and task in package_task_names():
-        importlib.import_module(f"lyceum_warp.tasks.{task}")
+    if task not in _tasks and (module := _package_modules().get(task)) is not None:
+        importlib.import_module(module)
     if task not in _tasks:
         close = difflib.get_close_matches(task, task_names(), 3)
         hint = f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(task_names())}"

@@ -71,7 +71,7 @@ class Probe:
         self._name, self._kernels, self._writes, self._params = task.name, task.kernels, task.writes, params
         self._layouts = task.obs_layouts
         self._memory: Mapping[str, Layout] = task.memory
-        self._metrics, self._device = list(task.task.metrics), device
+        self._metrics, self._device = list(task.metrics), device
         kernels, nu = task.kernels, task.model.nu
         self._world, self._fields = kernels.Batch(), {}
         written = frozenset[str]().union(*task.writes.values())
@@ -88,7 +88,7 @@ class Probe:
         self._ctrl, self._measured = self._rows((1, nu)), self._rows((1, len(self._metrics)))
         self._streams = self._rows((len(task.obs_layouts), 1), wp.uint32)
         with wp.ScopedDevice(self._device):
-            self._action = wp.zeros((1, sum((task.task.actions or {"": nu}).values())), dtype=float)
+            self._action = wp.zeros((1, sum((task.actions or {"": nu}).values())), dtype=float)
             self._yes, self._no = wp.full(1, True, dtype=bool), wp.full(1, False, dtype=bool)
             self._counters = steps.Counters()
             self._counters.step, self._counters.episode = wp.zeros(1, dtype=int), wp.zeros(1, dtype=int)

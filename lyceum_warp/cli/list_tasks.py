@@ -15,9 +15,10 @@ from lyceum_warp.binding.bound_task import obs_layouts, task_spec
 from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.models import compile_model, find_model
 from lyceum_warp.binding.parameters import defaults
+from lyceum_warp.binding.parts import length
 from lyceum_warp.binding.registry import find_task, task_names
 from lyceum_warp.cli.display import make_console
-from lyceum_warp.model_files import ModelFile, PackageFile
+from lyceum_warp.model_files import ModelFile
 from lyceum_warp.options import PhysicsOptions
 from lyceum_warp.task import Task
 
@@ -95,7 +96,8 @@ def _entry(name: str) -> _Entry:
     entry = _Entry(name)
     try:
         task = entry.task = find_task(name)
-        about = (inspect.getdoc(sys.modules[task.__module__]) or "").partition("\n")[0]
+        text = vars(task).get("__doc__") or inspect.getdoc(sys.modules[task.__module__]) or ""
+        about = text.partition("\n")[0]
         entry.about = (about.partition(": ")[2] or about).rstrip(".")
         entry.source = _source(task)
     except Exception as error:  # a broken task file may raise any error
@@ -110,9 +112,11 @@ def _cells(entry: _Entry) -> tuple[str, ...]:
         return (entry.name, *[_UNKNOWN] * 5, entry.source)
     obs = actions = timestep = _UNKNOWN
     try:
-        actions = _UNKNOWN if task.actions is None else str(sum(task.actions.values()))
         source = TaskSource(task, entry.name)
-        obs = str(sum(obs_layouts(source, defaults(source.params))["policy"].values()))
+        params = defaults(source.params, source.defaults)
+        if task.actions is not None:
+            actions = str(sum(length(f"the size of {name}", size, params) for name, size in task.actions.items()))
+        obs = str(sum(obs_layouts(source, params)["policy"].values()))
         spec = task_spec(task)
         actions = str(_controls(spec)) if task.actions is None else actions
         timestep = f"{spec.option.timestep * task.frame_skip:g} s"
@@ -136,7 +140,7 @@ def _source(task: type[Task]) -> str:
     found = model if isinstance(model, ModelFile) else find_model(model, task)
     if not isinstance(found, ModelFile):
         return found.name
-    extra = found.install.partition("[")[2].partition("]")[0] if isinstance(found, PackageFile) else ""
+    extra = getattr(found, "install", "").partition("[")[2].partition("]")[0]
     return f"{found.source} [{extra}]" if extra else f"{found.source}: {Path(found.file).name}"
 
 

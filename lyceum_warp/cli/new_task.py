@@ -6,7 +6,7 @@ import keyword
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import mujoco
 import tyro
@@ -15,6 +15,7 @@ from lyceum_warp.binding.models import compile_model
 from lyceum_warp.binding.registry import find_task, package_task_names, snake_case
 from lyceum_warp.cli.display import make_console
 from lyceum_warp.cli.task_text import literal, task_text
+from lyceum_warp.cli.velocity_text import Walker, velocity_text
 from lyceum_warp.model_files import ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, read_spec
 from lyceum_warp.options import PhysicsOptions
 from lyceum_warp.support.files import replaced
@@ -39,18 +40,32 @@ class New:
 
     $ lyceum-warp new walk --model robots/dog.xml
     $ lyceum-warp new tasks/hop.py --model gymnasium:hopper.xml
-    $ MENAGERIE_ROOT=~/mujoco_menagerie lyceum-warp new go1_walk --model menagerie:unitree_go1/scene.xml
+    $ lyceum-warp new go1_walk --model menagerie:unitree_go1/scene.xml
+    $ lyceum-warp new g1_walk --model menagerie:unitree_g1/scene_mjx.xml --template velocity
     """
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
     """The task's name in snake_case, to write TASK.py in the working directory; or a file, path/to/task.py."""
     model: Annotated[str, tyro.conf.arg(metavar="FILE")]
-    """An MJCF or URDF file; menagerie:ROBOT/FILE.xml, from the MuJoCo Menagerie checkout at the environment variable
-    MENAGERIE_ROOT; or gymnasium:FILE.xml or gymnasium_robotics:PATH, from these packages. A relative path is stored
-    relative to the task file."""
+    """An MJCF or URDF file; or menagerie:ROBOT/FILE.xml, of MuJoCo Menagerie (the extra "menagerie", the package
+    mujoco-menagerie, or a checkout to which MENAGERIE_ROOT points); or gymnasium:FILE.xml or gymnasium_robotics:PATH,
+    of these packages. A relative path is written relative to the task file."""
+
+    template: Literal["plain", "velocity"] = "plain"
+    """velocity: a task of the family of walking robots, which follow velocity commands. The robot needs a base that
+    moves freely, and legs of hinges with an actuator each. Its file is short, because functions, rewards and most
+    numbers are the family's."""
+    feet: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAMES")] = ()
+    """With --template velocity: sites, geoms or bodies that are feet. By default, the ends of the legs that reach
+    lowest."""
+    joints: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAMES")] = ()
+    """With --template velocity: joints that act. By default, all joints of the legs with an actuator; others keep their
+    pose."""
 
     def run(self) -> int:
-        """Run the command, and return the exit code."""
+        """Run the command; returns the exit code."""
+        if self.template == "plain" and (self.feet or self.joints):
+            raise ValueError("--feet and --joints belong to --template velocity")
         path = Path(self.task if self.task.endswith(".py") else f"{self.task}.py").expanduser()
         class_name = _class_name(path)
         if path.exists():
@@ -66,17 +81,29 @@ class New:
             raise ValueError(f"the model {self.model} has no actuators, so there is nothing to act on: add some to it")
         if model.nv == 0:
             raise ValueError(f"the model {self.model} has no joints, so nothing in it moves: add some to it")
-        _write(path, task_text(path.name, class_name, source, title, model))
-        task = find_task(path)
+        if self.template == "velocity":
+            walker = self._walker(spec)
+            _write(path, velocity_text(path.name, class_name, source, title, walker))
+            sizes = f"feet {', '.join(foot.name for foot in walker.feet)}; joints {', '.join(walker.joints)}"
+        else:
+            _write(path, task_text(path.name, class_name, source, title, model))
+            task = find_task(path)
+            sizes = (
+                f"{sum(task.obs.values())} observations, {model.nu} actions, "
+                f"{1000 * task.frame_skip * model.opt.timestep:.3g} ms in a step"
+            )
         console = make_console()
-        console.print(
-            f"{path}: {sum(task.obs.values())} observations, {model.nu} actions, "
-            f"{1000 * task.frame_skip * model.opt.timestep:.3g} ms in a step; check and train it with",
-            soft_wrap=True, markup=False,
-        )  # fmt: skip
+        console.print(f"{path}: {sizes}; check and train it with", soft_wrap=True, markup=False)
         for command in ("check", "train"):
-            console.print(f"  lyceum-warp {command} {path}", soft_wrap=True, markup=False)
+            algorithm = " --algorithm ppo" if (self.template, command) == ("velocity", "train") else ""
+            console.print(f"  lyceum-warp {command} {path}{algorithm}", soft_wrap=True, markup=False)
         return 0
+
+    def _walker(self, spec: mujoco.MjSpec) -> Walker:
+        try:
+            return Walker(spec, self.feet, self.joints)
+        except ValueError as error:
+            raise ValueError(f"{self.model}: {error}") from error
 
 
 def _class_name(path: Path) -> str:

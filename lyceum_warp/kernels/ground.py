@@ -51,6 +51,16 @@ def ground_normal(ground: wp.array2d[float], x: float, y: float) -> wp.vec3:
 
 
 @wp.func
+def ground_distance(ground: wp.array2d[float], point: wp.vec3) -> float:
+    """The distance of a point from the plane of the triangle below it, m; negative below the ground.
+
+    A sphere touches this triangle if the distance of its middle is at most its radius. Other triangles may be nearer.
+    """
+    t = _triangle(ground, point[0], point[1])
+    return (point[2] - t[0]) / wp.length(wp.vec3(t[1], t[2], 1.0))
+
+
+@wp.func
 def on_ground(ground: wp.array2d[float], x: float, y: float) -> bool:
     """Whether the field covers a point. A robot that leaves the field falls."""
     ny, nx = ground.shape[0] - 1, ground.shape[1] - 1

@@ -132,6 +132,9 @@ class TaskCode:
     copy_observations: wp.Function
     finite_memory: wp.Function
     valid_model: wp.Function  # whether the model fields that the task writes are valid
+    terms: Mapping[
+        str, wp.Function
+    ]  # ``reward``, ``score`` and ``terminated`` of a task with terms; see ``binding.terms``
     has_state: bool  # whether ``copy_state`` is needed
     has_memory: bool  # whether ``finite_memory`` is needed
     checks_model: bool  # whether ``valid_model`` is needed
@@ -269,7 +272,9 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
     reward, measure, evaluate, terminated, success = (
         task.functions[name] for name in ("reward", "measure", "evaluate", "terminated", "success")
     )
+    score, has_score = task.terms.get("score"), "score" in task.terms
     has_evaluate, has_measure = "evaluate" in task.written, "measure" in task.written
+    has_metrics = has_measure or has_score
     observe_group = task.observe_group
 
     @wp.func
@@ -294,6 +299,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         before: Batch,
         after: Batch,
         params: wp.array[Params],
+        weights_in: wp.array2d[float],
         action_in: wp.array2d[float],
         counters: Counters,
         transition: bool,
@@ -325,12 +331,19 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
                     if wp.static(has_evaluate):
                         found_out.eval[w] = evaluate(s1, p)
                 elif part == GAIN:
+                    if wp.static(has_score):
+                        for i in range(metrics_out.shape[1]):
+                            metrics_out[w, i] = 0.0
                     if transition:
-                        found_out.reward[w] = reward(view(before, w), action_in[w], s1, p)
+                        if wp.static(has_score):
+                            weights = weights_in[w % weights_in.shape[0]]
+                            found_out.reward[w] = score(view(before, w), action_in[w], s1, p, weights, metrics_out[w])
+                        else:
+                            found_out.reward[w] = reward(view(before, w), action_in[w], s1, p)
                         if not wp.isfinite(found_out.reward[w]):
                             found = REWARD
                 elif part == METRICS:
-                    if wp.static(has_measure):
+                    if wp.static(has_measure and not has_score):
                         for i in range(metrics_out.shape[1]):
                             metrics_out[w, i] = 0.0
                         if transition:
@@ -383,7 +396,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
             copy_observations(final_obs_inout, obs_out, w, lane, lanes)
         else:
             copy_observations(obs_out, final_obs_inout, w, lane, lanes)
-        if wp.static(has_measure):
+        if wp.static(has_metrics):
             for i in range(lane, out.metrics.shape[1], lanes):
                 if fault != 0 or not transition:
                     out.metrics[w, i] = 0.0
@@ -592,12 +605,14 @@ def rollout_kernels(task: TaskCode) -> RolloutKernels:
     Batch, Params = task.Batch, task.Params  # noqa: N806
     view = task.view
     reward, terminated, advance = (task.functions[name] for name in ("reward", "terminated", "advance"))
+    sum_of_terms, has_terms = task.terms.get("reward"), "reward" in task.terms
 
     @task.kernel()
     def judge_rows(
         before: Batch,
         after: Batch,
         params: wp.array[Params],
+        weights_in: wp.array2d[float],
         action_in: wp.array2d[float],
         reward_out: wp.array[float],
         terminated_out: wp.array[bool],
@@ -607,7 +622,11 @@ def rollout_kernels(task: TaskCode) -> RolloutKernels:
         row = first + wp.tid()
         p = params[row % params.shape[0]]
         s1 = view(after, row)
-        reward_out[row] = reward(view(before, row), action_in[row], s1, p)
+        if wp.static(has_terms):
+            weights = weights_in[row % weights_in.shape[0]]
+            reward_out[row] = sum_of_terms(view(before, row), action_in[row], s1, p, weights)
+        else:
+            reward_out[row] = reward(view(before, row), action_in[row], s1, p)
         terminated_out[row] = terminated(s1, p)
 
     @task.kernel_for("advance")
@@ -699,6 +718,8 @@ class Kernels(ActKernels, JudgeKernels, BeginKernels, RolloutKernels, SharedKern
     views: Mapping[Any, wp.Function]
     """By the task's structs, the functions that make them: World of a batch and a world's index, and the structs of
     observations of a row."""
+    terms: Mapping[str, wp.Function]
+    """The generated functions of a task with terms: ``reward``, ``score`` and ``terminated``."""
     Batch: Any
     Observations: Any
 
@@ -707,4 +728,4 @@ def make_kernels(task: TaskCode) -> Kernels:
     """Make all kernels of a task."""
     parts = (make(task) for make in (act_kernels, judge_kernels, begin_kernels, rollout_kernels, shared_kernels))
     kernels = {name: kernel for part in parts for name, kernel in vars(part).items()}
-    return Kernels(**kernels, views=task.views, Batch=task.Batch, Observations=task.Observations)
+    return Kernels(**kernels, views=task.views, terms=task.terms, Batch=task.Batch, Observations=task.Observations)

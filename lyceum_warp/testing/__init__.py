@@ -24,6 +24,7 @@ from lyceum_warp.testing import physics_rules as physics
 from lyceum_warp.testing import reset_rules as resets
 from lyceum_warp.testing import state_rules as state
 from lyceum_warp.testing.context import OUTCOMES, Context
+from lyceum_warp.testing.unused import unused
 
 log = logging.getLogger(__name__)
 
@@ -51,10 +52,13 @@ class Report:
     """Number of worlds."""
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     """Duration of each check, by the name of its rule."""
+    unused: list[str] = dataclasses.field(default_factory=list)
+    """Parts of the task without use: functions that nothing calls, and memory that nothing reads."""
 
     def __str__(self) -> str:
         head = f"{self.task} on the {self.engine} engine ({self.device}, {self.nworld} worlds) keeps the rules:"
-        return "\n".join([head, *(f"  {name:<20} {value:6.2f} s" for name, value in self.seconds.items())])
+        rules = (f"  {name:<20} {value:6.2f} s" for name, value in self.seconds.items())
+        return "\n".join([head, *rules, *(f"unused: {line}" for line in self.unused)])
 
 
 def check_task(
@@ -102,7 +106,7 @@ def check_task(
 
     a = make()
     ctx = Context(a, make(), make, steps, seed, a.task.name, a.engine.name)
-    report = Report(ctx.task, ctx.engine, a.device.alias, nworld)
+    report = Report(ctx.task, ctx.engine, a.device.alias, nworld, unused=unused(a.task))
     broken = []
     for check in checks:
         ctx.rule = check.__name__.removeprefix("check_")

@@ -45,6 +45,7 @@ class _Run:
         self.ctx, self.env, self.worlds = ctx, ctx.a, ctx.a.worlds
         task = self.env.task
         self.functions = {name: function for name, function in task.functions.items() if function is not None}
+        self.functions |= {name: function for name, function in task.kernels.terms.items() if name != "reward"}
         self.functions |= {observer_name(group): function for group, function in task.observers.items()}
         try:
             self.checked: CheckedFunctions = checked_functions(
@@ -56,7 +57,7 @@ class _Run:
         self.keep: list[wp.array] = []
         self.before, self.after, self.start = (self._batch() for _ in range(3))
         self.rng = np.random.default_rng(ctx.seed)
-        n, nact, nmetrics = self.env.nworld, self.worlds.action_space.size, len(task.task.metrics)
+        n, nact, nmetrics = self.env.nworld, self.worlds.action_space.size, len(task.metrics)
         sizes = {"action": nact, "ctrl": task.model.nu, "metrics": nmetrics}
         self.rows = {name: self._array((n, size), wp.float32) for name, size in sizes.items()}
         self.obs = {
@@ -143,10 +144,13 @@ class _Run:
         draws = self.rng.integers(0, 2**32, (self.env.nworld, 1), dtype=np.uint32)
         self.rows["rng"].assign(draws)
         values = {"s": state, "s0": self.before, "s1": state, "p": self.worlds.params} | self.rows
+        values["weights"] = self.worlds.weights
         if name in self.obs:
             values["obs"] = self.obs[name]
-        names = FUNCTIONS["observe" if name in self.obs else name].argument_names
-        given = [values[argument] for argument in names[: len(self.functions[name].input_types)]]
+        types = self.functions[name].input_types
+        form = FUNCTIONS.get("observe" if name in self.obs else name)
+        names = form.argument_names[: len(types)] if form else types  # of a generated function
+        given = [values[argument] for argument in names]
         kernel = self.checked.kernels[name]
         wp.launch(kernel, self.env.nworld, [self.report, *given], device=self.env.device)
 

@@ -50,7 +50,7 @@ def model() -> mujoco.MjModel:
 
 
 def parameters(model: mujoco.MjModel, struct: Any = Params, nworld: int = 2, **given: Any) -> Parameters:
-    return Parameters(struct, "arm", model, nworld=nworld, timestep=0.02, given=given)
+    return Parameters(struct, struct.cls, "arm", model, nworld=nworld, timestep=0.02, given=given)
 
 
 def test_defaults_come_from_the_struct_and_dt_from_the_timestep(model: mujoco.MjModel) -> None:
@@ -291,3 +291,36 @@ def test_check_task_finds_a_read_out_of_a_table(task_file: Any, found: str, engi
 
 def test_check_task_accepts_reads_within_a_table() -> None:
     check_task(Follow, steps=12)
+
+
+# parameters computed from the model
+
+
+@wp.struct
+class Computed:
+    dt: float
+    tip: int = lw.site("tip")
+    body: int = lw.from_model(lambda model, p: model.site_bodyid[p.tip])
+    masses: wp.array[float] = lw.from_model(lambda model, p: model.body_mass[1 : p.body + 1])
+
+
+def test_parameters_are_computed_from_the_model_and_from_earlier_parameters(model: mujoco.MjModel) -> None:
+    found = parameters(model, Computed)
+    assert found.values["body"] == 2
+    np.testing.assert_allclose(found.values["masses"], model.body_mass[1:3], rtol=1e-6)
+    assert found.changed({"tip": 0}).values["masses"] is found.values["masses"], "a table may be on a device already"
+    other = found.changed({"body": 1})
+    assert len(other.values["masses"]) == 1 and len(found.values["masses"]) == 2
+    assert other.changed({"tip": 0}).values["body"] == 1, "a value that was given is not computed again"
+
+
+@wp.struct
+class Uncomputable:
+    dt: float
+    body: int = lw.from_model(lambda model, p: model.body_mas[0])
+
+
+def test_a_parameter_that_cannot_be_computed_is_named(model: mujoco.MjModel) -> None:
+    with pytest.raises(ValueError, match="parameter body of 'arm' can't be computed from .*: Attri.* 'body_mas'"):
+        parameters(model, Uncomputable)
+    assert parameters(model, Uncomputable, body=1).values["body"] == 1

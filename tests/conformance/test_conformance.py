@@ -10,6 +10,7 @@ from lyceum_warp.testing import CHECKS, check_task
 from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import state_rules as state
 from lyceum_warp.testing.episode_rules import check_memory
+from lyceum_warp.testing.physics_rules import check_dynamics
 
 EVERY_RULE = ("hopper", "humanoid", "adroit_pen", "soft_ball")
 """Tasks for which all rules are checked on both engines; together they use most features of models."""
@@ -55,6 +56,9 @@ def test_a_task_keeps_the_rules(task: str, engine: str) -> None:
 def test_a_task_keeps_the_other_rules(task: str, engine: str) -> None:
     done = OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
     checks = [check for check in CHECKS if check not in done]
+    if engine == "warp" and "rough" in task:
+        # the rule compares with the C engine, which makes more contacts with a height field
+        checks.remove(check_dynamics)
     check_task(task, engine=engine, checks=checks, **options(task, engine))
 
 

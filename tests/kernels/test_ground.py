@@ -6,7 +6,7 @@ import pytest
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp.terrain import HeightField
+from lyceum_warp.terrain import height_table
 
 NROW, NCOL, SIZE = 6, 9, (2.0, 1.25, 0.8, 0.3)
 OFFSET = (0.5, -0.25, 0.125)
@@ -24,7 +24,7 @@ def model() -> mujoco.MjModel:
 
 @pytest.fixture(scope="module")
 def ground(model: mujoco.MjModel) -> wp.array:
-    return wp.array(HeightField("field").table(model), dtype=float, device="cpu")
+    return wp.array(height_table(model, "field"), dtype=float, device="cpu")
 
 
 def ray_heights(model: mujoco.MjModel, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -47,11 +47,12 @@ def look_up(ground: wp.array2d[float], points: wp.array[wp.vec2], out: wp.array2
     out[i, 0] = lw.ground_height(ground, x, y)
     lw.put(out[i], 1, lw.ground_normal(ground, x, y))
     lw.put(out[i], 4, lw.on_ground(ground, x, y))
+    out[i, 5] = lw.ground_distance(ground, wp.vec3(x, y, 2.0))
 
 
 def looked_up(ground: wp.array, points: np.ndarray) -> np.ndarray:
-    """Height, normal and whether the field covers the point, (n, 5)."""
-    out = wp.zeros((len(points), 5), dtype=float, device="cpu")
+    """Height, normal, whether the field covers the point, and distance of the point 2 m above 0, (n, 6)."""
+    out = wp.zeros((len(points), 6), dtype=float, device="cpu")
     wp.launch(look_up, len(points), [ground, wp.array(points, dtype=wp.vec2, device="cpu"), out], device="cpu")
     found: np.ndarray = out.numpy()
     return found
@@ -77,6 +78,7 @@ def test_heights_and_normals_in_both_triangles_of_every_cell_are_those_of_rays(
     found = looked_up(ground, points)
     np.testing.assert_allclose(found[:, 0], heights, atol=1e-6)
     np.testing.assert_allclose(found[:, 1:4], normals, atol=1e-5)
+    np.testing.assert_allclose(found[:, 5], (2.0 - heights) * normals[:, 2], atol=1e-5)
     assert found[:, 4].all()
 
 

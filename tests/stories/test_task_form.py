@@ -451,7 +451,8 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     ),
     "metrics as a number": ([line("metrics = 5")], r"metrics of the task 'tiny' must be names, .*, not 5"),
     "a comma in a metric's name": (
-        [line('metrics = ("a,b",)')], "the task 'tiny' has the metric 'a,b': .* no comma, quote or line break",
+        [line('metrics = ("a,b",)'), function(f"def measure({STEP}, metrics: Row[float]):\n    metrics[0] = 1.0")],
+        "the task 'tiny' has the metric 'a,b': .* no comma, quote or line break",
     ),
     "a metric's name twice": (
         [line('metrics = ("a", "b", "a")'),
@@ -459,7 +460,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
         "the task 'tiny' names the metric 'a' twice: give each one name",
     ),
     "metrics without measure": (
-        [line('metrics = ("a",)')], r"needs both metrics = \(\.\.\.\) in its class and measure",
+        [line('metrics = ("a",)')], "metrics of the task 'tiny' has 'a', but there is no such function: .* measure",
     ),
     "a keyframe that is not there": ([line('keyframe = "home"')], "'home'"),
     "a keyframe by its number": (

@@ -76,7 +76,7 @@ MISTAKES: dict[str, tuple[tuple[str, str], str]] = {
     "a function of another file": (
         (OWN_WORLD, "from other_rewards import World, reward\n"),
         r"reward of the task 'tiny' takes the Params of .*other_rewards\.py, but the task has the Params of .*tiny\.py"
-        ": import both structs from one module, or write reward for the task's own",
+        r": import both structs from one module, extend the first by @wp\.struct class Params\(module\.Params\), or",
     ),
     "a function of another file with its own structs": (
         ("class Tiny", "from other_rewards import reward\n\nclass Tiny"),

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.tasks import go1_velocity
+from lyceum_warp.tasks.velocity import go1
 
-GO1 = str(Path(go1_velocity.__file__).with_name("go1.xml"))
+GO1 = str(Path(go1.__file__).with_name("go1.xml"))
 DT, SUBSTEP = 0.02, 0.005
 LEGS = ("FR", "FL", "RR", "RL")
 HOME = np.array([0.1, 0.9, -1.8, -0.1, 0.9, -1.8] * 2)

@@ -1,0 +1,280 @@
+"""Find a task's terms and their arguments by name, and generate the functions that compute them.
+
+A term is a function of values, and its arguments are found by their names, as pytest finds fixtures: the state and the
+action, the result of another function of that name, a parameter, or a field. The generated text calls each function
+once, so that terms share its result.
+"""
+
+import difflib
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import warp as wp
+
+from lyceum_warp.binding.sources import FunctionSource, is_struct, overloads, run_source
+from lyceum_warp.task import Row, Task
+
+_STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
+"""The names that stand for the transition in a term of the reward or in a metric, with their names in the text."""
+
+_STATE = {"s": "s", "s1": "s", "p": "p"}
+"""The same in a termination, which sees one state."""
+
+_OWN = ("weights", "metrics", "total")
+"""Further names of the generated text."""
+
+_HEAD = "s0: World, action: Row[float], s1: World, p: Params, weights: Row[float]"
+
+
+class Terms:
+    """The terms of a task: ``rewards``, ``terminations`` and metrics without ``measure``.
+
+    Args:
+        task: The task's class.
+        name: Its name, for messages.
+        lookup: Finds a function by its name in the task's class, its module, and those of its base classes.
+        written: The task's functions by their names in the table; None for those that it lacks.
+        world: The task's World.
+        params: The task's Params.
+
+    Raises:
+        ValueError: A term, or one of its arguments, cannot be found or has another type.
+    """
+
+    def __init__(
+        self,
+        task: type[Task],
+        name: str,
+        lookup: Callable[[str], wp.Function | None],
+        written: Mapping[str, wp.Function | None],
+        world: Any,
+        params: Any,
+    ) -> None:
+        self._name, self.lookup, self._world, self._params = name, lookup, world, params
+        self.weights = self._checked_weights(task.rewards)
+        """The weights of the terms of the reward, by name."""
+        self.terminations = self._names("terminations", task.terminations)
+        self._reward, self._measure = written["reward"], written["measure"]
+        functions = self._names("metrics", task.metrics, written=self._measure is not None)
+        for attribute, kind in (("rewards", "reward"), ("rewards", "measure"), ("terminations", "terminated")):
+            if getattr(task, attribute) and written[kind]:
+                raise ValueError(f"the task {name!r} has {attribute} and a function {kind}: leave one of them out")
+        self.functions: dict[str, wp.Function] = {}
+        """The functions that the text calls, by name."""
+        self.text = ""
+        """The source of the generated functions; empty if the task has no terms."""
+        self.metrics = (*self.weights, *task.metrics, *self.terminations)
+        """The names of all metrics, in order."""
+        if self.weights or self.terminations or functions:
+            self.text = self._written_text(functions, len(task.metrics) - len(functions))
+
+    def generated(self, file: str) -> dict[str, wp.Function]:
+        """The generated functions: ``reward``, ``score`` and ``terminated``, without those that the task writes.
+
+        ``reward`` is that of a transition under weights; ``score`` also writes the metrics. ``file`` names the text.
+        """
+        if not self.text:
+            return {}
+        scope: dict[str, Any] = {"wp": wp, "Row": Row, "World": self._world, "Params": self._params}
+        scope |= {"__name__": f"lyceum_warp.generated.terms.{self._name}", **self.functions}
+        scope |= {"reward": self._reward, "measure": self._measure}
+        run_source(self.text, file, scope)
+        made = {"reward": bool(self.weights), "score": True, "terminated": bool(self.terminations)}
+        return {name: scope[name] for name, own in made.items() if own}
+
+    def _checked_weights(self, rewards: Any) -> dict[str, float]:
+        if not isinstance(rewards, Mapping):
+            raise ValueError(
+                f"rewards of the task {self._name!r} must be a dict of names and weights, such as {{'upright': 1.0}}, "
+                f"not {rewards!r}"
+            )
+        for term, weight in rewards.items():
+            if not isinstance(weight, int | float) or not math.isfinite(weight):
+                raise ValueError(f"the weight of {term!r} of the task {self._name!r} must be a number, not {weight!r}")
+        self._names("rewards", tuple(rewards))
+        if rewards and "dt" not in self._params.vars:
+            raise ValueError(f"rewards of the task {self._name!r} are per second: add dt: float to its Params")
+        if taken := [term for term in rewards if term in self._params.vars]:
+            raise ValueError(
+                f"the task {self._name!r} has a term and a parameter named {taken[0]!r}: set_params could not tell the "
+                "weight of the term from the parameter, so rename one"
+            )
+        return {term: float(weight) for term, weight in rewards.items()}
+
+    def _names(self, attribute: str, names: Any, *, written: bool = False) -> tuple[str, ...]:
+        """The functions that an attribute of the task names; none if the task has written the function for them."""
+        if not isinstance(names, tuple | list) or not all(isinstance(name, str) and name for name in names):
+            raise ValueError(
+                f"{attribute} of the task {self._name!r} must be names, such as ('forward', 'cost'), not {names!r}"
+            )
+        for name in () if written else names:
+            if self.lookup(name) is None:
+                more = ", or write measure" if attribute == "metrics" else ""
+                raise ValueError(
+                    f"{attribute} of the task {self._name!r} has {name!r}, but there is no such function: write it as "
+                    f"a @wp.func in the task's file, or import it there{more}"
+                )
+        return () if written else tuple(names)
+
+    # text
+
+    def _written_text(self, metrics: tuple[str, ...], first: int) -> str:
+        """The text; ``first`` is the number of metrics that ``measure`` writes."""
+        parts = []
+        if self.weights:
+            body = _Body(self, _STEP)
+            total = self._total(body, {term: f"weights[{i}] * {body.value(term, float)}" for i, term in
+                                       enumerate(self.weights)})  # fmt: skip
+            parts.append(body.function(f"reward({_HEAD}) -> float", [*total, "return p.dt * total"]))
+        body = _Body(self, _STEP)
+        lines = ["measure(s0, action, s1, p, metrics)"] if self._measure else []
+        found = {f"metrics[{i}]": f"weights[{i}] * {body.value(term, float)}" for i, term in enumerate(self.weights)}
+        lines += [f"{place} = p.dt * {value}" for place, value in found.items()]
+        start = len(self.weights) + first
+        for i, metric in enumerate(metrics, start):
+            lines.append(f"metrics[{i}] = {body.number(metric)}")
+        for i, termination in enumerate(self.terminations, start + len(metrics)):
+            lines.append(f"metrics[{i}] = {body.number(termination)}")
+        if self.weights:
+            lines += [*self._total(body, found), "return p.dt * total"]
+        else:
+            lines.append("return reward(s0, action, s1, p)" if self._reward else "return 0.0")
+        parts.append(body.function(f"score({_HEAD}, metrics: Row[float]) -> float", lines))
+        if self.terminations:
+            body = _Body(self, _STATE)
+            ends = " or ".join(body.value(termination, bool) for termination in self.terminations)
+            parts.append(body.function("terminated(s: World, p: Params) -> bool", [f"return {ends}"]))
+        return "\n\n".join(parts)
+
+    def _total(self, body: "_Body", values: Mapping[str, str]) -> list[str]:
+        first, *others = values.values()
+        return [f"total = {first}", *(f"total += {value}" for value in others)]
+
+    # names
+
+    def choose(self, name: str, given: Mapping[str, str], within: tuple[str, ...] = ()) -> tuple[wp.Function, Any]:
+        """The overload of a function whose arguments can be found, and the type of its result.
+
+        Args:
+            name: The function's name.
+            given: The names that stand for states, the action and parameters.
+            within: The names of the functions that ask for it.
+        """
+        if name in within:
+            raise ValueError(f"terms of the task {self._name!r} need each other: {' needs '.join((*within, name))}")
+        function = self.lookup(name)
+        assert function is not None
+        refused = None
+        for overload in overloads(function):
+            try:
+                for argument in overload.input_types:
+                    self.source_of(overload, argument, given, (*within, name))
+            except ValueError as error:
+                refused = refused or error
+            else:
+                return overload, self._result(overload)
+        assert refused is not None
+        raise refused
+
+    def source_of(
+        self, function: wp.Function, name: str, given: Mapping[str, str], within: tuple[str, ...]
+    ) -> tuple[Literal["expression", "function", "default"], str]:
+        """The source of an argument: an expression, the result of a function by its name, or the argument's default."""
+        source: Literal["expression", "function"] = "expression"
+        if name in given:
+            text = given[name]
+            kind: Any = {"p": self._params, "action": Row[float]}.get(name, self._world)
+        elif name not in _OWN and self.lookup(name) is not None:
+            source, text, kind = "function", name, self.choose(name, given, within)[1]
+        elif name in self._params.vars:
+            text, kind = f"p.{name}", self._params.vars[name].type
+        elif name in self._world.vars:
+            text, kind = f"{given['s']}.{name}", self._world.vars[name].type
+        elif name in function.defaults:
+            return "default", name
+        else:
+            raise ValueError(self._unknown(function, name, given))
+        if not _fits(expected := function.input_types[name], kind):
+            raise ValueError(
+                f"{self._place(function)} takes {name} as {_spelled(expected)}, but {text} is {_spelled(kind)}"
+            )
+        return source, text
+
+    def _unknown(self, function: wp.Function, name: str, given: Mapping[str, str]) -> str:
+        place = self._place(function)
+        if name in _STEP:
+            return f"{place} takes {name}, but a termination sees the state only: it may take s and p"
+        if name in _OWN:
+            return f"{place} takes {name}, which is a name of the generated text: rename it"
+        known = [*given, *self._params.vars, *self._world.vars, *FunctionSource(function).scope]
+        close = [other for other in difflib.get_close_matches(name, known, 1) if other != name]
+        hint = f": did you mean {close[0]}?" if close else ""
+        return f"{place} takes {name}, which is not a function of the task, a parameter or a field of World{hint}"
+
+    def _result(self, function: wp.Function) -> Any:
+        kind = function.adj.arg_types.get("return")
+        if kind is None:
+            raise ValueError(f"{self._place(function)} has no type for its result: add one, as -> float")
+        return kind
+
+    def _place(self, function: wp.Function) -> str:
+        source = FunctionSource(function)
+        return f"{source.name} of the task {self._name!r} ({source.place(source.tree)})"
+
+    def check_result(self, function: wp.Function, kind: Any, wanted: tuple[type, ...]) -> None:
+        """Refuse a result of another type."""
+        if not any(_fits(one, kind) for one in wanted):
+            raise ValueError(
+                f"{self._place(function)} returns {_spelled(kind)}, but must return "
+                f"{' or '.join(one.__name__ for one in wanted)}"
+            )
+
+
+class _Body:
+    """The lines of one generated function, which call each function once."""
+
+    def __init__(self, terms: Terms, given: Mapping[str, str]) -> None:
+        self._terms, self._given = terms, given
+        self._lines: list[str] = []
+        self._values: dict[str, tuple[wp.Function, Any]] = {}
+
+    def value(self, name: str, *wanted: type) -> str:
+        """The variable with the result of a function of the task, which must be one of the wanted types, if any."""
+        if name not in self._values:
+            function, kind = self._terms.choose(name, self._given)
+            arguments, named = [], False
+            for argument in function.input_types:
+                source, text = self._terms.source_of(function, argument, self._given, (name,))
+                text = self.value(text) if source == "function" else text
+                if source == "default":
+                    named = True  # so that the arguments behind it are passed by name
+                else:
+                    arguments.append(f"{argument}={text}" if named else text)
+            self._lines.append(f"{name}_ = {name}({', '.join(arguments)})")
+            self._values[name] = function, kind
+            found = self._terms.lookup(name)
+            assert found is not None
+            self._terms.functions[name] = found
+        if wanted:
+            self._terms.check_result(*self._values[name], wanted)
+        return f"{name}_"
+
+    def number(self, name: str) -> str:
+        """The same as a float; a bool counts as 0 or 1."""
+        value = self.value(name, float, bool)
+        return f"wp.where({value}, 1.0, 0.0)" if _fits(bool, self._values[name][1]) else value
+
+    def function(self, signature: str, lines: list[str]) -> str:
+        """The text of the function, whose last lines are given."""
+        return f"@wp.func\ndef {signature}:\n" + "\n".join(f"    {line}" for line in (*self._lines, *lines)) + "\n"
+
+
+def _fits(expected: Any, given: Any) -> bool:
+    if is_struct(expected) or is_struct(given):
+        return expected is given or expected is Any
+    return "Any" in wp.types.type_repr(expected) or bool(wp.types.types_equal(expected, given))
+
+
+def _spelled(kind: Any) -> str:
+    return str(kind.key) if is_struct(kind) else str(wp.types.type_repr(kind))

@@ -1,0 +1,175 @@
+"""Copy the functions of a task's family, so that a variant runs them over structs and with functions of its own.
+
+Warp compiles a function for the structs that it names. If a variant extends the World of its parent, the parent's
+functions are copied with the variant's World in its place, and calls of a function that the variant replaces go to the
+variant's. A copy has the source of its original: messages name the original's file and line.
+"""
+
+import sys
+import types
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import warp as wp
+
+from lyceum_warp.binding.sources import has_source, is_struct, name_of, overloads
+from lyceum_warp.task import Task
+
+
+class Variant:
+    """The functions and structs of a family as one task sees them.
+
+    Args:
+        modules: The modules of the family, that of the task first.
+        functions: Their functions with sources.
+        structs: By a struct, the one that takes its place.
+        replaced: By a function, the one that is called in its place.
+    """
+
+    def __init__(
+        self,
+        modules: Sequence[types.ModuleType],
+        functions: Sequence[wp.Function],
+        structs: Mapping[Any, Any],
+        replaced: Mapping[wp.Function, wp.Function],
+    ) -> None:
+        self._modules, self._structs, self._replaced = {m.__name__: m for m in modules}, structs, replaced
+        self._copies: dict[wp.Function, wp.Function] = {}
+        # Warp evaluates wp.static(...) when a function is defined, which needs the structs
+        scopes = {module.__name__: self._with_structs(vars(module)) for module in modules}
+        homes = {name: wp.Module(name, None) for name in scopes}
+        for function in functions:
+            home = _home(function)
+            self._copies[function] = self._copy(function, scopes[home], homes[home])
+        for name, scope in scopes.items():
+            scope |= {key: self.seen(value, name) for key, value in scope.items()}
+
+    def seen(self, value: Any, viewer: str = "") -> Any:
+        """The value that takes the place of a function, a struct or a module of the family.
+
+        ``viewer`` is the name of the module that uses the value. The module with a replacement still sees the function
+        that it replaces, so that the new one may call the old one.
+        """
+        if isinstance(value, wp.Function):
+            while (other := self._replaced.get(value)) is not None and _home(other) != viewer:
+                value = other
+            return self._copies.get(value, value)
+        if is_struct(value):
+            return self._structs.get(value, value)
+        if isinstance(value, types.ModuleType) and viewer and self._modules.get(value.__name__) is value:
+            proxy = types.ModuleType(value.__name__)
+            vars(proxy).update({name: self.seen(v, viewer) for name, v in vars(value).items()
+                                if not isinstance(v, types.ModuleType)})  # fmt: skip
+            return proxy
+        return value
+
+    def _with_structs(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: self._structs.get(value, value) if is_struct(value) else value for name, value in values.items()}
+
+    def _copy(self, function: wp.Function, scope: dict[str, Any], home: wp.Module) -> wp.Function:
+        first: wp.Function | None = None
+        for overload in overloads(function):
+            own: Any = overload.func
+            copy = types.FunctionType(own.__code__, scope, own.__name__, own.__defaults__, own.__closure__)
+            copy.__annotations__ = self._with_structs(own.__annotations__)
+            copy.__module__, copy.__qualname__, copy.__doc__ = own.__module__, own.__qualname__, own.__doc__
+            made: Any = wp.func(module=home)(copy)
+            if first is None:
+                first = made
+            else:
+                first.add_overload(made)
+        assert first is not None
+        return first
+
+
+_made: dict[Any, Variant] = {}
+
+
+def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any, own: Any) -> Variant | None:
+    """The variant that a task is of its family; None if it has its parents' structs and replaces no function.
+
+    Tasks with the same structs and replacements share it, and with it their compiled kernels.
+
+    Args:
+        task: The task's name, for messages.
+        owners: Its class and its base classes, without ``Task``.
+        world: Its World.
+        params: Its Params, which its functions take.
+        own: The struct with the defaults of its Params, which may be another one with the same fields.
+
+    Raises:
+        ValueError: A function replaces one that takes other arguments.
+    """
+    modules = list(dict.fromkeys(sys.modules[owner.__module__] for owner in owners))
+    values = [list(_values(module, owners)) for module in modules]
+    structs = {own: params} if own is not params else {}
+    for i, parents in enumerate(values):
+        for parent in filter(is_struct, parents):
+            if parent in (world, params, own):
+                continue
+            new = [world, params, *(v for own in values[:i] for v in own if is_struct(v) and v.key == parent.key)]
+            if extended := [struct for struct in new if struct is not parent and issubclass(struct.cls, parent.cls)]:
+                structs[parent] = extended[0]
+    replaced = {
+        value.replaces: value
+        for own in reversed(values)
+        for value in own
+        if isinstance(value, wp.Function) and hasattr(value, "replaces")
+    }
+    named = {*structs, *structs.values(), world, params}
+    for module in modules:  # the list grows
+        for value in _values(module, owners):
+            home = sys.modules.get(_home(value)) if isinstance(value, wp.Function) else value
+            if isinstance(home, types.ModuleType) and home not in modules and _names(home, named):
+                modules.append(home)
+    found = dict.fromkeys(v for module in modules for v in _values(module, owners) if isinstance(v, wp.Function))
+    functions = [f for f in found if has_source(f) and sys.modules.get(_home(f)) in modules]
+    taken = {kind for f in functions for overload in overloads(f) for kind in overload.input_types.values()
+             if is_struct(kind)}  # fmt: skip
+    structs = {struct: new for struct, new in structs.items() if struct in taken}
+    if not structs and not replaced:  # such as a robot that gives other defaults only
+        return None
+    key = (tuple(modules), tuple(functions), tuple(structs.items()), tuple(replaced.items()))
+    if key not in _made:
+        made = _made[key] = Variant(modules, functions, structs, replaced)
+        for before, after in replaced.items():
+            _check_replacement(task, made, before, after)
+    return _made[key]
+
+
+def _home(function: wp.Function) -> str:
+    """The name of the module that defines a function."""
+    return str(function.func.__module__) if function.func is not None else ""
+
+
+def _values(module: types.ModuleType, owners: Sequence[type[Task]]) -> Iterator[Any]:
+    """The values of a module, also as they were when its tasks were defined, and of these tasks' classes."""
+    for owner in owners:
+        if owner.__module__ == module.__name__:
+            own = (value.__func__ if isinstance(value, staticmethod) else value for value in vars(owner).values())
+            yield from own
+            yield from owner.scope.values()
+    yield from list(vars(module).values())
+
+
+def _names(module: types.ModuleType, structs: set[Any]) -> bool:
+    """Whether a function that a module defines takes one of the structs."""
+    return any(
+        isinstance(value, wp.Function) and _home(value) == module.__name__
+        and any(is_struct(kind) and kind in structs for f in overloads(value) for kind in f.input_types.values())
+        for value in vars(module).values()
+    )  # fmt: skip
+
+
+def _check_replacement(task: str, made: Variant, old: wp.Function, new: wp.Function) -> None:
+    """Refuse a replacement that takes other arguments than the function in whose place it is called."""
+    wanted, given = (list(made.seen(f, _home(new)).input_types.values()) for f in (old, new))
+    same = len(wanted) == len(given) and all(
+        a is b if is_struct(a) or is_struct(b) else wp.types.types_equal(a, b)
+        for a, b in zip(wanted, given, strict=True)
+    )
+    if not same:
+        raise ValueError(
+            f"{name_of(new)} of the task {task!r} replaces {name_of(old)} of {_home(old)}, so it must take the same "
+            f"arguments: {', '.join(old.input_types)}"
+        )

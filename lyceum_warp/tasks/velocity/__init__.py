@@ -1,0 +1,13 @@
+"""Walk at a commanded velocity: a family of tasks with one robot in each module."""
+
+TASKS = {
+    "go1_velocity": "go1",
+    "go1_rough_velocity": "go1_rough",
+    "spot_velocity": "spot",
+    "g1_velocity": "g1",
+    "g1_full_velocity": "g1",
+    "g1_rough_velocity": "g1_rough",
+    "h1_velocity": "h1",
+    "t1_velocity": "t1",
+}
+"""The modules of the tasks, by the tasks' names; the registry reads them without running this file."""

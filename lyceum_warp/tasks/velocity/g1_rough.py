@@ -1,0 +1,23 @@
+"""G1RoughVelocity: a Unitree G1 walks at a commanded velocity on rough ground, and scans it."""
+
+import mujoco
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import walkers
+from lyceum_warp.tasks.velocity import g1, rough
+
+
+@wp.struct
+class Params(rough.Params, g1.Params):
+    pass
+
+
+@lw.register
+class G1RoughVelocity(rough.Rough, g1.G1Velocity):
+    @staticmethod
+    def edit_model(spec: mujoco.MjSpec) -> None:
+        """Replace the floor by the terrain, and the soles by capsules."""
+        g1.G1Velocity.edit_model(spec)
+        walkers.round_feet(spec, g1.FEET)
+        rough.TERRAIN.add_to(spec)

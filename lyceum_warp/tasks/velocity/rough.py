@@ -1,0 +1,112 @@
+"""Add rough ground to velocity tasks: patches by level, a height scan in both groups, and levels by distance walked.
+
+The kinds of patches and their columns are those of Isaac Lab's rough terrain, the scan is that of legged_gym.
+"""
+
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row, terms
+from lyceum_warp.tasks.velocity import walking
+
+TERRAIN = lw.Terrain(
+    {"stairs_up": 4, "stairs_down": 4, "steps": 4, "rough": 4, "slope_up": 2, "slope_down": 2},
+    scale={"steps": 0.1, "rough": 0.06},
+)
+
+
+@wp.struct
+class World(walking.World):
+    level: Row[float] = lw.lasting_memory()
+    column: Row[float] = lw.lasting_memory()
+    walked: Row[float] = lw.lasting_memory()  # distance from the middle of the patch, m
+    commanded: Row[float] = lw.lasting_memory()  # distance that an episode at the present command would cover, m
+
+
+@wp.struct
+class Params(walking.Params):
+    terrain: wp.array2d[float] = lw.height_field("terrain")
+    origins: wp.array2d[wp.vec3] = TERRAIN.origins
+    patch: float = TERRAIN.patch
+    episode_seconds: float = 20.0
+    scan: wp.array[wp.vec2] = lw.scan_grid(1.6, 1.0)
+    scan_noise: float = 0.1  # +-, m
+
+
+@wp.struct
+class Policy(walking.Policy):
+    height_scan: Row[float] = lw.part("scan")
+
+
+@wp.struct
+class Critic(walking.Critic):
+    height_scan: Row[float] = lw.part("scan")
+
+
+@wp.func
+def ground(x: wp.vec3, s: World, p: Params) -> float:
+    return lw.ground_height(p.terrain, x[0], x[1])
+
+
+@wp.func
+def distance(x: wp.vec3, s: World, p: Params) -> float:
+    return lw.ground_distance(p.terrain, x)
+
+
+ground.replaces, distance.replaces = walking.ground, walking.distance
+
+
+@wp.func
+def base(s: World) -> wp.vec3:
+    return wp.vec3(s.qpos[0], s.qpos[1], s.qpos[2])
+
+
+@wp.func
+def base_height(s: World, p: Params) -> float:
+    return s.qpos[2] - ground(base(s), s, p)
+
+
+@wp.func
+def left_field(s: World, p: Params) -> bool:
+    return not lw.on_ground(p.terrain, s.qpos[0], s.qpos[1])
+
+
+@wp.func
+def terrain_level(level: Row[float]) -> float:
+    return level[0]
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Policy, rng: Row[wp.uint32]):
+    walking.observe(s, p, obs, rng)
+    lw.height_scan(obs.height_scan, p.terrain, p.scan, base(s), terms.orientation(s.qpos))
+    terms.add_uniform_noise(obs.height_scan, p.scan_noise, rng)
+
+
+@wp.func
+def observe_critic(s: World, p: Params, obs: Critic):
+    walking.observe_critic(s, p, obs)
+    lw.height_scan(obs.height_scan, p.terrain, p.scan, base(s), terms.orientation(s.qpos))
+
+
+@wp.func
+def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
+    walking.advance(s0, action, s1, p, rng)
+    c = walking.command(s1, p)
+    distance = p.episode_seconds * wp.length(wp.vec2(c[0], c[1]))
+    lw.follow_walk(s1.level, s1.column, s1.walked, s1.commanded, p.origins, base(s1), distance)
+
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    walking.randomize(s, p, rng)
+    start = lw.start_on_terrain(s.level, s.column, s.walked, s.commanded, p.origins, p.patch, rng)
+    for i in range(3):
+        s.qpos[i] += start[i]
+
+
+class Rough(walking.Velocity):
+    """A robot that follows velocity commands on rough ground."""
+
+    metrics = (*walking.Velocity.metrics, "terrain_level")
+    terminations = (*walking.Velocity.terminations, "left_field")

@@ -1,0 +1,36 @@
+"""SpotVelocity: a Boston Dynamics Spot walks at a commanded velocity. Feet are spheres."""
+
+import mujoco
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import walkers
+from lyceum_warp.tasks.velocity import walking
+
+LEGS, FEET = ("fl", "fr", "hl", "hr"), ("FL", "FR", "HL", "HR")
+
+
+@wp.struct
+class Params(walking.Params):
+    joints: wp.array[int] = lw.joints(*(f"{leg}_{joint}" for leg in LEGS for joint in ("hx", "hy", "kn")))
+    feet: wp.array[int] = lw.sites(*FEET)
+    standing_pose_std: wp.array[float] = 4 * [0.05, 0.05, 0.1]
+    walking_pose_std: wp.array[float] = 4 * [0.3, 0.3, 0.6]
+    action_scale: wp.array[float] = 12 * [0.25]
+    swing_target: float = 0.12
+    stages: wp.array2d[float] = [[0.0, -1.0, 1.5, 0.7]]
+    lateral_velocity: float = 0.7
+
+
+@lw.register
+class SpotVelocity(walking.Velocity):
+    model, keyframe, frame_skip = (
+        lw.playground_model("locomotion/spot/xmls/scene_mjx_feetonly_flat_terrain.xml"),
+        "home",
+        5,
+    )
+
+    @staticmethod
+    def edit_model(spec: mujoco.MjSpec) -> None:
+        """Let friction of the feet decide, and take the physics of the humanoids."""
+        walkers.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))

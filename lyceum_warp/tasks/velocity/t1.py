@@ -1,0 +1,30 @@
+"""T1Velocity: a Booster T1 walks at a commanded velocity with its twelve leg joints; its upper body keeps still."""
+
+import mujoco
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import walkers
+from lyceum_warp.tasks.velocity import walking
+
+FEET = ("left_foot", "right_foot")
+LEG = ("Hip_Pitch", "Hip_Roll", "Hip_Yaw", "Knee_Pitch", "Ankle_Pitch", "Ankle_Roll")
+
+
+@wp.struct
+class Params(walking.BipedParams):
+    joints: wp.array[int] = lw.joints(*(f"{side}_{joint}" for side in ("Left", "Right") for joint in LEG))
+    feet: wp.array[int] = lw.sites(*FEET)
+    walking_pose_std: wp.array[float] = 2 * [0.3, 0.15, 0.15, 0.35, 0.25, 0.1]
+    action_scale: wp.array[float] = 12 * [0.5]
+    least_height: float = 0.3
+
+
+@lw.register
+class T1Velocity(walking.Biped):
+    model = lw.playground_model("locomotion/t1/xmls/scene_mjx_feetonly_flat_terrain.xml")
+
+    @staticmethod
+    def edit_model(spec: mujoco.MjSpec) -> None:
+        """Sense forces on the feet, and let their friction decide."""
+        walkers.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))

@@ -1,0 +1,416 @@
+"""Compute the tables of a walking robot from its compiled model, and prepare models for walking.
+
+The functions of ``(model, p)`` are for ``lw.from_model``: ``p`` has the parameters ``joints`` and ``feet``, which are
+indices of joints and of sites. The base is the body of the first joint, which must be free.
+"""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import mujoco
+import numpy as np
+
+_JOINT, _SENSOR = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_SENSOR
+_CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+_FORCE, _NET = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3  # parameters of a contact sensor
+
+
+# joints
+
+
+def base(model: mujoco.MjModel, p: Any = None) -> int:
+    """The body that moves freely.
+
+    Raises:
+        ValueError: The first joint of the model is not free.
+    """
+    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+        raise ValueError("the first joint of the model is not a free joint, so there is no floating base")
+    return int(model.jnt_bodyid[0])
+
+
+def joint_qpos(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """The index of each joint in ``qpos``, (joints,)."""
+    return model.jnt_qposadr[p.joints]
+
+
+def joint_dof(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """The index of each joint in ``qvel``, (joints,)."""
+    return model.jnt_dofadr[p.joints]
+
+
+def servos(model: mujoco.MjModel, p: Any) -> list[int]:
+    """The actuator of each joint, (joints,).
+
+    Raises:
+        ValueError: A joint has no actuator or several.
+    """
+    moved = np.where(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, model.actuator_trnid[:, 0], -1)
+    found = [np.flatnonzero(moved == joint) for joint in p.joints]
+    for joint, actuators in zip(p.joints, found, strict=True):
+        if len(actuators) != 1:
+            raise ValueError(f"the joint {_name(model, _JOINT, joint)} has {len(actuators)} actuators: it needs one")
+    return [int(actuators[0]) for actuators in found]
+
+
+def controls(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """The index of each joint's servo in ``ctrl``, (joints,)."""
+    return model.actuator_ctrladr[servos(model, p)]
+
+
+def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """A quarter of the angle at which each joint's servo reaches its force limit, rad, (joints,).
+
+    0.25 * limit / kp, mjlab's scale of actions.
+
+    Raises:
+        ValueError: A servo has no force limit.
+    """
+    actuators = servos(model, p)
+    limits = np.where(
+        model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators, 1],
+        np.where(model.jnt_actfrclimited[p.joints], model.jnt_actfrcrange[p.joints, 1], 0.0),
+    )  # fmt: skip
+    if not limits.all():
+        unlimited = _name(model, _JOINT, p.joints[int(np.argmin(limits))])
+        raise ValueError(f"the servo of the joint {unlimited} has no force limit: give action_scale, in rad")
+    return 0.25 * limits / model.actuator_gainprm[actuators, 0]
+
+
+def home_qpos(model: mujoco.MjModel) -> np.ndarray:
+    """The coordinates of the keyframe "home", or else ``qpos0``."""
+    key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home")
+    return model.qpos0 if key < 0 else model.key_qpos[key]
+
+
+def home_pose(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """The positions of the joints in ``home_qpos``, rad, (joints,)."""
+    return home_qpos(model)[joint_qpos(model, p)]
+
+
+def home_height(model: mujoco.MjModel, p: Any) -> float:
+    """The height of the base in ``home_qpos``, m."""
+    return float(home_qpos(model)[2])
+
+
+# legs
+#
+# With all joints at 0, every joint of a leg has a constant axis in the base's axes, and a constant position relative to
+# the joint before it. A joint turns all that is behind it.
+
+
+def leg_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """The joints from the base to each foot, (feet, longest leg); -1 behind the end of a shorter leg.
+
+    Raises:
+        ValueError: A foot is not connected to the base by hinges.
+    """
+    chains = [leg_of(model, int(model.site_bodyid[foot])) for foot in p.feet]
+    longest = max(map(len, chains))
+    return np.array([chain + (longest - len(chain)) * [-1] for chain in chains])
+
+
+def leg_qpos(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """The index of each of ``leg_joints`` in ``qpos``, -1 behind the end of a leg."""
+    joints = leg_joints(model, p)
+    return np.where(joints < 0, -1, model.jnt_qposadr[joints])
+
+
+def leg_dof(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """The index of each of ``leg_joints`` in ``qvel``, -1 behind the end of a leg."""
+    joints = leg_joints(model, p)
+    return np.where(joints < 0, -1, model.jnt_dofadr[joints])
+
+
+def leg_axes(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """The axis of each of ``leg_joints``, (feet, longest leg, 3)."""
+    data = _straight(model)
+    return data.xaxis[leg_joints(model, p)]
+
+
+def leg_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """The position of each of ``leg_joints`` relative to the joint before it, the first to the base, m."""
+    anchors = _straight(model).xanchor[leg_joints(model, p)]
+    return np.diff(anchors, axis=1, prepend=0.0)
+
+
+def foot_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """The position of each foot's site relative to its last joint, m, (feet, 3)."""
+    data = _straight(model)
+    return np.array([data.site_xpos[foot] - data.xanchor[_last_joint(model, foot)] for foot in p.feet])
+
+
+def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """Spheres that touch a plane if and only if the foot does, (feet, most spheres, 4): centre and radius, m.
+
+    Centres are relative to the foot's last joint. A sphere is itself, a capsule its ends, a box its corners; other
+    geoms are the corners of their bounding boxes. Radii include the margin from which a contact has a force.
+
+    Raises:
+        ValueError: A foot has no geom in ``foot_geoms``.
+    """
+    data = _straight(model)
+    spheres = []
+    for foot in p.feet:
+        geoms = [geom for geom in p.foot_geoms if model.geom_bodyid[geom] == model.site_bodyid[foot]]
+        if not geoms:
+            raise ValueError(f"none of foot_geoms belongs to the body of the foot {model.site(foot).name!r}")
+        found = np.concatenate([_with_margin(model, geom, spheres_of(model, data, geom)) for geom in geoms])
+        found[:, :3] -= data.xanchor[_last_joint(model, foot)]
+        spheres.append(found)
+    most = max(map(len, spheres))
+    return np.array([np.resize(found, (most, 4)) for found in spheres])  # repeats the spheres of a foot with fewer
+
+
+def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
+    """The geoms of the bodies of the feet that can touch the ground, that is, a geom of the world.
+
+    Raises:
+        ValueError: A foot has none.
+    """
+    found = []
+    for foot in p.feet:
+        touching = contact_geoms(model, int(model.site_bodyid[foot]))
+        if not touching:
+            raise ValueError(f"the foot {model.site(foot).name!r} has no geom that can touch the ground")
+        found += touching
+    return found
+
+
+def contact_geoms(model: mujoco.MjModel, body: int) -> list[int]:
+    """The geoms of a body that can touch a geom of the world."""
+    ground = np.flatnonzero(model.geom_bodyid == 0).tolist()
+    pairs = {frozenset(pair) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
+    geoms = np.flatnonzero(model.geom_bodyid == body).tolist()
+    return [geom for geom in geoms if any(_collide(model, geom, other, pairs) for other in ground)]
+
+
+def foot_forces(model: mujoco.MjModel, p: Any) -> list[int]:
+    """The index in ``sensordata`` of the force on each foot, from the sensor FOOT_force, (feet,).
+
+    Raises:
+        ValueError: There is no such sensor of three numbers.
+    """
+    found = []
+    for foot in p.feet:
+        name = f"{model.site(foot).name}_force"
+        sensor = mujoco.mj_name2id(model, _SENSOR, name)
+        if sensor < 0 or model.sensor_dim[sensor] != 3:
+            raise ValueError(f"the model has no sensor {name!r} of a contact's force: prepare_walker adds it")
+        found.append(int(model.sensor_adr[sensor]))
+    return found
+
+
+def leg_of(model: mujoco.MjModel, body: int) -> list[int]:
+    """The joints from the base to a body.
+
+    Raises:
+        ValueError: The body is not connected to the base by hinges.
+    """
+    joints: list[int] = []
+    trunk, name = base(model), _name(model, mujoco.mjtObj.mjOBJ_BODY, body)
+    while body not in (0, trunk):
+        first = int(model.body_jntadr[body])
+        joints = [*range(first, first + int(model.body_jntnum[body])), *joints]
+        body = int(model.body_parentid[body])
+    if body == 0 or not joints:
+        raise ValueError(f"no joint connects the body {name} of a foot to the base {model.body(trunk).name!r}")
+    for joint in joints:
+        if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
+            raise ValueError(f"the joint {_name(model, _JOINT, joint)} of a leg is not a hinge")
+    return joints
+
+
+def _last_joint(model: mujoco.MjModel, foot: int) -> int:
+    return leg_of(model, int(model.site_bodyid[foot]))[-1]
+
+
+def _straight(model: mujoco.MjModel) -> mujoco.MjData:
+    """The model's kinematics with the base's frame at the world's and all other coordinates 0."""
+    data = mujoco.MjData(model)
+    data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = 0.0
+    start = int(model.jnt_qposadr[0])
+    data.qpos[start : start + 7] = 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
+def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[int]]) -> bool:
+    bits = model.geom_contype[geom] & model.geom_conaffinity[other]
+    return bool(bits | (model.geom_contype[other] & model.geom_conaffinity[geom])) or frozenset((geom, other)) in pairs
+
+
+def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.ndarray:
+    """Spheres of a geom, enlarged by the margin of its contacts with the ground, less their gap."""
+    ground = np.flatnonzero(model.geom_bodyid == 0)
+    margin = model.geom_margin[geom] + model.geom_margin[ground].max()
+    gap = model.geom_gap[geom] + model.geom_gap[ground].max()
+    return spheres + np.array([0.0, 0.0, 0.0, margin - gap])
+
+
+def spheres_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
+    """The spheres of ``soles`` for a geom, in the world's axes, (spheres, 4)."""
+    size, kind = model.geom_size[geom], mujoco.mjtGeom
+    radius, middle = 0.0, np.zeros(3)
+    if model.geom_type[geom] == kind.mjGEOM_SPHERE:
+        radius, points = float(size[0]), np.zeros((1, 3))
+    elif model.geom_type[geom] == kind.mjGEOM_CAPSULE:
+        radius, points = float(size[0]), np.array([[0.0, 0.0, -size[1]], [0.0, 0.0, size[1]]])
+    elif model.geom_type[geom] == kind.mjGEOM_BOX:
+        points = _CORNERS * size
+    else:
+        middle, points = model.geom_aabb[geom, :3], _CORNERS * model.geom_aabb[geom, 3:]
+    centres = data.geom_xpos[geom] + (middle + points) @ data.geom_xmat[geom].reshape(3, 3).T
+    return np.hstack([centres, np.full((len(points), 1), radius)])
+
+
+def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
+    return repr(mujoco.mj_id2name(model, kind, int(index)) or int(index))
+
+
+# models
+
+
+def prepare_walker(
+    spec: mujoco.MjSpec,
+    feet: Sequence[str],
+    *,
+    timestep: float | None = None,
+    iterations: tuple[int, int] | None = None,
+) -> None:
+    """Prepare a model for a velocity task: forces on its feet are sensed, and their friction decides.
+
+    The model's own sensors are removed, because each costs time and the task reads none of them. Geoms of the feet get
+    priority in contacts, so that friction that is drawn for them holds. Pairs of a foot's geom with the ground become
+    contacts of these geoms.
+
+    Args:
+        spec: The model, changed in place.
+        feet: Names of the sites of the feet.
+        timestep: Seconds in a substep; None keeps the model's.
+        iterations: The most iterations of the solver and of its line search; None keeps the model's.
+
+    Raises:
+        ValueError: A site of a foot is missing.
+    """
+    if timestep is not None:
+        spec.option.timestep = timestep
+    if iterations is not None:
+        spec.option.iterations, spec.option.ls_iterations = iterations
+    for sensor in list(spec.sensors):
+        spec.delete(sensor)
+    ground = {geom.name: geom for geom in spec.worldbody.geoms}
+    for pair in list(spec.pairs):
+        if (names := {pair.geomname1, pair.geomname2}) & ground.keys():
+            (foot,) = names - ground.keys()
+            spec.geom(foot).conaffinity, spec.geom(foot).condim = 1, pair.condim
+            spec.delete(pair)
+    for geom in ground.values():
+        geom.priority = 0
+    for name in feet:
+        site = spec.site(name)
+        if site is None:
+            raise ValueError(f"the model has no site {name!r} for a foot")
+        site.parent.name = site.parent.name or f"{name}_body"
+        for geom in site.parent.geoms:
+            if geom.contype or geom.conaffinity:
+                geom.priority, geom.condim = 1, max(3, geom.condim)
+        spec.add_sensor(
+            name=f"{name}_force", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=mujoco.mjtObj.mjOBJ_BODY,
+            objname=site.parent.name, intprm=[_FORCE, _NET, 1],
+        )  # fmt: skip
+
+
+def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]]) -> None:
+    """Add sites of feet to a model, changed in place.
+
+    Args:
+        spec: The model.
+        feet: By the names of the sites, the body of each, or a joint or geom of this body, and the position in it, m.
+
+    Raises:
+        ValueError: There is no such element.
+    """
+    for name, (element, position) in feet.items():
+        owner = spec.joint(element) or spec.geom(element)
+        body = spec.body(element) or (owner and owner.parent)
+        if body is None:
+            raise ValueError(f"the model has no body, joint or geom {element!r} for the foot {name!r}")
+        body.add_site(name=name, pos=position)
+
+
+def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0) -> None:
+    """Turn the motors of joints into position servos, in place; servos stay as they are.
+
+    The force limit stays. A servo reaches it at an error of ``reach`` rad: kp = limit / reach. Its damping is critical
+    for the inertia that the joint has in ``qpos0``: kp + kd s + M s^2 has a double root.
+
+    Args:
+        spec: The model.
+        joints: Names of the joints, with one actuator each.
+        reach: Error at which a servo's force reaches its limit, rad.
+
+    Raises:
+        ValueError: A joint has no actuator, or its force has no limit.
+    """
+    model = spec.copy().compile()
+    p = SimpleNamespace(joints=[model.joint(name).id for name in joints])
+    for name, joint, actuator in zip(joints, p.joints, servos(model, p), strict=True):
+        if model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_NONE:
+            continue
+        gear, gain = abs(float(model.actuator_gear[actuator, 0])), float(model.actuator_gainprm[actuator, 0])
+        limits = [math.inf]
+        if model.actuator_forcelimited[actuator]:
+            limits.append(gear * float(model.actuator_forcerange[actuator, 1]))
+        if model.actuator_ctrllimited[actuator]:
+            limits.append(gear * abs(gain * float(model.actuator_ctrlrange[actuator, 1])))
+        if model.jnt_actfrclimited[joint]:
+            limits.append(float(model.jnt_actfrcrange[joint, 1]))
+        if not math.isfinite(limit := min(limits)):
+            raise ValueError(f"the motor of the joint {name!r} has no limit: give it a ctrlrange or a forcerange")
+        kp, dof = limit / reach, int(model.jnt_dofadr[joint])
+        kd = max(2.0 * math.sqrt(kp * model.dof_M0[dof]) - model.dof_damping[dof].sum(), 0.0)
+        servo = spec.actuators[actuator]
+        servo.set_to_position(kp=kp, kv=kd)
+        servo.gear = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+        servo.forcelimited, servo.forcerange = True, (-limit, limit)
+        servo.ctrllimited, servo.inheritrange = False, 0.0
+
+
+def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.015) -> None:
+    """Let two capsules collide in place of each box of a foot, along its longer side; for height fields.
+
+    MuJoCo Warp 4.0 finds contacts of boxes and height fields with wrong normals and depths, which throw a robot away.
+    The capsules lie within the outline of the sole and have its lowest plane; masses stay.
+
+    Args:
+        spec: The model, changed in place, after ``prepare_walker``.
+        feet: Names of the sites of the feet.
+        radius: Radius of the capsules, m.
+
+    Raises:
+        ValueError: A box is narrower than a capsule.
+    """
+    box_type = mujoco.mjtGeom.mjGEOM_BOX
+    for name in feet:
+        for box in [g for g in spec.site(name).parent.geoms if g.type == box_type and (g.contype or g.conaffinity)]:
+            long, short = (0, 1) if box.size[0] >= box.size[1] else (1, 0)
+            if box.size[short] < radius:
+                raise ValueError(f"the box of the foot {name!r} is {2 * box.size[short]} m wide: give a smaller radius")
+            frame = spec.site(name).parent.add_frame(pos=box.pos, quat=box.quat)
+            for kind in ("type", "axisangle", "xyaxes", "zaxis", "euler"):
+                setattr(frame.alt, kind, getattr(box.alt, kind))
+            for side in (-1.0, 1.0):
+                position = np.zeros(3)
+                position[short], position[2] = side * (box.size[short] - radius), radius - box.size[2]
+                capsule = spec.site(name).parent.add_geom(
+                    type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[radius, box.size[long] - radius, 0.0], mass=0.0,
+                    pos=position, quat=[1.0, 0.0, 1.0, 0.0] if long == 0 else [1.0, 1.0, 0.0, 0.0], group=box.group,
+                    contype=box.contype, conaffinity=box.conaffinity, condim=box.condim, priority=box.priority,
+                    friction=box.friction, solref=box.solref, solimp=box.solimp, margin=box.margin, gap=box.gap,
+                )  # fmt: skip
+                capsule.set_frame(frame)
+            box.contype = box.conaffinity = 0

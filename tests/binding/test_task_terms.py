@@ -1,0 +1,226 @@
+"""Terms of the reward, terminations and metrics are functions, whose arguments are found by name."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_task
+import torch
+from terms_task import Ordered, Terms
+
+import lyceum_warp as lw
+from lyceum_warp.openloop import OpenLoop
+from lyceum_warp.testing import CHECKS, check_task
+from lyceum_warp.testing.episode_rules import check_memory
+from lyceum_warp.testing.index_rules import check_bounds
+
+ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
+
+
+def stepped(env: lw.Env, steps: int = 12) -> list[dict[str, np.ndarray]]:
+    """The states before and after each step, its action, reward, metrics and end."""
+    found = []
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(steps):
+        before = {name: part.numpy() for name, part in env.state_space.split(env.get_state()).items()}
+        action = torch.rand((env.nworld, env.action_space.size), generator=generator) * 2 - 1
+        env.step(action)
+        after = {name: part.numpy() for name, part in env.state_space.split(env.get_state()).items()}
+        shown = {"reward": env.reward, "terminated": env.terminated, **env.metrics}
+        found.append({f"{name}0": part for name, part in before.items()} | after | {"action": action.numpy()})
+        found[-1] |= {name: buffer.numpy().copy() for name, buffer in shown.items()}
+    return found
+
+
+@ENGINES
+def test_rewards_metrics_and_ends_are_those_of_the_formulas(engine: str) -> None:
+    env = lw.make(Terms, nworld=6, engine=engine, autoreset=False, seed=1)
+    ended = np.zeros(6, dtype=bool)
+    for s in stepped(env, 40):
+        wanted = {
+            "near": np.exp(-np.abs(s["qpos"][:, 0] - 0.3)), "fast": 2 * 0.5 * np.abs(s["qvel"][:, 0]),
+            "effort": -0.1 * (s["action"] ** 2).sum(axis=1), "change": 0.25 * 0.3 * (s["pushes"] - s["pushes0"])[:, 0],
+        }  # fmt: skip
+        wanted = {name: env.timestep * values for name, values in wanted.items()}
+        for name, values in wanted.items():
+            np.testing.assert_allclose(s[name], values, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(s["reward"], sum(wanted.values()), rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(s["distance"], np.abs(s["qpos"][:, 0] - 0.3), atol=1e-5)
+        outside, fast = np.abs(s["qpos"][:, 0]) > 0.4, np.abs(s["qvel"][:, 0]) > 3
+        assert np.array_equal(s["outside"] == 1, outside) and np.array_equal(s["too_fast"] == 1, fast)
+        assert np.array_equal(s["too_fast_before"] == 1, np.abs(s["qvel0"][:, 0]) > 3)
+        ended |= outside | fast
+        assert np.array_equal(s["terminated"], ended), "an end stays set without automatic resets"
+    assert list(env.metrics) == [*Terms.rewards, *Terms.metrics, *Terms.terminations] and ended.any()
+
+
+@ENGINES
+def test_weights_are_set_as_parameters_are_also_for_each_world(engine: str) -> None:
+    env, other = (lw.make(Terms, nworld=2, engine=engine, seed=1, **words) for words in ({}, {"near": 2.0, "fast": 0}))
+    action = torch.ones((2, env.action_space.size))
+    start = env.get_state()
+    env.step(action)
+    other.set_state(start)
+    other.step(action)
+    assert torch.equal(other.metrics["near"], 2 * env.metrics["near"]) and not other.metrics["fast"].any()
+    after = env.get_state()
+    plain = env.get_reward(start, action, after)
+    env.set_params(near=[1.0, 4.0])
+    different = env.get_reward(start, action, after) - plain
+    torch.testing.assert_close(different, torch.tensor([0.0, 3.0]) * env.metrics["near"], atol=1e-6, rtol=0)
+    assert env.replicate().task.params["near"].tolist() == [1.0, 4.0]
+    env.set_params(near=1)
+    assert torch.equal(env.get_reward(start, action, after), plain)
+    with pytest.raises(ValueError, match="the task 'terms' has no parameter 'neer': did you mean near"):
+        env.set_params(neer=2.0)
+
+
+@ENGINES
+def test_a_rollout_pays_what_steps_pay(engine: str) -> None:
+    env = lw.make(Terms, nworld=3, engine=engine, autoreset=False, horizon=0, near=[1.0, 2.0, 3.0])
+    loop = OpenLoop(lw.make(Terms, nworld=3, engine=engine, autoreset=False, near=[1.0, 2.0, 3.0]), 4)
+    loop.state.copy_(env.get_state()[0])
+    env.set_state(env.get_state()[:1].expand(3, -1).contiguous())
+    actions = torch.rand(loop.actions.shape) * 2 - 1
+    loop.actions.copy_(actions)
+    loop.run()
+    for t in range(4):
+        env.step(actions[t])
+        torch.testing.assert_close(loop.reward[t], env.reward, rtol=1e-6, atol=1e-7)
+        assert torch.equal(loop.terminated[t], env.terminated)
+
+
+def test_a_variant_of_weights_shares_the_kernels() -> None:
+    plain, other = lw.make(Terms), lw.make(Ordered)
+    assert plain.task.kernels is other.task.kernels
+    assert (plain.task.params["near"], other.task.params["near"]) == (1.0, 3.0)
+
+
+def test_the_text_calls_each_function_once_and_is_shown() -> None:
+    text = lw.make(Terms).task.reward_text
+    reward = text[text.index("def reward") : text.index("def score")]
+    assert "    total = weights[0] * near_\n    total += weights[1] * fast_\n" in reward
+    assert reward.count("place(") == 1 and "distance_ = distance(place_, p.target)" in reward
+    assert "fast_ = fast(s1.qvel)" in reward
+    ends = text[text.index("def terminated") :]
+    assert "return outside_ or too_fast_" in ends and "place_ = place(s)" in ends
+    assert lw.make("hopper").task.reward_text == ""
+
+
+TASK = "class Tiny(lw.Task):"
+
+
+def term(function: str, *lines: str, before: str = "") -> list[tuple[str, str]]:
+    """Changes that add a function, and lines to the class."""
+    body = "\n".join(f"    {line}" for line in lines or ('rewards = {"upright": 1.0}',))
+    return [(TASK, f"{before}@wp.func\n{function}\n\n{TASK}\n{body}")]
+
+
+UPRIGHT = "def upright(s: World) -> float:\n    return s.qpos[1]"
+
+MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
+    "a misspelt term": (
+        term(UPRIGHT, 'rewards = {"uprihgt": 1.0}'), "rewards of the task 'tiny' has 'uprihgt', but there is no such",
+    ),
+    "a misspelt argument": (
+        term("def upright(qops: Row[float]) -> float:\n    return qops[1]"),
+        r"upright of the task 'tiny' \(tiny\.py, line \d+\) takes qops, which is not a function of the task, a "
+        r"parameter or a field of World: did you mean qpos\?",
+    ),
+    "an argument of another type": (
+        term("def upright(qpos: float) -> float:\n    return qpos"),
+        r"upright of the task 'tiny' \(.*\) takes qpos as float, but s1\.qpos is array\(ndim=1, dtype=float32\)",
+    ),
+    "a result of another type": (
+        term("def upright(s: World) -> bool:\n    return s.qpos[1] > 1.0"),
+        r"upright of the task 'tiny' \(.*\) returns bool, but must return float",
+    ),
+    "no type of the result": (
+        term("def upright(s: World):\n    return s.qpos[1]"), r"upright of the task 'tiny' \(.*\) has no type for its",
+    ),
+    "a termination that returns a number": (
+        term(UPRIGHT, 'terminations = ("upright",)'), r"upright .* returns float, but must return bool",
+    ),
+    "a termination that asks for the action": (
+        term("def fell(action: Row[float]) -> bool:\n    return action[0] > 1.0", 'terminations = ("fell",)'),
+        r"fell of the task 'tiny' \(.*\) takes action, but a termination sees the state only: it may take s and p",
+    ),
+    "terms that need each other": (
+        term("def a(b: float) -> float:\n    return b", 'rewards = {"a": 1.0}',
+             before="@wp.func\ndef b(a: float) -> float:\n    return a\n\n"),
+        "terms of the task 'tiny' need each other: a needs b needs a",
+    ),
+    "a term that writes": (
+        term("def upright(s: World) -> float:\n    s.qpos[0] = 1.0\n    return 1.0"),
+        r"upright of the task 'tiny' writes s\.qpos \(tiny\.py, line \d+\): upright may write nothing",
+    ),
+    "rewards beside reward": (
+        term(f"def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:\n    return 0.0\n\n"
+             f"@wp.func\n{UPRIGHT}"),
+        "the task 'tiny' has rewards and a function reward: leave one of them out",
+    ),
+    "names without weights": (
+        term(UPRIGHT, 'rewards = ("upright",)'), r"rewards of the task 'tiny' must be a dict of names and weights",
+    ),
+    "a weight that is not a number": (
+        term(UPRIGHT, 'rewards = {"upright": "1"}'),
+        "the weight of 'upright' of the task 'tiny' must be a number, not '1'",
+    ),
+    "a term with the name of a parameter": (
+        [*term(UPRIGHT), ("    dt: float", "    dt: float\n    upright: float = 1.0")],
+        "the task 'tiny' has a term and a parameter named 'upright'",
+    ),
+    "a term with the name of an option": (
+        term("def horizon(s: World) -> float:\n    return 1.0", 'rewards = {"horizon": 1.0}'),
+        "the parameter 'horizon' of the task 'tiny' has the name of an option of make",
+    ),
+    "no seconds in a step": (
+        [*term(UPRIGHT), ("    dt: float", "    gain: float = 1.0")],
+        "rewards of the task 'tiny' are per second: add dt: float to its Params",
+    ),
+    "a metric without a function": (
+        [(TASK, f'{TASK}\n    metrics = ("height",)')],
+        "metrics of the task 'tiny' has 'height', but there is no such function: .*, or write measure",
+    ),
+    "a metric that is a term": (
+        term(UPRIGHT, 'rewards = {"upright": 1.0}', 'metrics = ("upright",)'),
+        "the task 'tiny' names the metric 'upright' twice",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "message"), MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_in_a_term_is_one_line_that_names_it(
+    changes: list[tuple[str, str]], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=f"^{message}") as caught:
+        lw.make(tiny_task.write(tmp_path, tiny_task.changed(*changes)))
+    assert "\n" not in str(caught.value)
+
+
+@ENGINES
+def test_a_task_with_terms_keeps_every_rule(engine: str) -> None:
+    quick = [check for check in CHECKS if check is not check_memory]
+    assert not check_task(Terms, engine=engine, steps=40, checks=quick).unused
+
+
+def test_parts_without_use_are_named(tmp_path: Path) -> None:
+    source = tiny_task.changed(
+        *term(
+            "def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):\n"
+            f"    s1.count[0] += 1.0\n\n@wp.func\n{UPRIGHT}\n\n@wp.func\n{UPRIGHT.replace('upright', 'level')}"
+        ),
+        ("    qpos: Row[float]", "    qpos: Row[float]\n    count: Row[float] = lw.memory()"),
+    )
+    report = check_task(tiny_task.write(tmp_path, source), engine="mujoco", steps=1, checks=[])
+    assert report.unused == [
+        "nothing calls level: name it in rewards, terminations or metrics, call it, or remove it",
+        "nothing reads World.count: remove it",
+    ]
+    assert str(report).endswith("unused: nothing reads World.count: remove it")
+
+
+def test_an_index_out_of_range_in_a_term_is_found(tmp_path: Path) -> None:
+    source = tiny_task.changed(*term("def upright(qpos: Row[float]) -> float:\n    return qpos[60] * 0.0"))
+    with pytest.raises(AssertionError, match=r"upright reads qpos\[60\] out of range \(tiny\.py, line \d+\)"):
+        check_task(tiny_task.write(tmp_path, source), engine="mujoco", steps=3, checks=[check_bounds])

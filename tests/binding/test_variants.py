@@ -1,0 +1,181 @@
+"""A variant extends the structs of its parent, and its parent's functions run over them."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import terms_task
+import tiny_task
+import torch
+from terms_task import Terms
+from terms_variant import Same, Variant
+
+import lyceum_warp as lw
+from lyceum_warp.testing import CHECKS, check_task
+from lyceum_warp.testing.episode_rules import check_memory
+
+ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
+
+
+@ENGINES
+def test_a_variant_has_its_parents_terms_and_its_own(engine: str) -> None:
+    parent, env = (lw.make(task, nworld=3, engine=engine, seed=2, horizon=0) for task in (Terms, Variant))
+    assert env.task.params["target"] == 0.1 and env.task.params["border"] == parent.task.params["border"]
+    assert list(env.state_space.parts)[-3:] == ["pushes", "work", "metrics"]
+    work = torch.zeros(3)
+    for _ in range(5):
+        action = torch.full((3, 1), 0.05)
+        x = env.field("qpos")[:, 0].clone()
+        parent.step(action)
+        env.step(action)
+        work += action[:, 0] * (env.field("qpos")[:, 0] - x) + 0.001 * env.time
+        torch.testing.assert_close(env.metrics["lasting"], 0.5 * env.timestep * 2.0 * work, atol=1e-7, rtol=1e-4)
+        # the replaced helper doubles, and the target, another default, is a third
+        torch.testing.assert_close(env.metrics["change"], parent.metrics["change"] * 2 / 3, rtol=1e-4, atol=1e-7)
+        assert torch.equal(env.metrics["effort"], parent.metrics["effort"])
+    total = sum(env.metrics[name] for name in Variant.rewards)
+    torch.testing.assert_close(env.reward, total, rtol=1e-5, atol=1e-7)
+
+
+def test_variants_of_the_same_structs_share_kernels_and_leave_their_parents_alone() -> None:
+    before = lw.make(Terms).task.kernels
+    assert lw.make(Variant).task.kernels is lw.make(Same).task.kernels is not before
+    assert lw.make(Terms).task.kernels is before
+
+
+@ENGINES
+def test_a_variant_keeps_every_rule(engine: str) -> None:
+    quick = [check for check in CHECKS if check is not check_memory]
+    assert not check_task(Variant, engine=engine, steps=30, checks=quick).unused
+
+
+PARENT = """
+import warp as wp
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+@wp.struct
+class World:
+    qpos: Row[float]
+
+@wp.struct
+class Params:
+    dt: float
+    place: int = 0
+
+@wp.func
+def scaled(x: float, s: World) -> float:
+    return x
+
+@wp.func
+def joint(s: World, p: Params) -> float:
+    return scaled(s.qpos[p.place], s)
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    obs[0] = joint(s, p)
+
+class Parent(lw.Task):
+    model = "hopper.xml"
+    obs = {"x": 1}
+"""
+
+CHILD = """
+import warp as wp
+import lyceum_warp as lw
+import variant_parent as parent
+
+@wp.struct
+class World(parent.World):
+    qvel: wp.array[float]
+
+@wp.func
+def tripled(x: float, s: World) -> float:
+    return 3.0 * parent.scaled(x, s) + s.qvel[0]
+
+tripled.replaces = parent.scaled
+
+class Child(parent.Parent):
+    pass
+"""
+
+
+def child(folder: Path, *changes: tuple[str, str]) -> Path:
+    source = CHILD
+    for old, new in changes:
+        assert old in source, old
+        source = source.replace(old, new)
+    (folder / "variant_parent.py").write_text(PARENT)
+    return tiny_task.write(folder, source, "child.py")
+
+
+def test_a_variant_in_a_file_replaces_a_helper_of_its_parents_functions(tmp_path: Path) -> None:
+    env = lw.make(child(tmp_path))
+    parent = lw.make(tmp_path / "variant_parent.py")
+    state = env.get_state()
+    env.state_space.split(state)["qpos"][0, 0] = 0.25
+    env.state_space.split(state)["qvel"][0, 0] = 0.5
+    env.set_state(state)
+    parent.set_state(state)
+    assert (env.obs.item(), parent.obs.item()) == (1.25, 0.25)
+
+
+def test_a_variant_in_another_folder_has_its_parents_model_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ball = "<body><freejoint/><geom size='.1'/></body>"
+    (tmp_path / "robot.xml").write_text(f"<mujoco><worldbody>{ball}</worldbody></mujoco>")
+    far = PARENT.replace("hopper.xml", "robot.xml").replace("class Parent", "class Far")
+    (tmp_path / "far_parent.py").write_text(f"{far}    actions = {{'x': 1}}\n\n"
+        "@wp.func\ndef control(s: World, action: Row[float], p: Params, ctrl: Row[float]):\n    pass\n")  # fmt: skip
+    monkeypatch.syspath_prepend(tmp_path)
+    folder = tmp_path / "variants"
+    folder.mkdir()
+    file = tiny_task.write(folder, "import far_parent\n\nclass Near(far_parent.Far):\n    horizon = 5\n", "near.py")
+    assert lw.make(file).model.nq == 7
+
+
+MISTAKES = {
+    "other arguments": (
+        [("def tripled(x: float, s: World)", "def tripled(x: float)"), ("parent.scaled(x, s) + s.qvel[0]", "x")],
+        "tripled of the task 'child' replaces scaled of .*, so it must take the same arguments: x, s",
+    ),
+    "structs that do not extend": (
+        [("class World(parent.World):\n    qvel", "class World:\n    qpos: wp.array[float]\n    qvel"),
+         ("\ntripled.replaces = parent.scaled\n", "")],
+        r"takes the World of .*parent\.py, but the task has the World of .*child\.py: .*"
+        r"extend the first by @wp\.struct class World\(module\.World\)",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "message"), MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_in_a_variant_is_one_line(changes: list[tuple[str, str]], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        lw.make(child(tmp_path, *changes))
+    assert "\n" not in str(caught.value)
+
+
+def test_an_error_in_a_copy_names_the_line_of_its_original(tmp_path: Path) -> None:
+    file = child(tmp_path)
+    parent = tmp_path / "variant_parent.py"
+    parent.write_text(PARENT.replace("scaled(s.qpos[p.place], s)", "scaled(s.qpos[p.place], s)\n\n").replace(
+        "    obs[0] = joint", "    s.qpos[0] = 1.0\n    obs[0] = joint"))  # fmt: skip
+    with pytest.raises(
+        ValueError, match=r"observe of the task 'child' writes s\.qpos \(variant_parent\.py, line \d+\)"
+    ):
+        lw.make(file)
+
+
+def test_the_module_of_a_variant_has_the_same_hash_in_every_process() -> None:
+    program = (
+        f"import sys; sys.path[:0] = {[str(Path(terms_task.__file__).parent)]}\n"
+        "import lyceum_warp as lw\nfrom terms_variant import Variant\n"
+        "print(lw.make(Variant).task.kernels.judge.module.hash_module().hex())"
+    )
+    found = {
+        subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()[-1]
+        for _ in range(2)
+    }
+    assert len(found) == 1

@@ -1,0 +1,147 @@
+"""``lyceum-warp new --template velocity`` writes a task of the family of walking robots for a model."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.testing import CHECKS, check_task
+from lyceum_warp.testing.episode_rules import check_memory
+
+SLED = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 .1"/>
+    <body name="trunk" pos="0 0 .3">
+      <freejoint/>
+      <geom type="box" size=".2 .1 .05"/>
+      <body name="left" pos="0 .15 0">
+        <joint name="left_hip" axis="0 1 0" range="-60 60" actuatorfrcrange="-20 20"/>
+        <geom name="left_shin" type="capsule" fromto="0 0 0 0 0 -.2" size=".02"/>
+        <body name="left_sole" pos="0 0 -.25"><geom name="left_box" type="box" size=".06 .03 .02" pos=".02 0 0"/></body>
+      </body>
+      <body name="right" pos="0 -.15 0">
+        <joint name="right_hip" axis="0 1 0" range="-60 60" actuatorfrcrange="-20 20"/>
+        <geom name="right_shin" type="capsule" fromto="0 0 0 0 0 -.2" size=".02"/>
+        <body name="right_sole" pos="0 0 -.25">
+          <geom name="right_box" type="box" size=".06 .03 .02" pos=".02 0 0"/><site name="toe" pos=".02 0 -.02"/>
+        </body>
+      </body>
+      <body name="tail" pos="-.2 0 0">
+        <joint name="tail" axis="0 0 1" range="-60 60" actuatorfrcrange="-2 2"/>
+        <geom type="capsule" fromto="0 0 0 -.2 0 0" size=".01"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="right_hip" joint="right_hip" kp="40" kv="2"/>
+    <position name="left_hip" joint="left_hip" kp="40" kv="2"/>
+    <motor name="tail" joint="tail" gear="2" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>
+"""
+"""Two legs with boxes as feet, in bodies without joints, and a tail. Actuators have another order than the joints."""
+
+
+@pytest.fixture
+def folder(pytestconfig: pytest.Config, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty current folder, the same in every run of the tests, so that Warp finds compiled kernels in its cache."""
+    assert pytestconfig.cache is not None
+    folder: Path = pytestconfig.cache.mkdir("new_velocity")
+    for file in folder.iterdir():
+        if file.is_file():
+            file.unlink()
+    monkeypatch.chdir(folder)
+    (folder / "sled.xml").write_text(SLED)
+    return folder
+
+
+def new(*words: str) -> int:
+    return cli.main(["new", *words, "--template", "velocity"])
+
+
+def test_the_file_of_a_robot_is_short_and_its_task_keeps_the_rules(folder: Path) -> None:
+    assert new("ant_walk", "--model", "gymnasium:ant.xml") == 0
+    text = Path("ant_walk.py").read_text()
+    assert len(text.splitlines()) < 60 and max(map(len, text.splitlines())) <= 120
+    checks = [check for check in CHECKS if check is not check_memory]
+    check_task("ant_walk.py", engine="mujoco", nworld=3, steps=30, checks=checks)
+    env = lw.make("ant_walk.py", nworld=2)
+    legs = [env.model.joint(name).id for leg in range(1, 5) for name in (f"hip_{leg}", f"ankle_{leg}")]
+    assert env.task.params["joints"].tolist() == legs and env.obs.shape == (2, 12 + 3 * 8)
+    assert len(env.task.params["feet"]) == 4
+
+
+def test_motors_become_servos_that_hold_the_pose(folder: Path) -> None:
+    assert new("ant_walk", "--model", "gymnasium:ant.xml") == 0
+    env = lw.make("ant_walk.py", nworld=2, push_seconds=(1e6, 1e6))
+    for _ in range(100):
+        env.step(torch.zeros(2, 8))
+    pose = env.field("qpos")[:, 7:].numpy()
+    wanted = np.array(env.task.params["default_pose"])[np.argsort(env.task.params["joints"])]
+    assert np.abs(pose - wanted).max() < 0.25 and not env.terminated.any()
+    assert env.obs_groups["critic"][:, -16:-12].all(), "all feet touch the ground"
+
+
+def test_a_robot_learns_for_an_iteration(folder: Path, tmp_path: Path) -> None:
+    assert new("ant_walk", "--model", "gymnasium:ant.xml") == 0
+    words = ["--algorithm", "ppo", "--nworld", "4", "--iterations", "1", "--num-steps", "4", "--mean-every", "0"]
+    assert cli.main(["train", "ant_walk.py", "--out", str(tmp_path / "run"), *words, "--no-video"]) == 0
+
+
+def test_feet_and_joints_are_those_of_the_legs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """New sites are in the middle of the soles; a site that is there stays; other joints keep their pose."""
+    assert new("sled_walk", "--model", "sled.xml") == 0
+    assert capsys.readouterr().out.startswith("sled_walk.py: feet foot_1, toe; joints left_hip, right_hip; check")
+    env = lw.make("sled_walk.py", nworld=1, **{"push_seconds": (1e6, 1e6), "sliding_friction": (1.0, 1.0)})
+    left, right = (env.model.site(name) for name in ("foot_1", "toe"))
+    np.testing.assert_allclose(left.pos, [0.02, 0.0, -0.02], atol=1e-6)
+    np.testing.assert_allclose(right.pos, [0.02, 0.0, -0.02], atol=1e-6)
+    env.step(torch.tensor([[1.0, -1.0]]))
+    right_hip, left_hip, tail = env.field("ctrl")[0].tolist()
+    assert left_hip > 0.25 > -0.25 > right_hip and tail == 0.0
+    assert issubclass(find_task("sled_walk.py"), lw.Task) and find_task("sled_walk.py").rewards["single_stance"] > 0
+
+
+def test_options_name_feet_and_joints(folder: Path) -> None:
+    assert new("sled_stand", "--model", "sled.xml", "--feet", "left_shin", "toe", "--joints", "left_hip") == 0
+    params = lw.make("sled_stand.py").task
+    assert [params.model.site(i).name for i in params.params["feet"]] == ["left_shin_foot", "toe"]
+    assert [params.model.joint(i).name for i in params.params["joints"]] == ["left_hip"]
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "words"),
+    [
+        ((), ["--feet", "tow"], "sled.xml: the model has no site, geom or body 'tow': --feet takes their names"),
+        ((), ["--joints", "hip"], "sled.xml: the model has no joint 'hip': --joints takes names of joints"),
+        (("<freejoint/>", ""), [], "sled.xml: the first joint of the model is not a free joint"),
+        (('<geom name="floor" type="plane" size="5 5 .1"/>', ""), [], "sled.xml: the model has no floor"),
+        (('<position name="left_hip" joint="left_hip" kp="40" kv="2"/>', ""), ["--joints", "left_hip"],
+         "sled.xml: the joint 'left_hip' has 0 actuators: it needs one"),
+    ],
+)  # fmt: skip
+def test_a_robot_without_legs_is_refused(
+    folder: Path, change: tuple[str, str], options: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("sled.xml").write_text(SLED.replace(*change) if change else SLED)
+    assert new("sled_walk", "--model", "sled.xml", *options) == 2
+    assert words in " ".join(capsys.readouterr().err.split()) and not Path("sled_walk.py").exists()
+
+
+def test_feet_without_the_template_are_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["new", "sled_walk", "--model", "sled.xml", "--feet", "toe"]) == 2
+    assert "--feet and --joints belong to --template velocity" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("task", ["g1_velocity", "spot_velocity"])
+def test_robots_of_menagerie_become_tasks(task: str, folder: Path) -> None:
+    model = {"g1_velocity": "unitree_g1/scene_mjx.xml", "spot_velocity": "boston_dynamics_spot/scene.xml"}[task]
+    assert new("walk", "--model", f"menagerie:{model}") == 0
+    found, own = lw.make("walk.py").task, lw.make(task).task
+    names = [[task.model.joint(i).name for i in task.params["joints"]] for task in (found, own)]
+    assert names[0] == names[1] and len(found.params["feet"]) == len(own.params["feet"])

@@ -1,0 +1,117 @@
+"""The family of velocity tasks: feet, contacts and forces of every robot are MuJoCo's, and other joints keep still."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from conftest import SharedEnv
+
+import lyceum_warp as lw
+from lyceum_warp.binding.registry import find_task, package_task_names
+from lyceum_warp.tasks.velocity import TASKS
+
+ROBOTS = [task for task in TASKS if task != "go1_velocity" and "rough" not in task]
+NWORLD = 16
+
+
+@pytest.fixture
+def env(task: str, shared_env: SharedEnv) -> lw.Env:
+    return shared_env(task, nworld=NWORLD, autoreset=False, push_seconds=(1e6, 1e6))
+
+
+def random_steps(env: lw.Env, steps: int, size: float) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(steps):
+        env.step(torch.from_numpy((size * rng.normal(size=env.action.shape)).astype(np.float32)))
+
+
+def feet(env: lw.Env, world: int) -> tuple[mujoco.MjData, list[bool]]:
+    """MuJoCo's kinematics of a world, and which feet touch the ground."""
+    model, data = env.model, mujoco.MjData(env.model)
+    data.qpos, data.qvel = env.field("qpos")[world], env.field("qvel")[world]
+    mujoco.mj_forward(model, data)
+    geoms = set(env.task.params["foot_geoms"].tolist())
+    pairs = [set(pair) for pair in data.contact.geom.tolist()]
+    bodies = [
+        {int(model.geom_bodyid[g]) for g in pair & geoms}
+        for pair in pairs
+        if any(model.geom_bodyid[g] == 0 for g in pair)
+    ]
+    return data, [any(int(model.site_bodyid[foot]) in found for found in bodies) for foot in env.task.params["feet"]]
+
+
+@pytest.mark.parametrize("task", ROBOTS)
+def test_heights_and_contacts_of_feet_are_mujocos(task: str, env: lw.Env) -> None:
+    n = len(env.task.params["feet"])
+    touched = 0
+    for _ in range(5):
+        random_steps(env, 6, 1.0)
+        critic = env.obs_groups["critic"].numpy()[:, -6 * n :]
+        for world in range(NWORLD):
+            data, touching = feet(env, world)
+            heights = np.clip([data.site_xpos[foot][2] for foot in env.task.params["feet"]], 0.0, 1.0)
+            np.testing.assert_allclose(critic[world, :n], heights, atol=2e-6)
+            np.testing.assert_array_equal(critic[world, 2 * n : 3 * n] > 0, touching)
+            touched += sum(touching)
+    assert 0.1 < touched / (5 * NWORLD * n) < 0.99
+
+
+@pytest.mark.parametrize("task", ROBOTS)
+def test_velocities_of_feet_are_mujocos(task: str, env: lw.Env) -> None:
+    """The slip of feet in contact, times the weight and the step."""
+    random_steps(env, 12, 1.0)
+    env.set_params(least_command=-1.0)
+    random_steps(env, 1, 1.0)
+    motion, clock = np.zeros(6), env.state_space.split(env.get_state())["contact_time"].numpy()
+    slips = []
+    for world in range(NWORLD):
+        data, _ = feet(env, world)
+        slip = 0.0
+        for foot, seconds in zip(env.task.params["feet"], clock[world], strict=True):
+            mujoco.mj_objectVelocity(env.model, data, mujoco.mjtObj.mjOBJ_SITE, foot, motion, 0)
+            slip += (seconds > 0) * float(motion[3:5] @ motion[3:5])
+        slips.append(slip)
+    found = env.metrics["foot_slip"].numpy()
+    env.set_params(least_command=0.05)
+    np.testing.assert_allclose(found, -0.1 * 0.02 * np.array(slips), rtol=2e-4, atol=1e-7)
+    assert np.count_nonzero(found) > NWORLD / 4
+
+
+@pytest.mark.parametrize("task", ROBOTS)
+def test_a_standing_robot_weighs_on_its_feet(task: str, env: lw.Env) -> None:
+    """Upright at rest, the forces on the feet carry its weight, and joints that do not act keep the home pose."""
+    total = []
+    for _ in range(12):
+        env.step(torch.zeros(env.action.shape))
+        force = env.field("sensordata").reshape(NWORLD, -1, 3).sum(dim=1)[:, 2].abs()
+        total.append(force.mean().item())
+    weight = 9.81 * float(env.model.body_subtreemass[0])
+    assert 0.5 * weight < np.mean(total[4:]) < 1.6 * weight
+    held = np.setdiff1d(np.arange(1, env.model.njnt), env.task.params["joints"])
+    assert len(held) == env.model.nu - len(env.task.params["joints"])
+    if len(held):
+        at = env.model.jnt_qposadr[held]
+        home = env.model.key("home").qpos[at]
+        assert np.abs(env.field("qpos").numpy()[:, at] - home).max() < 0.15
+
+
+@pytest.mark.parametrize("task", ROBOTS)
+def test_resets_put_the_robot_above_the_ground(task: str, env: lw.Env) -> None:
+    env.reset()
+    critic = env.obs_groups["critic"].numpy()
+    n = len(env.task.params["feet"])
+    qpos = env.field("qpos").numpy()
+    np.testing.assert_allclose(qpos, np.tile(env.model.key("home").qpos, (NWORLD, 1)), atol=1e-6)
+    assert (critic[:, -6 * n : -5 * n] < 0.15).all(), "feet are near the ground"
+
+
+def test_robots_with_equal_sizes_share_their_kernels(shared_env: SharedEnv) -> None:
+    g1, t1 = (shared_env(task, nworld=NWORLD, autoreset=False, push_seconds=(1e6, 1e6)) for task in
+              ("g1_velocity", "t1_velocity"))  # fmt: skip
+    assert g1.task.kernels is t1.task.kernels
+
+
+def test_the_family_declares_the_tasks_of_its_modules() -> None:
+    assert set(TASKS) <= set(package_task_names())
+    for name, module in TASKS.items():
+        assert find_task(name).__module__ == f"lyceum_warp.tasks.velocity.{module}"
