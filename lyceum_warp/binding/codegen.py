@@ -111,7 +111,7 @@ def kernels_of(
         memory: The layouts of its rows of memory.
         structs: The layouts of rows that functions see as structs: groups of observations, Shared and Sums.
     """
-    layouts = tuple((name, *layout.items()) for name, layout in (*memory.items(), *observations.items()))
+    layouts = tuple((name, *layout.items()) for name, layout in (*memory.items(), *structs.items()))
     called = tuple(source.terms.functions.items())
     key = (
         source.world, source.params, tuple(source.functions.values()), tuple(groups.items()), layouts,
@@ -119,11 +119,11 @@ def kernels_of(
     )  # fmt: skip
     with _MAKING:
         if key not in _kernels:
-            scope = _generated(source, groups, memory, observations)
+            scope = _generated(source, groups, memory, structs)
             scope["terms"] = source.terms.generated(f"<lyceum_warp {source.path} terms>")
             found = dict(source.functions)
             found["terminated"] = scope["terms"].get("terminated", found["terminated"])
-            functions = {name: function or scope[f"no_{name}"] for name, function in found.items()}
+            functions = {name: function or scope.get(f"no_{name}") for name, function in found.items()}
             written = [name for name, function in found.items() if function is not None]
             module = free_module_name(f"lyceum_warp.generated.{source.path}")
             given: dict[str, Any] = {"module": module, "functions": functions, "written": written}
