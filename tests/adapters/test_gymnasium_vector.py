@@ -239,7 +239,7 @@ def test_spaces_have_the_bounds_of_the_environment(vector: Callable[..., Gymnasi
     assert envs.single_action_space == gymnasium.spaces.Box(-1, 1, (3,), np.float32)
     assert {name: space.shape for name, space in envs.observation_space.items()} == {
         "policy": (N, 3),
-        "critic": (N, 10),
+        "critic": (N, 15),
     }
     obs, _ = envs.reset(seed=0)
     assert obs in envs.observation_space

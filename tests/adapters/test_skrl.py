@@ -54,7 +54,7 @@ def test_tensors_pass_through_the_wrapper_unchanged() -> None:
     env.reset()
     env.unwrapped.reset(seed=3)
     twin.rand_reset(3)
-    assert env.observation_space.shape == (3,) and env.state_space.shape == (10,) and env.device == torch.device("cpu")
+    assert env.observation_space.shape == (3,) and env.state_space.shape == (15,) and env.device == torch.device("cpu")
     for _ in range(25):
         action = 2 * torch.rand(N, 3) - 1
         obs, reward, terminated, truncated, info = env.step(action)

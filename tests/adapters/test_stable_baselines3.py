@@ -153,7 +153,7 @@ def test_groups_of_observations_are_a_dict_on_demand(full: StableBaselines3VecEn
     assert full.observation_space.shape == (3,)
     env = StableBaselines3VecEnv(full.env, dict_obs=True)
     obs = env.reset()
-    assert obs["critic"].shape == (N, 10) and env.observation_space["critic"].shape == (10,)
+    assert obs["critic"].shape == (N, 15) and env.observation_space["critic"].shape == (15,)
     model = PPO("MultiInputPolicy", env, n_steps=25, batch_size=50, n_epochs=1, device="cpu")
     model.learn(100)
 
