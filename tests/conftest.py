@@ -2,7 +2,7 @@
 
 import functools
 import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,15 @@ from lyceum_warp.support.warp_log import start_warp
 
 # the tests' batches are too small to divide, and on a busy machine torch's threads wait for each other
 torch.set_num_threads(1)
+
+SAME_FUNCTIONS = ("g1_full_velocity", "g1_rough_velocity", "h1_velocity", "spot_velocity", "t1_velocity")
+"""Walking robots that share every function with ``go1_velocity``, ``g1_velocity`` or ``go1_rough_velocity``."""
+
+
+def long_if_alike(tasks: Iterable[str]) -> list[Any]:
+    """Parameters of a test of every task; the tasks of ``SAME_FUNCTIONS`` are marked long."""
+    return [pytest.param(task, marks=pytest.mark.long) if task in SAME_FUNCTIONS else task for task in tasks]
+
 
 SharedEnv = Callable[..., lw.Env]
 TaskFile = Callable[[str, str], Path]

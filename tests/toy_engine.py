@@ -21,8 +21,8 @@ class ToyEngine(Engine):
 
     Each world has its own MjModel, and ``apply_model`` writes the world's fields into it.
 
-    Launches between two engine calls are captured, so ``reset``, ``commit``, ``find_faults`` and ``get_state`` are Warp
-    launches on these rows.
+    Everything between two engine calls is captured in a graph, so ``reset``, ``commit``, ``find_faults`` and
+    ``get_state`` consist of Warp launches on these rows.
     """
 
     name = "toy"

@@ -51,7 +51,7 @@ class NPGIteration(OnPolicyIteration):
 
 
 class UpdateNumbers(NamedTuple):
-    """Numbers about the update, named as in ``NPGIteration``."""
+    """Statistics of the update, with the names of ``NPGIteration``."""
 
     # equal in all processes
     finite: Scalar  # whether the step is finite

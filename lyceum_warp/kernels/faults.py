@@ -58,7 +58,7 @@ def faults_of_rows(
                 fault = fault | NAN
             else:
                 fault = fault | WARNING
-    if (fault & NAN) != 0:  # a bad state leads to further warnings, such as one of inertia
+    if (fault & NAN) != 0:  # a bad state causes more warnings, for example about the inertia matrix
         fault = fault & ~WARNING
     fault_out[w] = fault
 

@@ -1,4 +1,4 @@
-"""Use many worlds as a Stable-Baselines3 vector environment: numbers, learners, wrappers, errors."""
+"""Use many worlds as a Stable-Baselines3 vector environment: returned values, learners, wrappers, errors."""
 
 import warnings
 

@@ -89,7 +89,7 @@ class Sensing(lw.Task):
 
 
 def moving(model: str) -> type[lw.Task]:
-    """Return a task of a model that observes positions and velocities."""
+    """Return a task that uses a model and observes its positions and velocities."""
     spec = mujoco.MjSpec.from_string(model)
     compiled = spec.copy().compile()
     return type("Moving", (Moving,), {"model": spec, "obs": {"position": compiled.nq, "velocity": compiled.nv}})

@@ -1,7 +1,7 @@
 """Every task of the package obeys the rules on both engines, and some tasks also on a toy engine."""
 
 import pytest
-from conftest import settle
+from conftest import long_if_alike, settle
 from toy_engine import ToyEngine
 
 import lyceum_warp as lw
@@ -43,7 +43,7 @@ def options(task: str, engine: str) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-@pytest.mark.parametrize("task", PACKAGE)
+@pytest.mark.parametrize("task", long_if_alike(PACKAGE))
 def test_a_task_keeps_the_rules(task: str, engine: str) -> None:
     checks = CHECKS if task in EVERY_RULE else OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
     report = check_task(task, engine=engine, checks=checks, **options(task, engine))

@@ -126,7 +126,7 @@ def test_a_graph_of_torch_that_is_no_longer_used_leaves_a_capture_unharmed() -> 
         x += 1.0
     gc.collect()
     unused = [graph]
-    unused.append(unused)  # type: ignore[arg-type]  # only a collection finds it
+    unused.append(unused)  # type: ignore[arg-type]  # only the garbage collector frees it
     del graph, unused
     thresholds = gc.get_threshold()
     gc.set_threshold(1, 1, 1)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import SharedEnv
+from conftest import SharedEnv, long_if_alike
 from form_tasks import Drawn, Pushed
 
 import lyceum_warp as lw
@@ -135,7 +135,7 @@ def device(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-@pytest.fixture(scope="module", params=TASKS)
+@pytest.fixture(scope="module", params=long_if_alike(TASKS))
 def engines(request: pytest.FixtureRequest, device: str, shared_env: SharedEnv) -> Iterator[Engines]:
     task = request.param
     options = {"nworld": NWORLD, "cone": "elliptic", "frame_skip": 1, "autoreset": False, "horizon": 0}

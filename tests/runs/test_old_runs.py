@@ -54,7 +54,7 @@ def test_the_value_function_of_an_old_run_keeps_its_scale(gamma: float, old_run:
     npg.load_state_dict(run.read()["state"])
     obs, step = torch.linspace(-1.0, 1.0, 22).view(2, 11), torch.zeros(2)
     torch.testing.assert_close(npg.value(obs, step), lw.load_value(old_run)(obs, step))
-    # before the release that scales to the returns, a prediction was the network's output times this factor
+    # early releases predicted the network's output times this factor
     plain = npg.value.network(obs).squeeze(-1) / (1.0 - gamma)
     torch.testing.assert_close(npg.value(obs, step), plain)
 

@@ -1,4 +1,4 @@
-"""Invalid values that a task writes stay in their world, are named, and never make an invalid state."""
+"""Invalid values that a task writes stay in their world, are reported by name, and never produce an invalid state."""
 
 import mujoco
 import pytest

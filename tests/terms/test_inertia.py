@@ -34,7 +34,7 @@ def tensor(moments: np.ndarray, quat: np.ndarray) -> np.ndarray:
 
 
 def bodies(thickness: float) -> tuple[list[tuple[np.ndarray, np.ndarray]], dict[str, np.ndarray]]:
-    """Six point masses in each world, thin along one axis, and the fields of two bodies: the second is theirs."""
+    """Six point masses per world in a flat cloud, and the fields of two bodies; the masses form the second."""
     clouds = [
         (RNG.uniform(0.1, 2.0, 6), RNG.standard_normal((6, 3)) * [1.0, 0.3, thickness] + RNG.standard_normal(3))
         for _ in range(N)

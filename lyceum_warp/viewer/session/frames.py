@@ -18,7 +18,7 @@ _COLOURS = (
     (0.30, 0.80, 0.80),
 )  # fmt: skip
 _PAST, _FUTURE, _PLAN = (0.90, 0.25, 0.20), (0.25, 0.40, 0.95), (0.25, 0.90, 0.45)
-_OPACITY, _FADE = 0.35, 0.95  # fade: opacity of a state of the burst relative to the one before
+_OPACITY, _FADE = 0.35, 0.95  # fade: opacity of each state in the burst, relative to the previous state
 
 
 class FrameMaker:
