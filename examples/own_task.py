@@ -1,7 +1,6 @@
 """Define a task and its model in one file: swing up a pendulum whose motor is too weak to lift it directly.
 
-``python examples/own_task.py`` checks and steps it. docs/own_task.md shows the command line, and a task with its model
-in a file.
+``python examples/own_task.py`` checks and steps it; docs/own_task.md shows the command line and models in files.
 """
 
 import mujoco
