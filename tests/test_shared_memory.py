@@ -209,6 +209,21 @@ def test_only_share_may_write_shared_memory() -> None:
         lw.make(type("Lawless", (Balance,), {"reward": writes}))
 
 
+@pytest.mark.parametrize(("name", "row"), [("tally", "sums"), ("share", "shared")])
+def test_writes_beyond_shared_memory_are_refused_when_an_environment_is_made(name: str, row: str) -> None:
+    @wp.func
+    def beyond_sums(s0: World, action: Row[float], s1: World, p: Params, ended: bool, sums: Sums):
+        sums.falls[3] = 1.0
+
+    @wp.func
+    def beyond_shared(shared: Shared, sums: Sums, p: Params):
+        shared.falls[3] = 1.0
+
+    function = {"tally": beyond_sums, "share": beyond_shared}[name]
+    with pytest.raises(ValueError, match=f"{name} of the task 'beyond' writes .* into {row}, but {row.title()} decl"):
+        lw.make(type("Beyond", (Balance,), {name: function}))
+
+
 def test_share_without_tally_is_refused(tmp_path: Path) -> None:
     file = write(tmp_path, with_function("def share(shared: World, sums: World, p: Params):\n    pass"))
     with pytest.raises(ValueError, match="needs a struct Shared, listed in World as shared: Shared, a struct Sums"):

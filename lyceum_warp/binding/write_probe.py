@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from lyceum_warp.binding.bound_task import BoundTask
-from lyceum_warp.binding.parts import Layout
+from lyceum_warp.binding.parts import Layout, sizes
 from lyceum_warp.kernels import steps
 from lyceum_warp.spaces import Space
 from lyceum_warp.support.arrays import launch_parts, launch_worlds
@@ -87,8 +87,12 @@ class Probe:
             setattr(self._observations, group, self._groups[group].array)
         self._ctrl, self._measured = self._rows((1, nu)), self._rows((1, len(self._metrics)))
         self._streams = self._rows((len(task.obs_layouts), 1), wp.uint32)
+        self._sums, self._shared = (
+            self._rows((1, sum(sizes(task.shared.get(name, {})).values()))) for name in ("Sums", "Shared")
+        )
         with wp.ScopedDevice(self._device):
             self._action = wp.zeros((1, sum((task.actions or {"": nu}).values())), dtype=float)
+            self._totals, self._reason = wp.zeros(self._sums.size, dtype=wp.int64), wp.zeros(1, dtype=int)
             self._yes, self._no = wp.full(1, True, dtype=bool), wp.full(1, False, dtype=bool)
             self._counters = steps.Counters()
             self._counters.step, self._counters.episode = wp.zeros(1, dtype=int), wp.zeros(1, dtype=int)
@@ -111,6 +115,11 @@ class Probe:
         self._check_fields("substep")
         self._launch(kernels.advance_memory, s, s, p, action, counters)
         self._check_fields("advance")
+        self._launch(kernels.tally_worlds, s, s, p, action, self._reason, self._sums.array, self._totals)
+        self._check("tally", self._sums, "sums", f"Sums declares {self._sums.size}")
+        self._launch(kernels.share_memory, self._totals, self._sums.array, p, self._shared.array)
+        self._check("share", self._sums, "sums", f"Sums declares {self._sums.size}")
+        self._check("share", self._shared, "shared", f"Shared declares {self._shared.size}")
         masks = [wp.clone(self._no) for _ in range(4)]
         self._launch(kernels.run_events, self._no, s, p, counters, *masks)
         self._check_fields("event")

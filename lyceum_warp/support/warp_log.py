@@ -24,7 +24,7 @@ def start_warp() -> list[str]:
     to stderr; these are logged instead, and all other output is printed.
 
     Returns:
-        The messages about the driver, for the error messages of callers that need a CUDA device.
+        Messages about the CUDA driver, which callers add to errors about a missing device.
     """
     global _remarks
     with _lock:

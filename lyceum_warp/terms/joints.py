@@ -40,13 +40,9 @@ def pose(
     Standing is a ``command_size`` below the least. mjlab 1.6.0, ``variable_posture``, with the same values for walking
     and running.
     """
-    standing = command_size(command) < least_command
-    total = float(0.0)
-    for j in range(joint_qpos.shape[0]):
-        std = wp.where(standing, standing_pose_std[j], walking_pose_std[j])
-        error = (qpos[joint_qpos[j]] - default_pose[j]) / std
-        total += error * error
-    return wp.exp(-total / float(joint_qpos.shape[0]))
+    if command_size(command) < least_command:
+        return posture(qpos, joint_qpos, default_pose, standing_pose_std)
+    return posture(qpos, joint_qpos, default_pose, walking_pose_std)
 
 
 @wp.func
@@ -65,15 +61,9 @@ def gait_pose(
 
     mjlab 1.6.0, ``variable_posture``.
     """
-    size = command_size(command)
-    total = float(0.0)
-    for j in range(joint_qpos.shape[0]):
-        moving_std = wp.where(size < running_command, walking_pose_std[j], running_pose_std[j])
-        error = (qpos[joint_qpos[j]] - default_pose[j]) / wp.where(
-            size < least_command, standing_pose_std[j], moving_std
-        )
-        total += error * error
-    return wp.exp(-total / float(joint_qpos.shape[0]))
+    if command_size(command) >= running_command:
+        return posture(qpos, joint_qpos, default_pose, running_pose_std)
+    return pose(command, qpos, joint_qpos, default_pose, standing_pose_std, walking_pose_std, least_command)
 
 
 @wp.func

@@ -195,9 +195,8 @@ def height(x: wp.vec3, s: World, p: Params) -> float:  # above the ground; clipp
 
 
 @wp.func
-def touches(s: World, p: Params, foot: int) -> bool:
-    """Whether a foot touches the ground."""
-    x, turn, _, _ = last_joint(s, p, foot)
+def sole_touches(x: wp.vec3, turn: lw.quat, s: World, p: Params, foot: int) -> bool:
+    """Whether a foot touches the ground, from the position and rotation of its last joint."""
     touching = bool(False)
     for i in range(p.soles.shape[1]):
         sphere = p.soles[foot, i]
@@ -210,7 +209,8 @@ def touches(s: World, p: Params, foot: int) -> bool:
 @wp.func
 def substep(s: World, p: Params):
     for foot in range(p.feet.shape[0]):
-        terms.run_clocks(foot, touches(s, p, foot), s.contact_time, s.air_time, p.substep_dt)
+        x, turn, _, _ = last_joint(s, p, foot)
+        terms.run_clocks(foot, sole_touches(x, turn, s, p, foot), s.contact_time, s.air_time, p.substep_dt)
 
 
 # the command
@@ -281,10 +281,10 @@ def observe_critic(s: World, p: Params, obs: Critic):
     observe_robot(s, p, obs)
     terms.gather_positions(obs.joint_position, s.qpos, p.joint_qpos, p.default_pose)
     for foot in range(p.feet.shape[0]):
-        x, _ = foot_motion(s, p, foot)
-        obs.foot_height[foot] = height(x, s, p)
+        x, turn, _, _ = last_joint(s, p, foot)
+        obs.foot_height[foot] = height(x + lw.quat_rotate(turn, p.foot_offsets[foot]), s, p)
         obs.foot_air_time[foot] = s.air_time[foot]
-        obs.foot_contact[foot] = wp.where(touches(s, p, foot), 1.0, 0.0)
+        obs.foot_contact[foot] = wp.where(sole_touches(x, turn, s, p, foot), 1.0, 0.0)
         f = terms.sensor_vector(s.sensordata, p.foot_forces[foot])
         for i in range(3):
             f[i] = wp.sign(f[i]) * wp.log(1.0 + wp.abs(f[i]))
@@ -415,7 +415,6 @@ class BipedParams(Params):
     lateral_velocity: float = 0.5
     push_seconds: wp.vec2 = wp.vec2(5.0, 10.0)
     fall_angle: float = math.acos(0.6)
-    swing_target: float = 0.1
 
 
 class Biped(Velocity):
