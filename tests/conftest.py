@@ -137,7 +137,7 @@ def _task(item: pytest.Item) -> str | None:
 
 @functools.cache
 def _missing_model(task: str | None) -> str | None:
-    """Why a task's model is missing, and how to install it; None if it is there."""
+    """Return why a task's model is missing and how to install it; None if it is installed."""
     if task is None:
         return None
     try:

@@ -33,7 +33,7 @@ LEVELS = {
     "adapters": 13, "viewer": 13,
     "cli": 14, "gym": 14,
 }  # fmt: skip
-"""The floor of every room: a room imports from lower floors, or from itself."""
+"""The level of every room: a room imports only from lower levels and from itself."""
 
 TESTED_BY = {
     "done": "test_faults.py", "task": "binding", "testing": "conformance",
@@ -207,7 +207,7 @@ def private_names_of_others(tree: ast.AST) -> Iterator[str]:
             yield ast.unparse(node)
 
 
-def test_no_module_but_upstream_uses_private_names_of_other_packages() -> None:
+def test_only_upstream_uses_private_names_of_other_packages() -> None:
     found = {name: names for name, tree in TREES.items() if (names := set(private_names_of_others(tree)))}
     known = {"wp._src", "mujoco_warp._src.collision_sdf", "mujoco_warp._src.forward"}
     assert found == {UPSTREAM: known}, f"reach private names in {UPSTREAM}"
@@ -256,7 +256,7 @@ def test_every_room_has_tests_of_its_name() -> None:
         assert any(place.exists() for place in places), f"no tests of {own}: none of {', '.join(map(str, places))}"
 
 
-def test_every_folder_of_tests_belongs_to_a_room_or_goes_across_rooms() -> None:
+def test_every_folder_of_tests_belongs_to_a_room_or_is_listed() -> None:
     folders = {path.parent.relative_to(TESTS).as_posix() for path in TESTS.rglob("test_*.py")} - {"."}
     rooms = {path.parent.relative_to(ROOT).as_posix() for path in MODULES.values()}
     assert folders <= rooms | ACROSS | {"bench"}

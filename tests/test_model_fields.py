@@ -80,7 +80,7 @@ def test_geoms_with_wrapped_tendons_have_constants() -> None:
     assert Constants.INERTIAL not in describe_model_field(ANT, "geom_pos").constants
 
 
-def test_the_inertia_of_a_simple_body_stays_where_it_is() -> None:
+def test_the_inertial_frame_of_a_simple_body_cannot_move() -> None:
     ball = mujoco.MjModel.from_xml_string(
         "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
     )

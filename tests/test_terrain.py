@@ -1,4 +1,4 @@
-"""Terrains are as described, both engines stand on them, and tasks scan them and climb their levels."""
+"""Check the shapes of terrains, contacts with them on both engines, height scans, and levels."""
 
 import mujoco
 import numpy as np

@@ -1,4 +1,4 @@
-"""Compare hand-written passes with torch's modules and autograd."""
+"""Compare hand-written forward and backward passes with torch's modules and autograd."""
 
 import pytest
 import torch
@@ -27,7 +27,7 @@ def policy_of(activation: str, hidden: tuple[int, ...] = (8, 6), **options: obje
 
 @pytest.mark.parametrize("activation", ["tanh", "relu", "elu"])
 @pytest.mark.parametrize("hidden", [(), (8,), (8, 6), (3, 16, 4)])
-def test_written_out_products_equal_autograds(activation: str, hidden: tuple[int, ...]) -> None:
+def test_hand_written_products_equal_autograds(activation: str, hidden: tuple[int, ...]) -> None:
     policy = policy_of(activation, hidden)
     dense = DensePolicy.of(policy)
     assert dense is not None
@@ -95,13 +95,13 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("kind", OTHERS)
-def test_other_networks_are_left_to_autograd(kind: str) -> None:
+def test_other_networks_use_autograd(kind: str) -> None:
     assert DensePasses.of(OTHERS[kind]()) is None
     if kind != "shared layer":
         assert DensePolicy.of(lw.GaussianPolicy(5, 2, network=OTHERS[kind]())) is None
 
 
-def test_a_policy_of_a_class_of_its_own_or_with_frozen_layers_is_left_to_autograd() -> None:
+def test_a_policy_subclass_or_frozen_layers_use_autograd() -> None:
     class Policy(lw.GaussianPolicy):
         pass
 

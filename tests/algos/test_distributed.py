@@ -64,7 +64,7 @@ def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
     """Compare the tables' last rows and the checkpoints, up to rounding."""
     row, expected = table(one)[-1], table(other)[-1]
     for name in expected:
-        bound = tolerance * (10.0 if name.startswith("mean_") else 1.0)  # of whole episodes after the update
+        bound = tolerance * (10.0 if name.startswith("mean_") else 1.0)  # episodes amplify rounding
         np.testing.assert_allclose(row[name], expected[name], rtol=bound, atol=bound, err_msg=name)
     state, wanted = (Run.open(folder).read()["state"] for folder in (one, other))
     assert torch.equal(state["generator"], wanted["generator"])
@@ -73,7 +73,7 @@ def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
         for name, tensor in wanted[part].items():
             torch.testing.assert_close(state[part][name], tensor, **close)
     torch.testing.assert_close(state["returns"], wanted["returns"], **close, equal_nan=True)
-    if tolerance < 1e-3:  # afterwards a foot may touch the ground a step earlier
+    if tolerance < 1e-3:  # with a larger tolerance a foot may touch the ground a step earlier
         torch.testing.assert_close(state["env"], wanted["env"], **close)
 
 
@@ -102,7 +102,7 @@ def test_two_machines_make_the_same_update_as_one_process(tmp_path: Path) -> Non
 
 PPO = ["--algorithm", "ppo", "--nworld", "12", "--num-steps", "20", "--minibatches", "7", "--hidden", "8",
        "--value-hidden", "8", "--mean-every", "1", "--mean-episodes", "2"]  # fmt: skip
-"""Unfinished episodes, a normaliser, an adaptive learning rate, leftover samples, an evaluation."""
+"""Settings with unfinished episodes, a normaliser, an adaptive learning rate, leftover samples and an evaluation."""
 
 
 @pytest.mark.parametrize("minibatches", [[], ["--whiten-minibatches", "--std-type", "log"]])
@@ -180,7 +180,7 @@ sys.exit(main())
 
 @pytest.mark.long
 def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
-    """During learning they complete the iteration together; before it the run leaves no files."""
+    """A signal during training ends all processes after the iteration; an earlier signal leaves no files."""
     program, run = tmp_path / "interrupted.py", tmp_path / "learning"
     program.write_text(INTERRUPTED)
     arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations", "100000", "--out"]

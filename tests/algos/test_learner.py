@@ -89,7 +89,9 @@ def test_a_policy_other_than_a_gaussian_gets_a_run_and_an_export(env: lw.Env, tm
 @pytest.mark.parametrize("config, best_by", [
     (lw.NPGConfig(), "mean_return"), (lw.PPOConfig(mean_every=0), "return_mean"), (DriftConfig(), "mean_return"),
 ])  # fmt: skip
-def test_a_run_goes_by_the_returns_that_its_learner_reports(config: Any, best_by: str, env: lw.Env) -> None:
+def test_the_best_policy_is_chosen_by_the_returns_that_the_learner_reports(
+    config: Any, best_by: str, env: lw.Env
+) -> None:
     drift = Drift(env)
     drift.config = config
     assert drift.best_by == best_by

@@ -109,7 +109,7 @@ def test_results_of_other_machines_and_versions_do_not_count(
         row = lines(path)[-1]
 
 
-def test_failing_case_leaves_the_others(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failing_case_does_not_stop_the_others(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "toy.jsonl"
     assert toy.main("--out", path, "--contestants", "ours", "--seeds", 14) == 1
     assert len(lines(path)) == 3 and "failed: task=walk repeat=0 contestant=ours" in capsys.readouterr().err
@@ -150,9 +150,7 @@ def test_bad_input_of_an_experiment_gets_one_line(
     assert error.startswith(f"{name}: ") and message in error and error.count("\n") == 1
 
 
-def test_figures_and_tables_come_from_results_alone(
-    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_figures_and_tables_need_only_results(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     toy.main("--out", tmp_path / "toy.jsonl")
     toy.measured.clear()
     assert plot.main(plot.Options(("toy",), tmp_path)) == 0
@@ -216,7 +214,7 @@ def measure(case, options):
 """
 
 
-def test_cases_apart_are_processes_on_cores_of_their_own(
+def test_cases_run_in_subprocesses_on_separate_cores(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "apart_toy.py").write_text(TOY)

@@ -63,7 +63,9 @@ def test_another_machine_continues_in_the_folder_of_states(
     assert "skipped: there is no " in capsys.readouterr().out
 
 
-def test_what_spreads_or_is_missed_is_reported(work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fault_that_spreads_or_is_missed_is_reported(
+    work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(soak, "VARIANT", soak.VARIANT.replace("== 4.0", "== 7.0").replace("== 5.0", "== 6.0"))
     make, made = soak.lw.make, []
 

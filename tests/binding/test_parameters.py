@@ -61,7 +61,7 @@ def test_defaults_come_from_the_struct_and_dt_from_the_timestep(model: mujoco.Mj
     assert list(values["offset"]) == [0.0, 0.0, 0.5]
 
 
-def test_named_elements_become_their_places_in_the_model(model: mujoco.MjModel) -> None:
+def test_named_elements_become_their_indices_in_the_model(model: mujoco.MjModel) -> None:
     values = parameters(model).values
     assert (values["tip"], values["elbow"]) == (0, 1)
     for elbow in ("shoulder", lw.dof("shoulder"), 0):

@@ -60,7 +60,7 @@ def test_writes_out_of_range_are_refused_and_leave_the_heap_intact() -> None:
 
 
 @pytest.mark.parametrize("index", [0, 5, -1, -6])
-def test_indices_within_a_row_are_accepted_from_both_ends(index: int) -> None:
+def test_positive_and_negative_indices_within_a_row_are_accepted(index: int) -> None:
     env = lw.make(str(TASK), function=10, index=index)
     env.reset()
     assert env.field("qpos")[0, index] == 1.0

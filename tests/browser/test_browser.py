@@ -368,7 +368,7 @@ def test_pages_of_other_sites_cannot_reach_the_viewer(viewer: Viewer, context: B
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        for host in ("localhost", "127.0.0.1"):  # the second one is the same site
+        for host in ("localhost", "127.0.0.1"):  # the second page belongs to the viewer's site
             page = context.new_page()
             page.goto(f"http://{host}:{server.server_address[1]}/")
             assert not page.evaluate(opens, f"{base.replace('http', 'ws')}state")

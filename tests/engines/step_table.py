@@ -316,7 +316,7 @@ def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
 
 
 def _completed(case: Case, rng: random.Random, missing: Mapping[Any, None], strength: int) -> Case | None:
-    """Complete a case: the other factors, in random order, take the level that adds the most missing combinations."""
+    """Complete a case: in random order, each other factor takes the level that adds the most missing combinations."""
     rest = [name for name in FACTORS if name not in case]
     rng.shuffle(rest)
     for name in rest:

@@ -71,7 +71,7 @@ def make(
 
 
 def worlds(nworld: int = N, *chosen: int) -> wp.array:
-    """Return a mask of the chosen worlds; without any, of all worlds."""
+    """Return a mask of the chosen worlds, or of all worlds if none is chosen."""
     return wp.array([not chosen or w in chosen for w in range(nworld)], dtype=bool)
 
 
@@ -140,7 +140,7 @@ def test_worlds_run_as_plain_mujoco_does_on_their_models(engine: type[Engine]) -
     draw(made)
     draw(plain)
     steps = [(run(made, 1), run(plain, 1)) for _ in range(5)]
-    assert np.ptp(steps[-1][1], axis=0).max() > 0.01  # the models differ in effect
+    assert np.ptp(steps[-1][1], axis=0).max() > 0.01  # the models move differently
     for got, expected in steps:
         if engine is MujocoEngine:
             np.testing.assert_array_equal(got, expected)
@@ -300,7 +300,7 @@ def test_models_are_applied_and_worlds_settled_within_graphs() -> None:
 
     for engine, enabled in ((captured, True), (direct, False)):
         calls = Graphs(CPU, enabled=enabled).sequence(phases(engine))
-        for seed in range(4):  # the first pass runs the launches, the second captures them
+        for seed in range(4):  # the first iteration runs the launches, the second captures them
             rng = np.random.default_rng(seed)
             for name in engine.dynamics:
                 array = engine.arrays[name].numpy()

@@ -1,4 +1,4 @@
-"""The Warp engine's step equals MuJoCo Warp's to the bit, with any element of a model and any field of World."""
+"""Compare the Warp engine's step with MuJoCo Warp's to the bit, with any element of a model and any field of World."""
 
 import copy
 import itertools
@@ -189,7 +189,8 @@ def test_a_drawn_field_acts_as_in_an_edited_model(name: str, device: wp.Device) 
     model = spec.compile()
     edited, field = copy.copy(model), describe_model_field(model, name)
     value = field.value(edited)
-    most = 3.0 if name == "dof_solref" else 1.1  # most joints slip, with a force that does not depend on solref
+    # the friction force of a joint that slips, as most do, does not depend on solref
+    most = 3.0 if name == "dof_solref" else 1.1
     drawn = value * np.random.default_rng(0).uniform(1.0, most, size=value.shape) + 0.03 * (value == 0)
     if name.endswith("quat"):
         drawn = value + 0.05

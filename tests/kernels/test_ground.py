@@ -1,4 +1,4 @@
-"""Compare the look-up of heights with MuJoCo's rays, and the rule of levels with its definition."""
+"""Compare heights of a height field with MuJoCo's rays, and changes of the level with their definition."""
 
 import mujoco
 import numpy as np

@@ -142,7 +142,7 @@ def test_a_robots_state_has_the_nominal_model_unless_it_is_given() -> None:
     assert plan.state_of(body_mass=[0.0, 2.0])[columns].tolist() == [0.0, 2.0]
 
 
-def test_an_event_in_memory_leaves_the_physics_in_double_precision() -> None:
+def test_an_event_that_writes_memory_keeps_the_physics_in_double_precision() -> None:
     env = lw.make(Faulty, nworld=1, engine="mujoco", horizon=0)
     time = env.state_space.parts["time"]
     for _ in range(1000):

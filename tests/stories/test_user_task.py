@@ -273,7 +273,7 @@ def test_acceleration_sensors_belong_to_the_last_substep(module: ModuleType, eng
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_further_field_of_the_acceleration_stage_joins_the_state(module: ModuleType, engine: str) -> None:
+def test_an_additional_field_of_the_acceleration_stage_joins_the_state(module: ModuleType, engine: str) -> None:
     plain, env = (lw.make("follow_target", engine=engine, nworld=2, fields=fields) for fields in ((), ["qacc"]))
     assert env.state_space.size == plain.state_space.size + 2
     acceleration = env.field("qacc")

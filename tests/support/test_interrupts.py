@@ -45,7 +45,7 @@ def test_signals_are_ignored_after_the_caller_raised_a_postponed_one() -> None:
         signal.raise_signal(signal.SIGTERM)
 
 
-def test_signals_after_an_empty_postponement_raise_again() -> None:
+def test_a_signal_after_postponed_without_signals_raises() -> None:
     with signals():
         with postponed():
             pass

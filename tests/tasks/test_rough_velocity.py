@@ -1,4 +1,4 @@
-"""Velocity tasks on rough ground: feet and scans are MuJoCo's, and robots climb levels and may not leave the field."""
+"""Check velocity tasks on rough ground: foot heights and scans against MuJoCo, levels, and the end of the field."""
 
 from collections.abc import Mapping
 

@@ -56,7 +56,7 @@ def test_dragged_body_is_placed_while_paused_and_only_when_it_moves(bench: Bench
 
 
 @pytest.mark.parametrize("paused", [False, True])
-def test_push_ends_when_its_person_has_left(bench: Bench, paused: bool) -> None:
+def test_push_ends_when_its_browser_disconnects(bench: Bench, paused: bool) -> None:
     """A browser that is closed during a drag never releases the button."""
     drag(bench, "ball", paused=paused)
     bench.sent.clear()

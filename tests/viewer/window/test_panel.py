@@ -20,7 +20,7 @@ def bench() -> Bench:
 
 
 def pressed(bench: Bench, key: str, **status: object) -> list[object]:
-    """The commands that follow from a key."""
+    """Return the commands that a key causes."""
     bench.show(status_of(**status))
     KEYS[key].action(bench.panel.actions)
     return list(bench.sent)
@@ -37,7 +37,7 @@ def test_panel_draws_every_mode_with_all_windows_open(bench: Bench, mode: str) -
         samples=np.array([[0.0, 1.0, np.nan], [0.1, 2.0, 3.0]]), messages=("world 3: terminated",),
     )  # fmt: skip
     assert bench.sent == [Opened("http://here")]
-    assert bench.draw() == bench.draw(frame) == bench.draw() == []  # before the first frame, with it and after it
+    assert bench.draw() == bench.draw(frame) == bench.draw() == []  # before, with and after the first frame
     small = Bench(bench.model, scene_of(bench.model, nworld=1, controllers=(), episodes=(), curves=()))
     small.panel.actions.windows |= set(WINDOWS)
     assert small.draw(frame_of(small.model, small.data, status_of(controller=None, world=0))) == []
