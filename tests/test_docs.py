@@ -1,4 +1,4 @@
-"""Commands and Python on pages run, and links and file names in documents and project files are valid."""
+"""Run the commands and the Python of pages, and check links and file names in documents."""
 
 import re
 import runpy

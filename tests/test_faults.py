@@ -104,7 +104,7 @@ def test_a_contact_overflow_of_the_warp_engine_is_a_fault_of_every_world_without
         assert torch.isfinite(env.get_state()).all()
 
 
-def test_any_other_overflow_of_the_warp_engine_is_an_engine_warning() -> None:
+def test_another_overflow_of_the_warp_engine_is_an_engine_warning() -> None:
     """A contact sensor has more matches than its buffer holds."""
 
     def make() -> lw.Env:

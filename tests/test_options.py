@@ -1,4 +1,4 @@
-"""Options of environments and physics: checked when made, separated from parameters, suggested when misspelt."""
+"""Check options of environments and physics, separate them from parameters, and suggest similar names."""
 
 import dataclasses
 import inspect

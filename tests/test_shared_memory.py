@@ -1,4 +1,4 @@
-"""Memory that all worlds share: sums over worlds, its updates, and everything that copies it."""
+"""Test memory that all worlds share: sums over worlds, updates, and everything that copies it."""
 
 from collections.abc import Iterator
 from pathlib import Path

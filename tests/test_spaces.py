@@ -63,7 +63,7 @@ MANY = """
 """
 
 
-def test_an_actuator_has_as_many_actions_as_controls_and_a_name_of_its_own() -> None:
+def test_an_actuator_has_as_many_actions_as_controls_and_its_own_name() -> None:
     space = action_space(mujoco.MjModel.from_xml_string(MANY), None)
     assert space.parts == {"actuator_2": slice(0, 1), "aim": slice(1, 4), "actuator_2_": slice(4, 5)}
     assert space.low is not None

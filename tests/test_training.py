@@ -28,7 +28,7 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return six_iterations(tmp_path_factory.mktemp("runs") / "six")
 
 
-def test_a_run_of_python_has_the_numbers_of_the_command(six: Path, tmp_path: Path) -> None:
+def test_training_in_python_and_on_the_command_line_give_equal_numbers(six: Path, tmp_path: Path) -> None:
     options = ["--samples", "512", "--hidden", "8", "--value-hidden", "8", "--mean-every", "2", "--mean-episodes", "2"]
     out = tmp_path / "command"
     arguments = ["train", "point_mass", "--nworld", "2", "--iterations", "6", "--keep-every", "2", "--out", str(out)]
@@ -298,7 +298,7 @@ def test_train_from_a_run_starts_with_its_policy(six: Path, tmp_path: Path, caps
     assert not (tmp_path / "no").exists()
 
 
-def test_flags_with_the_defaults_of_new_runs_replace_the_settings_of_the_other_run(
+def test_flags_with_default_values_replace_the_settings_of_the_other_run(
     six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old, out = Path(shutil.copytree(six, tmp_path / "old")), tmp_path / "out"

@@ -1,4 +1,4 @@
-"""Tables of walking robots, compared with MuJoCo's kinematics and contacts, and models prepared for walking."""
+"""Compare tables of walking robots with MuJoCo's kinematics and contacts, and prepare models for walking."""
 
 from types import SimpleNamespace
 
@@ -102,7 +102,7 @@ def test_tables_give_the_positions_and_contacts_of_feet(shape: str) -> None:
 
 
 @pytest.mark.parametrize("shape", ["cylinder", "ellipsoid"])
-def test_other_shapes_touch_with_the_corners_of_their_boxes(shape: str) -> None:
+def test_feet_of_other_shapes_touch_with_the_corners_of_their_boxes(shape: str) -> None:
     """The corners reach at least as low as the shape."""
     model, p = made(shape)
     soles = walkers.soles(model, p)

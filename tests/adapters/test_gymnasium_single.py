@@ -49,7 +49,7 @@ def test_gymnasiums_checker_has_no_complaint(hopper: gymnasium.Env, draws: bool)
     assert not [text for text in said if not any(known in text for known in THEIRS)]
 
 
-def test_a_step_has_the_numbers_of_the_environment_behind_it() -> None:
+def test_a_step_returns_the_numbers_of_the_wrapped_environment() -> None:
     env, twin = GymnasiumEnv(Full), lw.make(Full, autoreset=False)
     obs, info = env.reset(seed=7)
     twin.rand_reset(7)

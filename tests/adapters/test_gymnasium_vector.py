@@ -83,7 +83,7 @@ def by_hand(env: lw.Env) -> list[dict[str, np.ndarray]]:
 
 
 @pytest.mark.parametrize("tensors", [False, True], ids=["numpy", "torch"])
-def test_a_step_has_the_numbers_of_the_environment_behind_it(
+def test_a_step_returns_the_numbers_of_the_wrapped_environment(
     tensors: bool, vector: Callable[..., GymnasiumVectorEnv]
 ) -> None:
     envs = vector(torch=tensors)

@@ -31,7 +31,7 @@ def hopper() -> StableBaselines3VecEnv:
     return StableBaselines3VecEnv("hopper", N)
 
 
-def test_a_step_has_the_numbers_of_the_environment_behind_it(full: StableBaselines3VecEnv) -> None:
+def test_a_step_returns_the_numbers_of_the_wrapped_environment(full: StableBaselines3VecEnv) -> None:
     twin = lw.make(Full, nworld=N)
     full.seed(9)
     np.testing.assert_array_equal(full.reset(), (twin.rand_reset(9), twin.obs.numpy())[1])

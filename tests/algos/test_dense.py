@@ -44,7 +44,7 @@ def test_hand_written_products_equal_autograds(activation: str, hidden: tuple[in
             torch.testing.assert_close(plain(direction), written(direction), rtol=1e-4, atol=1e-5)
 
 
-def test_a_frozen_log_std_is_left_out() -> None:
+def test_a_frozen_log_std_has_no_gradient() -> None:
     policy = policy_of("tanh")
     policy.log_std.requires_grad_(False)
     dense = DensePolicy.of(policy)
@@ -55,7 +55,7 @@ def test_a_frozen_log_std_is_left_out() -> None:
     torch.testing.assert_close(plain(gradients[0]), written(gradients[0]), rtol=1e-4, atol=1e-5)
 
 
-def test_samples_and_predictions_equal_those_of_the_modules() -> None:
+def test_samples_and_predictions_equal_the_modules() -> None:
     policy, generator = policy_of("tanh"), torch.Generator().manual_seed(0)
     dense = DensePolicy.of(policy)
     obs, noise = torch.randn(6, 5, generator=generator), torch.randn(6, 2, generator=generator)

@@ -1,4 +1,4 @@
-"""NPG in several processes: same worlds, same update, and a run that any number of processes can continue."""
+"""Train in several processes: the worlds and updates equal one process's, and any number of processes can resume."""
 
 import csv
 import os

@@ -102,11 +102,11 @@ ON_WARP = ("reach", "stop", "value", "covariance", "model", "cem_smoothed", "lin
 
 
 @pytest.mark.parametrize("case, engine", [*((c, "mujoco") for c in CASES), *((c, "warp") for c in ON_WARP)])
-def test_plans_equal_those_of_the_plain_version(case: str, engine: str) -> None:
+def test_plans_equal_the_plain_versions(case: str, engine: str) -> None:
     check_against(Plain, engine, **CASES[case])
 
 
-def test_plans_for_reach_equal_those_of_mujoco_and_numpy_alone() -> None:
+def test_plans_for_reach_equal_plans_with_only_mujoco_and_numpy() -> None:
     check_against(PlainReach, "mujoco", **REACH)
 
 
@@ -200,7 +200,7 @@ def test_equal_seeds_give_equal_plans_and_a_reset_starts_again(update: str) -> N
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("risk", ["mean", "worst"])
-def test_plans_in_several_models_equal_those_of_the_plain_version(risk: Any, engine: str) -> None:
+def test_plans_in_several_models_equal_the_plain_versions(risk: Any, engine: str) -> None:
     settings = dict(horizon=6, samples=8, noise=1.0, smoothing=(1, 0, 0), temperature=0.5, update="mppi", risk=risk)
     plan = MPPI(Weighed, engine=engine, models=3, seed=2, **settings)
     fields = {name: rows.numpy() for name, rows in plan.model_fields.items()}

@@ -1,4 +1,4 @@
-"""NPG as a whole: correct step lengths, exact resumption, and a task that it learns."""
+"""Test NPG as a whole: correct step lengths, exact resumption, and a task that it learns."""
 
 import copy
 import dataclasses

@@ -67,7 +67,7 @@ def test_episode_statistics_cover_only_complete_episodes(rollout: lw.Rollout) ->
     assert episode_statistics(parts) == pytest.approx(expected, rel=1e-5)
 
 
-def test_value_statistics_of_two_processes_equal_those_of_all_samples() -> None:
+def test_value_statistics_of_two_processes_equal_statistics_of_all_samples() -> None:
     returns, predicted = 3.0 + torch.randn(2, 50, dtype=torch.float64), 2.0 + torch.randn(2, 50, dtype=torch.float64)
     sums = [ValueSums(*(x.item() for x in prediction_sums(r, p))) for r, p in zip(returns, predicted, strict=True)]
     error = returns - predicted

@@ -1,4 +1,4 @@
-"""User-defined policy networks: NPG refuses unsuitable ones, and trains the others like its own."""
+"""Test user-defined policy networks: NPG refuses unsuitable ones, and trains the others like its own."""
 
 from collections.abc import Callable
 from pathlib import Path

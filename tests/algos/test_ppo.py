@@ -1,4 +1,4 @@
-"""PPO as a whole: it learns, bootstraps truncated episodes, follows its schedules, and resumes exactly."""
+"""Test PPO as a whole: it learns, bootstraps truncated episodes, follows its schedules, and resumes exactly."""
 
 import copy
 import dataclasses
@@ -72,7 +72,7 @@ def test_a_run_is_reproducible_and_resumes_to_the_bit(changes: dict[str, Any], e
         assert torch.equal(part, weights(resumed)[name]), name
 
 
-def test_statistics_are_those_of_the_samples(shared_env: SharedEnv) -> None:
+def test_statistics_equal_the_samples_statistics(shared_env: SharedEnv) -> None:
     """Every episode has 10 steps; an episode with a random start does not count."""
     ppo = made(shared_env(Metered, nworld=4, horizon=10, far=1e3))
     found: list[float] = []

@@ -1,4 +1,4 @@
-"""The fit of value functions, with and without a captured step."""
+"""Fit value functions, with and without a captured step."""
 
 from typing import Any
 

@@ -93,7 +93,7 @@ def test_stopped_run_continues_without_measuring_again(
     assert toy.main("--out", path, "--contestants", "ours") == 0 and not toy.measured
 
 
-def test_results_of_other_machines_and_versions_do_not_count(
+def test_results_of_other_machines_and_versions_are_not_reused(
     toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, options = tmp_path / "toy.jsonl", ("--contestants", "ours", "--tasks", "hop", "--repeats", 1)

@@ -1,4 +1,4 @@
-"""Parts of memory and of observations have names: their order, sizes and types, and mistakes in them."""
+"""Test named parts of memory and of observations: order, sizes, types, and mistakes."""
 
 from pathlib import Path
 from typing import Any
@@ -102,7 +102,7 @@ def test_parts_have_their_order_sizes_and_values_in_states_and_observations(engi
     assert env.obs[:, 5].tolist() == [6.0, 7.0]
 
 
-def test_a_table_sets_sizes_which_no_later_value_changes() -> None:
+def test_a_table_sets_the_sizes_of_parts_permanently() -> None:
     env = lw.make(Marked, places=[1.0, 2.0])
     assert env.obs.shape == (1, 5)
     env.set_params(places=[3.0, 4.0])

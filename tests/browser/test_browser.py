@@ -1,4 +1,4 @@
-"""The viewer in a real browser: what a page shows, and how it responds to input."""
+"""Test the viewer in a real browser: what a page shows, and how it responds to input."""
 
 import contextlib
 import http.server

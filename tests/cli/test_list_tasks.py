@@ -47,7 +47,7 @@ def test_tasks_are_listed_with_their_sizes_and_models(capsys: pytest.CaptureFixt
     assert "    hop forward on one leg (Gymnasium's Hopper-v5)" in out.splitlines()
 
 
-def test_listed_sizes_are_those_of_an_environment(capsys: pytest.CaptureFixture[str]) -> None:
+def test_listed_sizes_equal_an_environments(capsys: pytest.CaptureFixture[str]) -> None:
     cli.main(["tasks", "gymnasium"])
     found = rows(capsys.readouterr().out)
     for name in ("hopper", "humanoid", "pusher"):

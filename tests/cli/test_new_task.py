@@ -86,7 +86,7 @@ def test_a_new_task_observes_the_state_and_those_sensors_that_measure_it(folder:
     assert env.reward.tolist() == [0.0, 0.0]
 
 
-def test_a_model_whose_sensors_measure_every_joint_is_observed_through_them_alone(folder: Path) -> None:
+def test_a_model_whose_sensors_measure_every_joint_is_observed_only_through_them(folder: Path) -> None:
     task = find_task(new("sensed", SENSED))
     assert task.obs == {"sensors": 7}
     unsensed = SENSED.replace('<gyro site="imu"/>', '<gyro site="end"/>')  # no sensor measures the floating body

@@ -186,7 +186,7 @@ def test_a_folder_that_is_not_empty_is_refused(tmp_path: Path, capsys: pytest.Ca
     assert "--resume" not in (error := capsys.readouterr().err) and "holds a run: give another folder" in error
 
 
-def test_an_interrupt_keeps_whole_episodes(tmp_path: Path) -> None:
+def test_an_interrupt_keeps_complete_episodes(tmp_path: Path) -> None:
     out = tmp_path / "run"
     argv = ["plan", "point_mass", "--out", str(out), *SMALL, *QUIET, "--episodes", "100000"]
     program = f"{TAKE_SIGINT}import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"
@@ -233,7 +233,7 @@ def test_fill_is_a_word_or_one_number_or_an_action(words: list[str], fill: objec
     assert json.loads((tmp_path / "run" / "config.json").read_text())["planner"]["fill"] == fill
 
 
-def test_settings_that_are_not_given_are_those_of_the_task(tmp_path: Path) -> None:
+def test_settings_default_to_the_tasks(tmp_path: Path) -> None:
     argv = ["plan", "reach", "--out", str(tmp_path / "run"), *QUIET, "--steps", "1", "--samples", "7"]
     assert (
         cli.main([*argv, "--noise", "0.3", "0.4", "0.5", "0.6", "0.7", "0.8", "0.9", "--smoothing", "1", "0", "0"]) == 0

@@ -12,7 +12,7 @@ def env() -> lw.Env:
     return lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
 
 
-def test_control_returns_the_whole_episode(env: lw.Env) -> None:
+def test_control_returns_the_complete_episode(env: lw.Env) -> None:
     episode = control(env, towards, seed=3)
     assert episode.steps == 40 and episode.truncated and not episode.terminated
     assert episode.states.shape == (41, env.state_space.size) and episode.states.dtype == torch.float64

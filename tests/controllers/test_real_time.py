@@ -1,4 +1,4 @@
-"""The real-time loop: on a simulated clock with exact times, and with a thread on the real clock."""
+"""Test the real-time loop, on a simulated clock with exact times and with a thread on the real clock."""
 
 import math
 import subprocess

@@ -1,4 +1,4 @@
-"""Model fields that differ between worlds, inputs, initial states and settling, on every engine."""
+"""Test model fields that differ between worlds, inputs, initial states and settling, on every engine."""
 
 import copy
 from collections.abc import Mapping
@@ -110,7 +110,7 @@ def state_of(engine: Engine) -> wp.array:
 
 
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
-def test_constants_equal_those_of_a_recompiled_model(engine: type[Engine]) -> None:
+def test_constants_equal_a_recompiled_models(engine: type[Engine]) -> None:
     made = make(engine, "body_mass", "body_inertia", "body_ipos", "dof_armature", "actuator_gear", "geom_size")
     draw(made)
     for w in range(N):
@@ -188,7 +188,7 @@ def test_a_change_in_one_world_alters_no_other(engine: type[Engine]) -> None:
     assert (got[1] != expected[1]).any()
 
 
-def test_worlds_of_the_nominal_model_are_those_of_an_engine_without_dynamics() -> None:
+def test_worlds_of_the_nominal_model_equal_an_engine_without_dynamics() -> None:
     np.testing.assert_array_equal(run(make(MujocoEngine, *DRAWN)), run(make(MujocoEngine)))
 
 
@@ -368,7 +368,7 @@ SLIDERS = """<mujoco><worldbody>
 </worldbody></mujoco>"""
 
 
-def test_inverse_weights_of_bodies_that_only_slide_or_turn_are_those_of_a_compiled_model() -> None:
+def test_inverse_weights_of_bodies_that_only_slide_or_turn_equal_a_compiled_models() -> None:
     """MuJoCo gives weight 0 to directions in which a body cannot move, unlike MuJoCo Warp's ``set_const``."""
     model = mujoco.MjModel.from_xml_string(SLIDERS)
     engine = make(WarpEngine, "body_mass", nworld=2, model=model)

@@ -145,7 +145,7 @@ LADEN = table.PLAIN | {
 
 
 @pytest.mark.parametrize("asked", table.STAGES)
-def test_a_step_goes_on_from_the_fields_of_any_stage(asked: str, device: wp.Device) -> None:
+def test_a_step_continues_from_the_fields_of_any_stage(asked: str, device: wp.Device) -> None:
     """The step computes the parts that a field needs, and does not repeat parts that are already computed."""
     check(LADEN | {"asked": asked}, device)
 

@@ -1,4 +1,4 @@
-"""Tests that need a GPU: no step waits for the host, graphs equal direct launches, runs are reproducible."""
+"""Test on a GPU that no step waits for the host, graphs equal direct launches, and runs are reproducible."""
 
 import contextlib
 import gc

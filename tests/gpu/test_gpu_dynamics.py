@@ -1,4 +1,4 @@
-"""Worlds with different models on a GPU, in graphs, compared with the C engine."""
+"""Compare worlds with different models, in graphs on a GPU, with the C engine."""
 
 import mujoco
 import numpy as np

@@ -1,4 +1,4 @@
-"""Broken, foreign and missing files of policies and states."""
+"""Read broken, foreign and missing files of policies and states."""
 
 from pathlib import Path
 from random import Random

@@ -1,4 +1,4 @@
-"""Runs of earlier releases load, are evaluated and resume."""
+"""Load, evaluate and resume runs of earlier releases."""
 
 import shutil
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A run's copies of its task: what is copied, and which files later commands use after a move or an edit."""
+"""Copy a run's task, and test which files later commands use after a move or an edit."""
 
 import shutil
 from pathlib import Path

@@ -135,7 +135,7 @@ def test_a_draw_that_cannot_be_simulated_is_a_fault_of_its_world(engine: str) ->
     assert env.fault_counts["model"] == 2
 
 
-def test_a_robots_state_has_the_nominal_model_unless_it_is_given() -> None:
+def test_state_of_gives_a_robots_state_the_nominal_model_by_default() -> None:
     plan = lw.MPPI(Faulty, samples=2, horizon=2)
     columns = plan.env.state_space.parts["body_mass"]
     assert plan.state_of(qpos=[0.0])[columns].tolist() == [0.0, 1.0]

@@ -99,7 +99,7 @@ def test_a_randomised_world_continues_in_another_environment(engine: str) -> Non
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_draws_do_not_compound_over_resets(engine: str) -> None:
+def test_draws_do_not_accumulate_over_resets(engine: str) -> None:
     env = lw.make(Drawn, nworld=4, engine=engine)
     masses = []
     for _ in range(1000 if engine == "mujoco" else 100):
@@ -308,7 +308,7 @@ def test_inputs_that_a_reset_draws_act_in_steps_and_in_rollouts(engine: str) -> 
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_rollout_has_the_numbers_of_stepping_without_events(engine: str) -> None:
+def test_a_rollout_equals_steps_without_events(engine: str) -> None:
     env = lw.make(Full, nworld=3, engine=engine, autoreset=False, horizon=0)
     loop = OpenLoop(lw.make(Full, nworld=3, engine=engine, autoreset=False, seed=5), 4)
     for action in random_actions(env, 3, seed=1):

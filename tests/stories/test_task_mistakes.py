@@ -1,4 +1,4 @@
-"""Mistakes in a task file: the error is one line that names the mistake and its fix; the corrected file then loads.
+"""Test mistakes in a task file: one line names the mistake and its fix, and the corrected file then loads.
 
 tests/binding tests the same messages by module; these are the mistakes that newcomers made.
 """

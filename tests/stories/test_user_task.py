@@ -1,4 +1,4 @@
-"""A user's task in its own file, with every feature that a task may use, on both engines."""
+"""Test a user's task in its own file, with every feature that a task may use, on both engines."""
 
 import importlib.util
 import sys

@@ -1,4 +1,4 @@
-"""Parameters and metrics of adroit_hammer, adroit_door and adroit_relocate.
+"""Test parameters and metrics of adroit_hammer, adroit_door and adroit_relocate.
 
 oracles/test_gymnasium_robotics.py compares the tasks with the originals.
 """

@@ -1,4 +1,7 @@
-"""The aloha_lift task: its model, a scripted lift, and resets. test_panda_lift.py tests the terms of its reward."""
+"""Test the aloha_lift task: its model, a scripted lift, and resets.
+
+test_panda_lift.py tests the terms of its reward.
+"""
 
 import mujoco
 import numpy as np

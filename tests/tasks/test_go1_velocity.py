@@ -1,4 +1,4 @@
-"""The go1_velocity task: formulas, contact timers, commands, pushes, random draws and curriculum.
+"""Test the go1_velocity task: formulas, contact timers, commands, pushes, random draws and curriculum.
 
 tests/oracles/test_mjlab.py compares it with mjlab.
 """

@@ -1,4 +1,4 @@
-"""The panda_lift task: the robot, a scripted grasp, the reward terms (also of aloha_lift), resets and success."""
+"""Test the panda_lift task: robot, scripted grasp, reward terms (also of aloha_lift), resets and success."""
 
 import mujoco
 import numpy as np

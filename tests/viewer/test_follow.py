@@ -1,4 +1,4 @@
-"""Viewers that follow a run while it trains."""
+"""View a run while it trains."""
 
 import contextlib
 import importlib

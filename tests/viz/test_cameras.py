@@ -50,7 +50,7 @@ def test_an_unknown_camera_is_refused_with_the_models_cameras(model: mujoco.MjMo
         find_camera(mujoco.MjModel.from_xml_string("<mujoco/>"), 0)
 
 
-def test_a_free_camera_has_the_given_pose_and_otherwise_mujocos(model: mujoco.MjModel) -> None:
+def test_a_free_camera_has_the_given_pose_or_mujocos_default(model: mujoco.MjModel) -> None:
     default = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, default)
     for choice in ("free", FreeCamera()):

@@ -1,4 +1,4 @@
-"""The main loop, with real worlds and a window in memory."""
+"""Test the session's main loop, with real worlds and a window in memory."""
 
 import socket
 import threading

@@ -1,4 +1,4 @@
-"""The window process: what it serves, and how it ends."""
+"""Test the window process: what it serves, and how it ends."""
 
 import contextlib
 import os

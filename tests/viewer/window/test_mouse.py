@@ -33,7 +33,7 @@ def hold(bench: Bench, *, paused: bool) -> list[Perturb]:
     return bench.sent[before:]  # type: ignore[return-value]
 
 
-def test_dragged_body_is_pushed_until_it_is_left(bench: Bench) -> None:
+def test_dragged_body_is_pushed_until_the_release(bench: Bench) -> None:
     (push,) = drag(bench, "ball", paused=False)
     assert push.forces[bench.model.body("ball").id, 0] > 0
     assert push.qpos is None and push.mocap_pos is None

@@ -1,4 +1,4 @@
-"""The panel in a viewer without a screen: frames, windows, keys and cameras."""
+"""Test the panel in a viewer without a screen: frames, windows, keys and cameras."""
 
 import mujoco
 import numpy as np
@@ -122,7 +122,7 @@ def test_fixed_camera_of_the_model_can_be_chosen(bench: Bench) -> None:
 # models that differ between worlds
 
 
-def test_world_of_another_size_gets_a_model_of_its_own(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_world_with_other_sizes_gets_a_separate_model(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lyceum_warp.viewer.window.panel.SWAP_TIME", 0.0)
     sizes = np.array(bench.model.geom_size)
     sizes[1, 0] = 0.3

@@ -1,4 +1,4 @@
-"""The proxy: what it forwards, and the attacks that it refuses."""
+"""Test the proxy: what it forwards, and the attacks that it refuses."""
 
 import contextlib
 import http.client
