@@ -21,9 +21,10 @@ SAME_FUNCTIONS = ("g1_full_velocity", "g1_rough_velocity", "h1_velocity", "spot_
 """Walking robots that share every function with ``go1_velocity``, ``g1_velocity`` or ``go1_rough_velocity``."""
 
 
-def long_if_alike(tasks: Iterable[str]) -> list[Any]:
-    """Parameters of a test of every task; the tasks of ``SAME_FUNCTIONS`` are marked long."""
-    return [pytest.param(task, marks=pytest.mark.long) if task in SAME_FUNCTIONS else task for task in tasks]
+def long_if_alike(tasks: Iterable[str], *more: str) -> list[Any]:
+    """Return parameters for a test of every task; tasks of ``SAME_FUNCTIONS``, and ``more``, are marked long."""
+    alike = (*SAME_FUNCTIONS, *more)
+    return [pytest.param(task, marks=pytest.mark.long) if task in alike else task for task in tasks]
 
 
 SharedEnv = Callable[..., lw.Env]

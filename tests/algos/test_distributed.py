@@ -77,6 +77,7 @@ def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
         torch.testing.assert_close(state["env"], wanted["env"], **close)
 
 
+@pytest.mark.long
 def test_two_machines_make_the_same_update_as_one_process(tmp_path: Path) -> None:
     """Two torchrun commands stand in for two machines; a single process then continues their run."""
     two, one = tmp_path / "two", tmp_path / "one"
@@ -105,16 +106,25 @@ PPO = ["--algorithm", "ppo", "--nworld", "12", "--num-steps", "20", "--minibatch
 """Settings with unfinished episodes, a normaliser, an adaptive learning rate, leftover samples and an evaluation."""
 
 
-@pytest.mark.parametrize("minibatches", [[], ["--whiten-minibatches", "--std-type", "log"]])
-def test_two_processes_make_the_same_update_of_ppo_as_one(minibatches: list[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("settings", "tolerance"),
+    [
+        pytest.param(OPTIONS, 2e-4, id="npg"),
+        pytest.param(PPO, 2e-3, id="ppo"),  # Adam turns rounding errors of small gradients into steps
+        pytest.param(
+            [*PPO, "--whiten-minibatches", "--std-type", "log"], 2e-3, id="whitened ppo", marks=pytest.mark.long
+        ),
+    ],
+)
+def test_two_processes_make_the_same_update_as_one(settings: list[str], tolerance: float, tmp_path: Path) -> None:
     two, one = tmp_path / "two", tmp_path / "one"
-    arguments = ["train", "hopper", *PPO, *minibatches, *QUIET, "--iterations", "1", "--out"]
+    arguments = ["train", "hopper", *settings, *QUIET, "--iterations", "1", "--out"]
     launch = ["--standalone", "--nproc-per-node=2", "--monitor-interval=0.1", "--local-addr=127.0.0.1"]
     process = torchrun(*arguments, str(two), options=launch)
     assert cli.main([*arguments, str(one)]) == 0
     [(code, out, error)] = ended([process])
     assert code == 0 and "6 worlds each in 2 processes" in out, error
-    assert_equal_runs(two, one, tolerance=2e-3)  # Adam turns rounding errors of small gradients into steps
+    assert_equal_runs(two, one, tolerance=tolerance)
     assert cli.main(["train", "--resume", str(two), "--iterations", "2", *QUIET]) == 0
 
 

@@ -326,6 +326,7 @@ def test_an_episode_is_scrubbed_and_played(tab: Tab) -> None:
     tab.press("Space", lambda: viewer.status.step < STEPS / 2)
 
 
+@pytest.mark.long
 def test_another_browser_controls_after_one_is_closed_or_killed(
     viewer: Viewer, launch: Callable[[], Browser], context: BrowserContext, shared_tab: Tab
 ) -> None:

@@ -293,7 +293,7 @@ def singles() -> Iterator[Case]:
 
 @functools.cache
 def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
-    """Return cases that together contain each combination of two (or three, ...) levels of different factors.
+    """Return cases that together contain each combination of one, two, three, ... levels of different factors.
 
     A greedy search: each case starts with a combination that is still missing, and the other factors take the level
     that adds the most missing combinations. Refused combinations are omitted.

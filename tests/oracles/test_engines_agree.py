@@ -28,6 +28,8 @@ FORCE_PARTS = ("contact_force",)
 """Observation parts that depend on constraint forces, which are exact only to the solver's tolerance."""
 
 
+SAME_MODELS = ("adroit_door", "adroit_relocate", "humanoid_standup")
+"""Tasks on the hand or the humanoid of other tasks; they are long tests."""
 WALKERS = tuple(name for name in VELOCITY if name != "go1_velocity")
 CONVERGED = {"iterations": 100, "ls_iterations": 50}
 PARAMS: dict[str, dict[str, Any]] = {
@@ -135,7 +137,7 @@ def device(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-@pytest.fixture(scope="module", params=long_if_alike(TASKS))
+@pytest.fixture(scope="module", params=long_if_alike(TASKS, *SAME_MODELS))
 def engines(request: pytest.FixtureRequest, device: str, shared_env: SharedEnv) -> Iterator[Engines]:
     task = request.param
     options = {"nworld": NWORLD, "cone": "elliptic", "frame_skip": 1, "autoreset": False, "horizon": 0}
