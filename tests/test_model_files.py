@@ -62,7 +62,7 @@ def test_the_package_mujoco_menagerie_provides_robots_that_no_other_source_has(
         lw.menagerie_model("agility_cassie/scene.xml").path()
 
 
-def test_a_missing_file_of_menagerie_is_named_with_those_that_resemble_it(sources: dict[str, Path]) -> None:
+def test_a_missing_file_of_menagerie_is_named_with_similar_ones(sources: dict[str, Path]) -> None:
     with pytest.raises(FileNotFoundError, match=r"no model file 'leg/scone\.xml' in .*; it has leg/scene\.xml, arm"):
         lw.menagerie_model("leg/scone.xml").spec()
 

@@ -449,7 +449,7 @@ def test_a_fault_in_the_middle_is_reported_at_the_end(task: type[lw.Task]) -> No
     assert not run(loop, state, torch.full_like(actions, 9.81e-4))["fault"].any()
 
 
-def test_worlds_that_reset_and_bad_horizons_are_refused(shared_env: SharedEnv) -> None:
+def test_automatic_resets_and_bad_horizons_are_refused(shared_env: SharedEnv) -> None:
     with pytest.raises(ValueError, match=r"worlds that do not reset: make\(..., autoreset=False\)"):
         OpenLoop(shared_env("point_mass"), 5)
     env = shared_env("point_mass", autoreset=False)

@@ -107,7 +107,7 @@ def test_a_broken_task_is_listed_with_its_mistake(
 
 
 def test_a_closed_pipe_ends_the_list_quietly() -> None:
-    """The reader of the pipe ends before the first line."""
+    """The reader closes the pipe before the first line."""
     command = f"{sys.executable} -m lyceum_warp.cli tasks hopper | true"
     done = subprocess.run(command, shell=True, capture_output=True, text=True)
     assert done.stderr == ""

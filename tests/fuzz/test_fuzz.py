@@ -1,4 +1,4 @@
-"""Damaged files, random command lines and random arguments work or are refused with an error that gives the reason.
+"""Damage files, command lines and arguments at random: each works, or is refused with an error that gives the reason.
 
 A failure names its case and the command that repeats it.
 """
