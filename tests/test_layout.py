@@ -105,7 +105,7 @@ def test_no_module_imports_itself_through_others() -> None:
     def visit(name: str, path: tuple[str, ...]) -> None:
         assert name not in path, " imports ".join([*path[path.index(name) :], name])
         if name not in finished:
-            for other in imports()[name] - {"lyceum_warp"}:  # only tasks import these, and tasks have no users
+            for other in imports()[name] - {"lyceum_warp"}:  # only tasks import it, and nothing imports tasks
                 visit(other, (*path, name))
             finished.add(name)
 

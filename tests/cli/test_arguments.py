@@ -38,7 +38,7 @@ def test_a_parameter_is_read_with_its_type(text: str, value: object) -> None:
         ("mass=heavy", "the value in 'mass=heavy' must be a number, true or false"),
     ],
 )
-def test_a_parameter_written_in_another_way_is_refused(text: str, message: str) -> None:
+def test_a_malformed_parameter_is_refused(text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parameter(text)
 

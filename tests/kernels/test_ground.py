@@ -155,6 +155,6 @@ def test_levels_rise_and_fall_with_the_distance_walked(
     assert (next_levels(level, walked, commanded) == wanted).all()
 
 
-def test_after_the_last_level_follows_a_random_one() -> None:
+def test_a_random_level_follows_the_last_one() -> None:
     counts = np.bincount(next_levels(4, 4.1, 10.0), minlength=5)
     assert len(counts) == 5 and (abs(counts - 400) < 90).all()
