@@ -19,6 +19,8 @@ torch.set_num_threads(1)
 
 SAME_FUNCTIONS = ("g1_full_velocity", "g1_rough_velocity", "h1_velocity", "spot_velocity", "t1_velocity")
 """Walking robots that share every function with ``go1_velocity``, ``g1_velocity`` or ``go1_rough_velocity``."""
+SAME_MODELS = ("adroit_door", "adroit_relocate", "humanoid_standup")
+"""Tasks with the hand or the humanoid of other tasks, which need no quick tests of the Warp engine."""
 
 
 def long_if_alike(tasks: Iterable[str], *more: str) -> list[Any]:

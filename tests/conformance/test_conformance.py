@@ -1,7 +1,7 @@
 """Every task of the package obeys the rules on both engines, and some tasks also on a toy engine."""
 
 import pytest
-from conftest import long_if_alike, settle
+from conftest import SAME_FUNCTIONS, SAME_MODELS, settle
 from toy_engine import ToyEngine
 
 import lyceum_warp as lw
@@ -46,8 +46,14 @@ def options(task: str, engine: str) -> dict[str, int]:
     return {"steps": 50 if every else 25, "frame_skip": min(2, find_task(task).frame_skip)}
 
 
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-@pytest.mark.parametrize("task", long_if_alike(PACKAGE))
+@pytest.mark.parametrize(
+    ("engine", "task"),
+    [
+        pytest.param(engine, task, marks=pytest.mark.long if task in alike else ())
+        for engine, alike in (("mujoco", SAME_FUNCTIONS), ("warp", (*SAME_FUNCTIONS, *SAME_MODELS)))
+        for task in PACKAGE
+    ],
+)
 def test_a_task_keeps_the_rules(task: str, engine: str) -> None:
     checks = CHECKS if task in EVERY_RULE[engine] else OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
     report = check_task(task, engine=engine, checks=checks, **options(task, engine))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import SharedEnv, long_if_alike
+from conftest import SAME_MODELS, SharedEnv, long_if_alike
 from form_tasks import Drawn, Pushed
 
 import lyceum_warp as lw
@@ -28,8 +28,6 @@ FORCE_PARTS = ("contact_force",)
 """Observation parts that depend on constraint forces, which are exact only to the solver's tolerance."""
 
 
-SAME_MODELS = ("adroit_door", "adroit_relocate", "humanoid_standup")
-"""Tasks on the hand or the humanoid of other tasks; they are long tests."""
 WALKERS = tuple(name for name in VELOCITY if name != "go1_velocity")
 CONVERGED = {"iterations": 100, "ls_iterations": 50}
 PARAMS: dict[str, dict[str, Any]] = {
