@@ -374,7 +374,7 @@ def run(experiment: Experiment, options: Options) -> int:
                 print(f"skipped: {result}", flush=True)
             skipped.add(str(result))
             continue
-        if isinstance(result, Exception):  # a failure must not stop the remaining cases
+        if isinstance(result, Exception):  # the remaining cases run in any case
             failed += 1
             traceback.print_exception(result)
             print(f"failed: {_text(case)}", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""Options of environments and physics: checked when made, separated from parameters, suggested when misspelt."""
+"""Check options of environments and physics, separate them from parameters, and suggest similar names."""
 
 import dataclasses
 import inspect
@@ -81,7 +81,7 @@ def test_a_replica_has_the_options_of_the_original_except_for_the_changes() -> N
         ("qqq", ""),
     ],
 )
-def test_suggestion_knows_every_option_and_words_of_other_packages(word: str, expected: str) -> None:
+def test_suggestion_knows_every_option_and_names_of_other_packages(word: str, expected: str) -> None:
     assert suggestion(word) == expected
 
 

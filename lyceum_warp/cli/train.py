@@ -30,7 +30,6 @@ from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import read_checkpoint
 from lyceum_warp.runs.configuration import ALGORITHMS, Configuration, saved_networks
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.metrics_table import read_metrics
 from lyceum_warp.runs.task_copy import note_changes
 from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.training import train
@@ -247,7 +246,7 @@ class Train:
     def _report(self, run: Run, learner: Learner, console: Console) -> int:
         """Print the table, evaluate the policy, make the plot and the video; return the exit code."""
         env, policy, seed = learner.env, learner.policy, learner.env.options.seed + 1
-        console.print(curve_table(read_metrics(run.metrics)))
+        console.print(curve_table(run.rows()))
         few = evaluation_worlds(env, _FINAL_EPISODES)
         with LongWork("evaluating the mean policy", "steps", console) as work:
             returns = evaluate(few, moved(policy, few), _FINAL_EPISODES, seed=seed, progress=work).returns

@@ -28,7 +28,7 @@ _Kind = mujoco.mjtObj
 @dataclasses.dataclass
 class _Foot:
     name: str
-    """Name of the site, of the model or new."""
+    """Name of the foot's site, which the model has or the task adds."""
     body: int
     element: str = ""
     """A body, joint or geom in the foot's body; empty if the model has the site."""

@@ -43,8 +43,9 @@ class Run:
     ``metrics.csv``     one row per iteration
     ``policy.pt``       the last policy, and its value function
     ``best.pt``         the policy with the best return
-    ``policies/``       the policy of every n-th iteration, with ``keep_every`` ``checkpoint.pt``   the complete state
-    to resume from exactly, at the same iteration as ``policy.pt`` ``previous.pt``     the checkpoint before it
+    ``policies/``       the policy of every n-th iteration, with ``keep_every``
+    ``checkpoint.pt``   the complete state to resume from exactly, at the same iteration as ``policy.pt``
+    ``previous.pt``     the checkpoint before it
     ``task/``           copies of the task's file, modules and model, unless they are part of the package
     =================== ======================================================================================
 

@@ -52,14 +52,16 @@ def test_eval_prints_statistics_of_the_seeds_episodes(trained: Path, capsys: pyt
     assert "success:" in lines
 
 
-def test_eval_refuses_no_episodes_and_folders_without_a_run(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_eval_refuses_zero_episodes_and_folders_without_a_run(
+    trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["eval", str(trained), "--episodes", "0"]) == 2
     refused(capsys, "at least 1 episode")
     assert cli.main(["eval", str(trained.parent)]) == 2
     refused(capsys, "there is no run in")
 
 
-def test_a_folder_may_have_the_name_of_markup(
+def test_a_folder_name_may_look_like_rich_markup(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = Path(shutil.copytree(trained, tmp_path / "[" / "bold]x"))

@@ -93,7 +93,7 @@ def test_a_robot_learns_for_an_iteration(folder: Path, tmp_path: Path) -> None:
     assert cli.main(["train", "ant_walk.py", "--out", str(tmp_path / "run"), *words, "--no-video"]) == 0
 
 
-def test_feet_and_joints_are_those_of_the_legs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_feet_and_joints_are_found_on_the_legs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """New sites are in the middle of the soles; a site that is there stays; other joints keep their pose."""
     assert new("sled_walk", "--model", "sled.xml") == 0
     assert capsys.readouterr().out.startswith("sled_walk.py: feet foot_1, toe; joints left_hip, right_hip; check")
@@ -138,7 +138,7 @@ def test_feet_without_the_template_are_refused(folder: Path, capsys: pytest.Capt
     assert "--feet and --joints belong to --template velocity" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("task", ["g1_velocity", "spot_velocity"])
+@pytest.mark.parametrize("task", ["spot_velocity", pytest.param("g1_velocity", marks=pytest.mark.long)])
 def test_robots_of_menagerie_become_tasks(task: str, folder: Path) -> None:
     model = {"g1_velocity": "unitree_g1/scene_mjx.xml", "spot_velocity": "boston_dynamics_spot/scene.xml"}[task]
     assert new("walk", "--model", f"menagerie:{model}") == 0
