@@ -481,6 +481,14 @@ class Task:
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Change the model before it is compiled, also one that was passed to ``make``. Default: keeps it."""
 
+    @staticmethod
+    def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
+        """What a robot needs to run a policy, for the metadata of ONNX files: JSON values by name. Default: nothing.
+
+        ``model`` is the compiled model, and ``p`` has the parameters as attributes.
+        """
+        return {}
+
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
         if "gymnasium" not in vars(cls):

@@ -1,3 +1,4 @@
+import json
 import os
 import shutil
 import signal
@@ -343,3 +344,18 @@ def test_ppo_trains_by_the_same_loop_from_the_shell(six: Path, tmp_path: Path) -
     config = Run.open(tmp_path / "parts").config
     assert config["algorithm"] == "ppo" and config["ppo"]["hidden"] == [8] and "npg" not in config
     assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # PPO does not take NPG's settings
+
+
+def test_a_run_gets_a_verdict_on_its_policys_transfer(env: lw.Env, tmp_path: Path) -> None:
+    """By default only if the worlds' physics are not exact, because the other engine's kernels may take minutes."""
+    run = lw.train(algorithm(env), tmp_path / "exact", iterations=1)
+    assert not run.transfer.exists()
+    coarse = algorithm(lw.make("point_mass", nworld=2, frame_skip=2, horizon=20))
+    run = lw.train(coarse, tmp_path / "coarse", iterations=1)
+    found = json.loads(run.transfer.read_text())
+    (pair,) = found["comparisons"]
+    assert (found["iteration"], found["episodes"], pair["second"]) == (1, 64, "own physics")
+    lengths = pair["differences"][1]
+    assert (lengths["first"], lengths["second"], lengths["verdict"]) == (20.0, 20.0, "same")
+    assert found["line"].startswith(f"own physics against exact physics: {pair['verdict']} (return ")
+    assert not lw.train(coarse, tmp_path / "unwanted", iterations=2, transfer=False).transfer.exists()

@@ -114,3 +114,14 @@ def test_a_video_is_made_with_the_camera_that_is_named(
         assert cli.main(["eval", str(trained), "--episodes", "1", *flags]) == 2
         refused(capsys, message)
     assert len(cameras) == 3
+
+
+def test_eval_compares_both_engines(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["eval", str(trained), "--episodes", "4", "--horizon", "20", "--transfer"]
+    assert cli.main(arguments) == 0
+    shown = capsys.readouterr().out
+    assert "Warp engine on cpu against C engine: same" in shown
+    rows = [line.split() for line in shown.splitlines() if line.split()[:1] == ["length"]]
+    assert rows[-1] == ["length", "20", "20", "+0", "+0", "to", "+0", "1", "same"]
+    assert cli.main([*arguments, "--engine", "warp"]) == 2
+    refused(capsys, "--transfer plays on both engines: omit --engine")
