@@ -18,7 +18,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "mujoco": {  # without a slow check that does not depend on the model
         "nworld": 3, "steps": 20, "frame_skip": 2, "checks": [c for c in CHECKS if c is not episodes.check_memory],
     },
-    "warp": {"nworld": 2, "steps": 12, "horizon": 6, "frame_skip": 1, "checks": MODEL_CHECKS},
+    "warp": {"nworld": 2, "steps": 20, "horizon": 6, "frame_skip": 1, "checks": MODEL_CHECKS},
 }  # fmt: skip
 """Options of ``check_task`` for each engine."""
 
