@@ -46,13 +46,16 @@ def servos(model: mujoco.MjModel, p: Any) -> list[int]:
     """The actuator of each joint, (joints,).
 
     Raises:
-        ValueError: A joint has no actuator or several.
+        ValueError: A joint has no actuator of its own or several.
     """
     moved = np.where(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, model.actuator_trnid[:, 0], -1)
     found = [np.flatnonzero(moved == joint) for joint in p.joints]
     for joint, actuators in zip(p.joints, found, strict=True):
         if len(actuators) != 1:
-            raise ValueError(f"the joint {_name(model, _JOINT, joint)} has {len(actuators)} actuators: it needs one")
+            raise ValueError(
+                f"the joint {_name(model, _JOINT, joint)} has {len(actuators)} actuators of its own and needs one "
+                "(those of tendons do not count): change the model, or leave it out of the joints that act"
+            )
     return [int(actuators[0]) for actuators in found]
 
 

@@ -37,6 +37,7 @@ SLED = """
       </body>
     </body>
   </worldbody>
+  <tendon><fixed name="left"><joint joint="left_hip" coef="1"/></fixed></tendon>
   <actuator>
     <position name="right_hip" joint="right_hip" kp="40" kv="2"/>
     <position name="left_hip" joint="left_hip" kp="40" kv="2"/>
@@ -117,12 +118,14 @@ def test_options_name_feet_and_joints(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "options", "words"),
     [
-        ((), ["--feet", "tow"], "sled.xml: the model has no site, geom or body 'tow': --feet takes their names"),
-        ((), ["--joints", "hip"], "sled.xml: the model has no joint 'hip': --joints takes names of joints"),
+        ((), ["--feet", "tow"], "sled.xml: the model has no site, geom or body 'tow': --feet takes"),
+        ((), ["--joints", "hip"], "sled.xml: the model has no joint 'hip': --joints takes names, separated"),
         (("<freejoint/>", ""), [], "sled.xml: the first joint of the model is not a free joint"),
         (('<geom name="floor" type="plane" size="5 5 .1"/>', ""), [], "sled.xml: the model has no floor"),
         (('<position name="left_hip" joint="left_hip" kp="40" kv="2"/>', ""), ["--joints", "left_hip"],
-         "sled.xml: the joint 'left_hip' has 0 actuators: it needs one"),
+         "sled.xml: the joint 'left_hip' has 0 actuators of its own and needs one"),
+        (('<position name="left_hip" joint="left_hip" kp="40" kv="2"/>', '<motor tendon="left" ctrlrange="-1 1"/>'), [],
+         "sled.xml: the joint 'left_hip' has 0 actuators of its own and needs one (those of tendons do not count)"),
     ],
 )  # fmt: skip
 def test_a_robot_without_legs_is_refused(
