@@ -191,7 +191,7 @@ def _worlds(options: Plan, params: dict[str, Any], planner_params: dict[str, Any
         raise ValueError(f"episodes of {plant.task.name!r} never end without a horizon: give --steps")
     value = None if options.value is None else load_value(options.value)
     config = options.mppi.on_top_of(task_config(plant.task.task, value))
-    words = vars(options.planner) | options.planner_physics.options().given()
+    words = vars(options.planner) | options.planner_physics.given()
     if options.planner_model is not None:
         words["model"] = _model(options.planner_model)
     return plant, MPPI(plant.task.task, config, value=value, params=params | planner_params, **words)
