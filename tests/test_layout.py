@@ -18,9 +18,10 @@ ROOT = Path(lw.__file__).parent
 TESTS = Path(__file__).parent
 
 LEVELS = {
-    "support": -1, "done": 0,
-    "model_files": 0,
-    "fields": 1, "kernels": 1, "model_actuators": 1, "model_fields": 1, "options": 1, "task": 1, "walkers": 1,
+    "support": -2,
+    "model_files": -1,
+    "done": 0, "options": 0,
+    "fields": 1, "kernels": 1, "model_actuators": 1, "model_fields": 1, "task": 1, "walkers": 1,
     "graphs": 2, "spaces": 2, "terms": 2, "terrain": 2,
     "binding": 3, "engines": 3,
     "world_arrays": 4,

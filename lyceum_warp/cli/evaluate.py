@@ -13,7 +13,7 @@ from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_w
 from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.algos.transfer import Transfer, transfer
 from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Trust, given, parameters
+from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, Trust, given, parameters
 from lyceum_warp.cli.display import make_console, note, policy_video, tried
 from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.controllers.trajectory import source
@@ -31,7 +31,7 @@ from lyceum_warp.viz.video import check_video
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Eval:
-    """Evaluate a run's mean policy in whole episodes, with the run's own physics, and print statistics.
+    """Evaluate a run's mean policy in whole episodes, by default with the run's physics, and print statistics.
 
     If the task's file or model has moved or changed since the run started, the command uses the run's own copy and
     prints a message.
@@ -39,6 +39,7 @@ class Eval:
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
     $ lyceum-warp eval runs/hopper-20260101-120000 --video --camera track=torso --camera azimuth=45
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --transfer
+    $ lyceum-warp eval runs/humanoid-20260101-120000 --physics exact
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 8 --episodes-to runs/hopper-episodes
     """
 
@@ -66,6 +67,7 @@ class Eval:
     """A new or empty folder for one file per episode, in the format of lyceum-warp plan: episode-000.npz and so on."""
     trust: Trust = False
     env: tyro.conf.OmitArgPrefixes[EnvFlags] = dataclasses.field(default_factory=EnvFlags)
+    physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
     def run(self) -> int:
         """Run the command, and return the exit code."""
@@ -83,7 +85,8 @@ class Eval:
         run = Run.open(self.folder)
         nworld = min(self.nworld, self.episodes)
         path = run.policy_file(self.which)
-        env = run_worlds(run, self.env, parameters(self.param, self), nworld=nworld, task=self.task, trust=self.trust)
+        words, params = given(self.env) | self.physics.given(), parameters(self.param, self)
+        env = run_worlds(run, words, params, nworld=nworld, task=self.task, trust=self.trust)
         find_camera(env.model, camera)
         origin = _source(env, run)
         if env.horizon == 0:
@@ -140,12 +143,14 @@ def _print_transfer(verdict: Transfer, console: Console) -> None:
             console.print(f"faults: {comparison.faults[0]} and {comparison.faults[1]}")
 
 
-def run_worlds(run: Run, flags: Any, params: dict[str, Any], *, nworld: int, task: str | None, trust: bool) -> Env:
+def run_worlds(
+    run: Run, words: dict[str, Any], params: dict[str, Any], *, nworld: int, task: str | None, trust: bool
+) -> Env:
     """Make worlds of a run's task, with the run's options and parameters as defaults.
 
     Args:
         run: The run.
-        flags: Flags that override options; without a device, the worlds run on the CPU if the engine is auto.
+        words: Options that override the run's; without a device, the worlds run on the CPU if the engine is auto.
         params: Parameters that override the run's.
         nworld: Number of worlds.
         task: A different task, with its own options and parameters.
@@ -155,8 +160,8 @@ def run_worlds(run: Run, flags: Any, params: dict[str, Any], *, nworld: int, tas
     known, own = saved.options.changed({"seed": 0}), dict(saved.params)
     if task is not None and task_name(find_task(task)) != run.task_name:
         known, own = EnvOptions(engine=known.engine, device=known.device, nthread=known.nthread), {}
-    known = known.changed({"nworld": nworld} | given(flags))
-    if flags.device is None:
+    known = known.changed({"nworld": nworld} | words)
+    if "device" not in words:
         known = known.changed(options_for_few_worlds(known.engine, known.device))
     with run.settings():
         env = run_env(run, known, own | params, note=note, task=task, trust=trust)

@@ -54,6 +54,7 @@ class Settings:
     min_noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
     include_plan: Annotated[bool | None, tyro.conf.arg(metavar="True|False")] = None
     spline: Annotated[str | None, tyro.conf.arg(metavar="zero|linear|cubic")] = None
+    between: Annotated[str | None, tyro.conf.arg(metavar="hold|linear")] = None
     risk: Annotated[str | None, tyro.conf.arg(metavar="mean|worst")] = None
 
     def on_top_of(self, config: MPPIConfig) -> MPPIConfig:
@@ -76,7 +77,8 @@ class Plan:
     """Control a task with a planner that replans at every step, and report rewards, success and planning times.
 
     The planner is MPPI, or with --update the cross-entropy method (cem) or predictive sampling. Its default settings
-    come from the task. Physics options (--integrator, --solver, ...) apply only to the planner.
+    come from the task. Physics options (--physics, --integrator, ...) apply only to the planner; --physics exact is the
+    controlled world's physics.
 
     The command writes config.json, versions.json, report.json, plan.png, a video of the first episode (video.mp4), and
     one file per episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy) into a
@@ -87,6 +89,7 @@ class Plan:
     $ lyceum-warp plan half_cheetah --steps 200 --samples 128 --temperature 1
     $ lyceum-warp plan reach --update predictive_sampling --knots 4 --replan-every 2
     $ lyceum-warp plan hopper --steps 300 --horizon 16 --value runs/hopper-20260101-120000 --discount 0.995
+    $ lyceum-warp plan humanoid --physics exact --steps 100
     $ lyceum-warp plan adroit_pen --device cuda:0 --samples 1024 --solver noslip_iterations=0
     """
 
@@ -191,7 +194,7 @@ def _worlds(options: Plan, params: dict[str, Any], planner_params: dict[str, Any
         raise ValueError(f"episodes of {plant.task.name!r} never end without a horizon: give --steps")
     value = None if options.value is None else load_value(options.value)
     config = options.mppi.on_top_of(task_config(plant.task.task, value))
-    words = vars(options.planner) | options.planner_physics.options().given()
+    words = vars(options.planner) | options.planner_physics.given()
     if options.planner_model is not None:
         words["model"] = _model(options.planner_model)
     return plant, MPPI(plant.task.task, config, value=value, params=params | planner_params, **words)
@@ -217,9 +220,11 @@ def _model(path: Path) -> Path:
 def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
     console, simulated, update = make_console(), planner.env, planner.settings["update"]
     name = {"mppi": "MPPI", "cem": "CEM", "predictive_sampling": "predictive sampling"}.get(update, update)
+    physics = ", ".join(f"{option} {value}" for option, value in simulated.options.physics.given().items())
     console.print(
         f"[bold]{plant.task.name}[/]: {name}, {planner.samples} samples of {planner.horizon} steps "
-        f"({planner.horizon * planner.timestep:.3g} s), {simulated.engine.name} engine on {simulated.device.alias}; "
+        f"({planner.horizon * planner.timestep:.3g} s), {simulated.engine.name} engine on {simulated.device.alias}"
+        f"{f' ({physics})' if physics else ''}; "
         f"{'real time' if options.real_time else 'the world waits'}; files in {escape(str(run.folder))}",
         soft_wrap=True,
     )  # fmt: skip

@@ -251,7 +251,7 @@ def test_settings_are_json_values() -> None:
         "horizon": 2, "samples": 2, "temperature": 0.1, "noise": [[0.5]], "smoothing": [0.25, 0.8, 0.0],
         "discount": 1.0, "iterations": 1, "fill": [0.1], "termination": "stop", "nominal_model": False,
         "update": "mppi", "elites": None, "min_noise": None, "include_plan": True, "knots": None, "spline": "cubic",
-        "models": 1, "risk": "mean",
+        "models": 1, "risk": "mean", "between": "hold",
         "solver": {"iterations": 3},
         "model": "MjSpec 'MuJoCo Model'", "limit": [1.0, 2.0], "wrong": 3.0, "fields": ["xpos"],
     }  # fmt: skip

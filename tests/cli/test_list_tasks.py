@@ -44,6 +44,10 @@ def test_tasks_are_listed_with_their_sizes_and_models(capsys: pytest.CaptureFixt
     assert max(map(len, out.splitlines())) <= 100
     assert found["hopper"] == ["11", "3", "4", "0.008", "s", "1000", "gymnasium:", "hopper.xml"]
     assert found["adroit_pen"][-2:] == ["gymnasium-robotics", "[hand]"]
+    assert (
+        "    walk forward on two legs without falling over (Gymnasium's Humanoid-v5) (physics: fast)"
+        in out.splitlines()
+    )
     assert "    hop forward on one leg (Gymnasium's Hopper-v5)" in out.splitlines()
 
 

@@ -58,6 +58,26 @@ def test_a_run_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.Captu
     assert torch.equal(again.states, Trajectory.load(out / "episode-001.npz").states)
 
 
+def test_a_planner_has_the_suggested_physics_unless_others_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, flags, timestep in (("fast", [], 0.015), ("exact", ["--physics", "exact"], None)):
+        small = ["--steps", "2", "--horizon", "2", *QUIET, *flags]
+        assert plan(tmp_path / name, *small, task="humanoid") == 0
+        assert json.loads((tmp_path / name / "config.json").read_text())["planner"].get("timestep") == timestep
+        assert ("(frame_skip 1, timestep 0.015, integrator implicitfast)" in capsys.readouterr().out) == (
+            name == "fast"
+        )
+    held = ["--frame-skip", "2", "--between", "linear", *QUIET]
+    assert plan(tmp_path / "held", *held) == 0
+    config = json.loads((tmp_path / "held" / "config.json").read_text())["planner"]
+    assert config["frame_skip"] == 2 and config["between"] == "linear"
+    capsys.readouterr()
+    assert plan(tmp_path / "other", "--timestep", "0.013", *QUIET) == 2
+    refused(capsys, "the controller's step of 0.013 s must be a whole multiple of the plant's, 0.02 s")
+    assert not (tmp_path / "other").exists()
+
+
 def test_a_video_is_made_of_the_first_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(tmp_path / "run", "--no-plot", "--steps", "12", "--camera", "azimuth=20", "--camera", "track=1") == 0
     lines = capsys.readouterr().out.splitlines()

@@ -11,6 +11,7 @@ from typing import Any
 
 import mujoco
 import pytest
+import tiny_task
 from conftest import TaskFile
 from training_runs import QUIET, TINY, interrupted, metrics, refused, train
 
@@ -170,6 +171,24 @@ def test_a_run_keeps_its_physics(tmp_path: Path, made_envs: list[lw.Env], capsys
     ]:
         assert cli.main([*resume, "4", *other]) == 2
         refused(capsys, words, "a run keeps its settings")
+
+
+def test_physics_by_name_are_saved_as_options_and_eval_replaces_them(
+    tmp_path: Path, made_envs: list[lw.Env], task_file: TaskFile, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = "    physics = {'fast': lw.PhysicsOptions(integrator='euler', timestep=0.004, frame_skip=2)}\n"
+    task = task_file("fast.py", tiny_task.changed(("    model", f"{line}    model")))
+    out = tmp_path / "run"
+    assert train(out, "--iterations", "1", "--physics", "fast", "--cone", "elliptic", task=str(task)) == 0
+    given = {"integrator": "euler", "timestep": 0.004, "frame_skip": 2, "cone": "elliptic"}
+    assert Run.open(out).config["physics"] == given
+    for flags, timestep in (([], 0.004), (["--physics", "exact"], 0.002)):
+        assert cli.main(["eval", str(out), "--episodes", "1", *flags]) == 0
+        assert made_envs[-1].model.opt.timestep == timestep
+    capsys.readouterr()
+    assert cli.main(["train", str(task), "--physics", "slow", "--out", str(tmp_path / "other")]) == 2
+    refused(capsys, "the task has no physics 'slow': it has 'exact', 'fast'")
+    assert not (tmp_path / "other").exists()
 
 
 def changed_config(trained: Path, folder: Path, change: Any) -> list[str]:
