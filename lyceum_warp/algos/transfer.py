@@ -182,7 +182,7 @@ def task_physics(env: Env) -> tuple[dict[str, PhysicsOptions], str]:
 
     Options that only the Warp engine has are left out.
     """
-    named = {EXACT: PhysicsOptions(), **getattr(env.task.task, "physics", {})}
+    named = {EXACT: PhysicsOptions(), **env.task.task.physics}
     given = dataclasses.replace(env.options.physics, nconmax=None, njmax=None, deterministic=False)
     own = next((name for name, options in named.items() if options == given), "own")
     return named | {own: given}, own
