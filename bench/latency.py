@@ -115,11 +115,12 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     with experiment.cores(case.threads):
         own_horizon = find_task(case.task).horizon or steps
         plant = lw.make(case.task, autoreset=False, nthread=1, horizon=min(own_horizon, steps))
-        physics = {} if case.physics == "own" else {"physics": case.physics}
-        threads = {"nthread": case.threads} if case.contestant == "mujoco" else {}
+        words: dict[str, Any] = {} if case.physics == "own" else {"physics": case.physics}
+        if case.contestant == "mujoco":
+            words["nthread"] = case.threads
         planner = lw.MPPI(
             case.task, samples=case.samples, horizon=case.horizon, engine=case.contestant, device=case.device,
-            **physics, **threads,
+            **words,
         )  # fmt: skip
         done: list[lw.Trajectory] = []
         while (left := steps - sum(episode.steps for episode in done)) > 0:
