@@ -3,9 +3,9 @@
     lyceum-warp bench humanoid
     lyceum-warp bench humanoid --tasks humanoid_stand --contestants real_time --repeats 20
 
-Starts and pushes are constants of this program. An episode lasts 20 s. ``real_time``: the plant keeps its rate, and the
-planner plans as often as it can (``lw.control_async``). ``in_turn``: the plant waits for each plan (``lw.control``). Run
-the real-time episodes on idle cores: other work on them delays plans.
+Starts and pushes are constants of this program. An episode lasts 20 s. ``real_time``: the plant keeps its rate, and
+the planner plans as often as it can (``lw.control_async``). ``in_turn``: the plant waits for each plan. Run the
+real-time episodes on idle cores: other work on them delays plans.
 """
 
 import dataclasses

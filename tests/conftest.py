@@ -17,8 +17,11 @@ from lyceum_warp.support.warp_log import start_warp
 # the tests' batches are too small to divide, and on a busy machine torch's threads wait for each other
 torch.set_num_threads(1)
 
-SAME_FUNCTIONS = ("g1_full_velocity", "g1_rough_velocity", "h1_velocity", "spot_velocity", "t1_velocity")
-"""Walking robots that share every function with ``go1_velocity``, ``g1_velocity`` or ``go1_rough_velocity``."""
+SAME_FUNCTIONS = (
+    "g1_full_velocity", "g1_rough_velocity", "h1_velocity", "humanoid_walk", "spot_velocity", "t1_velocity",
+)  # fmt: skip
+"""Tasks that share their functions with ``go1_velocity``, ``g1_velocity``, ``go1_rough_velocity`` or
+``humanoid_stand``."""
 
 
 def long_if_alike(tasks: Iterable[str]) -> list[Any]:

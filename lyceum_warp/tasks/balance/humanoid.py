@@ -173,7 +173,7 @@ class HumanoidStand(lw.Task):
     terminations = ("too_low",)
     physics = {"fast": lw.PhysicsOptions(integrator="implicitfast", timestep=0.015, frame_skip=1)}
     planning = lw.Planning(
-        settings=dict(horizon=32, samples=24, knots=6, noise=0.15, temperature=0.0075), options={"physics": "fast"}
+        settings=dict(horizon=40, samples=24, knots=8, noise=0.15, temperature=0.0075), options={"physics": "fast"}
     )
 
 
