@@ -2,9 +2,9 @@
 
 import dataclasses
 import datetime
+import functools
 import signal
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -160,7 +160,7 @@ class Plan:
         find_camera(plant.model, camera)
         choice = _choice(self, plant, make_planner) if self.real_time else None
         if choice is not None:
-            every = choice.replan_every
+            every = round(choice.deadline / plant.timestep) * choice.replan_every
             make_console().print(str(choice), soft_wrap=True, markup=False)
         planner = make_planner(None if choice is None else choice.setting)
         CheckedController(planner, plant).check_horizon(planner.horizon, every)
@@ -232,7 +232,10 @@ _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 
 
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
-    """Choose the settings that the flags leave open, from measured planning times; None if they leave nothing open."""
+    """Choose the settings that the flags leave open, from measured planning times; None if they leave nothing open.
+
+    The deadline is a step of the plant, or if nothing meets it, a longer step of the planner.
+    """
     task, flags = plant.task.task, given(options.mppi)
     config = options.mppi.on_top_of(task_config(task))
     samples = (config.samples,) if {"samples", "elites"} & flags.keys() else _SAMPLES
@@ -245,10 +248,14 @@ def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) 
     if len(samples) == len(horizons) == len(physics) == 1:
         return None
 
+    @functools.cache
     def measure(setting: RealTimeSetting) -> float:
         return planning_time(plant, make(setting))
 
-    return choose_setting(samples, horizons, physics, measure, deadline=plant.timestep)
+    choice = choose_setting(samples, horizons, physics, measure, deadline=plant.timestep)
+    if choice.replan_every > 1 and (step := make(choice.setting).timestep) > plant.timestep:
+        choice = choose_setting(samples, horizons, physics, measure, deadline=step)
+    return choice
 
 
 def _suggested_physics(task: type[Task]) -> str | None:
@@ -286,7 +293,7 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
     )  # fmt: skip
     done: list[Trajectory] = []
     aborted: list[Trajectory] = []
-    method: Any = control_async if options.real_time else partial(control, replan_every=options.replan_every)
+    method: Any = control_async if options.real_time else functools.partial(control, replan_every=options.replan_every)
     shown: dict[str, Any] = dict(steps=plant.horizon, timestep=plant.timestep, real_time=options.real_time)
     try:
         for episode in range(options.episodes):

@@ -39,23 +39,24 @@ class RealTimeChoice:
     """A setting, and the measurements that led to it. Planning times are 99 % quantiles in seconds."""
 
     setting: RealTimeSetting
-    """The largest setting that meets the deadline, or else the smallest setting."""
+    """The largest setting that meets the deadline, or else the fastest that was measured."""
     planning_time: float
     """Its planning time."""
     deadline: float
-    """Time from one step of the plant to the next, seconds."""
+    """Longest time of a plan, seconds."""
     larger: tuple[int, float] | None
     """The smallest measured number of samples that misses the deadline, and its planning time."""
 
     @property
     def replan_every(self) -> int:
-        """Steps of the plant from one plan to the next: 1 if plans meet the deadline."""
+        """Number of deadlines from one plan to the next: 1 if plans meet the deadline."""
         return max(1, math.ceil(self.planning_time / (SHARE * self.deadline)))
 
     def __str__(self) -> str:
         found = f"{self.setting}: {_ms(self.planning_time)} of {_ms(self.deadline)}"
         if self.replan_every > 1:
-            return f"no setting meets the deadline; {found}, so a plan is made every {self.replan_every} steps"
+            every = _ms(self.replan_every * self.deadline)
+            return f"no setting meets the deadline; {found}, so there is a plan every {every}"
         return found if self.larger is None else f"{found}; {self.larger[0]} would take {_ms(self.larger[1])}"
 
 
@@ -77,7 +78,7 @@ def choose_setting(
         horizons: Horizons, the preferred one first.
         physics: Names of physics, the preferred one first.
         measure: Returns the 99 % quantile of a setting's planning times, seconds.
-        deadline: Time from one step of the plant to the next, seconds.
+        deadline: Longest time of a plan, seconds.
 
     Returns:
         The choice. If no setting meets the deadline, it is the fastest one measured.

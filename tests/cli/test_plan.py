@@ -128,10 +128,26 @@ def test_real_time_shortens_the_horizon_and_replans_less_often(
     argv = ["plan", "reach", "--out", str(out), "--steps", "3", "--knots", "4", "--real-time", *QUIET]
     assert cli.main(argv) == 0
     assert capsys.readouterr().out.startswith(
-        "no setting meets the deadline; 16 samples, horizon 16: 64 ms of 20 ms, so a plan is made every 4 steps\n"
+        "no setting meets the deadline; 16 samples, horizon 16: 64 ms of 20 ms, so there is a plan every 80 ms\n"
     )
     config, report = (json.loads((out / name).read_text()) for name in ("config.json", "report.json"))
     assert config["replan_every"] == 4 and report["deadline_ms"] == pytest.approx(80.0)
+    held = [
+        "plan",
+        "reach",
+        "--out",
+        str(tmp_path / "held"),
+        "--steps",
+        "3",
+        "--frame-skip",
+        "4",
+        "--real-time",
+        *QUIET,
+    ]
+    monkeypatch.setattr(plan_command, "planning_time", measured_by(100.0))
+    assert cli.main([*held, "--horizon", "16"]) == 0
+    assert "16 samples, horizon 16: 25.6 ms of 40 ms; 32 would take 51.2 ms" in capsys.readouterr().out
+    assert json.loads((tmp_path / "held" / "config.json").read_text())["replan_every"] == 2
     argv = ["plan", "humanoid_stand", "--out", str(tmp_path / "knots"), "--steps", "2", "--real-time", *QUIET]
     monkeypatch.setattr(plan_command, "planning_time", measured_by(40.0))
     assert cli.main(argv) == 0

@@ -59,7 +59,7 @@ def test_without_a_setting_in_time_the_fastest_is_replanned_less_often() -> None
     choice = choose_setting(SAMPLES, [32, 16], [None], Machine(100.0), deadline=0.01)
     assert choice.setting == RealTimeSetting(16, 16) and choice.replan_every == 4  # 26.6 ms are 3.3 times 8 ms
     assert str(choice) == (
-        "no setting meets the deadline; 16 samples, horizon 16: 26.6 ms of 10 ms, so a plan is made every 4 steps"
+        "no setting meets the deadline; 16 samples, horizon 16: 26.6 ms of 10 ms, so there is a plan every 40 ms"
     )
 
 
