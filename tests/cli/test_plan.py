@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,6 +19,7 @@ from training_runs import QUIET, TINY, interrupted, refused
 import lyceum_warp as lw
 from lyceum_warp import Trajectory, cli
 from lyceum_warp.binding.registry import find_task
+from lyceum_warp.cli import plan as plan_command
 from lyceum_warp.cli.display import PlanDisplay
 from lyceum_warp.cli.plan import Settings
 
@@ -93,6 +95,65 @@ def test_real_time_keeps_the_rate_of_the_plant(tmp_path: Path, capsys: pytest.Ca
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["mode"] == "async" and report["deadline_ms"] == pytest.approx(20.0)
     assert 0.5 < report["real_time_factor"] < 1.01  # 40 steps of 20 ms; a busy machine may be late
+
+
+def measured_by(microseconds: float) -> Any:
+    """Replace a measurement by planning times that are proportional to the samples and the horizon of a planner."""
+    return lambda plant, planner: 1e-6 * microseconds * planner.samples * planner.horizon
+
+
+def test_real_time_chooses_what_is_not_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plan_command, "planning_time", measured_by(30.0))
+    for name, flags, line, samples in (
+        ("all", ["--horizon", "10"], "32 samples, horizon 10: 9.6 ms of 20 ms; 64 would take 19.2 ms\n", 32),
+        ("samples", ["--samples", "8", "--horizon", "10"], "", 8),
+    ):
+        out = tmp_path / name
+        argv = ["plan", "point_mass", "--out", str(out), "--steps", "3", "--real-time", *QUIET, *flags]
+        assert cli.main(argv) == 0
+        shown = capsys.readouterr().out
+        assert shown.startswith(line or "point_mass: MPPI")
+        config = json.loads((out / "config.json").read_text())
+        assert (config["planner"]["samples"], config["planner"]["horizon"]) == (samples, 10)
+        assert json.loads((out / "report.json").read_text())["deadline_ms"] == pytest.approx(20.0)
+
+
+def test_real_time_shortens_the_horizon_and_replans_less_often(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plan_command, "planning_time", measured_by(250.0))
+    out = tmp_path / "run"
+    argv = ["plan", "reach", "--out", str(out), "--steps", "3", "--knots", "4", "--real-time", *QUIET]
+    assert cli.main(argv) == 0
+    assert capsys.readouterr().out.startswith(
+        "no setting meets the deadline; 16 samples, horizon 16: 64 ms of 20 ms, so there is a plan every 80 ms\n"
+    )
+    config, report = (json.loads((out / name).read_text()) for name in ("config.json", "report.json"))
+    assert config["replan_every"] == 4 and report["deadline_ms"] == pytest.approx(80.0)
+    held = [
+        "plan",
+        "reach",
+        "--out",
+        str(tmp_path / "held"),
+        "--steps",
+        "3",
+        "--frame-skip",
+        "4",
+        "--real-time",
+        *QUIET,
+    ]
+    monkeypatch.setattr(plan_command, "planning_time", measured_by(100.0))
+    assert cli.main([*held, "--horizon", "16"]) == 0
+    assert "16 samples, horizon 16: 25.6 ms of 40 ms; 32 would take 51.2 ms" in capsys.readouterr().out
+    assert json.loads((tmp_path / "held" / "config.json").read_text())["replan_every"] == 2
+    argv = ["plan", "humanoid_stand", "--out", str(tmp_path / "knots"), "--steps", "2", "--real-time", *QUIET]
+    monkeypatch.setattr(plan_command, "planning_time", measured_by(40.0))
+    assert cli.main(argv) == 0
+    assert "16 samples, horizon 16, physics fast: 10.2 ms of 15 ms" in capsys.readouterr().out
+    planner = json.loads((tmp_path / "knots" / "config.json").read_text())["planner"]
+    assert (planner["knots"], planner["timestep"]) == (3, 0.015)
 
 
 def test_a_value_function_of_a_run_changes_plans(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
