@@ -15,7 +15,7 @@ import mujoco
 
 from lyceum_warp.model_files import ModelFile
 from lyceum_warp.support.docstrings import attribute_docs, document_attributes, listed
-from lyceum_warp.support.validate import check_flag, check_kind, described, whole_number
+from lyceum_warp.support.validate import check_flag, check_kind, described, positive_number, whole_number
 
 ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
 """The source of a model: a file or an MjSpec."""
@@ -76,6 +76,8 @@ class PhysicsOptions:
 
     frame_skip: int | None = None
     """Substeps in a step."""
+    timestep: float | None = None
+    """Length of a substep in seconds."""
     cone: str | None = None
     """Friction cone: pyramidal or elliptic."""
     integrator: str | None = None
@@ -96,6 +98,8 @@ class PhysicsOptions:
         """Check every value."""
         for name, low in (("frame_skip", 1), ("nconmax", 1), ("njmax", 1)):
             _whole(self, name, low)
+        if self.timestep is not None:
+            object.__setattr__(self, "timestep", positive_number("timestep", self.timestep, "seconds"))
         _one_of("friction cone", self.cone, CONES)
         _one_of("integrator", self.integrator, INTEGRATORS)
         _flags(self, "deterministic")

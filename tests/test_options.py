@@ -22,6 +22,8 @@ from lyceum_warp.options import OPTION_DOCS, OPTIONS, EnvOptions, PhysicsOptions
         ({"fields": "sensordata"}, r"fields must be names of fields, as in fields=\['sensordata'\], not 'sensordata'"),
         ({"fields": ["qpos", 3]}, r"fields must be names of fields, .* not \['qpos', 3\]"),
         ({"frame_skip": 0}, "frame_skip must be a whole number from 1 .*, not 0"),
+        ({"timestep": 0.0}, "timestep must be a positive number of seconds, not 0.0"),
+        ({"timestep": float("inf")}, "timestep must be a positive number of seconds, not inf"),
         ({"integrator": 1}, "no integrator 1: use"),
         ({"cone": "round"}, "there is no friction cone 'round': use 'pyramidal' or 'elliptic'"),
         ({"integrator": "rk5"}, "no integrator 'rk5': use 'euler', 'rk4', 'implicit' or 'implicitfast'"),

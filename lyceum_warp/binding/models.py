@@ -109,7 +109,7 @@ def compile_model(
     Args:
         spec: The model; changed in place.
         fields: Names of the fields that will be read.
-        physics: Cone, integrator and solver limits that replace the model's own.
+        physics: Time step, cone, integrator and solver limits that replace the model's own.
         varied: Names of the model fields that will differ between worlds.
 
     Raises:
@@ -124,6 +124,8 @@ def compile_model(
     _remove_repeated_pairs(spec)
     if "energy" in fields:
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    if physics.timestep is not None:
+        spec.option.timestep = physics.timestep
     if physics.cone is not None:
         spec.option.cone = CONES[physics.cone]
     if physics.integrator is not None:

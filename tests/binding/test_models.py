@@ -123,9 +123,10 @@ def test_the_energy_is_turned_on_if_it_is_read() -> None:
 
 
 def test_physics_options_replace_the_models_own() -> None:
-    physics = PhysicsOptions(cone="elliptic", integrator="implicitfast", solver={"iterations": 7, "ls_iterations": 9})
+    solver = {"iterations": 7, "ls_iterations": 9}
+    physics = PhysicsOptions(timestep=0.015, cone="elliptic", integrator="implicitfast", solver=solver)
     option = compile_model(ball('cone="pyramidal" integrator="RK4"'), (), physics).opt
-    assert option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert option.timestep == 0.015 and option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     assert (option.iterations, option.ls_iterations) == (7, 9)
 
