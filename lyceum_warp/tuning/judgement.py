@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from lyceum_warp.support.validate import check_word
-
 TOLERANCES = {"strict": 0.02, "loose": 0.05, "any": math.inf}
 """Largest difference of returns, relative to the mean absolute return of the task as it is."""
+
+RANK_CORRELATIONS = {"strict": 0.9, "loose": 0.8, "any": -1.0}
+"""Smallest rank correlation of a planner's physics with the plant's, by the same names."""
 
 LEAST_GAIN = 1.03
 """A setting that is not this many times faster, and takes no less memory, is not judged further."""
@@ -38,7 +39,8 @@ class Difference:
         return self.low > tolerance or self.high < -tolerance
 
     def __str__(self) -> str:
-        return f"{100 * self.mean:+.1f} [{100 * self.low:+.1f}, {100 * self.high:+.1f}]"
+        """The interval in percent."""
+        return f"[{100 * self.low:+.1f}, {100 * self.high:+.1f}]"
 
 
 def difference(reference: np.ndarray, returns: np.ndarray) -> Difference:
@@ -57,6 +59,22 @@ def difference(reference: np.ndarray, returns: np.ndarray) -> Difference:
     return Difference(float(change.mean() / scale.mean()), low, high, len(change))
 
 
+@dataclasses.dataclass(frozen=True)
+class Mean:
+    """A mean with the bounds of its 95 % interval, a percentile bootstrap."""
+
+    mean: float
+    low: float
+    high: float
+
+
+def mean_interval(values: np.ndarray) -> Mean:
+    """The mean of some values, (n,), with its interval."""
+    rows = np.random.default_rng(0).integers(len(values), size=(_RESAMPLES, len(values)))
+    low, high = np.quantile(values[rows].mean(1), (0.025, 0.975)).tolist()
+    return Mean(float(values.mean()), low, high)
+
+
 def episodes_needed(found: Difference, half_width: float) -> int:
     """The number of episodes for an interval of the given half width, estimated from some episodes.
 
@@ -66,30 +84,32 @@ def episodes_needed(found: Difference, half_width: float) -> int:
     return found.episodes if now <= half_width else math.ceil(min(found.episodes * (now / half_width) ** 2, 1e9))
 
 
-def check_tolerance(name: Any) -> float:
-    """The tolerance of a name.
-
-    Raises:
-        ValueError: There is no such tolerance.
-    """
-    check_word("tolerance", name, list(TOLERANCES))
-    return TOLERANCES[name]
-
-
 def buys(speedup: float, memory: float) -> bool:
     """Whether a setting is faster or smaller than the task as it is, given the ratios of speed and memory."""
     return speedup >= LEAST_GAIN or memory <= _LEAST_SAVING
 
 
-def verdict(row: Mapping[str, Any], tolerance: float) -> str:
-    """What a row of results shows: "same", "different", "not shown", "faults", "no gain" or "refused"."""
+def verdict(row: Mapping[str, Any], tolerance: str) -> str:
+    """What a row of results shows; see ``Tuning.rows``."""
     if row["refused"]:
         return "refused"
+    if "ranks" in row:
+        return _verdict_on_ranks(row, RANK_CORRELATIONS[tolerance])
     if not buys(row["speedup"], row["memory"]):
         return "no gain"
     if row["faults_per_million"] > 2 * row["reference_faults_per_million"]:
         return "faults"
+    limit = TOLERANCES[tolerance]
     found = [Difference(**part) for part in row["returns"].values()]
-    if all(part.within(tolerance) for part in found):
+    if all(part.within(limit) for part in found):
         return "same"
-    return "different" if any(part.beyond(tolerance) for part in found) else "not shown"
+    return "different" if any(part.beyond(limit) for part in found) else "not shown"
+
+
+def _verdict_on_ranks(row: Mapping[str, Any], least: float) -> str:
+    found = [Mean(**part) for part in row["ranks"].values()]
+    if any(part.high < least for part in found):
+        return "ranks badly"
+    if row["speedup"] < LEAST_GAIN:
+        return "no gain"
+    return "same" if found and all(part.low >= least for part in found) else "not shown"

@@ -14,12 +14,13 @@ from lyceum_warp.runs.checkpoints import check_sizes
 from lyceum_warp.runs.configuration import Configuration
 from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_flag, check_function, whole_number
+from lyceum_warp.support.validate import check_flag, check_function, check_word, whole_number
 from lyceum_warp.task import Task
 from lyceum_warp.tuning.candidates import Setting, candidates, combined, flags, not_tried, task_line
-from lyceum_warp.tuning.judgement import check_tolerance, verdict
+from lyceum_warp.tuning.judgement import TOLERANCES, verdict
+from lyceum_warp.tuning.ranking import Rankings
 from lyceum_warp.tuning.row_file import RowFile, identity
-from lyceum_warp.tuning.trial import FULL, SHORT, Trials
+from lyceum_warp.tuning.trial import FULL, SHORT, Effort, Trials
 
 NWORLD, GPU_NWORLD = 256, 4096
 """Number of worlds by default."""
@@ -36,13 +37,11 @@ class Tuning:
     """The results of each setting, the fastest first; docs/physics.md describes the entries. ``verdict`` is "same",
     "different" or "not shown" (the interval of the returns lies within, outside or across the tolerance), "faults"
     (more than twice as many as in the task as it is), "no gain" (less than 3 % faster and no smaller: returns are not
-    compared), or "refused" (by MuJoCo or the engine, whose reason is in ``refused``)."""
+    compared), "refused" (by MuJoCo or the engine, whose reason is in ``refused``), or for a planner "ranks badly"."""
     reference: Row
     """The results of the task as it is, measured against itself."""
     not_tried: list[str]
     """What was not tried, with reasons."""
-    in_contact: float
-    """The fraction of states in contact among those from which speed and divergence are measured."""
     path: Path
     """The file of the results."""
 
@@ -70,6 +69,7 @@ def tune(
     tolerance: str = "strict",
     short: bool = False,
     episodes: int | None = None,
+    planning: bool = False,
     out: str | Path | None = None,
     seed: int = 0,
     progress: Callable[[Row], object] | None = None,
@@ -90,8 +90,12 @@ def tune(
         short: Whether to compare the first 100 steps of episodes, for a few seconds, instead of whole episodes.
         episodes: Number of episodes of each setting, rounded up to a multiple of the number of worlds. By default as
             many as the interval needs, within a minute, or 3 s if ``short``.
+        planning: Whether to find physics for the task's planner instead of its worlds: compares the time of a plan,
+            and the ranks that both physics give to the same samples, from standing, moving and fallen states. A setting
+            is suggested if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8 ("loose").
+            ``nworld`` is then the number of samples, and ``episodes`` the number of states of each kind.
         out: File of the results, to which rows are appended; rows that it has are not measured again. By default
-            tune/TASK.jsonl.
+            tune/TASK.jsonl, or tune/TASK-planning.jsonl.
         seed: Seed of initial states and actions.
         progress: Called with each row.
         words: Options and parameters as for ``lw.make``; by default 256 worlds on the CPU, 4096 on a GPU.
@@ -100,27 +104,49 @@ def tune(
         ValueError: An argument is unknown or does not fit, or the run is one of another task.
         FileNotFoundError: A model, a task or a run is missing.
     """
-    limit = check_tolerance(tolerance)
-    check_flag("short", short)
+    check_word("tolerance", tolerance, list(TOLERANCES))
+    for name, flag in (("short", short), ("planning", planning)):
+        check_flag(name, flag)
     check_function("progress", progress)
     if episodes is not None:
         whole_number("episodes", episodes, low=1)
     kind = find_task(task)
-    params = {} if run is None else _params_of(run, kind)
-    options, own = EnvOptions.split(words)
+    measured: dict[str, Any] = {"short": short, "episodes": episodes, "seed": seed}
+    trials: Rankings | Trials
+    if planning:
+        if run is not None:
+            raise ValueError("planning compares samples of the task's planner, without a run: omit one of them")
+        states, repeats = (6, 5) if short else (16, 15)
+        samples = words.pop("nworld", None)
+        trials = Rankings(kind, states=episodes or states, repeats=repeats, samples=samples, seed=seed, **words)
+        measured["planner"] = trials.exact.settings
+    else:
+        trials = _trials(kind, run, which, words, effort=SHORT if short else FULL, seed=seed, episodes=episodes)
+        measured["policy"] = None if run is None else _digest(run, which)
+    name = f"{task_name(kind)}{'-planning' * planning}.jsonl"
+    rows = RowFile(Path("tune", name) if out is None else Path(out), identity(trials.reference, **measured))
+    return _Search(trials, rows, tolerance, progress).run()
+
+
+def _trials(
+    task: type[Task], run: str | Path | None, which: str, words: Mapping[str, Any], *, effort: Effort, seed: int,
+    episodes: int | None,
+) -> Trials:  # fmt: skip
+    """The task as it is, and the policy of a run."""
+    options, params = EnvOptions.split(words)
     if "nworld" not in words:
         options = options.changed({"nworld": GPU_NWORLD if str(options.device).startswith("cuda") else NWORLD})
-    env = Env(kind, options.changed({"autoreset": False}), **{**params, **own})
-    policy, digest = None, None
+    known = {} if run is None else _params_of(run, task)
+    env, policy = Env(task, options.changed({"autoreset": False}), **{**known, **params}), None
     if run is not None:
-        file = Run.open(run).policy_file(which)
-        policy = load(run, which=which, device=env.obs.device)
-        check_sizes(policy, env, file)
-        policy, digest = acting(policy), hashlib.sha256(file.read_bytes()).hexdigest()[:16]
-    path = Path("tune", f"{env.task.name}.jsonl") if out is None else Path(out)
-    rows = RowFile(path, identity(env, policy=digest, short=short, episodes=episodes, seed=seed))
-    trials = Trials(env, policy, effort=SHORT if short else FULL, seed=seed, episodes=episodes)
-    return _Search(trials, rows, limit, progress).run()
+        own = load(run, which=which, device=env.obs.device)
+        check_sizes(own, env, Run.open(run).policy_file(which))
+        policy = acting(own)
+    return Trials(env, policy, effort=effort, seed=seed, episodes=episodes)
+
+
+def _digest(run: str | Path, which: str) -> str:
+    return hashlib.sha256(Run.open(run).policy_file(which).read_bytes()).hexdigest()[:16]
 
 
 def _params_of(run: str | Path, task: type[Task]) -> Mapping[str, Any]:
@@ -138,8 +164,10 @@ def _params_of(run: str | Path, task: type[Task]) -> Mapping[str, Any]:
 class _Search:
     """The search over settings."""
 
-    def __init__(self, trials: Trials, file: RowFile, limit: float, progress: Callable[[Row], object] | None) -> None:
-        self.trials, self.file, self.limit, self.progress = trials, file, limit, progress
+    def __init__(
+        self, trials: Trials | Rankings, file: RowFile, tolerance: str, progress: Callable[[Row], object] | None
+    ) -> None:
+        self.trials, self.file, self.tolerance, self.progress = trials, file, tolerance, progress
 
     def run(self) -> Tuning:
         """Try all settings."""
@@ -158,11 +186,11 @@ class _Search:
                 break
             settings = settings[: settings.index(both.parts[-1])]  # without the part that buys least
         rows.sort(key=lambda row: -row.get("speedup", 0.0))
-        return Tuning(rows, reference, not_tried(env), self.trials.in_contact, self.file.path)
+        return Tuning(rows, reference, not_tried(env), self.file.path)
 
     def _row(self, setting: Setting) -> Row:
         row = self.file.get(setting.physics) or self.file.add(self.trials.measure(setting))
-        row = {**row, "verdict": verdict(row, self.limit) if setting.physics else "reference"}
+        row = {**row, "verdict": verdict(row, self.tolerance) if setting.physics else "reference"}
         if self.progress is not None:
             self.progress(row)
         return row

@@ -70,11 +70,6 @@ class Trials:
         self.steps = effort.steps or reference.horizon or ENDLESS_STEPS
         if reference.horizon:
             self.steps = min(self.steps, reference.horizon)
-        device = reference.obs.device
-        low, high = reference.action_space.low, reference.action_space.high
-        assert low is not None and high is not None
-        self._low = torch.as_tensor(np.where(np.isfinite(low), low, -1.0), dtype=torch.float32, device=device)
-        self._range = torch.as_tensor(np.where(np.isfinite(high), high, 1.0), device=device).float() - self._low
         self._returns: dict[tuple[str, int], tuple[np.ndarray, int, int]] = {}
         self._record()
 
@@ -82,7 +77,7 @@ class Trials:
 
     def _record(self) -> None:
         """Record states under random actions and, in half of the worlds, the policy, and 50 actions after each."""
-        env, draw = self.reference, self._draws(self.seed)
+        env, draw = self.reference, random_actions(self.reference, self.seed)
         policy_worlds = torch.arange(env.nworld, device=env.obs.device)[:, None] % 2 == 1
         length = max(DIVERGENCE_STEPS)
         starts, runs = [], []
@@ -115,13 +110,6 @@ class Trials:
         self._block = 1
         self._block = max(1, round(self.effort.block_seconds / self._seconds(env, 0)))
 
-    def _draws(self, seed: int) -> Iterator[torch.Tensor]:
-        """Uniformly random actions, one batch after another."""
-        generator = torch.Generator(self.reference.obs.device).manual_seed(seed)
-        while True:
-            drawn = torch.rand(self.reference.action.shape, generator=generator, device=self._low.device)
-            yield self._low + self._range * drawn
-
     def _mixed(self, random: torch.Tensor, policy_worlds: torch.Tensor) -> torch.Tensor:
         if self.policy is None:
             return random
@@ -151,7 +139,12 @@ class Trials:
             return row | {"refused": str(error)}
         taken = before - self._free()
         speed, speedup = self._speed(env)
-        row |= {"steps_per_second": speed, "speedup": speedup, "bytes_per_world": env.bytes_per_world}
+        row |= {
+            "in_contact": self.in_contact,
+            "steps_per_second": speed,
+            "speedup": speedup,
+            "bytes_per_world": env.bytes_per_world,
+        }
         row["memory"] = env.bytes_per_world / self.reference.bytes_per_world
         if env.device.is_cuda:
             row["device_bytes"] = taken
@@ -251,7 +244,7 @@ class Trials:
         self.reference.rand_reset(seed)
         if env is not self.reference:
             env.set_state(self.reference.get_state())
-        draw, policy = self._draws(seed), self.sources[source]
+        draw, policy = random_actions(env, seed), self.sources[source]
         total = torch.zeros(env.nworld, dtype=torch.float64, device=env.obs.device)
         alive = torch.ones(env.nworld, dtype=torch.bool, device=env.obs.device)
         faults, steps = (torch.zeros((), dtype=torch.int64, device=env.obs.device) for _ in range(2))
@@ -264,3 +257,14 @@ class Trials:
             if step % 10 == 9 and not alive.any():
                 break
         return total.cpu().numpy(), int(faults), int(steps)
+
+
+def random_actions(env: Env, seed: int) -> Iterator[torch.Tensor]:
+    """Draw uniformly random actions, (nworld, nact), one batch after another; actions without bounds from -1 to 1."""
+    device, low, high = env.obs.device, env.action_space.low, env.action_space.high
+    assert low is not None and high is not None
+    generator = torch.Generator(device).manual_seed(seed)
+    start = torch.as_tensor(np.where(np.isfinite(low), low, -1.0), device=device).float()
+    size = torch.as_tensor(np.where(np.isfinite(high), high, 1.0), device=device).float() - start
+    while True:
+        yield start + size * torch.rand(env.action.shape, generator=generator, device=device)
