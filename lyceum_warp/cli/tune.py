@@ -56,7 +56,8 @@ class Tune:
     seed: int = 0
     """Seed of initial states and actions."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File of the results, by default tune/TASK.jsonl or tune/TASK-planning.jsonl. Results that it has are not measured again."""
+    """File of the results, by default tune/TASK.jsonl or tune/TASK-planning.jsonl. Results that it has are not measured
+    again."""
     param: ParamWords = ()
     env: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
 
