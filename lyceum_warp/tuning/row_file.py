@@ -10,6 +10,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.runs.task_copy import json_value, task_copy
 from lyceum_warp.support.versions import versions
 
+_BEGIN = b'{"name": '
 _VERSIONS = ("lyceum_warp", "mujoco", "mujoco_warp")
 
 
@@ -45,15 +46,17 @@ class RowFile:
     def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
         self.path, self.identity = path, dict(identity)
         self._rows: dict[str, dict[str, Any]] = {}
-        lines = path.read_text().splitlines() if path.exists() else []
+        self._whole = 0
+        lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
         for number, line in enumerate(lines, 1):
             try:
                 row = json.loads(line)
                 found, key = row["identity"], _key(row["physics"])
             except (ValueError, TypeError, KeyError):
-                if number == len(lines):  # cut off when its process was killed
-                    continue
+                if number == len(lines) and line.startswith(_BEGIN):  # its process was killed; the next row replaces it
+                    break
                 raise ValueError(f"line {number} of {path} is no result of tune: give another file") from None
+            self._whole += len(line)
             if found == self.identity:
                 self._rows[key] = row
 
@@ -65,11 +68,9 @@ class RowFile:
         """Append a row to the file, and return it as the file has it."""
         line = json.dumps({**row, "identity": self.identity})
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("a+") as file:
-            file.seek(max(0, file.tell() - 1))
-            if file.read() not in ("", "\n"):
-                file.write("\n")
-            file.write(f"{line}\n")
+        with self.path.open("ab") as file:
+            file.truncate(self._whole)
+            self._whole += file.write(f"{line}\n".encode())
         self._rows[_key(row["physics"])] = kept = json.loads(line)
         return kept
 

@@ -25,8 +25,6 @@ NUDGE = 1e-6
 """Standard deviation of the change of positions and velocities, to see how chaotic the task is."""
 _HALF_WIDTH = TOLERANCES["strict"] / 2
 """Half width of the interval of the difference of returns that the number of episodes aims at."""
-_RECORDED_AT = (5, 20, 50, 100)
-"""Steps of a run after which states are recorded, for speed and divergence."""
 _CONTACT_STATES = 64
 
 Policy = Callable[[torch.Tensor], torch.Tensor]
@@ -44,10 +42,12 @@ class Effort:
     """Time limit for the episodes of a setting, for random actions and for the policy each."""
     steps: int
     """Longest episode; 0 for the task's own horizon."""
+    recorded_at: tuple[int, ...]
+    """Steps of a run after which states are recorded, from which speed and divergence are measured."""
 
 
-FULL = Effort(repeats=15, block_seconds=0.3, judging_seconds=60.0, steps=0)
-SHORT = Effort(repeats=5, block_seconds=0.1, judging_seconds=3.0, steps=100)
+FULL = Effort(repeats=15, block_seconds=0.3, judging_seconds=60.0, steps=0, recorded_at=(5, 20, 50, 100))
+SHORT = Effort(repeats=7, block_seconds=0.1, judging_seconds=3.0, steps=100, recorded_at=(30,))
 
 
 class Trials:
@@ -79,29 +79,28 @@ class Trials:
         """Record states under random actions and, in half of the worlds, the policy, and 50 actions after each."""
         env, draw = self.reference, random_actions(self.reference, self.seed)
         policy_worlds = torch.arange(env.nworld, device=env.obs.device)[:, None] % 2 == 1
-        length = max(DIVERGENCE_STEPS)
-        starts, runs = [], []
+        self._parts = [env.state_space.parts[name] for name in ("qpos", "qvel")]
+        self._starts: list[torch.Tensor] = []
+        self._actions: list[torch.Tensor] = []
         env.rand_reset(self.seed)
-        for step in range(max(_RECORDED_AT) + 1):
-            if step in _RECORDED_AT:
-                starts.append(env.get_state())
+        for step in range(max(self.effort.recorded_at) + 1):
+            if step in self.effort.recorded_at:
+                self._starts.append(env.get_state())
             env.rand_reset(mask=env.done)
             env.step(self._mixed(next(draw), policy_worlds))
-        for start in starts:
+        for start in self._starts:
             env.set_state(start)
-            actions = torch.empty(length, *env.action.shape, device=env.obs.device)
-            for step in range(length):
-                actions[step] = self._mixed(next(draw), policy_worlds)
-                env.step(actions[step])
-            runs.append(actions)
-        self._starts, self._actions = starts, runs
-        self._positions = [env.state_space.parts["qpos"], env.state_space.parts["qvel"]]
-        self._exact = [self._velocities(env, k) for k in range(len(starts))]
+            actions = []
+            for _ in range(max(DIVERGENCE_STEPS)):
+                actions.append(self._mixed(next(draw), policy_worlds))
+                env.step(actions[-1])
+            self._actions.append(torch.stack(actions))
+        self._exact = [self._velocities(env, k) for k in range(len(self._starts))]
         noise = torch.Generator("cpu").manual_seed(self.seed)
         nudged = []
-        for k, start in enumerate(starts):
+        for k, start in enumerate(self._starts):
             start = start.clone()
-            for part in self._positions:
+            for part in self._parts:
                 moved = torch.randn(start[:, part].shape, generator=noise, dtype=torch.float64)
                 start[:, part] += NUDGE * moved.to(start.device)
             nudged.append(self._velocities(env, k, start))
@@ -138,20 +137,16 @@ class Trials:
         except ValueError as error:
             return row | {"refused": str(error)}
         taken = before - self._free()
-        speed, speedup = self._speed(env)
-        row |= {
-            "in_contact": self.in_contact,
-            "steps_per_second": speed,
-            "speedup": speedup,
-            "bytes_per_world": env.bytes_per_world,
-        }
+        speed, speedup, quartile = self._speed(env)
+        row |= {"steps_per_second": speed, "speedup": speedup, "speedup_quartile": quartile}
+        row |= {"in_contact": self.in_contact, "bytes_per_world": env.bytes_per_world}
         row["memory"] = env.bytes_per_world / self.reference.bytes_per_world
         if env.device.is_cuda:
             row["device_bytes"] = taken
         row["divergence"] = self._distance([self._velocities(env, k) for k in range(len(self._starts))])
         row["nudged_divergence"] = self.nudged
         row["returns"], faults, steps = {}, np.zeros(2), np.zeros(2)
-        if not setting.physics or buys(speedup, row["memory"]):
+        if not setting.physics or buys(quartile, row["memory"]):
             for source in self.sources:
                 found, *counts = self._compare(env, source)
                 row["returns"][source] = dataclasses.asdict(found)
@@ -169,8 +164,8 @@ class Trials:
         wp.synchronize_device(self.reference.device)
         return free_memory(self.reference.device) or 0
 
-    def _speed(self, env: Env) -> tuple[float, float]:
-        """Steps per second of all worlds, and how many times faster than the task as it is."""
+    def _speed(self, env: Env) -> tuple[float, float, float]:
+        """Steps per second of all worlds; median and lower quartile of the ratio to the task as it is."""
         count = self._block * env.nworld
         times, ratios = [], []
         for repeat in range(self.effort.repeats):
@@ -178,7 +173,7 @@ class Trials:
             exact, own = self._seconds(self.reference, k), self._seconds(env, k)
             times.append(own)
             ratios.append(exact / own)
-        return count / statistics.median(times), statistics.median(ratios)
+        return count / statistics.median(times), statistics.median(ratios), float(np.quantile(ratios, 0.25))
 
     def _seconds(self, env: Env, k: int) -> float:
         """Seconds of a block of steps from the k-th recorded states, after one step that is not timed."""
@@ -200,7 +195,7 @@ class Trials:
             env.step(action)
             bad |= env.done_reason & int(FAULTS) != 0
             if step in DIVERGENCE_STEPS:
-                found.append(env.get_state()[:, self._positions[1]].masked_fill(bad[:, None], torch.nan))
+                found.append(env.get_state()[:, self._parts[1]].masked_fill(bad[:, None], torch.nan))
         return torch.stack(found)
 
     def _distance(self, velocities: list[torch.Tensor]) -> list[float]:

@@ -1,12 +1,13 @@
 """lyceum-warp tune: its table, the flags that it prints, and errors."""
 
+import dataclasses
 from pathlib import Path
 
 import pytest
 
 from lyceum_warp import cli
 from lyceum_warp.tuning import search
-from lyceum_warp.tuning.trial import Effort
+from lyceum_warp.tuning.trial import SHORT
 
 QUICK = ["--short", "--episodes", "8", "--nworld", "8", "--nthread", "1", "--tolerance", "any"]
 
@@ -14,7 +15,7 @@ QUICK = ["--short", "--episodes", "8", "--nworld", "8", "--nthread", "1", "--tol
 def test_tune_prints_the_table_and_flags_that_another_command_takes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(search, "SHORT", Effort(repeats=2, block_seconds=0.005, judging_seconds=1.0, steps=40))
+    monkeypatch.setattr(search, "SHORT", dataclasses.replace(SHORT, repeats=2, block_seconds=0.005, steps=40))
     assert cli.main(["tune", "half_cheetah", *QUICK, "--out", str(tmp_path / "rows.jsonl")]) == 0
     out, err = capsys.readouterr()
     assert "half_cheetah: 8 worlds, mujoco engine on" in out and "the task as it is" in out

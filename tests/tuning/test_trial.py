@@ -8,7 +8,7 @@ from lyceum_warp.tuning.candidates import Setting
 from lyceum_warp.tuning.judgement import verdict
 from lyceum_warp.tuning.trial import Effort, Trials
 
-BRIEF = Effort(repeats=2, block_seconds=0.001, judging_seconds=1.0, steps=60)
+BRIEF = Effort(repeats=2, block_seconds=0.001, judging_seconds=1.0, steps=60, recorded_at=(5, 30))
 SAME = Setting("", "", {})
 CRUDE = Setting("crude", "", {"frame_skip": 1, "timestep": 0.05, "solver": {"iterations": 1}})
 
