@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.planner import MPPI
 from lyceum_warp.options import PhysicsOptions
 from lyceum_warp.task import Task
@@ -17,7 +18,8 @@ from lyceum_warp.tuning.trial import random_actions
 
 _LEAST_SAMPLES = 64
 _MOVING_STEPS, _FALLING_STEPS, _LYING_STEPS = 30, 200, 10
-_IMPROVEMENTS = 3
+_REPLAN_EVERY = 3
+_IMPROVEMENTS = 2
 """Improvements of the plan around which the compared samples are drawn."""
 
 
@@ -29,7 +31,7 @@ class Rankings:
     physics. There are states of three kinds:
 
     - standing: random initial states;
-    - moving: states of the plant after 30 steps under the planner with the plant's physics;
+    - moving: states of the plant after 30 steps under the planner with the plant's physics, with a plan every 3 steps;
     - fallen: states after random actions until the end of the episode, at most 200 steps, and 10 steps more.
 
     Args:
@@ -46,16 +48,17 @@ class Rankings:
     ) -> None:
         self.task, self.states, self.repeats, self.seed, self.words = task, states, repeats, seed, words
         # several improvements would adapt the samples to each planner's own physics
-        self.words = {"iterations": 1, "plants": states, "seed": seed, **words}
-        own = MPPI(task, samples=samples, physics=PhysicsOptions(), **{**self.words, "plants": 1})
-        self.words["samples"] = max(own.samples, _LEAST_SAMPLES) if samples is None else own.samples
-        self.exact = self._planner({})
+        self.words = {"iterations": 1, "seed": seed, **words}
+        if samples is None:
+            samples = max(task_config(task).samples, _LEAST_SAMPLES)
+        self.words["samples"] = samples
+        self.exact, self.one = self._planner({}, states), self._planner({}, 1)
         self.reference = self.exact.env
         self._starts = self._find_states()
         self._exact = {kind: self._prepared(start) for kind, start in self._starts.items()}
 
-    def _planner(self, physics: Any) -> MPPI:
-        return MPPI(self.task, physics=PhysicsOptions(**physics), **self.words)
+    def _planner(self, physics: Any, plants: int) -> MPPI:
+        return MPPI(self.task, physics=PhysicsOptions(**physics), plants=plants, **self.words)
 
     def _find_states(self) -> dict[str, torch.Tensor]:
         """States of each kind, (states, state_space.size)."""
@@ -63,8 +66,10 @@ class Rankings:
         plant.rand_reset(self.seed)
         found = {"standing": plant.get_state()}
         self.exact.reset(self.seed)
-        for _ in range(_MOVING_STEPS):
-            plant.step(self.exact(plant.get_state()))
+        for step in range(_MOVING_STEPS):
+            if step % _REPLAN_EVERY == 0:
+                self.exact(plant.get_state(), shift=_REPLAN_EVERY if step else 0)
+            plant.step(self.exact.actions[step % _REPLAN_EVERY].reshape(plant.action.shape))
         found["moving"] = plant.get_state()
         plant.rand_reset(self.seed + 1)
         draw, fallen = random_actions(plant, self.seed), torch.zeros_like(plant.done)
@@ -97,18 +102,17 @@ class Rankings:
         """Measure a setting, and return the row of its results."""
         row: dict[str, Any] = {"name": setting.name, "physics": dict(setting.physics), "refused": ""}
         try:
-            planner = self._planner(setting.physics)
+            planner, one = self._planner(setting.physics, self.states), self._planner(setting.physics, 1)
         except ValueError as error:
             return row | {"refused": str(error)}
         times, ratios = [], []
-        start = self._starts["moving"]
+        start = self._starts["moving"][0]
         for repeat in range(self.repeats + 1):
-            exact, own = self._seconds(self.exact, start), self._seconds(planner, start)
+            exact, own = self._seconds(self.one, start), self._seconds(one, start)
             if repeat:  # the first plans warm up
                 times.append(own)
                 ratios.append(exact / own)
-        row |= {"plan_ms": 1e3 * statistics.median(times), "speedup": statistics.median(ratios)}
-        row |= {"bytes_per_world": planner.env.bytes_per_world, "ranks": {}}
+        row |= {"plan_ms": 1e3 * statistics.median(times), "speedup": statistics.median(ratios), "ranks": {}}
         for kind, (plan, returns) in self._exact.items():
             found = rank_correlations(returns, self._returns(planner, self._starts[kind], plan))
             if len(found):
@@ -116,7 +120,7 @@ class Rankings:
         return row
 
     def _seconds(self, planner: MPPI, start: torch.Tensor) -> float:
-        """Seconds of a plan for all states."""
+        """Seconds of a plan from a state."""
         begin = time.perf_counter()
         planner(start)
         if planner.actions.is_cuda:

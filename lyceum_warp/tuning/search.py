@@ -116,7 +116,7 @@ def tune(
     if planning:
         if run is not None:
             raise ValueError("planning compares samples of the task's planner, without a run: omit one of them")
-        states, repeats = (6, 5) if short else (16, 15)
+        states, repeats = (6, 3) if short else (16, 15)
         samples = words.pop("nworld", None)
         trials = Rankings(kind, states=episodes or states, repeats=repeats, samples=samples, seed=seed, **words)
         measured["planner"] = trials.exact.settings
