@@ -27,7 +27,7 @@ class Rankings:
     """Measures a planner's physics against the plant's.
 
     From each state, planners with both physics draw the same samples around the same plan. A planner only uses the
-    order and the differences of returns, so the rank correlation of the returns tells whether it can plan with coarser
+    order and the differences of returns, so the rank correlation of the returns shows whether it can plan with coarser
     physics. There are states of three kinds:
 
     - standing: random initial states;
@@ -54,8 +54,8 @@ class Rankings:
         self.words["samples"] = samples
         self.exact, self.one = self._planner({}, states), self._planner({}, 1)
         self.reference = self.exact.env
-        self._starts = self._find_states()
-        self._exact = {kind: self._prepared(start) for kind, start in self._starts.items()}
+        self.starts = self._find_states()
+        self._exact = {kind: self._prepared(start) for kind, start in self.starts.items()}
 
     def _planner(self, physics: Any, plants: int) -> MPPI:
         return MPPI(self.task, physics=PhysicsOptions(**physics), plants=plants, **self.words)
@@ -106,7 +106,7 @@ class Rankings:
         except ValueError as error:
             return row | {"refused": str(error)}
         times, ratios = [], []
-        start = self._starts["moving"][0]
+        start = self.starts["moving"][0]
         for repeat in range(self.repeats + 1):
             exact, own = self._seconds(self.one, start), self._seconds(one, start)
             if repeat:  # the first plans warm up
@@ -114,7 +114,7 @@ class Rankings:
                 ratios.append(exact / own)
         row |= {"plan_ms": 1e3 * statistics.median(times), "speedup": statistics.median(ratios), "ranks": {}}
         for kind, (plan, returns) in self._exact.items():
-            found = rank_correlations(returns, self._returns(planner, self._starts[kind], plan))
+            found = rank_correlations(returns, self._returns(planner, self.starts[kind], plan))
             if len(found):
                 row["ranks"][kind] = dataclasses.asdict(mean_interval(found))
         return row

@@ -44,7 +44,7 @@ class RowFile:
     """
 
     def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
-        self.path, self.identity = path, dict(identity)
+        self.path, self.identity = path, json.loads(json.dumps(identity))  # with lists for tuples
         self._rows: dict[str, dict[str, Any]] = {}
         self._whole = 0
         lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
@@ -55,7 +55,7 @@ class RowFile:
             except (ValueError, TypeError, KeyError):
                 if number == len(lines) and line.startswith(_BEGIN):  # its process was killed; the next row replaces it
                     break
-                raise ValueError(f"line {number} of {path} is no result of tune: give another file") from None
+                raise ValueError(f"line {number} of {path} is not a result of tune: give another file") from None
             self._whole += len(line)
             if found == self.identity:
                 self._rows[key] = row

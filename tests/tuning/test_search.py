@@ -115,7 +115,7 @@ def test_wrong_arguments_are_one_error_each(run: Path, tmp_path: Path) -> None:
         ("point_mass", {"run": run, "which": "worst"}, "which must be 'last', 'best' or the number"),
         ("hopper", {"episodes": 0}, "episodes must be a whole number from 1 .*, not 0"),
         ("hopper", {"short": "yes"}, "short must be True or False, not 'yes'"),
-        ("hopper", {"out": other, "nworld": 2}, "line 1 of .*notes.txt is no result of tune: give another file"),
+        ("hopper", {"out": other, "nworld": 2}, "line 1 of .*notes.txt is not a result of tune: give another file"),
         ("hopper", {"gravity": 3}, "gravity"),
     ]
     for task, words, message in wrong:
