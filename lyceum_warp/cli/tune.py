@@ -45,7 +45,7 @@ class Tune:
     short: bool = False
     """Compare the first 100 steps of episodes, for a few seconds for each setting, instead of whole episodes."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Number of episodes of each setting; by default as many as the interval needs, within a minute (3 s with
+    """Number of episodes of each setting; by default as many as the interval needs, within a minute (5 s with
     --short)."""
     planning: bool = False
     """Find physics for the task's planner: compare the time of a plan, and the ranks that the coarser physics and the

@@ -89,7 +89,7 @@ def tune(
             return; "loose": within 5 %; "any": only faults count.
         short: Whether to compare the first 100 steps of episodes, for a few seconds, instead of whole episodes.
         episodes: Number of episodes of each setting, rounded up to a multiple of the number of worlds. By default as
-            many as the interval needs, within a minute, or 3 s if ``short``.
+            many as the interval needs, within the time limit: a minute, or 5 s if ``short``.
         planning: Whether to find physics for the task's planner instead of its worlds: compares the time of a plan,
             and the ranks that both physics give to the same samples, from standing, moving and fallen states. A setting
             is suggested if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8 ("loose").

@@ -39,7 +39,7 @@ class Effort:
     block_seconds: float
     """Duration of a block in the task as it is."""
     judging_seconds: float
-    """Time limit for the episodes of a setting, for random actions and for the policy each."""
+    """Time limit for all episodes of the task as it is, for random actions and for the policy each."""
     steps: int
     """Longest episode; 0 for the task's own horizon."""
     recorded_at: tuple[int, ...]
@@ -47,7 +47,7 @@ class Effort:
 
 
 FULL = Effort(repeats=15, block_seconds=0.3, judging_seconds=60.0, steps=0, recorded_at=(5, 20, 50, 100))
-SHORT = Effort(repeats=7, block_seconds=0.1, judging_seconds=3.0, steps=100, recorded_at=(30,))
+SHORT = Effort(repeats=7, block_seconds=0.1, judging_seconds=5.0, steps=100, recorded_at=(30,))
 
 
 class Trials:
@@ -71,6 +71,7 @@ class Trials:
         if reference.horizon:
             self.steps = min(self.steps, reference.horizon)
         self._returns: dict[tuple[str, int], tuple[np.ndarray, int, int]] = {}
+        self._batch_seconds: dict[str, float] = {}
         self._record()
 
     # states in the middle of a run, and actions that follow them
@@ -214,19 +215,18 @@ class Trials:
         wanted = self.batches or 1
         while len(pairs) < wanted:
             batch = len(pairs)
-            key = (source, batch)
-            if key not in self._returns:
-                self._returns[key] = self._episodes(self.reference, source, batch)
-            start = time.perf_counter()
-            own, exact = self._episodes(env, source, batch), self._returns[key]
-            seconds = time.perf_counter() - start
+            if (source, batch) not in self._returns:
+                start = time.perf_counter()
+                self._returns[source, batch] = self._episodes(self.reference, source, batch)
+                self._batch_seconds[source] = time.perf_counter() - start
+            own, exact = self._episodes(env, source, batch), self._returns[source, batch]
             pairs.append(np.stack([exact[0], own[0]]))
             faults += (own[1], exact[1])
             steps += (own[2], exact[2])
             if batch == 0 and self.batches is None:
                 first = difference(*pairs[0])
                 if not first.beyond(TOLERANCES["loose"]):
-                    most = max(1, int(self.effort.judging_seconds / seconds))
+                    most = max(1, int(self.effort.judging_seconds / self._batch_seconds[source]))
                     wanted = min(most, math.ceil(episodes_needed(first, _HALF_WIDTH) / env.nworld))
         return difference(*np.concatenate(pairs, axis=1)), faults, steps
 
