@@ -14,8 +14,7 @@ RANK_CORRELATIONS = {"strict": 0.9, "loose": 0.8, "any": -1.0}
 """Smallest rank correlation of a planner's physics with the plant's, by the same names."""
 
 LEAST_GAIN = 1.03
-"""A setting that is not this many times faster in three quarters of the repeats, and takes no less memory, is not
-judged further."""
+"""A setting that is not at least this many times faster, and takes no less memory, is not judged further."""
 _LEAST_SAVING = 0.95
 
 _RESAMPLES = 1000
@@ -86,7 +85,7 @@ def episodes_needed(found: Difference, half_width: float) -> int:
 
 
 def buys(speedup: float, memory: float) -> bool:
-    """Whether a setting is faster or smaller, given the lower quartile of the speed-up and the ratio of memory."""
+    """Whether a setting is faster or smaller, given the lower bound of its speed-up and the ratio of memory."""
     return speedup >= LEAST_GAIN or memory <= _LEAST_SAVING
 
 
@@ -96,7 +95,7 @@ def verdict(row: Mapping[str, Any], tolerance: str) -> str:
         return "refused"
     if "ranks" in row:
         return _verdict_on_ranks(row, RANK_CORRELATIONS[tolerance])
-    if not buys(row["speedup_quartile"], row["memory"]):
+    if not buys(row["speedup_low"], row["memory"]):
         return "no gain"
     if row["faults_per_million"] > 2 * row["reference_faults_per_million"]:
         return "faults"

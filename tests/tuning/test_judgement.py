@@ -32,7 +32,7 @@ def test_returns_that_were_all_zero_show_nothing() -> None:
 
 def row(*bounds: tuple[float, float], **entries: Any) -> dict[str, Any]:
     returns = {str(i): {"mean": 0.0, "low": low, "high": high, "episodes": 9} for i, (low, high) in enumerate(bounds)}
-    known = {"refused": "", "speedup": 2.0, "speedup_quartile": 1.9, "memory": 1.0, "faults_per_million": 0.0}
+    known = {"refused": "", "speedup": 2.0, "speedup_low": 1.9, "memory": 1.0, "faults_per_million": 0.0}
     return {**known, "reference_faults_per_million": 0.0, "returns": returns, **entries}
 
 
@@ -43,8 +43,8 @@ def row(*bounds: tuple[float, float], **entries: Any) -> dict[str, Any]:
         (row((-0.01, 0.03), (0.0, 0.0)), "not shown"),
         (row((-0.01, 0.02), (0.03, 0.04)), "different"),
         (row((-0.05, -0.03)), "different"),
-        (row((0.0, 0.0), speedup_quartile=1.01), "no gain"),
-        (row((0.0, 0.0), speedup_quartile=1.01, memory=0.6), "same"),
+        (row((0.0, 0.0), speedup_low=1.01), "no gain"),
+        (row((0.0, 0.0), speedup_low=1.01, memory=0.6), "same"),
         (row((0.0, 0.0), faults_per_million=3.0, reference_faults_per_million=1.0), "faults"),
         (row((0.0, 0.0), faults_per_million=3.0, reference_faults_per_million=2.0), "same"),
         ({"refused": "MuJoCo refuses it"}, "refused"),
