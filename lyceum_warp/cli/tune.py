@@ -52,7 +52,7 @@ class Tune:
     task as it is give to the same samples. --nworld is then the number of samples, and --episodes the number of states
     of each kind."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Number of worlds; by default 256, or 4096 on a GPU. With --planning the planner's samples, at least 64."""
+    """Number of worlds; by default 256, or 4096 on a GPU. With --planning the planner's samples, by default 64."""
     seed: int = 0
     """Seed of initial states and actions."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.planner import MPPI
 from lyceum_warp.options import PhysicsOptions
 from lyceum_warp.task import Task
@@ -16,9 +15,9 @@ from lyceum_warp.tuning.candidates import Setting
 from lyceum_warp.tuning.judgement import mean_interval
 from lyceum_warp.tuning.trial import random_actions
 
-_LEAST_SAMPLES = 64
+_SAMPLES = 64
 _MOVING_STEPS, _FALLING_STEPS, _LYING_STEPS = 30, 200, 10
-_REPLAN_EVERY = 3
+_REPLAN_EVERY = 6
 _IMPROVEMENTS = 2
 """Improvements of the plan around which the compared samples are drawn."""
 
@@ -31,27 +30,24 @@ class Rankings:
     physics. There are states of three kinds:
 
     - standing: random initial states;
-    - moving: states of the plant after 30 steps under the planner with the plant's physics, with a plan every 3 steps;
+    - moving: states of the plant after 30 steps under the planner with the plant's physics, with a plan every 6 steps;
     - fallen: states after random actions until the end of the episode, at most 200 steps, and 10 steps more.
 
     Args:
         task: The task.
         states: Number of states of each kind.
         repeats: Number of timed plans.
-        samples: Number of samples; by default the task's, at least 64.
+        samples: Number of samples.
         seed: Seed of states and noise.
         words: Options and parameters as for ``lw.MPPI``.
     """
 
     def __init__(
-        self, task: type[Task], *, states: int, repeats: int, samples: int | None = None, seed: int = 0, **words: Any
+        self, task: type[Task], *, states: int, repeats: int, samples: int = _SAMPLES, seed: int = 0, **words: Any
     ) -> None:
-        self.task, self.states, self.repeats, self.seed, self.words = task, states, repeats, seed, words
+        self.task, self.states, self.repeats, self.seed = task, states, repeats, seed
         # several improvements would adapt the samples to each planner's own physics
-        self.words = {"iterations": 1, "seed": seed, **words}
-        if samples is None:
-            samples = max(task_config(task).samples, _LEAST_SAMPLES)
-        self.words["samples"] = samples
+        self.words = {"iterations": 1, "seed": seed, "samples": samples, **words}
         self.exact, self.one = self._planner({}, states), self._planner({}, 1)
         self.reference = self.exact.env
         self.starts = self._find_states()

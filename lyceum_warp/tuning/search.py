@@ -93,7 +93,7 @@ def tune(
         planning: Whether to find physics for the task's planner instead of its worlds: compares the time of a plan,
             and the ranks that both physics give to the same samples, from standing, moving and fallen states. A setting
             is suggested if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8 ("loose").
-            ``nworld`` is then the number of samples, and ``episodes`` the number of states of each kind.
+            ``nworld`` is then the number of samples, by default 64, and ``episodes`` the number of states of each kind.
         out: File of the results, to which rows are appended; rows that it has are not measured again. By default
             tune/TASK.jsonl, or tune/TASK-planning.jsonl.
         seed: Seed of initial states and actions.
@@ -116,9 +116,10 @@ def tune(
     if planning:
         if run is not None:
             raise ValueError("planning compares samples of the task's planner, without a run: omit one of them")
-        states, repeats = (6, 3) if short else (16, 15)
-        samples = words.pop("nworld", None)
-        trials = Rankings(kind, states=episodes or states, repeats=repeats, samples=samples, seed=seed, **words)
+        states, repeats = (4, 3) if short else (16, 15)
+        if "nworld" in words:
+            words["samples"] = words.pop("nworld")
+        trials = Rankings(kind, states=episodes or states, repeats=repeats, seed=seed, **words)
         measured["planner"] = trials.exact.settings
     else:
         trials = _trials(kind, run, which, words, effort=SHORT if short else FULL, seed=seed, episodes=episodes)
