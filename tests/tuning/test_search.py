@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from training_runs import CONFIG
 
 import lyceum_warp as lw
 from lyceum_warp.tuning import search
@@ -85,10 +86,8 @@ def test_a_new_row_follows_a_line_that_was_cut_off(tmp_path: Path, monkeypatch: 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "point_mass"
-    npg = lw.NPG(
-        lw.make("point_mass", nworld=4, nthread=1, success_distance=0.05), horizon=8, value_hidden=(8,), hidden=(8,)
-    )
-    lw.train(npg, folder, iterations=1)
+    env = lw.make("point_mass", nworld=2, nthread=1, success_distance=0.05)
+    lw.train(lw.NPG(env, config=CONFIG), folder, iterations=1)
     return folder
 
 
