@@ -58,6 +58,7 @@ if TYPE_CHECKING:
         tendon)
     from lyceum_warp.terrain import Terrain, height_field, scan_grid
     from lyceum_warp.training import train
+    from lyceum_warp.tuning.search import Tuning, tune
     from lyceum_warp.viewer.follow import RunViewer
     from lyceum_warp.viewer.show import view
 
@@ -66,17 +67,17 @@ __all__ = [
     "Episodes", "GaussianPolicy", "Iteration", "Learner", "MPPIConfig", "ModelFile", "NPGConfig", "OpenLoop",
     "PPOConfig", "PhysicsOptions", "PlanSamples", "PlanUpdate", "Planner", "Planning", "PlanningController",
     "PredictiveSampling", "Rollout", "Row", "RunViewer", "Sigmoid", "Task", "Terrain", "Trajectory", "Transfer",
-    "ValueFunction", "act", "actuator", "actuators", "all_inside", "angle_between", "bodies", "body", "body_velocity",
-    "camera", "control", "control_async", "control_report", "ctrl", "dof", "dofs", "equality", "evaluate",
-    "export_policy", "follow_velocity", "follow_walk", "from_model", "geom", "geoms", "grasp_terms", "ground_distance",
-    "ground_height", "ground_normal", "gymnasium_model", "gymnasium_robotics_model", "height_field", "height_scan",
-    "inside", "joint", "joints", "lasting_memory", "load", "load_value", "local_velocity", "make", "memory",
-    "menagerie_model", "mocap", "next_level", "normal", "on_ground", "package_model", "part", "playground_model", "put",
-    "put_upright", "qpos", "qposes", "quat", "quat_angle", "quat_difference", "quat_from_axis_angle", "quat_from_euler",
-    "quat_from_mat", "quat_from_rotvec", "quat_inverse", "quat_mul", "quat_random", "quat_rotate",
-    "quat_rotate_inverse", "quat_to_euler", "quat_to_mat", "quat_to_rotvec", "register", "scan_grid", "sensor",
-    "sensors", "site", "sites", "start_on_terrain", "sum_squares", "task_names", "tendon", "tolerance", "train",
-    "transfer", "uniform", "vec10", "view"]
+    "Tuning", "ValueFunction", "act", "actuator", "actuators", "all_inside", "angle_between", "bodies", "body",
+    "body_velocity", "camera", "control", "control_async", "control_report", "ctrl", "dof", "dofs", "equality",
+    "evaluate", "export_policy", "follow_velocity", "follow_walk", "from_model", "geom", "geoms", "grasp_terms",
+    "ground_distance", "ground_height", "ground_normal", "gymnasium_model", "gymnasium_robotics_model", "height_field",
+    "height_scan", "inside", "joint", "joints", "lasting_memory", "load", "load_value", "local_velocity", "make",
+    "memory", "menagerie_model", "mocap", "next_level", "normal", "on_ground", "package_model", "part",
+    "playground_model", "put", "put_upright", "qpos", "qposes", "quat", "quat_angle", "quat_difference",
+    "quat_from_axis_angle", "quat_from_euler", "quat_from_mat", "quat_from_rotvec", "quat_inverse", "quat_mul",
+    "quat_random", "quat_rotate", "quat_rotate_inverse", "quat_to_euler", "quat_to_mat", "quat_to_rotvec", "register",
+    "scan_grid", "sensor", "sensors", "site", "sites", "start_on_terrain", "sum_squares", "task_names", "tendon",
+    "tolerance", "train", "transfer", "tune", "uniform", "vec10", "view"]
 
 _NAMES = {
     "model_actuators": "follow_velocity",
@@ -124,6 +125,7 @@ _NAMES = {
         "joint joints lasting_memory memory mocap part qpos qposes sensor sensors site sites tendon",
     "terrain": "Terrain height_field scan_grid",
     "training": "train",
+    "tuning.search": "Tuning tune",
     "viewer.follow": "RunViewer",
     "viewer.show": "view",
 }

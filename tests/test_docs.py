@@ -73,6 +73,7 @@ QUICK = {
     ),
     "train --resume": ["--iterations", "3", "--no-video"],
     "eval": ["--episodes", "2", "--no-video"],
+    "tune": ["--nworld", "8", "--episodes", "4"],
     "plan": ["--steps", "3", "--samples", "4", "--no-video"],
 }
 """Options added to a page's commands, so that they are quick."""

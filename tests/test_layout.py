@@ -30,6 +30,7 @@ LEVELS = {
     "openloop": 7,
     "algos": 8, "controllers": 8, "testing": 8,
     "runs": 9,
+    "tuning": 10,
     "viz": 11,
     "training": 12,
     "adapters": 13, "viewer": 13,
