@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.distributed import Team
+from lyceum_warp.algos.replay import Replay
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
@@ -113,6 +114,9 @@ class Learner(abc.ABC):
     """The processes that learn together."""
     generator: torch.Generator | None = None
     """The random generator, if the algorithm has one."""
+    replay: Replay | None = None
+    """The replay buffer, if the algorithm has one. ``state_dict`` does not contain it, because it may be large: a run
+    keeps it in files of its own, which are updated step by step."""
     iteration: int
     """Number of complete iterations."""
     samples: int
@@ -154,12 +158,17 @@ class Learner(abc.ABC):
         """
         return "return_mean" if getattr(self.config, "mean_every", None) == 0 else "mean_return"
 
+    @property
+    def title(self) -> str:
+        """Name of the algorithm in messages, with what a user should know of it."""
+        return self.algorithm
+
     def settings(self) -> dict[str, Any]:
         """The hyperparameters for a run's config.json."""
         return dataclasses.asdict(self.config)
 
     def state_dict(self) -> dict[str, Any]:
-        """Copy the complete state, including the worlds of all processes, to resume from.
+        """Copy the complete state except ``replay``, including the worlds of all processes, to resume from.
 
         The state consists of tensors, numbers, strings, dicts and lists. All processes must call this method. Any
         number of processes can resume from the state.
@@ -175,6 +184,8 @@ class Learner(abc.ABC):
             state["value"] = self.value.state_dict()
         if self.generator is not None:
             state["generator"] = self.generator.get_state()
+        if self.replay is not None:
+            state["stored"] = self.replay.stored
         return copy.deepcopy(state)  # a module's state_dict shares memory with its parameters
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -359,4 +359,4 @@ class PPO(OnPolicyLearner):
             self.std.copy_(state["std"])
         self._recent.clear()
         self._recent.extend(state["recent"])
-        self.minibatches.forget()  # the graph stores the addresses of the old moments
+        self.minibatches.epoch.forget()  # the graph stores the addresses of the old moments
