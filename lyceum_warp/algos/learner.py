@@ -117,6 +117,8 @@ class Learner(abc.ABC):
     replay: Replay | None = None
     """The replay buffer, if the algorithm has one. ``state_dict`` does not contain it, because it may be large: a run
     keeps it in files of its own, which are updated step by step."""
+    own_worlds: slice
+    """This process's worlds among those of all processes."""
     iteration: int
     """Number of complete iterations."""
     samples: int
@@ -127,11 +129,11 @@ class Learner(abc.ABC):
         self.team = team = team or Team()
         self.iteration = self.samples = 0
         n = env.nworld
-        self._own = slice(team.rank * n, (team.rank + 1) * n)
-        if team.size > 1 and env.first_world != self._own.start:
+        self.own_worlds = slice(team.rank * n, (team.rank + 1) * n)
+        if team.size > 1 and env.first_world != self.own_worlds.start:
             raise ValueError(
                 f"process {team.rank} of {team.size} with {n} worlds needs an environment with "
-                f"first_world={self._own.start}, not {env.first_world}"
+                f"first_world={self.own_worlds.start}, not {env.first_world}"
             )
         if not env.autoreset:
             raise ValueError(
@@ -204,6 +206,6 @@ class Learner(abc.ABC):
             self.generator.set_state(state["generator"].cpu())
         if "shared" in state:  # earlier releases had none
             self.env.set_shared(state["shared"].to(self.env.obs.device))
-        self.env.set_state(state["env"][self._own].to(self.env.obs.device))
+        self.env.set_state(state["env"][self.own_worlds].to(self.env.obs.device))
         self.iteration = whole_number("iteration", state["iteration"], low=0)
         self.samples = whole_number("samples", state["samples"], low=0, high=2**63 - 1)

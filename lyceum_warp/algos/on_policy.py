@@ -138,4 +138,4 @@ class OnPolicyLearner(Learner):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume from a state of ``state_dict``; see ``Learner``."""
         super().load_state_dict(state)
-        self.rollout.running_return.copy_(state["returns"][self._own])
+        self.rollout.running_return.copy_(state["returns"][self.own_worlds])

@@ -257,10 +257,10 @@ class SAC(Learner):
         env, noise = self.env, self._act_noise
         if self._warms_up and self.replay.stored * len(noise) < self.config.warmup:
             noise.uniform_(-1.0, 1.0, generator=self.generator)
-            unit = noise[self._own]
+            unit = noise[self.own_worlds]
         else:
             noise.normal_(generator=self.generator)
-            unit, _ = self.policy.sample(env.obs, noise[self._own])
+            unit, _ = self.policy.sample(env.obs, noise[self.own_worlds])
         env.action.copy_(self.policy.scaled(unit))
         self.rollout.store_inputs()
         self.replay.step()
@@ -358,7 +358,7 @@ class SAC(Learner):
         self.target.load_state_dict(state["target"])
         with torch.no_grad():
             self.log_temperature.copy_(state["temperature"])
-        self.rollout.running_return.copy_(state["returns"][self._own])
+        self.rollout.running_return.copy_(state["returns"][self.own_worlds])
         for step, saved in zip(self._steps, state["optimizers"], strict=True):
             step.optimizer.load_state_dict(saved)
         self._learn.forget()  # the graph stores the addresses of the old moments
