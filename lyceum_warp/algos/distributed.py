@@ -168,6 +168,7 @@ class Captured:
         self.graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self) -> None:
+        """Call the function, or replay its graph."""
         if not self.enabled:
             self.function()
             return

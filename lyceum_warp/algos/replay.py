@@ -85,10 +85,9 @@ class Replay:
         self.env, n, device = env, env.nworld, env.obs.device
         sizes = [space.size for space in env.obs_spaces.values()]
         nact = env.action_space.size
-        each = 4 * (2 * sum(sizes) + nact + 1) + 2
+        each = _transition_bytes(env)
         if capacity is None:
-            wanted, free = max(_TRANSITIONS, _STEPS * n), free_memory(env.device)
-            capacity = wanted if free is None else max(min(wanted, int(_SHARE * free) // each), n)
+            capacity = default_capacity(env)
         self.steps = steps = -(-whole_number("capacity", capacity, low=1, high=2**62) // n)
         self.nbytes = each * steps * n
         check_fit(each * steps, n, env.device, model=f"{steps} steps in a replay buffer")
@@ -235,3 +234,20 @@ class Replay:
         self.stored = stored
         self._count.fill_(self.count)
         self._oldest.fill_((stored - self.count) % self.steps)
+
+
+def default_capacity(env: Env, processes: int = 1) -> int:
+    """The default capacity of a replay buffer in transitions.
+
+    Args:
+        env: The environment.
+        processes: Number of processes with such an environment, which share the capacity.
+    """
+    wanted, free = max(-(-_TRANSITIONS // processes), _STEPS * env.nworld), free_memory(env.device)
+    return wanted if free is None else max(min(wanted, int(_SHARE * free) // _transition_bytes(env)), env.nworld)
+
+
+def _transition_bytes(env: Env) -> int:
+    """Bytes of one transition."""
+    nobs = sum(space.size for space in env.obs_spaces.values())
+    return 4 * (2 * nobs + env.action_space.size + 1) + 2

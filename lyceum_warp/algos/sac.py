@@ -18,7 +18,7 @@ from lyceum_warp.algos.evaluation import MeanPolicyEvaluation
 from lyceum_warp.algos.learner import Learner
 from lyceum_warp.algos.minibatches import precision, room
 from lyceum_warp.algos.networks import trainable
-from lyceum_warp.algos.replay import Replay, Transitions
+from lyceum_warp.algos.replay import Replay, Transitions, default_capacity
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.rollout_statistics import (
     EpisodeSums,
@@ -97,8 +97,8 @@ class SAC(Learner):
     """The critics."""
     target: TwinCritic
     """The target critics, which share the critics' normaliser."""
-    config: SACConfig
-    """Hyperparameters, without None."""
+    config: Any
+    """Hyperparameters, an ``SACConfig`` without None."""
     replay: Replay
     """The replay buffer, with the samples of this process's worlds."""
     generator: torch.Generator
@@ -124,57 +124,57 @@ class SAC(Learner):
         check_kind("value of SAC", value, TwinCritic | None, "as lw.load_value(run) returns it for a run of SAC")
         super().__init__(env, seed=seed, team=team)
         team, device, nworld = self.team, env.obs.device, env.nworld * self.team.size
-        config = (config or SACConfig()).resolved(nworld)
+        given: Any = (config or SACConfig()).resolved(nworld)
         nact, self._warms_up = env.action_space.size, policy is None
 
         # networks
         init = torch.Generator().manual_seed(self.seed)
-        options: dict[str, Any] = dict(normalize=config.normalize, generator=init)
-        low, high = action_bounds(env, config.action_limit)
-        group = value_group(env, config.value_group) if value is None else value.group
+        options: dict[str, Any] = dict(normalize=given.normalize, generator=init)
+        low, high = action_bounds(env, given.action_limit)
+        group = value_group(env, given.value_group) if value is None else value.group
         self.policy = policy or SquashedPolicy(
-            env.obs_space.size, nact, config.hidden, low=low, high=high, activation=config.activation, **options
+            env.obs_space.size, nact, given.hidden, low=low, high=high, activation=given.activation, **options
         )
         self.value = value or TwinCritic(
-            env.obs_spaces[group].size, nact, config.value_hidden, activation=config.value_activation,
-            layer_norm=config.layer_norm, group=group, **options,
+            env.obs_spaces[group].size, nact, given.value_hidden, activation=given.value_activation,
+            layer_norm=given.layer_norm, group=group, **options,
         )  # fmt: skip
         _check_sizes(self.policy, self.value, env, low, high)
         trainable(self.policy.to(device)), trainable(self.value.to(device))
         self.target = copy.deepcopy(self.value).requires_grad_(False)
         self.target.normalizer = self.value.normalizer
-        self.log_temperature = torch.tensor(math.log(config.temperature), device=device, requires_grad=True)
-        rate = config.learning_rate
+        self.log_temperature = torch.tensor(math.log(given.temperature), device=device, requires_grad=True)
+        rate = given.learning_rate
         self.actor_step = GradientStep(self.policy.parameters(), rate, team)
         self.critic_step = GradientStep(self.value.parameters(), rate, team)
         self.temperature_step = GradientStep([self.log_temperature], rate, team)
 
         # samples
-        self.replay = Replay(env, None if config.replay is None else -(-config.replay // team.size))
-        capacity, shape = self.replay.steps * nworld, {"hidden": self.policy.shape, "value_hidden": self.value.shape}
-        found = {name: tuple(made["hidden"]) for name, made in shape.items()}
-        self.config = config = dataclasses.replace(
-            config, replay=capacity, activation=self.policy.shape["activation"],
-            normalize=self.policy.shape["normalize"], value_activation=self.value.shape["activation"],
-            layer_norm=self.value.shape["layer_norm"], **found,
+        (least,) = team.largest(-default_capacity(env, team.size))  # all processes have buffers of the same size
+        self.replay = Replay(env, -least if given.replay is None else -(-given.replay // team.size))
+        own, critics = self.policy.shape, self.value.shape
+        self.config = dataclasses.replace(
+            given, replay=self.replay.steps * nworld, hidden=tuple(own["hidden"]), activation=own["activation"],
+            normalize=own["normalize"], value_hidden=tuple(critics["hidden"]), value_activation=critics["activation"],
+            layer_norm=critics["layer_norm"],
         )  # fmt: skip
-        self.rollout = Rollout(env, config.num_steps)
-        self.count = config.num_steps * nworld
+        self.rollout = Rollout(env, given.num_steps)
+        self.count = given.num_steps * nworld
         # a separate seed, so that weights and noise are independent
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
         self._act_noise = torch.empty(nworld, nact, device=device)
 
         # updates
-        share = room(config.batch, team)
-        self._index = torch.zeros(config.updates, share, dtype=torch.long, device=device)
-        self._weight = torch.full((config.updates, share), 1.0 / config.batch, device=device)
-        self._noise = torch.zeros(config.updates, share, 2 * nact, device=device)
+        share = room(given.batch, team)
+        self._index = torch.zeros(given.updates, share, dtype=torch.long, device=device)
+        self._weight = torch.full((given.updates, share), 1.0 / given.batch, device=device)
+        self._noise = torch.zeros(given.updates, share, 2 * nact, device=device)
         self._sums = torch.zeros(4, device=device)
         self._losses = [self.critic_loss, self.actor_loss]
-        if config.compiled:
+        if given.compiled:
             self._losses = [torch.compile(loss) for loss in self._losses]
         self._learn = Captured(self.learn, team, device)
-        self._evaluate_mean = MeanPolicyEvaluation(env, config.mean_episodes, team)
+        self._evaluate_mean = MeanPolicyEvaluation(env, given.mean_episodes, team)
         self.rollout.restart()
         self.rollout.stagger(self.generator, team)
 
@@ -182,7 +182,7 @@ class SAC(Learner):
     def title(self) -> str:
         """The algorithm, with the size of its replay buffer."""
         size = self.replay.nbytes * self.team.size / 1e9
-        return f"sac with a replay buffer of {self.config.replay:,d} samples ({size:.2g} GB)"
+        return f"{self.algorithm} with a replay buffer of {self.config.replay:,d} samples ({size:.2g} GB)"
 
     def __next__(self) -> SACIteration:
         config, rollout, team = self.config, self.rollout, self.team
@@ -272,9 +272,10 @@ class SAC(Learner):
     def draw(self) -> None:
         """Draw the samples and the noise of the updates after a step, for all processes; keep this process's part."""
         team, nworld, batch = self.team, self.env.nworld, self.config.batch
-        shape, random = (len(self._index), batch), dict(generator=self.generator, device=self._index.device)
+        shape = len(self._index), batch
+        random: dict[str, Any] = dict(generator=self.generator, device=self._index.device)
         index = torch.randint(self.replay.count * nworld * team.size, shape, **random)
-        noise = torch.randn(*shape, self._noise.shape[-1], **random)
+        noise = torch.randn((*shape, self._noise.shape[-1]), **random)
         if team.size > 1:  # as in Minibatches: move own samples to the front, and drop the few that exceed the room
             index, own = team.locate(index, nworld)
             first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self._index.shape[1]]

@@ -109,7 +109,7 @@ class Saver:
         learner, run, replay = self.learner, self.run, self.learner.replay
         state = learner.state_dict()  # gathers the worlds of all ranks
         if replay is not None:
-            write_replay(run and run.replay, replay, learner.team, self._stored, self._check)
+            write_replay(None if run is None else run.replay, replay, learner.team, self._stored, self._check)
         with learner.team.together():
             if run is not None:
                 self._check()
