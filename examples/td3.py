@@ -94,8 +94,9 @@ class TD3(lw.Learner):
         if self.updates % config.actor_every == 0:
             descend(actor_step, -self.value(obs, self.policy.unit(self.policy.act(obs)))[0].mean())
             with torch.no_grad():
-                for target, own in zip(self.targets, (self.policy, self.value), strict=True):
-                    torch._foreach_lerp_(list(target.parameters()), list(own.parameters()), config.tau)
+                own = [*self.policy.parameters(), *self.value.parameters()]
+                for target, parameter in zip(self.targets.parameters(), own, strict=True):
+                    target.lerp_(parameter, config.tau)
         return loss.detach()
 
     def normal(self, like: torch.Tensor) -> torch.Tensor:

@@ -303,7 +303,8 @@ class SAC(Learner):
                 share = (entropy - config.target_entropy * nact) / self.team.size
                 self.temperature_step(self.log_temperature * share)
             with torch.no_grad():
-                torch._foreach_lerp_(list(self.target.parameters()), list(self.value.parameters()), config.tau)
+                for target, own in zip(self.target.parameters(), self.value.parameters(), strict=True):
+                    target.lerp_(own, config.tau)
 
     def critic_loss(
         self, batch: Transitions, weight: torch.Tensor, noise: torch.Tensor
