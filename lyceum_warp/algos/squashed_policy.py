@@ -69,7 +69,7 @@ class SquashedPolicy(Normalized):
 
     def forward(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Compute the Gaussian's means and the logarithms of its standard deviations, each (..., nact)."""
-        mean, spread = self.network(self.normalizer(obs)).chunk(2, dim=-1)
+        mean, spread = self.network(self.normalizer(obs)).float().chunk(2, dim=-1)  # float32 also under autocast
         return mean, _LOWEST + 0.5 * (_HIGHEST - _LOWEST) * (1.0 + torch.tanh(spread))
 
     def act(self, obs: torch.Tensor) -> torch.Tensor:
