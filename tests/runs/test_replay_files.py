@@ -1,5 +1,6 @@
 """The replay buffer in a run's folder: what a killed save leaves, and what a save writes."""
 
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,22 @@ def test_a_save_killed_at_any_file_leaves_a_run_that_continues_to_the_same_numbe
     lw.train(made(), tmp_path / "run", iterations=5, resume=True, save_every=1)
     np.testing.assert_equal(numbers(tmp_path / "run"), whole)
     assert len(list((tmp_path / "run" / "replay").iterdir())) == 20
+
+
+def test_an_interrupted_run_continues_to_the_same_numbers(whole: list[dict[str, Any]], tmp_path: Path) -> None:
+    def interrupting(iteration: lw.Iteration) -> None:
+        if iteration.iteration == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may make its children ignore it
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            lw.train(made(), tmp_path / "run", iterations=5, callback=interrupting)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert Run.open(tmp_path / "run").read()["iteration"] == 3
+    lw.train(made(), tmp_path / "run", iterations=5, resume=True)
+    np.testing.assert_equal(numbers(tmp_path / "run"), whole)
 
 
 def test_a_save_writes_only_the_parts_that_have_grown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
