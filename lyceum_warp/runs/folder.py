@@ -344,6 +344,8 @@ def load(
 def load_value(run: str | Path | Run, *, which: str | int = "last", device: str | torch.device = "cpu") -> Any:
     """Load a run's value function, a ``ValueFunction``: ``value(obs, step)`` predicts discounted returns.
 
+    A run of SAC has a ``TwinCritic`` instead: ``value(obs, unit_action)``.
+
     Args:
         run: A run's folder, or a file in it with a value function.
         which: See ``load``.
