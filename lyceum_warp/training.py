@@ -19,6 +19,7 @@ from lyceum_warp.runs.configuration import Configuration, describe
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.lock import RunLock
 from lyceum_warp.runs.metrics_table import cut_rows
+from lyceum_warp.runs.replay_files import read_replay
 from lyceum_warp.runs.saving import Saver
 from lyceum_warp.runs.task_copy import note_changes, run_params, task_copy
 from lyceum_warp.support.files import replaced
@@ -263,6 +264,8 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
     note_changes(run, learner.env, note=note)
     try:
         learner.load_state_dict(content["state"])
+        if learner.replay is not None:
+            read_replay(run.replay, learner.replay, content["state"]["stored"], learner.own_worlds)
     except Exception as error:  # a damaged state may raise any error
         text = " ".join(str(error).split())
         raise ValueError(f"{run.checkpoint} does not fit the configuration beside it: {text}") from error

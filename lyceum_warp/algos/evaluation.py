@@ -1,6 +1,7 @@
 """Evaluate policies in whole episodes, without exploration noise."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -172,6 +173,12 @@ class MeanPolicyEvaluation:
             means.copy_(torch.stack([part.mean() for part in parts]))
         self.team.copy_leader([means])
         return dict(zip(MEAN_STATISTICS, means.tolist(), strict=True))
+
+    def added(self, statistics: Mapping[str, Any], policy: torch.nn.Module, *, due: bool) -> dict[str, Any]:
+        """Add the evaluation's statistics, or None for each if it is not due, to those of the samples."""
+        mean: dict[str, Any] = self(policy) if due else dict.fromkeys(MEAN_STATISTICS)
+        success = self.env.task.functions["success"] is not None
+        return {**statistics, **mean} | ({} if success else {"success": math.nan, "mean_success": None})
 
 
 MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")

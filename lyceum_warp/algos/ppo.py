@@ -223,7 +223,7 @@ class PPO(OnPolicyLearner):
         env, rollout, std = self.env, self.rollout, self.policy.log_std.exp()
         with one_thread():
             self.noise.normal_(generator=self.generator)
-            noise = self.noise[:, self._own]
+            noise = self.noise[:, self.own_worlds]
             rollout.begin()
             for t in range(rollout.steps):
                 self._mean[t] = self.policy(env.obs)
@@ -359,4 +359,4 @@ class PPO(OnPolicyLearner):
             self.std.copy_(state["std"])
         self._recent.clear()
         self._recent.extend(state["recent"])
-        self.minibatches.forget()  # the graph stores the addresses of the old moments
+        self.minibatches.epoch.forget()  # the graph stores the addresses of the old moments

@@ -55,7 +55,7 @@ _KEPT = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Train:
-    """Train a policy on a task, with the natural policy gradient or with PPO.
+    """Train a policy on a task, with the natural policy gradient, PPO or SAC.
 
     The command writes config.json, versions.json, metrics.csv (one row per iteration), policy.pt, best.pt,
     checkpoint.pt, curve.png and video.mp4 into the run's folder. Ctrl-C saves and ends the run after the current
@@ -68,6 +68,7 @@ class Train:
     $ lyceum-warp train --resume runs/mine --iterations 200
     $ lyceum-warp train my_changed_task.py --from runs/mine --which best
     $ lyceum-warp train hopper --algorithm ppo --iterations 300 --learning-rate 3e-4
+    $ lyceum-warp train half_cheetah --algorithm sac --iterations 1000
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
     The processes of torchrun share the worlds, even across machines. With --device cuda each process uses the GPU of
@@ -78,8 +79,8 @@ class Train:
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
-    algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo")] = None
-    """npg (the default), the natural policy gradient; or ppo."""
+    algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac")] = None
+    """npg (the default), the natural policy gradient; ppo; or sac, soft actor-critic with a replay buffer."""
     iterations: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 100)")] = None
     """Iterations in total, including those before --resume."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
@@ -106,9 +107,9 @@ class Train:
     tensorboard: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to also write metrics for TensorBoard into the run's folder."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Total number of worlds of all processes; by default 64, or 4096 per GPU. With npg, each world makes samples /
-    nworld steps per iteration: whole episodes if they fit (as in the paper, with 10 worlds, 10,000 samples and episodes
-    of 1,000 steps), otherwise segments of episodes."""
+    """Total number of worlds of all processes; by default 64 (8 with sac), or 4096 per GPU. With npg, each world makes
+    samples / nworld steps per iteration: whole episodes if they fit (as in the paper, with 10 worlds, 10,000 samples
+    and episodes of 1,000 steps), otherwise segments of episodes."""
     threads: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 1)")] = None
     """Number of torch threads on the CPU. Small networks gain little from more threads. Runs are identical bit for bit
     only with the same number. --nthread sets the threads of the mujoco engine."""
@@ -197,7 +198,8 @@ class Train:
             if value is not None:
                 words[name] = value
         if source is None:
-            nworld = 4096 * team.size if (self.env.device or "cpu").startswith("cuda") else 64
+            few = 8 if self.algorithm == "sac" else 64  # each of SAC's worlds has an update per step
+            nworld = 4096 * team.size if (self.env.device or "cpu").startswith("cuda") else few
             options = EnvOptions(nworld=nworld, device="cpu")
             base = Configuration(task=self.task, options=options, algorithm="npg", hyperparameters=None)
         else:

@@ -128,13 +128,35 @@ def test_two_processes_make_the_same_update_as_one(settings: list[str], toleranc
     assert cli.main(["train", "--resume", str(two), "--iterations", "2", *QUIET]) == 0
 
 
+SAC = ["--algorithm", "sac", "--nworld", "12", "--num-steps", "20", "--updates", "4", "--actor-every", "2", "--n-step",
+       "2", "--batch", "64", "--warmup", "60", "--replay", "120", "--hidden", "8", "--value-hidden", "8",
+       "--mean-every", "1", "--mean-episodes", "2"]  # fmt: skip
+"""A replay buffer that is full after 10 steps, a normaliser, a warm-up, an evaluation."""
+
+
+@pytest.mark.long
+def test_two_processes_make_the_same_updates_of_sac_as_one(tmp_path: Path) -> None:
+    two, one = tmp_path / "two", tmp_path / "one"
+    arguments = ["train", "hopper", *SAC, *QUIET, "--iterations", "1", "--out"]
+    launch = ["--standalone", "--nproc-per-node=2", "--monitor-interval=0.1", "--local-addr=127.0.0.1"]
+    process = torchrun(*arguments, str(two), options=launch)
+    assert cli.main([*arguments, str(one)]) == 0
+    [(code, out, error)] = ended([process])
+    assert code == 0 and "6 worlds each in 2 processes" in out, error
+    assert Run.open(two).config == Run.open(one).config
+    assert_equal_runs(two, one, tolerance=2e-3)
+    for run in (one, two):  # a single process continues the run of two, with the replay buffer of both
+        assert cli.main(["train", "--resume", str(run), "--iterations", "2", *QUIET]) == 0
+    assert_equal_runs(two, one, tolerance=1e-2)
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
-@pytest.mark.parametrize("algorithm", ["npg", "ppo"])
+@pytest.mark.parametrize("algorithm", ["npg", "ppo", "sac"])
 def test_gpu_two_processes_make_the_same_update_as_one_and_end(algorithm: str, tmp_path: Path) -> None:
     """NCCL calls are captured in the graphs of the value fit and of PPO's epochs."""
     two, one = tmp_path / "two", tmp_path / "one"
-    options = OPTIONS if algorithm == "npg" else PPO
+    options = {"npg": OPTIONS, "ppo": PPO, "sac": SAC}[algorithm]
     arguments = ["train", "hopper", *options, *QUIET, "--device", "cuda", "--iterations", "1", "--out"]
     assert cli.main([*arguments, str(one)]) == 0
     [(code, _, error)] = ended([torchrun(*arguments, str(two), options=["--standalone", "--nproc-per-node=2"])])

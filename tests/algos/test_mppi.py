@@ -426,6 +426,7 @@ def test_a_value_function_must_fit_the_observations_of_its_group() -> None:
         (lambda obs: obs, r"value must return 7 numbers for \(7, 6\) observations, not .* \(7, 6\)"),
         (lambda obs: 0.0, "value must return 7 numbers for .*, not float 0.0"),
         (torch.nn.Linear(5, 1), r"value cannot take observations .* \(7, 6\)"),
+        (lw.TwinCritic(6, 2), r"value cannot take observations .* missing 1 required positional argument: 'action'"),
         (3.0, "value must be a function of observations, or None, not float 3.0"),
     ],
 )  # fmt: skip

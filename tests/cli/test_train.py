@@ -232,10 +232,11 @@ def test_a_flag_of_the_other_algorithm_is_refused(capsys: pytest.CaptureFixture[
     for words, message in (
         (
             ["--learning-rate", "3"],
-            "--learning-rate is a setting of ppo, not of npg: omit it, or give --algorithm",
+            "--learning-rate is a setting of ppo or sac, not of npg: omit it, or give --algorithm",
         ),
         (["--no-stagger"], "--stagger is a setting of ppo, not of npg"),
         (["--algorithm", "ppo", "--samples", "9"], "--samples is a setting of npg, not of ppo"),
+        (["--algorithm", "sac", "--clip", "0.1"], "--clip is a setting of ppo, not of sac"),
     ):
         assert cli.main(["train", "hopper", *words]) == 2
         refused(capsys, message)
@@ -245,7 +246,7 @@ def test_hyperparameters_are_shown_by_help_with_their_algorithms(capsys: pytest.
     with pytest.raises(SystemExit):
         cli.main(["train", "--help"])
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    for words in ("--whiten, --no-whiten", "(npg 0.995, ppo 0.99)", "(npg 64 64, ppo 512 256 128)", "(ppo 24)"):
+    for words in ("--whiten, --no-whiten", "(npg 0.995, ppo 0.99, sac)", "sac 0.0003)", "(ppo 24, sac)"):
         assert words in shown
 
 
@@ -361,12 +362,15 @@ def test_a_return_below_require_return_exits_with_1(tmp_path: Path, capsys: pyte
     assert (tmp_path / "hard" / "checkpoint.pt").exists()
 
 
-def test_the_default_number_of_worlds_depends_on_the_device() -> None:
+def test_the_default_number_of_worlds_depends_on_the_device_and_the_algorithm() -> None:
     found = []
     for device, size, nworld in (("cpu", 2, None), ("cuda:0", 1, None), ("cuda", 2, None), ("cuda", 2, 96)):
         options = Train(task="hopper", env=EnvFlags(device=device), nworld=nworld)
         found.append(options.configuration(None, Team(0, size)).options.nworld)
     assert found == [64, 4096, 8192, 96]
+    for device, nworld in (("cpu", 8), ("cuda", 4096)):
+        options = Train(task="hopper", algorithm="sac", env=EnvFlags(device=device))
+        assert options.configuration(None, Team()).options.nworld == nworld
 
 
 # interruptions

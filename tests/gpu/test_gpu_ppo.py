@@ -26,7 +26,7 @@ def test_captured_epochs_equal_direct_ones(changes: dict[str, Any]) -> None:
     """The entropy weight changes between iterations; the graph must read it on the device."""
     changes = {"schedule": "fixed", "final_entropy_coef": 0.1, "entropy_decay": (1, 4)} | changes
     captured, direct = made(**changes), made(**changes)
-    direct.minibatches.captures = False
+    direct.minibatches.epoch.enabled = False
     for _ in range(5):
         one, other = next(captured), next(direct)
         for name in ("kl", "std_mean", "surrogate_loss", "entropy", "value_loss"):
@@ -34,7 +34,7 @@ def test_captured_epochs_equal_direct_ones(changes: dict[str, Any]) -> None:
         for module, same in ((captured.policy, direct.policy), (captured.value, direct.value)):
             for name, part in module.state_dict().items():
                 torch.testing.assert_close(part, same.state_dict()[name], rtol=2e-2, atol=2e-3, msg=name)
-    assert captured.minibatches._graph is not None and direct.minibatches._graph is None
+    assert captured.minibatches.epoch.graph is not None and direct.minibatches.epoch.graph is None
 
 
 def test_the_learning_rate_adapts_within_a_graph() -> None:

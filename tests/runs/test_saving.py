@@ -14,7 +14,7 @@ from training_runs import QUIET, algorithm, metrics, refused, six_iterations
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.saving import SAVE_SECONDS, SHARE, Saver
+from lyceum_warp.runs.saving import LONG, SAVE_SECONDS, SHARE, Saver
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return six_iterations(tmp_path_factory.mktemp("runs") / "six")
 
 
-@pytest.mark.parametrize("seconds, wait", [(0.02, SHARE * 0.02), (1.0, SAVE_SECONDS)])
+@pytest.mark.parametrize("seconds, wait", [(0.02, SHARE * 0.02), (1.0, SAVE_SECONDS), (9.0, LONG * 9.0)])
 def test_saves_take_a_small_share_of_the_time(seconds: float, wait: float, npg: lw.NPG, tmp_path: Path) -> None:
     saver = Saver(Run.create(tmp_path / "run", {}), npg)
     saver.save()
