@@ -204,7 +204,7 @@ class GetUpParams(Params):
 
 @wp.func
 def lie_down(s: World, p: Params):
-    s.qpos[2] = 0.25
+    s.qpos[2] = 0.15
 
 
 @wp.func
@@ -226,4 +226,15 @@ class HumanoidGetUp(HumanoidStand):
     """Gymnasium's humanoid gets up from lying on its back or its front; success: it has stood for a second."""
 
     Params, initialize, randomize, success = GetUpParams, lie_down, turn_over, stands
-    terminations, success_steps, settle = (), 67, 150
+    terminations, success_steps = (), 67
+    rewards = HumanoidStand.rewards | {
+        "height_l2": -30.0,
+        "capture_l2": -8.0,
+        "velocity_l2": -0.5,
+        "turned": 0.0,
+        "pose_l2": -0.1,
+        "joint_velocity_l2": 0.0,
+    }
+    planning = lw.Planning(
+        settings=dict(horizon=40, samples=24, knots=5, noise=0.3, temperature=0.02), options={"physics": "fast"}
+    )
