@@ -96,6 +96,6 @@ def test_the_action_of_a_fill_is_within_the_bounds() -> None:
 
 @pytest.mark.parametrize("task", [name for name in lw.task_names() if find_task(name).planning != lw.Planning()])
 def test_the_settings_of_a_task_make_a_plan(task: str) -> None:
-    plan = lw.MPPI(task, horizon=3, samples=4)
+    plan = lw.MPPI(task, horizon=8, samples=4)
     action = plan(plan.env.get_state()[0])
     assert torch.isfinite(action).all() and action.abs().max() > 0.0

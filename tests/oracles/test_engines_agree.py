@@ -76,7 +76,10 @@ ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median
     "herb_reach": Bounds(4e-7, 8e-7, 5e-5, 2e-4),  # 1.1e-7, 2.2e-7; 1.3e-5, 4.8e-5
     "hopper": Bounds(1e-7, 2e-7, 1e-6, 5e-6),  # 3.0e-8, 5.5e-8; 2.9e-7, 1.6e-6
     "humanoid": Bounds(2e-7, 4e-7, 3e-5, 1.2e-4),  # 5.6e-8, 1.1e-7; 8.8e-6, 3.9e-5
+    "humanoid_get_up": Bounds(2e-7, 4e-7, 5e-5, 2e-4),  # 5.3e-8, 1.1e-7; 1.3e-5, 5.3e-5
+    "humanoid_stand": Bounds(2e-7, 4e-7, 5e-5, 2e-4),  # 6.0e-8, 1.1e-7; 1.5e-5, 5.1e-5
     "humanoid_standup": Bounds(2e-7, 4e-7, 2e-5, 8e-5),  # 5.3e-8, 1.0e-7; 6.1e-6, 2.3e-5
+    "humanoid_walk": Bounds(2e-7, 4e-7, 5e-5, 2e-4),  # as humanoid_stand
     "inverted_double_pendulum": Bounds(3e-8, 1e-7, 6e-7, 2e-6),  # 6.9e-9, 2.9e-8; 1.6e-7, 6.4e-7
     "inverted_pendulum": Bounds(6e-9, 2e-8, 2e-7, 6e-7),  # 1.8e-9, 6.5e-9; 5.4e-8, 1.8e-7
     "panda_lift": Bounds(3e-7, 4e-7, 5e-6, 1.2e-5),  # 8.0e-8, 1.2e-7; 1.5e-6, 3.4e-6
