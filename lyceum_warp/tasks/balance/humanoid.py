@@ -227,3 +227,14 @@ class HumanoidGetUp(HumanoidStand):
 
     Params, initialize, randomize, success = GetUpParams, lie_down, turn_over, stands
     terminations, success_steps = (), 67
+    rewards = HumanoidStand.rewards | {
+        "height_l2": -30.0,
+        "capture_l2": -8.0,
+        "velocity_l2": -0.5,
+        "turned": 0.0,
+        "pose_l2": -0.1,
+        "joint_velocity_l2": 0.0,
+    }
+    planning = lw.Planning(
+        settings=dict(horizon=40, samples=24, knots=5, noise=0.3, temperature=0.02), options={"physics": "fast"}
+    )
