@@ -111,10 +111,8 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     if case.task.startswith("adroit"):
         installed("gymnasium_robotics", "gymnasium-robotics")
     torch.set_num_threads(1)
-    steps = round(case.seconds / lw.make(case.task, nthread=1).timestep)
     with experiment.cores(case.threads):
-        own_horizon = find_task(case.task).horizon or steps
-        plant = lw.make(case.task, autoreset=False, nthread=1, horizon=min(own_horizon, steps))
+        plant = lw.make(case.task, autoreset=False, nthread=1)
         words: dict[str, Any] = {} if case.physics == "own" else {"physics": case.physics}
         if case.contestant == "mujoco":
             words["nthread"] = case.threads
@@ -123,6 +121,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
             **words,
         )  # fmt: skip
         done: list[lw.Trajectory] = []
+        steps = round(case.seconds / plant.timestep)
         while (left := steps - sum(episode.steps for episode in done)) > 0:
             done.append(lw.control_async(plant, planner, steps=left, seed=1000 * case.repeat + len(done)))
     report = lw.control_report(done)

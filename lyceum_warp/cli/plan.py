@@ -228,7 +228,7 @@ def _worlds(
 
 
 _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
-"""Numbers of samples to choose from in real time."""
+"""Numbers of samples to choose from in real time, beside the task's own."""
 
 
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
@@ -238,7 +238,9 @@ def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) 
     """
     task, flags = plant.task.task, given(options.mppi)
     config = options.mppi.on_top_of(task_config(task))
-    samples = (config.samples,) if {"samples", "elites"} & flags.keys() else _SAMPLES
+    samples = [config.samples]
+    if not {"samples", "elites"} & flags.keys():
+        samples = sorted({*_SAMPLES, *samples})
     horizons = [config.horizon]
     if config.horizon > 1 and not {"horizon", "knots"} & flags.keys():
         horizons.append(config.horizon // 2)

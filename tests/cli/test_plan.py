@@ -146,14 +146,16 @@ def test_real_time_shortens_the_horizon_and_replans_less_often(
     ]
     monkeypatch.setattr(plan_command, "planning_time", measured_by(100.0))
     assert cli.main([*held, "--horizon", "16"]) == 0
-    assert "16 samples, horizon 16: 25.6 ms of 40 ms; 32 would take 51.2 ms" in capsys.readouterr().out
+    assert "16 samples, horizon 16: 25.6 ms of 40 ms; 30 would take 48 ms" in capsys.readouterr().out
     assert json.loads((tmp_path / "held" / "config.json").read_text())["replan_every"] == 2
+    settings = find_task("humanoid_stand").planning.settings
+    half = settings["horizon"] // 2
     argv = ["plan", "humanoid_stand", "--out", str(tmp_path / "knots"), "--steps", "2", "--real-time", *QUIET]
-    monkeypatch.setattr(plan_command, "planning_time", measured_by(40.0))
+    monkeypatch.setattr(plan_command, "planning_time", measured_by(9000 / (16 * half)))
     assert cli.main(argv) == 0
-    assert "16 samples, horizon 16, physics fast: 10.2 ms of 15 ms" in capsys.readouterr().out
+    assert f"16 samples, horizon {half}, physics fast: 9 ms of 15 ms; " in capsys.readouterr().out
     planner = json.loads((tmp_path / "knots" / "config.json").read_text())["planner"]
-    assert (planner["knots"], planner["timestep"]) == (3, 0.015)
+    assert (planner["knots"], planner["timestep"]) == (settings["knots"] // 2, 0.015)
 
 
 def test_a_value_function_of_a_run_changes_plans(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
