@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from lyceum_warp.algos.ppo import PPO
     from lyceum_warp.algos.ppo_config import PPOConfig
     from lyceum_warp.algos.rollout_buffer import Rollout
+    from lyceum_warp.algos.transfer import Transfer, transfer
     from lyceum_warp.algos.value import ValueFunction
     from lyceum_warp.binding.registry import register, task_names
     from lyceum_warp.controllers.control_report import ControlReport, control_report
@@ -65,18 +66,18 @@ __all__ = [
     "CEM", "MPPI", "NPG", "PPO", "ControlProgress", "ControlReport", "Controller", "Done", "Env", "EnvOptions",
     "Episodes", "GaussianPolicy", "Iteration", "Learner", "MPPIConfig", "ModelFile", "NPGConfig", "OpenLoop",
     "PPOConfig", "PhysicsOptions", "PlanSamples", "PlanUpdate", "Planner", "Planning", "PlanningController",
-    "PredictiveSampling", "Rollout", "Row", "RunViewer", "Sigmoid", "Task", "Terrain", "Trajectory", "Tuning",
-    "ValueFunction", "act", "actuator", "actuators", "all_inside", "angle_between", "bodies", "body", "body_velocity",
-    "camera", "control", "control_async", "control_report", "ctrl", "dof", "dofs", "equality", "evaluate",
-    "export_policy", "follow_velocity", "follow_walk", "from_model", "geom", "geoms", "grasp_terms", "ground_distance",
-    "ground_height", "ground_normal", "gymnasium_model", "gymnasium_robotics_model", "height_field", "height_scan",
-    "inside", "joint", "joints", "lasting_memory", "load", "load_value", "local_velocity", "make", "memory",
-    "menagerie_model", "mocap", "next_level", "normal", "on_ground", "package_model", "part", "playground_model",
-    "put", "put_upright", "qpos", "qposes", "quat", "quat_angle", "quat_difference", "quat_from_axis_angle",
-    "quat_from_euler", "quat_from_mat", "quat_from_rotvec", "quat_inverse", "quat_mul", "quat_random", "quat_rotate",
-    "quat_rotate_inverse", "quat_to_euler", "quat_to_mat", "quat_to_rotvec", "register", "scan_grid", "sensor",
-    "sensors", "site", "sites", "start_on_terrain", "sum_squares", "task_names", "tendon", "tolerance", "train",
-    "tune", "uniform", "vec10", "view"]
+    "PredictiveSampling", "Rollout", "Row", "RunViewer", "Sigmoid", "Task", "Terrain", "Trajectory", "Transfer",
+    "Tuning", "ValueFunction", "act", "actuator", "actuators", "all_inside", "angle_between", "bodies", "body",
+    "body_velocity", "camera", "control", "control_async", "control_report", "ctrl", "dof", "dofs", "equality",
+    "evaluate", "export_policy", "follow_velocity", "follow_walk", "from_model", "geom", "geoms", "grasp_terms",
+    "ground_distance", "ground_height", "ground_normal", "gymnasium_model", "gymnasium_robotics_model", "height_field",
+    "height_scan", "inside", "joint", "joints", "lasting_memory", "load", "load_value", "local_velocity", "make",
+    "memory", "menagerie_model", "mocap", "next_level", "normal", "on_ground", "package_model", "part",
+    "playground_model", "put", "put_upright", "qpos", "qposes", "quat", "quat_angle", "quat_difference",
+    "quat_from_axis_angle", "quat_from_euler", "quat_from_mat", "quat_from_rotvec", "quat_inverse", "quat_mul",
+    "quat_random", "quat_rotate", "quat_rotate_inverse", "quat_to_euler", "quat_to_mat", "quat_to_rotvec", "register",
+    "scan_grid", "sensor", "sensors", "site", "sites", "start_on_terrain", "sum_squares", "task_names", "tendon",
+    "tolerance", "train", "transfer", "tune", "uniform", "vec10", "view"]
 
 _NAMES = {
     "model_actuators": "follow_velocity",
@@ -92,6 +93,7 @@ _NAMES = {
     "algos.ppo": "PPO",
     "algos.ppo_config": "PPOConfig",
     "algos.rollout_buffer": "Rollout",
+    "algos.transfer": "Transfer transfer",
     "algos.value": "ValueFunction",
     "binding.registry": "register task_names",
     "controllers.control_report": "ControlReport control_report",

@@ -126,7 +126,7 @@ class Env:
     device: wp.Device
     """The Warp device; ``obs.device`` is its torch counterpart."""
     options: EnvOptions
-    """The options that the environment was made with."""
+    """The options that the environment was made with; names of physics are replaced by their options."""
     task: BoundTask
     """The task with its model, parameters (``task.params``) and kernels."""
     engine: Engine
@@ -150,12 +150,13 @@ class Env:
         self, task: str | type[Task], options: EnvOptions | None = None, *, _replica: bool = False, **words: Any
     ) -> None:
         check_kind("options", options, EnvOptions | None, "as lw.EnvOptions(nworld=64)")
-        self.options, params = EnvOptions.split(words, options)
-        options = self.options
+        task = find_task(task)
+        options, params = EnvOptions.split(words, options)
+        self.options = options = options.changed({"physics": options.physics.resolved(task.physics)})
         self.nworld = options.nworld
         self.device = find_device(options.device)
         self.task = BoundTask(
-            find_task(task), options.nworld, model=options.model, fields=options.fields, dynamics=options.dynamics,
+            task, options.nworld, model=options.model, fields=options.fields, dynamics=options.dynamics,
             physics=options.physics, params=params,
         )  # fmt: skip
         self.timestep = self.task.timestep

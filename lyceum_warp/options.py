@@ -78,6 +78,8 @@ class PhysicsOptions:
         ValueError: A value is unknown or out of range.
     """
 
+    base: str | None = None
+    """Name of one of the task's ``physics``, from which the other options differ; "exact" is the task's own."""
     frame_skip: int | None = None
     """Substeps in a step."""
     timestep: float | None = None
@@ -104,6 +106,7 @@ class PhysicsOptions:
 
     def __post_init__(self) -> None:
         """Check every value."""
+        check_kind("base", self.base, str | None, "the name of one of the task's physics, as 'exact'")
         for name, low in (("frame_skip", 1), ("nconmax", 1), ("njmax", 1)):
             _whole(self, name, low)
         if self.timestep is not None:
@@ -120,6 +123,22 @@ class PhysicsOptions:
     def given(self) -> dict[str, Any]:
         """The options that differ from their defaults, by name."""
         return _given(self)
+
+    def resolved(self, named: Mapping[str, "PhysicsOptions"]) -> "PhysicsOptions":
+        """Replace ``base`` by the options that it names.
+
+        Args:
+            named: The task's physics.
+
+        Raises:
+            ValueError: The task has no physics of this name.
+        """
+        if self.base is None:
+            return self
+        known = {"exact": PhysicsOptions(), **named}
+        if self.base not in known:
+            raise ValueError(f"the task has no physics {self.base!r}: it has {', '.join(map(repr, known))}")
+        return dataclasses.replace(known[self.base], **(self.given() | {"base": None}))
 
 
 @document_attributes
@@ -160,7 +179,7 @@ class EnvOptions:
     """Model fields that may differ between worlds, for ``env.set_dynamics``, in addition to the fields that the task
     randomizes."""
     physics: PhysicsOptions = PhysicsOptions()
-    """How the worlds are simulated."""
+    """How the worlds are simulated; also the name of one of the task's ``physics``, or "exact" for its own."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -171,7 +190,7 @@ class EnvOptions:
             raise ValueError(f"engine must be 'auto', 'mujoco', 'warp' or a callable, not {described(self.engine)}")
         if self.model is not None and not isinstance(self.model, mujoco.MjModel):  # MjModel raises its own error
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
-        check_kind("physics", self.physics, PhysicsOptions, _PHYSICS_EXAMPLE)
+        object.__setattr__(self, "physics", _physics(self.physics))
         _flags(self, "autoreset", "graphs")
         for option, example in (("fields", "sensordata"), ("dynamics", "body_mass")):
             names = getattr(self, option)
@@ -196,9 +215,7 @@ class EnvOptions:
         physics = {name: value for name, value in words.items() if name in _PHYSICS}
         others = {name: value for name, value in words.items() if name not in _PHYSICS}
         if physics:
-            base = others.get("physics", self.physics)
-            check_kind("physics", base, PhysicsOptions, _PHYSICS_EXAMPLE)
-            others["physics"] = dataclasses.replace(base, **physics)
+            others["physics"] = dataclasses.replace(_physics(others.get("physics", self.physics)), **physics)
         return dataclasses.replace(self, **others)
 
     def for_engine(self) -> dict[str, Any]:
@@ -213,12 +230,20 @@ class EnvOptions:
         return own | self.physics.given()
 
 
-_PHYSICS = tuple(field.name for field in dataclasses.fields(PhysicsOptions))
-_PHYSICS_EXAMPLE = "as lw.PhysicsOptions(cone='elliptic')"
+def _physics(given: Any) -> PhysicsOptions:
+    if isinstance(given, str):
+        return PhysicsOptions(base=given)
+    check_kind("physics", given, PhysicsOptions, "as lw.PhysicsOptions(cone='elliptic')")
+    return given
+
+
+_PHYSICS = tuple(field.name for field in dataclasses.fields(PhysicsOptions) if field.name != "base")
 OPTIONS = (*(field.name for field in dataclasses.fields(EnvOptions)), *_PHYSICS)
 """Names of all options, in the order of the help text."""
 
-OPTION_DOCS = listed({**attribute_docs(EnvOptions), **attribute_docs(PhysicsOptions)})
+_DOCS = {**attribute_docs(EnvOptions), **attribute_docs(PhysicsOptions)}
+
+OPTION_DOCS = listed({name: _DOCS[name] for name in OPTIONS})
 """The options with their docstrings, as the body of an ``Args:`` section."""
 
 _OTHER_WORDS = {
@@ -247,6 +272,7 @@ def signature_of_options(function: Callable[..., Any]) -> inspect.Signature:
         inspect.Parameter(field.name, keyword, default=field.default, annotation=field.type)
         for kind in (EnvOptions, PhysicsOptions)
         for field in dataclasses.fields(kind)
+        if field.name in OPTIONS
     ]
     rest = inspect.Parameter("params", inspect.Parameter.VAR_KEYWORD, annotation=Any)
     signature = inspect.signature(function)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import mujoco
 import warp as wp
 
+from lyceum_warp.options import PhysicsOptions
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.upstream import extend_structs
 
@@ -354,7 +355,7 @@ class Planning:
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Settings of the planner, by the names of ``lw.MPPIConfig``."""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Options of the planner's worlds, by the names of ``lw.make``, such as ``{"integrator": "euler"}``."""
+    """Options of the planner's worlds, by the names of ``lw.make``, such as ``{"physics": "fast"}``."""
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Parameters of the planner's worlds, by the names of the task's ``Params``. They are ignored if MPPI has a value
     function, because that was fitted to the rewards of the unchanged task."""
@@ -471,6 +472,9 @@ class Task:
     trace: ClassVar[str | None] = None
     """Name of the site or body whose path the viewer draws for a planner's samples. None: the centre of mass of a robot
     whose base moves freely, or the end of an arm."""
+    physics: ClassVar[Mapping[str, PhysicsOptions]] = {}
+    """Physics to choose from by name, such as ``{"fast": lw.PhysicsOptions(integrator="implicitfast")}``, as in
+    ``lw.make(task, physics="fast")``. The default, "exact", is the physics of the model and ``frame_skip``."""
     planning: ClassVar[Planning] = Planning()
     """The task's settings for MPPI, such as ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
 
@@ -480,6 +484,14 @@ class Task:
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Change the model before it is compiled, also one that was passed to ``make``. Default: keeps it."""
+
+    @staticmethod
+    def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
+        """What a robot needs to run a policy, for the metadata of ONNX files: JSON values by name. Default: nothing.
+
+        ``model`` is the compiled model, and ``p`` has the parameters as attributes.
+        """
+        return {}
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)

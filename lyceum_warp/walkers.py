@@ -46,13 +46,16 @@ def servos(model: mujoco.MjModel, p: Any) -> list[int]:
     """The actuator of each joint, (joints,).
 
     Raises:
-        ValueError: A joint has no actuator or several.
+        ValueError: A joint has no actuator of its own or several.
     """
     moved = np.where(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, model.actuator_trnid[:, 0], -1)
     found = [np.flatnonzero(moved == joint) for joint in p.joints]
     for joint, actuators in zip(p.joints, found, strict=True):
         if len(actuators) != 1:
-            raise ValueError(f"the joint {_name(model, _JOINT, joint)} has {len(actuators)} actuators: it needs one")
+            raise ValueError(
+                f"the joint {_name(model, _JOINT, joint)} has {len(actuators)} actuators of its own and needs one "
+                "(those of tendons do not count): change the model, or leave it out of the joints that act"
+            )
     return [int(actuators[0]) for actuators in found]
 
 
@@ -69,15 +72,20 @@ def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
     Raises:
         ValueError: A servo has no force limit.
     """
-    actuators = servos(model, p)
-    limits = np.where(
-        model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators, 1],
-        np.where(model.jnt_actfrclimited[p.joints], model.jnt_actfrcrange[p.joints, 1], 0.0),
-    )  # fmt: skip
+    limits = force_limits(model, p)
     if not limits.all():
         unlimited = _name(model, _JOINT, p.joints[int(np.argmin(limits))])
         raise ValueError(f"the servo of the joint {unlimited} has no force limit: give action_scale, in rad")
-    return 0.25 * limits / model.actuator_gainprm[actuators, 0]
+    return 0.25 * limits / model.actuator_gainprm[servos(model, p), 0]
+
+
+def force_limits(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """The largest force of each joint's servo, N m, (joints,); 0 without a limit."""
+    actuators = servos(model, p)
+    return np.where(
+        model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators, 1],
+        np.where(model.jnt_actfrclimited[p.joints], model.jnt_actfrcrange[p.joints, 1], 0.0),
+    )  # fmt: skip
 
 
 def home_qpos(model: mujoco.MjModel) -> np.ndarray:
@@ -94,6 +102,28 @@ def home_pose(model: mujoco.MjModel, p: Any) -> np.ndarray:
 def home_height(model: mujoco.MjModel, p: Any) -> float:
     """The height of the base in ``home_qpos``, m."""
     return float(home_qpos(model)[2])
+
+
+def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
+    """What a robot needs to run a policy of a velocity task, for ``lw.Task.deployment``; lists follow ``joints``."""
+    actuators, stages = servos(model, p), np.asarray(p.stages)
+    damping = model.dof_damping[joint_dof(model, p)].reshape(len(actuators), -1)[:, 0]  # the model's, part of the gain
+    yaw, lateral = float(stages[:, 3].max()), float(np.max(p.lateral_velocity))
+    return {
+        "base": model.body(base(model)).name,
+        "velocimeter": np.asarray(p.imu).tolist(),  # its position on the base, m
+        "joints": [model.joint(joint).name for joint in p.joints],
+        "default_pose": np.asarray(p.default_pose).tolist(),
+        "action_scale": np.asarray(p.action_scale).tolist(),
+        "stiffness": model.actuator_gainprm[actuators, 0].tolist(),
+        "damping": (damping - model.actuator_biasprm[actuators, 2]).tolist(),
+        "force_limit": force_limits(model, p).tolist(),
+        "commands": {
+            "forward_velocity": [float(stages[:, 1].min()), float(stages[:, 2].max())],
+            "lateral_velocity": [-lateral, lateral],
+            "yaw_rate": [-yaw, yaw],
+        },
+    }
 
 
 # legs

@@ -1,4 +1,4 @@
-"""Commands and Python on pages run, and links and file names in documents and project files are valid."""
+"""Run the commands and the Python of pages, and check links and file names in documents."""
 
 import re
 import runpy
@@ -54,7 +54,7 @@ MISTAKES = WRONG.findall((ROOT / "docs" / "warp_for_python.md").read_text())
 
 
 @pytest.mark.parametrize("number", range(len(MISTAKES)))
-def test_a_mistake_of_the_page_about_warp_has_the_message_there(number: int, task_file: TaskFile) -> None:
+def test_a_mistake_on_the_page_about_warp_gives_the_message_shown_there(number: int, task_file: TaskFile) -> None:
     function, message = MISTAKES[number]
     task = python_of(ROOT / "docs" / "warp_for_python.md")
     assert task.count("class Measured") == 1
@@ -152,7 +152,7 @@ def test_commands_and_python_of_a_page_run_in_order(
 
 
 @pytest.mark.long
-def test_the_page_on_a_task_of_your_own_keeps_its_promises(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tasks_of_the_page_on_your_own_task_keep_the_rules(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         check_video()
     except NoVideoError as error:

@@ -1,4 +1,4 @@
-"""Options of environments and physics: checked when made, separated from parameters, suggested when misspelt."""
+"""Check options of environments and physics, separate them from parameters, and suggest similar names."""
 
 import dataclasses
 import inspect
@@ -6,6 +6,7 @@ import inspect
 import pytest
 
 import lyceum_warp as lw
+from lyceum_warp.binding.registry import find_task
 from lyceum_warp.options import OPTION_DOCS, OPTIONS, EnvOptions, PhysicsOptions, suggestion
 
 
@@ -66,6 +67,34 @@ def test_options_in_one_piece_and_by_name_make_the_same_environment() -> None:
         assert (env.nworld, env.horizon) == (2, 5)
 
 
+FAST = PhysicsOptions(integrator="implicitfast", timestep=0.004, frame_skip=2)
+Fast = type("Fast", (find_task("hopper"),), {"physics": {"fast": FAST}})
+
+
+def test_a_tasks_physics_by_name_are_its_options_and_others_change_them() -> None:
+    env = lw.make(Fast, physics="fast")
+    assert env.options.physics == FAST and env.options.given() == FAST.given() and env.timestep == 0.008
+    assert env.model.opt.timestep == 0.004 and env.replicate(physics="exact").options.physics == PhysicsOptions()
+    assert lw.make(Fast).options.physics == PhysicsOptions()
+    for given in ({"physics": "fast", "cone": "elliptic"}, {"physics": PhysicsOptions(base="fast", cone="elliptic")}):
+        assert lw.make(Fast, **given).options.physics == dataclasses.replace(FAST, cone="elliptic")
+    with pytest.raises(ValueError, match="^the task has no physics 'quick': it has 'exact', 'fast'$"):
+        lw.make(Fast, physics="quick")
+    with pytest.raises(ValueError, match="base must be .* as 'exact', not int 3"):
+        PhysicsOptions(base=3)  # type: ignore[arg-type]
+
+
+def test_a_planner_takes_physics_by_name_from_its_words_or_the_tasks_planning() -> None:
+    assert lw.MPPI(Fast, horizon=2, samples=2, physics="fast").settings["timestep"] == 0.004
+    planned = type("Planned", (Fast,), {"planning": lw.Planning(options={"physics": "fast"})})
+    plan = lw.MPPI(planned, horizon=2, samples=2)
+    assert plan.env.options.physics == FAST and plan.settings["frame_skip"] == 2 and "base" not in plan.settings
+    assert lw.MPPI(planned, horizon=2, samples=2, physics="exact").env.options.physics == PhysicsOptions()
+    planned.planning = lw.Planning(options={"physics": "quick"})
+    with pytest.raises(ValueError, match="planning.options of the task 'planned': the task has no physics 'quick'"):
+        lw.MPPI(planned)
+
+
 def test_a_replica_has_the_options_of_the_original_except_for_the_changes() -> None:
     env = lw.make("hopper", nworld=2, horizon=5, integrator="euler", solver={"iterations": 4}, seed=3)
     replica = env.replicate(nworld=3, horizon=6)
@@ -85,12 +114,13 @@ def test_a_replica_has_the_options_of_the_original_except_for_the_changes() -> N
         ("qqq", ""),
     ],
 )
-def test_suggestion_knows_every_option_and_words_of_other_packages(word: str, expected: str) -> None:
+def test_suggestion_knows_every_option_and_names_of_other_packages(word: str, expected: str) -> None:
     assert suggestion(word) == expected
 
 
 def test_every_option_is_in_the_help_and_the_signature_of_make() -> None:
     names = [field.name for kind in (EnvOptions, PhysicsOptions) for field in dataclasses.fields(kind)]
+    names.remove("base")  # given as physics="fast"
     assert list(OPTIONS) == names
     for name in names:
         assert f"    {name}: " in OPTION_DOCS

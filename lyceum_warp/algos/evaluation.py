@@ -38,6 +38,8 @@ class Episodes:
     """The evaluation metric at the end of each episode."""
     success: torch.Tensor
     """Whether the goal was met at the end of each episode: 1.0 or 0.0."""
+    terminated: torch.Tensor
+    """Whether the task ended each episode, not the time limit or a fault: 1.0 or 0.0."""
     metrics: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
     """Sums of the task's metrics, by name."""
 
@@ -85,10 +87,10 @@ def evaluate(
     if not env.autoreset:
         raise ValueError("evaluate needs an environment that resets automatically: make it with autoreset=True")
     act, each = acting(policy), -(-episodes // env.nworld)
-    check_fit(8 * (5 + len(env.episode_metrics)) * each, env.nworld, env.device, model=f"{each} episodes")
+    check_fit(8 * (6 + len(env.episode_metrics)) * each, env.nworld, env.device, model=f"{each} episodes")
     env.rand_reset(None if seed is None else evaluation_seed(seed))
     metrics = list(env.episode_metrics.values())
-    results = torch.zeros(5 + len(metrics), each, env.nworld, device=env.obs.device)
+    results = torch.zeros(6 + len(metrics), each, env.nworld, device=env.obs.device)
     count = torch.zeros(env.nworld, dtype=torch.long, device=env.obs.device)
     total = torch.zeros(env.nworld, device=env.obs.device)
     worlds = torch.arange(env.nworld, device=env.obs.device)
@@ -97,7 +99,8 @@ def evaluate(
         env.action.copy_(act(env.obs) if t else _first_actions(act, env))
         env.step()
         total += env.reward
-        now = torch.stack([total, length, env.reward, env.eval, env.success.float(), *metrics])
+        ends = (env.success.float(), env.terminated.float())
+        now = torch.stack([total, length, env.reward, env.eval, *ends, *metrics])
         slot = count.clamp_max(each - 1)
         wanted = env.done & (count < each)
         results[:, slot, worlds] = torch.where(wanted, now, results[:, slot, worlds])
@@ -108,8 +111,9 @@ def evaluate(
                 progress(t + 1, each * env.horizon)
             if bool((count >= each).all()):
                 break
-    returns, lengths, rewards, evals, success, *sums = results.flatten(1).cpu()
-    return Episodes(returns, lengths, rewards, evals, success, dict(zip(env.episode_metrics, sums, strict=True)))
+    returns, lengths, rewards, evals, success, terminated, *sums = results.flatten(1).cpu()
+    named = dict(zip(env.episode_metrics, sums, strict=True))
+    return Episodes(returns, lengths, rewards, evals, success, terminated, named)
 
 
 def _first_actions(act: Callable[[torch.Tensor], torch.Tensor], env: Env) -> torch.Tensor:

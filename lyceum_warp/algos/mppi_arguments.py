@@ -82,6 +82,7 @@ def planner_arguments(
     given = {word: words[word] for word in words if word in OPTIONS and word not in SETTINGS}
     _check_options(given)
     options = EnvOptions().changed(planning.options).changed(given)
+    options = options.changed({"physics": options.physics.resolved(task.physics)})
 
     rest = {word: words[word] for word in words if word not in SETTINGS and word not in OPTIONS} | dict(params or {})
     if unknown := [word for word in rest if word not in known]:
@@ -187,7 +188,7 @@ def _planning(task: type[Task]) -> Planning:
             raise ValueError(f"{unknown[0]!r} in planning.{part} of the task {name!r} is unknown: {hint}")
     try:
         _check_options(planning.options)
-        EnvOptions().changed(planning.options)
+        EnvOptions().changed(planning.options).physics.resolved(task.physics)
     except ValueError as error:
         raise ValueError(f"planning.options of the task {name!r}: {error}") from error
     return planning

@@ -59,6 +59,9 @@ class MPPIConfig:
     spline: Literal["zero", "linear", "cubic"] = "cubic"
     """Interpolation between knots: piecewise constant ("zero"), piecewise linear ("linear"), or cubic Hermite
     ("cubic")."""
+    between: Literal["hold", "linear"] = "hold"
+    """Actions of the plant's steps between two actions of the plan, if the planner's time step is a multiple of the
+    plant's: the earlier action ("hold"), or linear interpolation ("linear")."""
     discount: float | None = None
     """Discount factor of rewards and of the terminal value. None means the value function's discount, or 1 without
     one."""
@@ -93,6 +96,7 @@ class MPPIConfig:
         checked["fill"] = _fill(self.fill)
         check_word("termination", self.termination, ("stop", "ignore"))
         check_word("spline", self.spline, tuple(ORDERS))
+        check_word("between", self.between, ("hold", "linear"))
         check_word("risk", self.risk, ("mean", "worst"))
         if not isinstance(self.update, PlanUpdate):
             updates = ("mppi", "cem", "predictive_sampling")

@@ -71,9 +71,11 @@ class Planner:
 
     The planner simulates in its own worlds, one per sample. It controls a plant: an environment, with
     ``plan(env.get_state()[0])``, or a robot, with ``plan(plan.state_of(qpos=..., qvel=..., time=...))``. The plant's
-    model, time step and parameters may differ from the planner's. Random streams are counter-based: a plan depends on
-    the seed, on the number of plans before it, and on the plan it starts from. In each sample, the task's functions
-    draw from a separate stream seeded by the planner, so a plan cannot anticipate the plant's random numbers.
+    model, physics, time step and parameters may differ from the planner's. If the planner's time step is a multiple of
+    the plant's, ``lw.control`` and ``lw.control_async`` apply the plan as ``between`` says. Random streams are
+    counter-based: a plan depends on the seed, on the number of plans before it, and on the plan it starts from. In each
+    sample, the task's functions draw from a separate stream seeded by the planner, so a plan cannot anticipate the
+    plant's random numbers.
 
     ``plants=n`` plans for n plants at a time, as in ``env.step(plan(env.get_state()))`` with n worlds. Plant i uses the
     seed ``seed + i`` for its noise, so its plan equals that of a single-plant planner with this seed on the same
@@ -161,7 +163,7 @@ class Planner:
             self.env = Env(task, options, nworld=nworld, autoreset=False, horizon=0, **own_params)
         drawn = self._drawn_fields()
         self.env.reset()
-        self.timestep = self.env.timestep
+        self.timestep, self.between = self.env.timestep, self.config.between
         self._initial = self.env.get_state()[0]
         for name, row in self.env.engine.nominal.items():  # a robot has the nominal model, not one drawn by startup
             self._initial[self.env.state_space.parts[name]] = torch_view(flat(row))[0].double()

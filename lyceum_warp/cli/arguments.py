@@ -134,10 +134,13 @@ class EnvFlags:
     the CPU, where a few worlds step fastest."""
 
 
-@optional_flags(PhysicsOptions, default="")
+@optional_flags(PhysicsOptions, omit=("base",), default="")
 class Physics:
-    """How the worlds are simulated. The defaults come from the task or its model."""
+    """How the worlds are simulated. The defaults come from the run, the task or its model."""
 
+    physics: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    """One of the task's physics by name, as listed by lyceum-warp tasks, or exact for the task's own. The other options
+    change it."""
     solver: Repeated = ()
     """A limit of the constraint solver, such as iterations=4, ls_iterations=10 or noslip_iterations=0; may be repeated.
     By default the model's limits."""
@@ -150,14 +153,6 @@ class Physics:
         """
         limits = {"solver": dict(map(parameter, self.solver))} if self.solver else {}
         return given(self) | limits
-
-    def options(self) -> PhysicsOptions:
-        """The given options, validated.
-
-        Raises:
-            ValueError: A value is not valid.
-        """
-        return PhysicsOptions(**self.given())
 
 
 def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str] | None = None) -> dict[str, Any]:

@@ -39,7 +39,7 @@ class Check:
 
     def run(self) -> int:
         """Run the command, and return the exit code."""
-        words = vars(self.env) | self.physics.options().given() | parameters(self.param, self)
+        words = vars(self.env) | self.physics.given() | parameters(self.param, self)
         checks = [_check(name) for name in self.rule] or CHECKS
         console = make_console()
         try:

@@ -6,12 +6,14 @@ from typing import Annotated, Any
 
 import rich.box
 import tyro
+from rich.console import Console
 from rich.table import Table
 
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.policy import Policy, acting
+from lyceum_warp.algos.transfer import Transfer, transfer
 from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Trust, given, parameters
+from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, Trust, given, parameters
 from lyceum_warp.cli.display import make_console, note, policy_video, tried
 from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.controllers.trajectory import source
@@ -29,13 +31,15 @@ from lyceum_warp.viz.video import check_video
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Eval:
-    """Evaluate a run's mean policy in whole episodes, with the run's own physics, and print statistics.
+    """Evaluate a run's mean policy in whole episodes, by default with the run's physics, and print statistics.
 
     If the task's file or model has moved or changed since the run started, the command uses the run's own copy and
     prints a message.
 
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
     $ lyceum-warp eval runs/hopper-20260101-120000 --video --camera track=torso --camera azimuth=45
+    $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --transfer
+    $ lyceum-warp eval runs/humanoid-20260101-120000 --physics exact
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 8 --episodes-to runs/hopper-episodes
     """
 
@@ -56,15 +60,21 @@ class Eval:
     video: bool = False
     """Whether to write a video of one episode, eval.mp4 in the run's folder."""
     camera: CameraWords = ()
+    transfer: bool = False
+    """Whether to play the episodes on both engines, and under each of the task's physics, and to print the differences
+    with a verdict. The Warp engine runs on --device, by default on a GPU if there is one."""
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder for one file per episode, in the format of lyceum-warp plan: episode-000.npz and so on."""
     trust: Trust = False
     env: tyro.conf.OmitArgPrefixes[EnvFlags] = dataclasses.field(default_factory=EnvFlags)
+    physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
     def run(self) -> int:
         """Run the command, and return the exit code."""
         if self.episodes < 1 or self.nworld < 1:
             raise ValueError(f"eval needs at least 1 episode and 1 world, not {self.episodes} and {self.nworld}")
+        if self.transfer and self.env.engine is not None:
+            raise ValueError("--transfer plays on both engines: omit --engine")
         camera = parsed_camera(self.camera)
         if self.video:
             check_video()
@@ -75,7 +85,8 @@ class Eval:
         run = Run.open(self.folder)
         nworld = min(self.nworld, self.episodes)
         path = run.policy_file(self.which)
-        env = run_worlds(run, self.env, parameters(self.param, self), nworld=nworld, task=self.task, trust=self.trust)
+        words, params = given(self.env) | self.physics.given(), parameters(self.param, self)
+        env = run_worlds(run, words, params, nworld=nworld, task=self.task, trust=self.trust)
         find_camera(env.model, camera)
         origin = _source(env, run)
         if env.horizon == 0:
@@ -99,6 +110,12 @@ class Eval:
         console.print(table)
         if env.task.functions["success"] is not None:
             console.print(f"success: {episodes.success.mean().item():.0%}")
+        if self.transfer:
+            with LongWork("judging the policy's transfer", "steps", make_console()) as work:
+                verdict = transfer(
+                    env, policy, max(2, self.episodes), seed=self.seed, device=self.env.device, progress=work
+                )
+            _print_transfer(verdict, console)
         if self.episodes_to is not None:
             paths = _save_episodes(env, policy, self, origin)
             console.print(f"episodes: {paths}", soft_wrap=True, markup=False)
@@ -110,12 +127,30 @@ class Eval:
         return 0
 
 
-def run_worlds(run: Run, flags: Any, params: dict[str, Any], *, nworld: int, task: str | None, trust: bool) -> Env:
+def _print_transfer(verdict: Transfer, console: Console) -> None:
+    """Print a table of the differences of each comparison, and its verdict."""
+    for comparison in verdict.comparisons:
+        table = Table(box=rich.box.SIMPLE)
+        for heading in ("", comparison.first, comparison.second, "difference", "95 % interval", "margin", "verdict"):
+            table.add_column(heading, justify="right" if heading else "left")
+        for one in comparison.differences:
+            numbers = (f"{one.first:.6g}", f"{one.second:.6g}", f"{one.second - one.first:+.3g}")
+            interval = f"{one.low:+.3g} to {one.high:+.3g}"
+            table.add_row(one.quantity, *numbers, interval, f"{one.margin:.3g}", one.verdict)
+        console.print(f"{comparison.second} against {comparison.first}: {comparison.verdict}", soft_wrap=True)
+        console.print(table)
+        if any(comparison.faults):
+            console.print(f"faults: {comparison.faults[0]} and {comparison.faults[1]}")
+
+
+def run_worlds(
+    run: Run, words: dict[str, Any], params: dict[str, Any], *, nworld: int, task: str | None, trust: bool
+) -> Env:
     """Make worlds of a run's task, with the run's options and parameters as defaults.
 
     Args:
         run: The run.
-        flags: Flags that override options; without a device, the worlds run on the CPU if the engine is auto.
+        words: Options that override the run's; without a device, the worlds run on the CPU if the engine is auto.
         params: Parameters that override the run's.
         nworld: Number of worlds.
         task: A different task, with its own options and parameters.
@@ -125,8 +160,8 @@ def run_worlds(run: Run, flags: Any, params: dict[str, Any], *, nworld: int, tas
     known, own = saved.options.changed({"seed": 0}), dict(saved.params)
     if task is not None and task_name(find_task(task)) != run.task_name:
         known, own = EnvOptions(engine=known.engine, device=known.device, nthread=known.nthread), {}
-    known = known.changed({"nworld": nworld} | given(flags))
-    if flags.device is None:
+    known = known.changed({"nworld": nworld} | words)
+    if "device" not in words:
         known = known.changed(options_for_few_worlds(known.engine, known.device))
     with run.settings():
         env = run_env(run, known, own | params, note=note, task=task, trust=trust)

@@ -99,6 +99,7 @@ def _entry(name: str) -> _Entry:
         text = vars(task).get("__doc__") or inspect.getdoc(sys.modules[task.__module__]) or ""
         about = text.partition("\n")[0]
         entry.about = (about.partition(": ")[2] or about).rstrip(".")
+        entry.about += f" (physics: {', '.join(task.physics)})" * bool(task.physics)
         entry.source = _source(task)
     except Exception as error:  # a broken task file may raise any error
         entry.note = _reason(error)

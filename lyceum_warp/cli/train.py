@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import datetime
+import json
 import signal
 from pathlib import Path
 from typing import Annotated, Any
@@ -30,7 +31,6 @@ from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import read_checkpoint
 from lyceum_warp.runs.configuration import ALGORITHMS, Configuration, saved_networks
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.metrics_table import read_metrics
 from lyceum_warp.runs.task_copy import note_changes
 from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.training import train
@@ -118,6 +118,11 @@ class Train:
     video_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Iterations between two videos of the mean policy, videos/000100.mp4 and so on in the run's folder; 0 for none."""
     camera: CameraWords = ()
+    transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
+    """Whether to judge at the end whether the policy does the same on the other engine, and write transfer.json. By
+    default worlds on a GPU are compared with the C engine, and physics other than the task's own with those. With
+    --transfer the Warp engine also judges a policy trained on CPU cores, after minutes of compilation if its kernels
+    are cold, and each physics of the task is compared."""
     trust: Trust = False
     take_over: bool = False
     """Continue a run that another process has locked, on this or another host. The other process ends at its next
@@ -162,8 +167,8 @@ class Train:
                 with RunViewer(folder) if self.view and leads else contextlib.nullcontext():
                     run = train(
                         learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
-                        take_over=self.take_over, minutes=self.minutes, entries=entries, display=Display(console),
-                        **settings,
+                        take_over=self.take_over, minutes=self.minutes, transfer=self.transfer, entries=entries,
+                        display=Display(console), **settings,
                     )  # fmt: skip
             except Interrupted as signalled:
                 if leads and (path := folder / "policy.pt").exists():
@@ -247,7 +252,7 @@ class Train:
     def _report(self, run: Run, learner: Learner, console: Console) -> int:
         """Print the table, evaluate the policy, make the plot and the video; return the exit code."""
         env, policy, seed = learner.env, learner.policy, learner.env.options.seed + 1
-        console.print(curve_table(read_metrics(run.metrics)))
+        console.print(curve_table(run.rows()))
         few = evaluation_worlds(env, _FINAL_EPISODES)
         with LongWork("evaluating the mean policy", "steps", console) as work:
             returns = evaluate(few, moved(policy, few), _FINAL_EPISODES, seed=seed, progress=work).returns
@@ -261,6 +266,8 @@ class Train:
             every = "" if learner.best_by == "return_mean" else " (of the evaluated ones)"
             console.print(f"best policy: return {best[1]:.1f} in iteration {best[0]}{every}", soft_wrap=True)
             paths["best"] = str(run.best)
+        if run.transfer.is_file():
+            console.print(f"transfer: {json.loads(run.transfer.read_text())['line']}", soft_wrap=True, markup=False)
         if self.plot:
             paths["curve"] = tried(learning_curve, run)
         if self.video:

@@ -15,7 +15,7 @@ import tyro
 
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.planner import MPPI
-from lyceum_warp.cli.arguments import NO_FLAGS, ParamWords, Trust, given, optional_flags, parameters
+from lyceum_warp.cli.arguments import NO_FLAGS, ParamWords, Physics, Trust, given, optional_flags, parameters
 from lyceum_warp.cli.display import note
 from lyceum_warp.cli.evaluate import run_worlds
 from lyceum_warp.cli.plan import Settings
@@ -88,6 +88,7 @@ class View:
     param: ParamWords = ()
     trust: Trust = False
     place: tyro.conf.OmitArgPrefixes[Place] = dataclasses.field(default_factory=Place)
+    physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
     planner: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
 
     def run(self) -> int:
@@ -177,14 +178,19 @@ def _task_worlds(options: View) -> Env:
     nworld = options.nworld or 1
     if options.mppi and nworld == 1:  # the plant itself
         return Env(options.what[0], autoreset=False, nthread=1, **params)
-    return Env(options.what[0], nworld=nworld, **given(options.place), **params)
+    return Env(options.what[0], nworld=nworld, **_words(options), **params)
 
 
 def _planner(options: View, env: Env) -> MPPI:
     """The planner, on the engine and device given by the flags."""
     config = options.planner.on_top_of(task_config(env.task.task, None))
-    words = given(options.place) | ({} if env.options.model is None else {"model": env.options.model})
+    words = _words(options) | ({} if env.options.model is None else {"model": env.options.model})
     return MPPI(env.task.task, config, seed=options.seed, params=env.given_params, **words)
+
+
+def _words(options: View) -> dict[str, Any]:
+    """The options of the worlds, or with --mppi of the planner's worlds."""
+    return given(options.place) | options.physics.given()
 
 
 def _run(options: View, seconds: float) -> Run:
@@ -199,7 +205,7 @@ def _run(options: View, seconds: float) -> Run:
 def _run_worlds(options: View, run: Run) -> Env:
     nworld = options.nworld or _RUN_WORLDS
     params = parameters(options.param, options)
-    return run_worlds(run, options.place, params, nworld=nworld, task=options.task, trust=options.trust)
+    return run_worlds(run, _words(options), params, nworld=nworld, task=options.task, trust=options.trust)
 
 
 def attached() -> None:

@@ -1,4 +1,4 @@
-"""Check the actions of controllers, and convert between the time steps of plant and plan."""
+"""Check the actions of controllers, and select a plan's action for each step of the plant."""
 
 import inspect
 import json
@@ -14,7 +14,7 @@ from lyceum_warp.support.validate import described, positive_number
 
 
 class CheckedController:
-    """Calls a controller, checks its actions, and converts steps of the plant to steps of the controller.
+    """Calls a controller, checks its actions, and selects the action of a plan that applies in a step of the plant.
 
     Args:
         controller: The controller.
@@ -22,7 +22,7 @@ class CheckedController:
 
     Raises:
         ValueError: The controller cannot be called with a state and an observation, uses the plant for planning or
-            plans for several plants, or its time step is not positive.
+            plans for several plants, or its time step is neither a multiple nor a fraction of the plant's.
     """
 
     def __init__(self, controller: Controller, env: Env) -> None:
@@ -40,7 +40,10 @@ class CheckedController:
         self._controller: Any = controller
         self._names = env.action_space.columns
         timestep = getattr(controller, "timestep", env.timestep)
-        self._ratio = env.timestep / positive_number("the timestep of a controller", timestep, "seconds")
+        self._plan_steps, self._plant_steps = _steps(
+            env.timestep, positive_number("the timestep of a controller", timestep, "seconds")
+        )
+        self._linear = getattr(controller, "between", "hold") == "linear"
         self._takes_shift = (signature := _signature(controller)) is not None and "shift" in signature.parameters
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, shift: int, step: int) -> torch.Tensor:
@@ -78,16 +81,30 @@ class CheckedController:
         return failed, 0.0 if failed == getattr(self._controller, "samples", None) else effective
 
     def steps(self, plant_steps: int) -> int:
-        """Convert steps of the plant to steps of the controller, rounded."""
-        return math.floor(plant_steps * self._ratio + 0.5 + 1e-9)
+        """Convert steps of the plant to complete steps of the controller."""
+        return plant_steps * self._plan_steps // self._plant_steps
 
     def passed(self, before: int, now: int) -> int:
         """Number of controller steps between two steps of the plant's episode; adjacent intervals add up exactly."""
         return self.steps(now) - self.steps(before)
 
-    def index(self, plant_steps: int, horizon: int) -> int:
-        """Index of the action to apply after ``plant_steps`` steps of the plant since the plan's state."""
-        return min(self.steps(plant_steps), horizon - 1)
+    def action(self, plan: torch.Tensor, plant_steps: int) -> torch.Tensor:
+        """The action of a plan to apply ``plant_steps`` steps of the plant after the plan's state.
+
+        If a step of the plan is several steps of the plant, they all apply its action, or with ``between="linear"``
+        interpolate to the next one. After the end of the plan, its last action applies.
+
+        Args:
+            plan: The plan, (horizon, nact).
+            plant_steps: Number of steps.
+
+        Returns:
+            The action, (nact,).
+        """
+        index, rest = self.steps(plant_steps), plant_steps * self._plan_steps % self._plant_steps
+        if rest and self._linear and index < len(plan) - 1:
+            return torch.lerp(plan[index], plan[index + 1], rest / self._plant_steps)
+        return plan[min(index, len(plan) - 1)]
 
     def check_horizon(self, horizon: int, steps: int) -> None:
         """Check that a plan of length ``horizon`` covers a number of plant steps.
@@ -126,6 +143,21 @@ class CheckedController:
             number, name = plan[tuple(where)].item(), self._names[where[-1]]
             raise ValueError(f"the controller's action {name!r} at step {step} must be finite, not {number}")
         return plan
+
+
+def _steps(plant: float, plan: float) -> tuple[int, int]:
+    """The numbers of steps of a plan and of steps of the plant in the longer of their two time steps.
+
+    Raises:
+        ValueError: Neither time step is a multiple of the other.
+    """
+    many = round(max(plant, plan) / min(plant, plan))
+    if not math.isclose(many * min(plant, plan), max(plant, plan), rel_tol=1e-6):
+        raise ValueError(
+            f"the controller's step of {plan:g} s must be a whole multiple of the plant's, {plant:g} s, or a whole "
+            "fraction: choose the planner's frame_skip and timestep accordingly"
+        )
+    return (many, 1) if plant > plan else (1, many)
 
 
 def _check_call(controller: Any) -> None:

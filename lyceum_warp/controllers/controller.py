@@ -1,7 +1,7 @@
 """Define the protocols of controllers, which ``lw.control`` and ``lw.control_async`` call."""
 
 from collections.abc import Mapping
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 
@@ -62,7 +62,15 @@ class PlanningController(Controller, Protocol):
 
     @property
     def timestep(self) -> float:
-        """Simulated seconds between two actions of the plan; by default the plant's time step."""
+        """Simulated seconds between two actions of the plan; by default the plant's time step.
+
+        It must be a multiple of the plant's time step, or a fraction of it.
+        """
+        ...
+
+    @property
+    def between(self) -> Literal["hold", "linear"]:
+        """How the plant's steps between two actions of the plan are filled; see ``MPPIConfig.between``."""
         ...
 
     @property

@@ -70,7 +70,7 @@ def control(
                 plan, planned = TimedPlan(index, k, begun, time.perf_counter() - begun, actions), step
                 checked.check_horizon(len(actions), every)
                 quality = checked.quality()
-            env.action[0] = plan.actions[min(checked.passed(planned, step), len(plan.actions) - 1)]
+            env.action[0] = checked.action(plan.actions, k - plan.step)
             episode.before_step(plan, episode.elapsed(), time.perf_counter() - plan.begun, late=False)
             if plan.step == k:
                 episode.add_plan(plan, quality)

@@ -52,9 +52,9 @@ def control_async(
     The plant steps in the calling thread. Step k is due at ``k * period``; a late step does not delay later steps. The
     controller plans in a second thread, each time from the newest state, and never twice from the same state.
 
-    Each step applies the newest finished plan. If d simulated seconds have passed since the plan's state, it applies
-    action ``round(d / timestep)`` of the plan, or the last action if the plan is shorter. This compensates for the
-    planning delay up to the length of the plan. The plant waits for the first plan, so the first action has age 0. All
+    Each step applies the newest finished plan, at the time that has passed since the plan's state: the action of the
+    plan's step at that time, or the last action if the plan is shorter. This compensates for the planning delay up to
+    the length of the plan. The plant waits for the first plan, so the first action has age 0. All
     other actions are at least one step old, and exactly one step old if every plan takes less than a period.
 
     Before the clock starts, the controller is called three times with the first state, and the plant takes three steps
@@ -155,7 +155,7 @@ def run_plant(
         late = k > 0 and clock.now() > due
         clock.wait_until(due)
         plan = plans.newest()
-        env.action[0] = plan.actions[controller.index(k - plan.step, len(plan.actions))]
+        env.action[0] = controller.action(plan.actions, k - plan.step)
         now = episode.elapsed()
         # the first action has age 0, because the clock starts when its plan is finished
         planned_from = episode.times[plan.step] if plan.step < k else now

@@ -43,8 +43,10 @@ class Run:
     ``metrics.csv``     one row per iteration
     ``policy.pt``       the last policy, and its value function
     ``best.pt``         the policy with the best return
-    ``policies/``       the policy of every n-th iteration, with ``keep_every`` ``checkpoint.pt``   the complete state
-    to resume from exactly, at the same iteration as ``policy.pt`` ``previous.pt``     the checkpoint before it
+    ``policies/``       the policy of every n-th iteration, with ``keep_every``
+    ``checkpoint.pt``   the complete state to resume from exactly, at the same iteration as ``policy.pt``
+    ``previous.pt``     the checkpoint before it
+    ``transfer.json``   the verdict of ``lw.transfer`` on the last policy
     ``task/``           copies of the task's file, modules and model, unless they are part of the package
     =================== ======================================================================================
 
@@ -63,6 +65,8 @@ class Run:
     """Path of the last policy."""
     best: Path
     """Path of the best policy."""
+    transfer: Path
+    """Path of the verdict on the last policy's transfer."""
     task_folder: Path
     """Path of the folder with the copies of the task's file and model."""
 
@@ -71,6 +75,7 @@ class Run:
         self.metrics, self.task_folder = folder / "metrics.csv", folder / _TASK
         self.checkpoint, self.previous = folder / "checkpoint.pt", folder / "previous.pt"
         self.policy, self.best = folder / "policy.pt", folder / "best.pt"
+        self.transfer = folder / "transfer.json"
 
     @property
     def task_name(self) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 
 import mujoco
 import pytest
+import tiny_task
 from conftest import TaskFile
 from training_runs import QUIET, TINY, interrupted, metrics, refused, train
 
@@ -76,7 +77,7 @@ def test_a_task_file_is_trained_and_evaluated(
     assert f"video: {video if video.exists() else 'none: '}" in capsys.readouterr().out
 
 
-def test_a_video_that_fails_is_one_line_of_a_successful_run(
+def test_a_video_that_fails_prints_one_line_and_the_run_succeeds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(*args: object, **words: object) -> None:
@@ -127,7 +128,7 @@ def test_resume_refuses_other_settings(trained: Path, tmp_path: Path, capsys: py
     refused(capsys, "there is no run in")
 
 
-def test_a_resumed_run_shows_the_same(tmp_path: Path) -> None:
+def test_a_resumed_run_keeps_its_tensorboard_and_video_settings(tmp_path: Path) -> None:
     out = tmp_path / "run"
     pytest.importorskip("tensorboard")
     assert train(out, "--iterations", "1", "--tensorboard", "--video-every", "50") == 0
@@ -161,7 +162,7 @@ def test_a_run_keeps_its_physics(tmp_path: Path, made_envs: list[lw.Env], capsys
     assert cli.main([*resume, "3", "--solver", "iterations=7", "--integrator", "euler"]) == 0
     assert cli.main(["eval", str(out), "--episodes", "2", "--video"]) == 0
     assert {physics(env) for env in made_envs} == {(mujoco.mjtIntegrator.mjINT_EULER, 7, 9, True)}
-    assert {env.nworld for env in made_envs} == {1, 2, 32}  # a video, all iterations and eval, the final evaluation
+    assert {env.nworld for env in made_envs} == {1, 2, 32}  # the video; training and eval; the evaluation at the end
     capsys.readouterr()
     for other, words in [
         (["--integrator", "rk4"], "has integrator euler, not rk4"),
@@ -170,6 +171,24 @@ def test_a_run_keeps_its_physics(tmp_path: Path, made_envs: list[lw.Env], capsys
     ]:
         assert cli.main([*resume, "4", *other]) == 2
         refused(capsys, words, "a run keeps its settings")
+
+
+def test_physics_by_name_are_saved_as_options_and_eval_replaces_them(
+    tmp_path: Path, made_envs: list[lw.Env], task_file: TaskFile, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = "    physics = {'fast': lw.PhysicsOptions(integrator='euler', timestep=0.004, frame_skip=2)}\n"
+    task = task_file("fast.py", tiny_task.changed(("    model", f"{line}    model")))
+    out = tmp_path / "run"
+    assert train(out, "--iterations", "1", "--physics", "fast", "--cone", "elliptic", task=str(task)) == 0
+    given = {"integrator": "euler", "timestep": 0.004, "frame_skip": 2, "cone": "elliptic"}
+    assert Run.open(out).config["physics"] == given
+    for flags, timestep in (([], 0.004), (["--physics", "exact"], 0.002)):
+        assert cli.main(["eval", str(out), "--episodes", "1", *flags]) == 0
+        assert made_envs[-1].model.opt.timestep == timestep
+    capsys.readouterr()
+    assert cli.main(["train", str(task), "--physics", "slow", "--out", str(tmp_path / "other")]) == 2
+    refused(capsys, "the task has no physics 'slow': it has 'exact', 'fast'")
+    assert not (tmp_path / "other").exists()
 
 
 def changed_config(trained: Path, folder: Path, change: Any) -> list[str]:
@@ -237,7 +256,7 @@ def test_hyperparameters_are_shown_by_help_with_their_algorithms(capsys: pytest.
     (lambda config: config.update(nworld="many"), "not 'many'"),
     (lambda config: config.pop("params"), "'params'"),
 ])  # fmt: skip
-def test_a_configuration_that_does_not_fit_is_one_line(
+def test_a_configuration_that_does_not_fit_prints_one_line(
     change: Any, words: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(changed_config(trained, tmp_path / "run", change)) == 2
@@ -281,7 +300,7 @@ def test_a_broken_checkpoint_falls_back_to_the_one_before_it(
     assert metrics(out) == metrics(trained)
 
 
-def test_a_broken_best_policy_is_replaced_with_a_line(
+def test_a_broken_best_policy_is_replaced_with_a_message(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     resume = changed_config(trained, tmp_path / "run", lambda config: None)
@@ -322,7 +341,7 @@ def test_train_refuses_to_overwrite_a_run(trained: Path, capsys: pytest.CaptureF
         ("point_mass", ["--solver", "iterations"], ["'iterations'", "NAME=VALUE"]),
     ],
 )
-def test_a_bad_option_is_one_line_and_leaves_no_folder(
+def test_a_bad_option_prints_one_line_and_leaves_no_folder(
     task: str, options: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert train(tmp_path / "run", *options, task=task) == 2
@@ -335,7 +354,7 @@ def test_train_without_a_task_is_refused(capsys: pytest.CaptureFixture[str]) -> 
     refused(capsys, "train needs a task", "hopper")
 
 
-def test_a_return_that_is_too_small_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_return_below_require_return_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert train(tmp_path / "easy", "--iterations", "1", "--require-return", "-1e6") == 0
     assert train(tmp_path / "hard", "--iterations", "1", "--require-return", "1e6") == 1
     assert "--require-return demands more than 1e+06" in capsys.readouterr().err

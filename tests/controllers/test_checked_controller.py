@@ -64,14 +64,41 @@ def test_a_bad_action_or_plan_is_refused(run: Run, env: lw.Env) -> None:
             run(env, controller)
 
 
-def test_index_converts_steps_of_the_plant_to_steps_of_the_plan(env: lw.Env) -> None:
+def test_action_holds_or_interpolates_a_plan_with_longer_steps_and_skips_in_a_finer_one(env: lw.Env) -> None:
+    plan = torch.tensor([[0.0, 1.0], [1.0, 3.0], [2.0, 9.0]])
+
+    def applied(timestep: float, steps: int, **words: str) -> list[float]:
+        planner = StepPlanner(env)
+        planner.timestep = timestep
+        vars(planner).update(words)
+        checked = CheckedController(planner, env)
+        return [round(checked.action(plan, step)[0].item(), 6) for step in range(steps)]
+
+    assert applied(env.timestep, 4) == applied(env.timestep, 4, between="linear") == [0, 1, 2, 2]
+    assert applied(2 * env.timestep, 7) == [0, 0, 1, 1, 2, 2, 2]
+    assert applied(2 * env.timestep, 7, between="linear") == [0, 0.5, 1, 1.5, 2, 2, 2]
+    assert applied(env.timestep / 2, 3) == [0, 2, 2]
+
+
+def test_a_time_step_that_is_no_multiple_of_the_plants_is_refused(env: lw.Env) -> None:
     planner = StepPlanner(env)
-    planner.timestep = 2 * env.timestep
-    coarse = CheckedController(planner, env)
-    assert [coarse.index(steps, 3) for steps in range(8)] == [0, 1, 1, 2, 2, 2, 2, 2]
-    planner.timestep = env.timestep / 2
-    fine = CheckedController(planner, env)
-    assert [fine.index(steps, 8) for steps in range(6)] == [0, 2, 4, 6, 7, 7]
+    planner.timestep = 1.5 * env.timestep
+    with pytest.raises(ValueError, match=r"step of 0.03 s must be a whole multiple of the plant's, 0.02 s, or a whole"):
+        CheckedController(planner, env)
+
+
+@pytest.mark.parametrize("between, change", [("hold", [0, 1, 0, 1, 0]), ("linear", [1, 1, 1, 1, 1])])
+def test_a_planner_with_twice_the_interval_applies_each_action_twice_or_interpolates(
+    between: str, change: list[int]
+) -> None:
+    plant = lw.make("point_mass", autoreset=False, horizon=40)
+    plan = lw.MPPI("point_mass", frame_skip=2 * plant.task.frame_skip, horizon=4, samples=8, between=between)
+    assert plan.timestep == 2 * plant.timestep
+    actions = control(plant, plan, seed=1, steps=6, replan_every=6).actions
+    assert [int(bool(moved)) for moved in actions.diff(dim=0).any(1)] == change
+    torch.testing.assert_close(actions[::2], plan.actions[:3], rtol=0, atol=0)
+    timed = control_async(plant, plan, seed=1, steps=6)
+    torch.testing.assert_close(timed.actions[0], actions[0], rtol=0, atol=0)
 
 
 def test_a_function_is_described_by_its_name(env: lw.Env, tmp_path: Path) -> None:
@@ -90,7 +117,7 @@ def test_settings_are_described_as_json_holds_them(env: lw.Env, tmp_path: Path) 
     assert Trajectory.load(episode.save(tmp_path / "a.npz")).controller == episode.controller
 
 
-def test_a_task_with_a_part_of_several_actions_is_controlled(shared_env: SharedEnv) -> None:
+def test_a_task_with_an_action_of_several_numbers_is_controlled(shared_env: SharedEnv) -> None:
     env = shared_env("go1_velocity", engine="mujoco", autoreset=False)
     trajectory = control(env, lambda state, obs: torch.zeros(12), steps=2, seed=0)
     assert trajectory.actions.shape == (2, 12)

@@ -1,4 +1,4 @@
-"""Decide when a run is saved, and save what is possible if its folder cannot be written."""
+"""Decide when a run is saved; a folder that cannot be written ends the run and keeps its last save."""
 
 import os
 import resource
@@ -67,7 +67,7 @@ def test_a_file_that_cannot_be_written_ends_the_run_and_leaves_its_last_save(six
     assert metrics(folder) == metrics(six)
 
 
-def test_a_row_that_was_written_in_part_does_not_stop_a_resumed_run(six: Path, tmp_path: Path) -> None:
+def test_an_incomplete_row_does_not_stop_a_resumed_run(six: Path, tmp_path: Path) -> None:
     folder, limits = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def limit() -> None:

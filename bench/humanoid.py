@@ -1,0 +1,145 @@
+"""Plan a humanoid in real time, at its own 67 Hz: it stands and walks under pushes, and gets up.
+
+    lyceum-warp bench humanoid
+    lyceum-warp bench humanoid --tasks humanoid_stand --contestants real_time --repeats 20
+
+Starts and pushes are constants of this program. An episode lasts 20 s. ``real_time``: the plant keeps its rate, and
+the planner plans as often as it can (``lw.control_async``). ``in_turn``: the plant waits for each plan. Run the
+real-time episodes on idle cores: other work on them delays plans.
+"""
+
+import dataclasses
+import functools
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import experiment
+import torch
+from experiment import Row, Table, choose, median_and_range
+
+import lyceum_warp as lw
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.controllers.control_report import wilson
+from lyceum_warp.support.machine import cpu_cores
+
+SECONDS = 20.0
+STARTS = dict(start_noise=0.02)  # rad and rad/s, uniform, of every joint
+PUSHES = dict(push_times=[5.0, 10.0, 15.0], push_impulse=[10.0, 20.0])  # s; N s, in uniformly drawn directions
+TASKS = {
+    "humanoid_stand": PUSHES, "humanoid_walk": PUSHES, "humanoid_get_up": dict(push_times=[15.0]),
+}  # fmt: skip
+"""Parameters of the plant, in addition to ``STARTS``."""
+FIRST_SEED = 1000
+"""Seed of the first episode: of its start, its pushes and the planner's noise."""
+WALKS, UP = 0.5, 1.1
+"""The least mean speed of a walk, m/s, and the least height of a standing torso, m."""
+CONTESTANTS = {"real_time": "in real time", "in_turn": "the plant waits"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(experiment.Options):
+    """A humanoid under a planner in real time."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    task: str
+    contestant: str
+    seed: int
+    seconds: float
+    threads: int
+    settings: str
+    """The planner's settings that are not defaults."""
+
+
+@functools.cache
+def planner(task: str, threads: int) -> lw.MPPI:
+    return lw.MPPI(task, nthread=threads)
+
+
+def settings(task: str) -> str:
+    planning = find_task(task).planning
+    return ", ".join(f"{name} {value}" for name, value in (*planning.settings.items(), *planning.options.items()))
+
+
+def cases(options: Options) -> list[Case]:
+    """List the episodes; contestants take turns."""
+    tasks = choose(options.tasks, TASKS, ("humanoid_stand",) if options.short else (), what="task")
+    contestants = choose(options.contestants, CONTESTANTS, what="contestant")
+    repeats = options.repeats or (1 if options.short else 20)
+    seconds = 0.3 if options.short else SECONDS
+    return [
+        Case(task, name, FIRST_SEED + repeat, seconds, options.threads or cpu_cores(), settings(task))
+        for task in tasks for repeat in range(repeats) for name in contestants
+    ]  # fmt: skip
+
+
+def estimate(case: Case) -> float:
+    return 1.1 * case.seconds
+
+
+@torch.no_grad()
+def measure(case: Case, options: Options) -> dict[str, Any]:
+    """Run an episode."""
+    params = STARTS | TASKS[case.task]
+    with experiment.cores(case.threads):
+        plant = lw.make(case.task, autoreset=False, nthread=1, **params)
+        run = lw.control_async if case.contestant == "real_time" else lw.control
+        done = run(plant, planner(case.task, case.threads), steps=round(case.seconds / plant.timestep), seed=case.seed)
+    report = lw.control_report([done])
+    positions = done.states[:, slice(*done.state_parts["qpos"])]
+    up = positions[:, 2] > UP
+    return {
+        "seconds": done.steps * done.timestep, "fell": bool(plant.terminated), "return": done.episode_return,
+        "speed": ((positions[-1, 0] - positions[0, 0]) / (done.steps * done.timestep)).item(),
+        "up_share": up.float().mean().item(), "up_at_the_end": bool(up[-round(0.05 * len(up)) :].all()),
+        "plans": report.plans, "misses": report.misses, "plan_ms": report.plan_p50_ms,
+        "plan_p99_ms": report.plan_p99_ms, "plan_max_ms": report.plan_max_ms,
+        "late_steps": int(done.late.sum()), "oldest_action_steps": int(done.age_steps.max()),
+    }  # fmt: skip
+
+
+def share(good: int, count: int) -> str:
+    low, high = wilson(good, count)
+    return f"{good} of {count} ({low:.0%} to {high:.0%})"
+
+
+def tables(rows: Sequence[Row]) -> list[Table]:
+    lines = []
+    for task in TASKS:
+        for name, label in CONTESTANTS.items():
+            found = [row.result for row in rows if (row.case["task"], row.case["contestant"]) == (task, name)]
+            if not found:
+                continue
+            if task == "humanoid_get_up":
+                good = [one["up_at_the_end"] for one in found]
+            elif task == "humanoid_walk":
+                good = [not one["fell"] and one["speed"] >= WALKS for one in found]
+            else:
+                good = [not one["fell"] for one in found]
+            plans, misses = (sum(one[key] for one in found) for key in ("plans", "misses"))
+            lines.append([
+                task, label, share(sum(good), len(found)), median_and_range([one["seconds"] for one in found], ".1f"),
+                median_and_range([one["speed"] for one in found]), f"{1 - misses / max(plans, 1):.2%}",
+                median_and_range([one["plan_ms"] for one in found if one["plan_ms"]], ".1f"),
+                f"{max(one['plan_max_ms'] or 0.0 for one in found):.1f}",
+                str(max(one["oldest_action_steps"] for one in found)),
+            ])  # fmt: skip
+    title = (
+        f"Episodes of {SECONDS:g} s. Success: stands through; walks at {WALKS} m/s or more, without a fall; has got up "
+        f"(torso above {UP} m in the last second). Deadlines: plans within 15 ms. Age: steps from the state of a plan "
+        "to its last action that was applied."
+    )
+    header = ["task", "planner", "success (95 % interval)", "seconds before a fall", "speed, m/s", "deadlines met",
+              "plan, ms", "longest, ms", "age"]  # fmt: skip
+    return [Table(title, header, lines)]
+
+
+EXPERIMENT = experiment.Experiment(
+    name="humanoid", summary="A humanoid planned in real time: standing, walking, getting up.",
+    cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
+)  # fmt: skip
+
+if __name__ == "__main__":
+    sys.exit(experiment.main(EXPERIMENT))

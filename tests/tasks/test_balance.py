@@ -1,0 +1,74 @@
+"""Tasks of balance: servos, pushes, the capture point, and plans that keep the humanoid upright."""
+
+import numpy as np
+import pytest
+import torch
+from conftest import SharedEnv
+
+import lyceum_warp as lw
+from lyceum_warp.tasks.balance.humanoid import JOINTS
+
+
+def test_motors_are_servos_within_the_torques_of_the_model(shared_env: SharedEnv) -> None:
+    env = shared_env("humanoid_stand", nworld=2, autoreset=False, fields=["ctrl"])
+    before, action = env.field("qpos").clone(), torch.zeros(2, 17)
+    action[0], action[1] = 0.01, 100.0
+    env.step(action)
+    joint = JOINTS.index("left_hip_y")
+    column, motor = env.model.joint("left_hip_y").qposadr[0], env.model.actuator("left_hip_y").id
+    torque = 150.0 * (-0.3 + 1.0 * 0.01 - before[0, column])  # the servo has no damping of its own
+    assert env.task.params["stiffness"][joint] == 150.0 and env.model.actuator_gear[motor, 0] == 300.0
+    assert env.field("ctrl")[0, motor].item() == pytest.approx(torque.item() / 300.0, rel=1e-4)
+    assert env.field("ctrl")[1, motor].item() == pytest.approx(0.4)
+
+
+def test_a_push_changes_the_momentum_by_its_impulse_at_its_time() -> None:
+    options = {"nworld": 16, "autoreset": False, "seed": 3}
+    pushed, free = (lw.make("humanoid_stand", push_times=[time], **options) for time in (0.03, 9.0))
+    for env in (pushed, free):
+        env.rand_reset(3)
+        env.step()
+    assert torch.equal(pushed.field("qvel"), free.field("qvel"))
+    for env in (pushed, free):
+        env.step()
+    change = (pushed.field("qvel") - free.field("qvel")).double()
+    mass = pushed.model.body_subtreemass[0]
+    impulse = mass * change[:, :2].norm(dim=1)
+    assert 10.0 <= impulse.min() < 13.0 and 17.0 < impulse.max() <= 20.0 and not change[:, 2:].any()
+    directions = torch.atan2(change[:, 1], change[:, 0])
+    assert directions.min() < -1.0 and directions.max() > 1.0
+
+
+def test_capture_is_the_distance_of_the_capture_point_from_the_feet(shared_env: SharedEnv) -> None:
+    env = shared_env("humanoid_stand", nworld=2, autoreset=False, fields=["qvel"])
+    env.reset()
+    state = env.get_state()
+    state[1, env.state_space.parts["qvel"].start] = 1.0  # forward, m/s
+    env.set_state(state)
+    env.step(torch.zeros(2, 17))
+    metric = env.metrics["capture_l2"] / (-20.0 * env.timestep)  # m^2
+    height = env.field("subtree_com")[0, 0, 2].item()
+    still, moving = metric.sqrt().tolist()
+    assert moving - still == pytest.approx(np.sqrt(height / 9.81), rel=0.15)
+
+
+def test_a_plan_keeps_the_humanoid_up_that_falls_without(shared_env: SharedEnv) -> None:
+    env = shared_env("humanoid_stand", autoreset=False)
+    plan = lw.MPPI("humanoid_stand", samples=16, nthread=1)
+    assert plan.env.options.physics.timestep == 0.015 and plan.timestep == env.timestep
+    planned = lw.control(env, plan, seed=0, steps=120)
+    fallen = lw.control(env, lambda state, obs: torch.zeros(17), seed=0, steps=120)
+    height = planned.states[:, planned.state_parts["qpos"][0] + 2]
+    assert planned.steps == 120 and height.min() > 1.1
+    assert fallen.steps < 120
+
+
+def test_getting_up_starts_on_the_back_or_the_front_and_goes_on_while_lying(shared_env: SharedEnv) -> None:
+    env = shared_env("humanoid_get_up", nworld=16, autoreset=False)
+    qpos = env.field("qpos")
+    assert (qpos[:, 2] < 0.4).all()
+    forward = 2.0 * (qpos[:, 4] * qpos[:, 6] - qpos[:, 3] * qpos[:, 5])  # z of the torso's x axis: up on the back
+    assert forward.max() > 0.7 and forward.min() < -0.7
+    for _ in range(5):
+        env.step(torch.zeros(16, 17))
+    assert not env.terminated.any() and not env.success.any()
