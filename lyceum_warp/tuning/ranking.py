@@ -12,7 +12,7 @@ from lyceum_warp.algos.planner import MPPI
 from lyceum_warp.options import PhysicsOptions
 from lyceum_warp.task import Task
 from lyceum_warp.tuning.candidates import Setting
-from lyceum_warp.tuning.judgement import mean_interval
+from lyceum_warp.tuning.judgement import Correlation
 from lyceum_warp.tuning.trial import random_actions
 
 _SAMPLES = 64
@@ -112,7 +112,7 @@ class Rankings:
         for kind, (plan, returns) in self._exact.items():
             found = rank_correlations(returns, self._returns(planner, self.starts[kind], plan))
             if len(found):
-                row["ranks"][kind] = dataclasses.asdict(mean_interval(found))
+                row["ranks"][kind] = dataclasses.asdict(Correlation.of(found))
         return row
 
     def _seconds(self, planner: MPPI, start: torch.Tensor) -> float:
