@@ -62,10 +62,11 @@ class Rankings:
         plant.rand_reset(self.seed)
         found = {"standing": plant.get_state()}
         self.exact.reset(self.seed)
+        every = min(_REPLAN_EVERY, self.exact.horizon)
         for step in range(_MOVING_STEPS):
-            if step % _REPLAN_EVERY == 0:
-                self.exact(plant.get_state(), shift=_REPLAN_EVERY if step else 0)
-            plant.step(self.exact.actions[step % _REPLAN_EVERY].reshape(plant.action.shape))
+            if step % every == 0:
+                self.exact(plant.get_state(), shift=every if step else 0)
+            plant.step(self.exact.actions[step % every].reshape(plant.action.shape))
         found["moving"] = plant.get_state()
         plant.rand_reset(self.seed + 1)
         draw, fallen = random_actions(plant, self.seed), torch.zeros_like(plant.done)
