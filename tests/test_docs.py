@@ -1,5 +1,6 @@
 """Run the commands and the Python of pages, and check links and file names in documents."""
 
+import dataclasses
 import re
 import runpy
 import shlex
@@ -14,6 +15,7 @@ from training_runs import TINY
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.runs.folder import Run
+from lyceum_warp.tuning import search
 from lyceum_warp.viewer import show as views
 from lyceum_warp.viz.video import NoVideoError, check_video
 
@@ -132,6 +134,12 @@ def short_views(monkeypatch: pytest.MonkeyPatch) -> None:
         return MemoryWindow(lambda frame, number: [] if number < 1 else None)
 
     monkeypatch.setattr(views, "opened", opened)
+
+
+@pytest.fixture(autouse=True)
+def short_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let tune measure speeds for milliseconds."""
+    monkeypatch.setattr(search, "SHORT", dataclasses.replace(search.SHORT, repeats=2, block_seconds=0.005, steps=40))
 
 
 @pytest.fixture

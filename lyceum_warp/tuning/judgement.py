@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from lyceum_warp.support.intervals import mean_interval
+
 TOLERANCES = {"strict": 0.02, "loose": 0.05, "any": math.inf}
 """Largest difference of returns, relative to the mean absolute return of the task as it is."""
 
@@ -16,8 +18,6 @@ RANK_CORRELATIONS = {"strict": 0.9, "loose": 0.8, "any": -1.0}
 LEAST_GAIN = 1.03
 """A setting that is not at least this many times faster, and takes no less memory, is not judged further."""
 _LEAST_SAVING = 0.95
-
-_RESAMPLES = 1000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,35 +44,32 @@ class Difference:
 
 
 def difference(reference: np.ndarray, returns: np.ndarray) -> Difference:
-    """Compare the returns of the same episodes, (episodes,) each; the interval is a percentile bootstrap.
+    """Compare the returns of the same episodes, (episodes,) each.
 
     If all returns of the task as it is are 0, there is no scale, and every difference is infinite.
     """
-    change, scale = returns - reference, np.abs(reference)
+    change, scale = returns - reference, float(np.abs(reference).mean())
     if not change.any():
         return Difference(0.0, 0.0, 0.0, len(change))
-    if not scale.any():
+    if not scale:
         return Difference(math.inf, -math.inf, math.inf, len(change))
-    rows = np.random.default_rng(0).integers(len(change), size=(_RESAMPLES, len(change)))
-    ratios = change[rows].mean(1) / np.maximum(scale[rows].mean(1), np.finfo(float).tiny)
-    low, high = np.quantile(ratios, (0.025, 0.975)).tolist()
-    return Difference(float(change.mean() / scale.mean()), low, high, len(change))
+    mean, half = mean_interval(change / scale)
+    return Difference(mean, mean - half, mean + half, len(change))
 
 
 @dataclasses.dataclass(frozen=True)
-class Mean:
-    """A mean with the bounds of its 95 % interval, a percentile bootstrap."""
+class Correlation:
+    """The mean rank correlation over some states, with the bounds of its 95 % interval."""
 
     mean: float
     low: float
     high: float
 
-
-def mean_interval(values: np.ndarray) -> Mean:
-    """The mean of some values, (n,), with its interval."""
-    rows = np.random.default_rng(0).integers(len(values), size=(_RESAMPLES, len(values)))
-    low, high = np.quantile(values[rows].mean(1), (0.025, 0.975)).tolist()
-    return Mean(float(values.mean()), low, high)
+    @classmethod
+    def of(cls, values: np.ndarray) -> "Correlation":
+        """The mean of the states' correlations, (states,)."""
+        mean, half = mean_interval(values)
+        return cls(mean, mean - half, mean + half)
 
 
 def episodes_needed(found: Difference, half_width: float) -> int:
@@ -107,7 +104,7 @@ def verdict(row: Mapping[str, Any], tolerance: str) -> str:
 
 
 def _verdict_on_ranks(row: Mapping[str, Any], least: float) -> str:
-    found = [Mean(**part) for part in row["ranks"].values()]
+    found = [Correlation(**part) for part in row["ranks"].values()]
     if any(part.high < least for part in found):
         return "ranks badly"
     if row["speedup"] < LEAST_GAIN:

@@ -12,7 +12,7 @@ from lyceum_warp.algos.planner import MPPI
 from lyceum_warp.options import PhysicsOptions
 from lyceum_warp.task import Task
 from lyceum_warp.tuning.candidates import Setting
-from lyceum_warp.tuning.judgement import mean_interval
+from lyceum_warp.tuning.judgement import Correlation
 from lyceum_warp.tuning.trial import random_actions
 
 _SAMPLES = 64
@@ -62,10 +62,11 @@ class Rankings:
         plant.rand_reset(self.seed)
         found = {"standing": plant.get_state()}
         self.exact.reset(self.seed)
+        every = min(_REPLAN_EVERY, self.exact.horizon)
         for step in range(_MOVING_STEPS):
-            if step % _REPLAN_EVERY == 0:
-                self.exact(plant.get_state(), shift=_REPLAN_EVERY if step else 0)
-            plant.step(self.exact.actions[step % _REPLAN_EVERY].reshape(plant.action.shape))
+            if step % every == 0:
+                self.exact(plant.get_state(), shift=every if step else 0)
+            plant.step(self.exact.actions[step % every].reshape(plant.action.shape))
         found["moving"] = plant.get_state()
         plant.rand_reset(self.seed + 1)
         draw, fallen = random_actions(plant, self.seed), torch.zeros_like(plant.done)
@@ -112,7 +113,7 @@ class Rankings:
         for kind, (plan, returns) in self._exact.items():
             found = rank_correlations(returns, self._returns(planner, self.starts[kind], plan))
             if len(found):
-                row["ranks"][kind] = dataclasses.asdict(mean_interval(found))
+                row["ranks"][kind] = dataclasses.asdict(Correlation.of(found))
         return row
 
     def _seconds(self, planner: MPPI, start: torch.Tensor) -> float:
