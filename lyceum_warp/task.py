@@ -471,6 +471,9 @@ class Task:
     trace: ClassVar[str | None] = None
     """Name of the site or body whose path the viewer draws for a planner's samples. None: the centre of mass of a robot
     whose base moves freely, or the end of an arm."""
+    mirror: ClassVar[Any] = None
+    """The task's mirror image, ``lw.Mirror(...)``, or a static method ``mirror(model, p)`` that returns it, to learn
+    symmetric policies; None if there is none."""
     planning: ClassVar[Planning] = Planning()
     """The task's settings for MPPI, such as ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
 

@@ -18,7 +18,7 @@ TESTS = Path(__file__).parent
 
 LEVELS = {
     "support": -1, "done": 0,
-    "model_files": 0,
+    "mirror": 0, "model_files": 0,
     "fields": 1, "kernels": 1, "model_actuators": 1, "model_fields": 1, "options": 1, "task": 1, "walkers": 1,
     "graphs": 2, "spaces": 2, "terms": 2, "terrain": 2,
     "binding": 3, "engines": 3,
