@@ -47,7 +47,7 @@ class PolicyMirror(nn.Module):
     def average(self, function: Callable[[torch.Tensor], torch.Tensor], obs: torch.Tensor) -> torch.Tensor:
         """Average the actions of a function of observations with the mirror image's.
 
-        The result is equivariant to the bit: the mirror image of an observation gives the mirror image of the action.
+        The mirror images of a batch of observations give the mirror images of the actions, to the bit.
         """
         return 0.5 * (function(obs) + self.action(function(self.obs(obs))))
 
