@@ -25,11 +25,11 @@ class Reflected(nn.Module):
 
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
         """Compute the mirror image."""
-        return rows[..., self.order] * self.signs
+        return self.swapped(rows) * self.signs
 
     def swapped(self, rows: torch.Tensor) -> torch.Tensor:
         """Compute the mirror image of sizes, such as standard deviations, which have no sign."""
-        return rows[..., self.order]
+        return rows.index_select(-1, self.order)
 
 
 class PolicyMirror(nn.Module):

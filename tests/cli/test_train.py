@@ -424,3 +424,13 @@ def test_a_killed_run_continues(trained: Path, tmp_path: Path) -> None:
     assert cli.main(["train", "--resume", str(out), "--iterations", str(total), *QUIET]) == 0
     assert metrics(out)[:4] == metrics(trained)[:4]
     assert len(metrics(out)) == total
+
+
+def test_the_verdict_on_transfer_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--iterations", "1", "--horizon", "20"]
+    assert train(tmp_path / "exact", *options) == 0
+    assert "transfer:" not in capsys.readouterr().out
+    assert train(tmp_path / "coarse", *options, "--frame-skip", "2") == 0
+    assert "transfer: own physics against exact physics: " in capsys.readouterr().out
+    assert train(tmp_path / "both", *options, "--transfer") == 0
+    assert "transfer: Warp engine on cpu against C engine: same (return " in capsys.readouterr().out
