@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from lyceum_warp.kernels.task_helpers import (
         Sigmoid, all_inside, angle_between, body_velocity, grasp_terms, inside, local_velocity, put, put_upright,
         sum_squares, tolerance)
+    from lyceum_warp.mirror import Mirror
     from lyceum_warp.model_files import (
         ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, package_model, playground_model)
     from lyceum_warp.openloop import OpenLoop
@@ -69,7 +70,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CEM", "MPPI", "NPG", "PPO", "SAC", "ControlProgress", "ControlReport", "Controller", "Done", "Env", "EnvOptions",
-    "Episodes", "GaussianPolicy", "Iteration", "Learner", "MPPIConfig", "ModelFile", "NPGConfig", "OpenLoop",
+    "Episodes", "GaussianPolicy", "Iteration", "Learner", "MPPIConfig", "Mirror", "ModelFile", "NPGConfig", "OpenLoop",
     "PPOConfig", "PhysicsOptions", "PlanSamples", "PlanUpdate", "Planner", "Planning", "PlanningController",
     "PredictiveSampling", "Replay", "Rollout", "Row", "RunViewer", "SACConfig", "Sigmoid", "SquashedPolicy", "Task",
     "Terrain", "Trajectory", "Transfer", "Transitions", "Tuning", "TwinCritic", "ValueFunction", "act", "actuator",
@@ -125,6 +126,7 @@ _NAMES = {
     "kernels.task_helpers":
         "Sigmoid all_inside angle_between body_velocity grasp_terms inside local_velocity put put_upright sum_squares "
         "tolerance",
+    "mirror": "Mirror",
     "model_files":
         "ModelFile gymnasium_model gymnasium_robotics_model menagerie_model package_model "
         "playground_model",

@@ -19,7 +19,7 @@ TESTS = Path(__file__).parent
 
 LEVELS = {
     "support": -2,
-    "model_files": -1,
+    "mirror": -1, "model_files": -1,
     "done": 0, "options": 0,
     "fields": 1, "kernels": 1, "model_actuators": 1, "model_fields": 1, "task": 1, "walkers": 1,
     "graphs": 2, "spaces": 2, "terms": 2, "terrain": 2,

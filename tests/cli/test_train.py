@@ -153,11 +153,11 @@ def physics(env: lw.Env) -> tuple[int, int, int, bool]:
 def test_a_run_keeps_its_physics(tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     options = ["--integrator", "euler", "--solver", "iterations=7", "--solver", "ls_iterations=9", "--deterministic"]
-    assert train(out, "--iterations", "1", *options, task="hopper") == 0  # its own integrator is RK4
+    assert train(out, "--iterations", "1", "--no-transfer", *options, task="hopper") == 0  # its own integrator is RK4
     solver = {"iterations": 7, "ls_iterations": 9}
     given = {"integrator": "euler", "solver": solver, "deterministic": True}
     assert Run.open(out).config["physics"] == given
-    resume = ["train", "--resume", str(out), *QUIET, "--iterations"]
+    resume = ["train", "--resume", str(out), *QUIET, "--no-transfer", "--iterations"]
     assert cli.main([*resume, "2"]) == 0
     assert cli.main([*resume, "3", "--solver", "iterations=7", "--integrator", "euler"]) == 0
     assert cli.main(["eval", str(out), "--episodes", "2", "--video"]) == 0
@@ -447,3 +447,13 @@ def test_a_killed_run_continues(trained: Path, tmp_path: Path) -> None:
     assert cli.main(["train", "--resume", str(out), "--iterations", str(total), *QUIET]) == 0
     assert metrics(out)[:4] == metrics(trained)[:4]
     assert len(metrics(out)) == total
+
+
+def test_the_verdict_on_transfer_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--iterations", "1", "--horizon", "20"]
+    assert train(tmp_path / "exact", *options) == 0
+    assert "transfer:" not in capsys.readouterr().out
+    assert train(tmp_path / "coarse", *options, "--frame-skip", "2") == 0
+    assert "transfer: own physics against exact physics: " in capsys.readouterr().out
+    assert train(tmp_path / "both", *options, "--transfer") == 0
+    assert "transfer: Warp engine on cpu against C engine: same (return " in capsys.readouterr().out
