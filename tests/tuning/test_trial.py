@@ -4,6 +4,7 @@ import pytest
 import torch
 
 import lyceum_warp as lw
+from lyceum_warp.tuning import trial
 from lyceum_warp.tuning.candidates import Setting
 from lyceum_warp.tuning.judgement import verdict
 from lyceum_warp.tuning.trial import Effort, Trials
@@ -11,6 +12,12 @@ from lyceum_warp.tuning.trial import Effort, Trials
 BRIEF = Effort(repeats=2, block_seconds=0.001, judging_seconds=1.0, steps=60, recorded_at=(5, 30))
 SAME = Setting("", "", {})
 CRUDE = Setting("crude", "", {"frame_skip": 1, "timestep": 0.05, "solver": {"iterations": 1}})
+
+
+@pytest.fixture(autouse=True)
+def judge_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compare the returns of every setting, whatever the speeds on a busy machine."""
+    monkeypatch.setattr(trial, "buys", lambda speedup, memory: True)
 
 
 def lean(obs: torch.Tensor) -> torch.Tensor:
@@ -35,7 +42,7 @@ def test_the_task_as_it_is_differs_from_itself_by_exactly_zero() -> None:
 def test_a_crude_setting_is_different_and_diverges_beyond_chaos() -> None:
     own = trials(policy=True)
     row = own.measure(CRUDE)
-    assert verdict(row, "loose") in ("different", "faults")
+    assert verdict({**row, "speedup_low": 2.0}, "loose") in ("different", "faults")
     assert all(1e-8 < small < 1e-3 < found for small, found in zip(own.nudged, row["divergence"], strict=True))
 
 
