@@ -2,8 +2,9 @@
 
 import dataclasses
 import datetime
+import functools
 import signal
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,11 +32,14 @@ from lyceum_warp.controllers.checked_controller import CheckedController
 from lyceum_warp.controllers.control_report import ControlReport, control_report
 from lyceum_warp.controllers.loop import control
 from lyceum_warp.controllers.real_time import control_async
+from lyceum_warp.controllers.real_time_setting import RealTimeChoice, RealTimeSetting, choose_setting, planning_time
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
+from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.folder import Run, load_value
 from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.support.validate import whole_number
+from lyceum_warp.task import Task
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 from lyceum_warp.viz.control_plot import control_plot
 
@@ -79,6 +83,10 @@ class Plan:
     The planner is MPPI, or with --update the cross-entropy method (cem) or predictive sampling. Its default settings
     come from the task. Physics options (--physics, --integrator, ...) apply only to the planner; --physics exact is the
     controlled world's physics.
+
+    With --real-time the world keeps its rate. The command then measures planning times for a few seconds, and chooses
+    the largest number of samples that meets the deadline on this machine, or if none does, a shorter horizon or other
+    physics of the task. It chooses only what is not given: --samples, --horizon, --physics.
 
     The command writes config.json, versions.json, report.json, plan.png, a video of the first episode (video.mp4), and
     one file per episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy) into a
@@ -148,9 +156,14 @@ class Plan:
         instead = {"model": "--planner-model"}
         params = parameters(self.param, self, instead=instead | {"horizon": "--steps"})
         planner_params = parameters(self.planner_param, self, instead=instead | {"nworld": "--samples"})
-        plant, planner = _worlds(self, params, planner_params)
-        CheckedController(planner, plant).check_horizon(planner.horizon, every)
+        plant, make_planner = _worlds(self, params, planner_params)
         find_camera(plant.model, camera)
+        choice = _choice(self, plant, make_planner) if self.real_time else None
+        if choice is not None:
+            every = round(choice.deadline / plant.timestep) * choice.replan_every
+            make_console().print(str(choice), soft_wrap=True, markup=False)
+        planner = make_planner(None if choice is None else choice.setting)
+        CheckedController(planner, plant).check_horizon(planner.horizon, every)
         config = {
             "algorithm": planner.settings["update"], "task": spelled_task(plant.task.task), "params": params,
             "planner": planner.settings, "planner_params": planner_params,
@@ -159,7 +172,8 @@ class Plan:
             "engine": planner.env.engine.name, "episodes": self.episodes, "steps": self.steps,
             "replan_every": every, "seed": self.seed, "real_time": self.real_time,
         }  # fmt: skip
-        return _run(Run.create(out, config, device=self.planner.device), plant, planner, self)
+        run = Run.create(out, config, device=self.planner.device)
+        return _run(run, plant, planner, dataclasses.replace(self, replan_every=every))
 
 
 def _check_value_task(run: Path, task: str) -> None:
@@ -186,18 +200,69 @@ def _stem(task: str) -> str:
     return Path(task.partition(":")[0]).stem
 
 
-def _worlds(options: Plan, params: dict[str, Any], planner_params: dict[str, Any]) -> tuple[Env, MPPI]:
-    """Make the controlled world and its planner."""
+def _worlds(
+    options: Plan, params: dict[str, Any], planner_params: dict[str, Any]
+) -> tuple[Env, Callable[[RealTimeSetting | None], MPPI]]:
+    """Make the controlled world, and a function that makes its planner with a chosen setting, or with the flags."""
     steps: dict[str, Any] = {} if options.steps is None else {"horizon": whole_number("steps", options.steps, low=1)}
     plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
     if plant.horizon == 0:
         raise ValueError(f"episodes of {plant.task.name!r} never end without a horizon: give --steps")
+    task = plant.task.task
     value = None if options.value is None else load_value(options.value)
-    config = options.mppi.on_top_of(task_config(plant.task.task, value))
+    config = options.mppi.on_top_of(task_config(task, value))
     words = vars(options.planner) | options.planner_physics.given()
     if options.planner_model is not None:
         words["model"] = _model(options.planner_model)
-    return plant, MPPI(plant.task.task, config, value=value, params=params | planner_params, **words)
+
+    def make(setting: RealTimeSetting | None) -> MPPI:
+        chosen, physics = config, {}
+        if setting is not None:
+            knots = config.knots and max(1, config.knots * setting.horizon // config.horizon)  # as far apart as before
+            chosen = config.changed({"samples": setting.samples, "horizon": setting.horizon, "knots": knots})
+            if setting.physics not in (None, _suggested_physics(task)):
+                physics = {"physics": setting.physics}
+        return MPPI(task, chosen, value=value, params=params | planner_params, **words | physics)
+
+    return plant, make
+
+
+_SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
+"""Numbers of samples to choose from in real time, beside the task's own."""
+
+
+def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
+    """Choose the settings that the flags leave open, from measured planning times; None if they leave nothing open.
+
+    The deadline is a step of the plant, or if nothing meets it, a longer step of the planner.
+    """
+    task, flags = plant.task.task, given(options.mppi)
+    config = options.mppi.on_top_of(task_config(task))
+    samples = [config.samples]
+    if not {"samples", "elites"} & flags.keys():
+        samples = sorted({*_SAMPLES, *samples})
+    horizons = [config.horizon]
+    if config.horizon > 1 and not {"horizon", "knots"} & flags.keys():
+        horizons.append(config.horizon // 2)
+    physics = [options.planner_physics.physics]
+    if not options.planner_physics.given():
+        physics = list(dict.fromkeys((_suggested_physics(task), *task.physics)))
+    if len(samples) == len(horizons) == len(physics) == 1:
+        return None
+
+    @functools.cache
+    def measure(setting: RealTimeSetting) -> float:
+        return planning_time(plant, make(setting))
+
+    choice = choose_setting(samples, horizons, physics, measure, deadline=plant.timestep)
+    if choice.replan_every > 1 and (step := make(choice.setting).timestep) > plant.timestep:
+        choice = choose_setting(samples, horizons, physics, measure, deadline=step)
+    return choice
+
+
+def _suggested_physics(task: type[Task]) -> str | None:
+    """Name of the physics that a task suggests for planners."""
+    return EnvOptions().changed(task.planning.options).physics.base
 
 
 def _fill(words: tuple[str, ...]) -> Any:
@@ -230,7 +295,7 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
     )  # fmt: skip
     done: list[Trajectory] = []
     aborted: list[Trajectory] = []
-    method: Any = control_async if options.real_time else partial(control, replan_every=options.replan_every)
+    method: Any = control_async if options.real_time else functools.partial(control, replan_every=options.replan_every)
     shown: dict[str, Any] = dict(steps=plant.horizon, timestep=plant.timestep, real_time=options.real_time)
     try:
         for episode in range(options.episodes):

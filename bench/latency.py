@@ -1,0 +1,172 @@
+"""Measure planning in real time: planning time, deadlines met, age of actions and rewards.
+
+    lyceum-warp bench latency
+    lyceum-warp bench latency --tasks reach humanoid --samples 256 1024 --horizons 32 --device cuda
+
+Each case is one cell of the table: a task, the physics of the planner's worlds, a number of samples, a horizon, an
+engine and its device. Episodes run in real time (``lw.control_async``) until their steps take ``--seconds``: the plant
+keeps its rate, and the planner plans as often as it can. A plan meets its deadline if it takes at most a step of the
+plant. Run this on idle cores: other work on them delays plans. Without --samples and --horizons, cells are left out
+whose plans take long on two cores.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import experiment
+import torch
+from experiment import Row, Table, choose, installed
+
+import lyceum_warp as lw
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.options import EnvOptions
+from lyceum_warp.support.machine import cpu_cores
+
+COST = {
+    ("point_mass", "own"): 2.0, ("reach", "own"): 6.0, ("cartpole_swingup", "own"): 2.0, ("half_cheetah", "own"): 15.0,
+    ("humanoid", "fast"): 9.0, ("humanoid", "exact"): 120.0, ("adroit_pen", "own"): 95.0,
+}  # fmt: skip
+"""Microseconds of a sample's step on two cores, by task and planning physics; the default tasks."""
+LONGEST = 0.2
+"""Longest expected plan of a cell, in seconds, unless its samples or horizon are given."""
+SAMPLES, HORIZONS = (16, 64, 256, 1024), (16, 32, 64)
+CONTESTANTS = {"mujoco": "C engine", "warp": "Warp engine"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(experiment.Options):
+    """Planning in real time, by task, samples, horizon, engine and device."""
+
+    samples: tuple[int, ...] = ()
+    """Numbers of samples; by default 16, 64, 256 and 1024."""
+    horizons: tuple[int, ...] = ()
+    """Horizons of plans, in steps; by default 16, 32 and 64."""
+    physics: tuple[str, ...] = ()
+    """Names of the planner's physics: exact, or names that a task gives; by default the task's suggestion, and exact if
+    it suggests a name."""
+    seconds: float = 10.0
+    """Seconds of a case; the 99.9 % quantile needs a thousand plans."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One cell of the table."""
+
+    task: str
+    physics: str
+    """Name of the planner's physics; "own" for the task's suggestion without a name."""
+    samples: int
+    horizon: int
+    contestant: str
+    """Engine of the planner's worlds."""
+    device: str
+    threads: int
+    seconds: float
+    repeat: int
+    """Also the seed of the first episode."""
+
+
+def cases(options: Options) -> list[Case]:
+    """List the cells of each task, small plans first."""
+    short, cuda = options.short, options.device.startswith("cuda")
+    tasks = options.tasks or (("point_mass",) if short else tuple(dict.fromkeys(task for task, _ in COST)))
+    contestants = choose(options.contestants, CONTESTANTS, ("warp",) if cuda else ("mujoco",), what="contestant")
+    samples = options.samples or (SAMPLES[:1] if short else SAMPLES)
+    horizons = options.horizons or (HORIZONS[:1] if short else HORIZONS)
+    seconds, threads = 1.0 if short else options.seconds, options.threads or cpu_cores()
+    devices = {"mujoco": "cpu", "warp": options.device}
+    return [
+        Case(task, physics, number, horizon, name, devices[name], threads, seconds, repeat)
+        for repeat in range(options.repeats or 1) for task in tasks for physics in physics_of(task, options.physics)
+        for horizon in horizons for number in samples for name in contestants
+        if options.samples or options.horizons or cuda or expected(task, physics, number, horizon) < LONGEST
+    ]  # fmt: skip
+
+
+def physics_of(task: str, names: Sequence[str]) -> Sequence[str]:
+    """Return those of the given names that the task knows, or else its default cells."""
+    found = find_task(task)
+    if names:
+        return [name for name in names if name == "exact" or name in found.physics]
+    suggested = EnvOptions().changed(found.planning.options).physics.base
+    return ["own"] if suggested is None else list(dict.fromkeys((suggested, "exact")))
+
+
+def expected(task: str, physics: str, samples: int, horizon: int) -> float:
+    """Return the expected seconds of a plan on two cores."""
+    return 1e-6 * COST.get((task, physics), 20.0) * samples * horizon
+
+
+def estimate(case: Case) -> float:
+    if case.device != "cpu":
+        return case.seconds + 5.0
+    return case.seconds + 1.0 + 4.0 * expected(case.task, case.physics, case.samples, case.horizon)
+
+
+@torch.no_grad()
+def measure(case: Case, options: Options) -> dict[str, Any]:
+    """Run episodes in real time until their steps take the case's seconds."""
+    if case.task.startswith("adroit"):
+        installed("gymnasium_robotics", "gymnasium-robotics")
+    torch.set_num_threads(1)
+    with experiment.cores(case.threads):
+        plant = lw.make(case.task, autoreset=False, nthread=1)
+        words: dict[str, Any] = {} if case.physics == "own" else {"physics": case.physics}
+        if case.contestant == "mujoco":
+            words["nthread"] = case.threads
+        planner = lw.MPPI(
+            case.task, samples=case.samples, horizon=case.horizon, engine=case.contestant, device=case.device,
+            **words,
+        )  # fmt: skip
+        done: list[lw.Trajectory] = []
+        steps = round(case.seconds / plant.timestep)
+        while (left := steps - sum(episode.steps for episode in done)) > 0:
+            done.append(lw.control_async(plant, planner, steps=left, seed=1000 * case.repeat + len(done)))
+    report = lw.control_report(done)
+    return {
+        "deadline_ms": report.deadline_ms, "plans": report.plans, "plan_ms": report.plan_p50_ms,
+        "p99_ms": report.plan_p99_ms, "p99_9_ms": report.plan_p99_9_ms, "max_ms": report.plan_max_ms,
+        "met": None if report.miss_share is None else 1.0 - report.miss_share, "age_steps": report.age_steps_mean,
+        "age_steps_max": report.age_steps_max, "age_ms": report.age_mean_ms, "late_steps": report.late_ticks,
+        "reward_per_second": sum(episode.episode_return for episode in done) / (report.steps * plant.timestep),
+        "episodes": len(done), "terminated": sum(episode.terminated for episode in done),
+    }  # fmt: skip
+
+
+def tables(rows: Sequence[Row]) -> list[Table]:
+    """Make one table per task."""
+    made: dict[str, list[list[str]]] = {}
+    deadlines = {row.case["task"]: row.result["deadline_ms"] for row in rows}
+    order = ("physics", "contestant", "device", "horizon", "samples", "repeat")
+    for row in sorted(rows, key=lambda row: [row.case[name] for name in order]):
+        case, found = row.case, row.result
+        made.setdefault(case["task"], []).append([
+            case["physics"], f"{case['samples']} x {case['horizon']}",
+            f"{CONTESTANTS[case['contestant']]}, {case['device']}", number(found["plan_ms"], ".3g"),
+            number(found["p99_9_ms"], ".3g") or f"{number(found['max_ms'], '.3g')} (longest)",
+            number(found["met"], ".1%"), f"{found['age_steps']:.2f} (at most {found['age_steps_max']})",
+            f"{found['age_ms']:.0f}", f"{found['reward_per_second']:.4g}",
+            f"{found['terminated']} of {found['episodes']}",
+        ])  # fmt: skip
+    header = ["physics", "samples x horizon", "engine", "plan, ms", "99.9 %, ms", "deadlines met", "age, steps",
+              "age, ms", "reward a second", "ended early"]  # fmt: skip
+    return [
+        Table(f"{task}, a step every {deadlines[task]:.3g} ms. Plan: median time; below a thousand plans, the longest "
+              "time stands for the 99.9 % quantile. Age of actions: mean and maximum.", header, lines)
+        for task, lines in made.items()
+    ]  # fmt: skip
+
+
+def number(value: float | None, form: str) -> str:
+    return "" if value is None else format(value, form)
+
+
+EXPERIMENT = experiment.Experiment(
+    name="latency", summary="Planning in real time: planning time, deadlines met, age of actions and rewards.",
+    cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options, packages=("gymnasium-robotics",),
+)  # fmt: skip
+
+if __name__ == "__main__":
+    sys.exit(experiment.main(EXPERIMENT))

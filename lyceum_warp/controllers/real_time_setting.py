@@ -1,0 +1,126 @@
+"""Choose the largest setting of a planner whose plans meet the deadline in real time, from measured planning times."""
+
+import bisect
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from lyceum_warp.controllers.controller import Controller
+from lyceum_warp.controllers.real_time import control_async
+from lyceum_warp.env import Env
+
+SHARE = 0.8
+"""Largest share of the deadline that the 99 % planning time may take."""
+
+_SECONDS = 0.4  # of a measurement, but at least this number of steps
+_STEPS = 12
+
+
+@dataclasses.dataclass(frozen=True)
+class RealTimeSetting:
+    """The settings of a planner that determine its planning time."""
+
+    samples: int
+    """Number of samples."""
+    horizon: int
+    """Number of steps in a plan."""
+    physics: str | None = None
+    """Name of the physics of the planner's worlds; None if it is not chosen by name."""
+
+    def __str__(self) -> str:
+        physics = "" if self.physics is None else f", physics {self.physics}"
+        return f"{self.samples} samples, horizon {self.horizon}{physics}"
+
+
+@dataclasses.dataclass(frozen=True)
+class RealTimeChoice:
+    """A setting, and the measurements that led to it. Planning times are 99 % quantiles in seconds."""
+
+    setting: RealTimeSetting
+    """The largest setting that meets the deadline, or else the fastest that was measured."""
+    planning_time: float
+    """Its planning time."""
+    deadline: float
+    """Longest time of a plan, seconds."""
+    larger: tuple[int, float] | None
+    """The smallest measured number of samples that misses the deadline, and its planning time."""
+
+    @property
+    def replan_every(self) -> int:
+        """Number of deadlines from one plan to the next: 1 if plans meet the deadline."""
+        return max(1, math.ceil(self.planning_time / (SHARE * self.deadline)))
+
+    def __str__(self) -> str:
+        found = f"{self.setting}: {_ms(self.planning_time)} of {_ms(self.deadline)}"
+        if self.replan_every > 1:
+            every = _ms(self.replan_every * self.deadline)
+            return f"no setting meets the deadline; {found}, so there is a plan every {every}"
+        return found if self.larger is None else f"{found}; {self.larger[0]} would take {_ms(self.larger[1])}"
+
+
+def choose_setting(
+    samples: Sequence[int],
+    horizons: Sequence[int],
+    physics: Sequence[str | None],
+    measure: Callable[[RealTimeSetting], float],
+    *,
+    deadline: float,
+) -> RealTimeChoice:
+    """Choose the largest number of samples whose plans meet a deadline.
+
+    Shorter horizons, and after them other physics, are tried only if the smallest number of samples misses the
+    deadline.
+
+    Args:
+        samples: Numbers of samples, in ascending order.
+        horizons: Horizons, the preferred one first.
+        physics: Names of physics, the preferred one first.
+        measure: Returns the 99 % quantile of a setting's planning times, seconds.
+        deadline: Longest time of a plan, seconds.
+
+    Returns:
+        The choice. If no setting meets the deadline, it is the fastest one measured.
+    """
+    budget, missed = SHARE * deadline, []
+    for name in physics:
+        for horizon in horizons:
+            times: dict[int, float] = {}
+            low, high, tried = -1, len(samples), 0  # the number at index low meets the deadline, and at high misses it
+            while high - low > 1:
+                setting = RealTimeSetting(samples[tried], horizon, name)
+                found = times[samples[tried]] = measure(setting)
+                if found > budget:
+                    high = tried
+                    missed.append(RealTimeChoice(setting, found, deadline, None))
+                else:
+                    low = tried
+                # times grow at most in proportion to the number of samples
+                reachable = bisect.bisect(samples, samples[tried] * budget / found) - 1
+                tried = min(max(reachable, low + 1), high - 1)
+            if low >= 0:
+                larger = None if high == len(samples) else (samples[high], times[samples[high]])
+                setting = RealTimeSetting(samples[low], horizon, name)
+                return RealTimeChoice(setting, times[setting.samples], deadline, larger)
+    return min(missed, key=lambda choice: choice.planning_time)
+
+
+def planning_time(plant: Env, planner: Controller) -> float:
+    """Measure a planner in real time, for about half a second, and restore the plant's state.
+
+    Args:
+        plant: The plant.
+        planner: The planner.
+
+    Returns:
+        The 99 % quantile of the planning times, seconds.
+    """
+    before = plant.get_state()
+    done = control_async(plant, planner, steps=max(_STEPS, round(_SECONDS / plant.timestep)), seed=0)
+    plant.set_state(before)
+    return float(np.quantile(done.plan_times.numpy(), 0.99))
+
+
+def _ms(seconds: float) -> str:
+    return f"{1e3 * seconds:.3g} ms"

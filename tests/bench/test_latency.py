@@ -1,0 +1,33 @@
+from pathlib import Path
+
+import experiment
+import latency
+import pytest
+
+
+def main(out: Path, *words: str) -> int:
+    return experiment.main(latency.EXPERIMENT, ["--short", "--threads", "1", "--out", str(out), *words])
+
+
+def test_the_short_mode_runs_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "latency.jsonl"
+    assert main(out, "--samples", "8", "16") == 0
+    text = capsys.readouterr().out
+    assert "0 of 2 cases are stored" in text and "| own | 8 x 16 | C engine, cpu |" in text
+    assert main(out, "--samples", "8", "16") == 0
+    assert "2 of 2 cases are stored" in capsys.readouterr().out
+    for row in experiment.read(out):
+        found = row.result
+        assert found["plans"] > 1 and 0.0 < found["plan_ms"] <= found["max_ms"] and found["deadline_ms"] == 20.0
+        assert found["age_steps"] <= found["age_steps_max"] and found["episodes"] == 1
+
+
+def test_a_task_that_suggests_physics_is_also_planned_with_its_own() -> None:
+    cases = latency.cases(latency.Options(tasks=("humanoid", "reach"), threads=2))
+    assert {(case.task, case.physics) for case in cases} == {
+        ("humanoid", "fast"), ("humanoid", "exact"), ("reach", "own"),
+    }  # fmt: skip
+    most = {physics: max(case.samples for case in cases if case.physics == physics) for physics in ("fast", "exact")}
+    assert most == {"fast": 1024, "exact": 64}
+    named = latency.cases(latency.Options(tasks=("humanoid", "reach"), physics=("fast",), samples=(4096,)))
+    assert {(case.task, case.samples) for case in named} == {("humanoid", 4096)}

@@ -1,0 +1,72 @@
+import pytest
+import torch
+from conftest import SharedEnv
+from toy_controllers import StepPlanner
+
+from lyceum_warp.controllers.real_time_setting import RealTimeSetting, choose_setting, planning_time
+
+SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
+
+
+class Machine:
+    """A machine whose planning time is proportional to the samples and the horizon, beside a constant."""
+
+    def __init__(self, microseconds: float, constant: float = 1e-3, **faster: float) -> None:
+        self.cost, self.constant, self.faster = 1e-6 * microseconds, constant, faster
+        self.measured: list[RealTimeSetting] = []
+
+    def __call__(self, setting: RealTimeSetting) -> float:
+        self.measured.append(setting)
+        cost = self.cost / self.faster.get(str(setting.physics), 1.0)
+        return self.constant + cost * setting.samples * setting.horizon
+
+
+@pytest.mark.parametrize("microseconds", [0.1, 0.5, 1.0, 3.0, 7.0, 20.0])
+def test_the_largest_number_of_samples_that_meets_the_deadline_is_chosen(microseconds: float) -> None:
+    machine = Machine(microseconds)
+    choice = choose_setting(SAMPLES, [32], [None], machine, deadline=0.015)
+    times = {number: Machine(microseconds)(RealTimeSetting(number, 32)) for number in SAMPLES}
+    assert choice.setting.samples == max(number for number, seconds in times.items() if seconds <= 0.8 * 0.015)
+    assert choice.planning_time == times[choice.setting.samples] and choice.replan_every == 1
+    more = [number for number in SAMPLES if number > choice.setting.samples]
+    assert choice.larger == ((more[0], times[more[0]]) if more else None)
+    assert len(machine.measured) == len(set(machine.measured)) <= 5
+
+
+def test_the_choice_is_one_line_with_the_next_number_of_samples() -> None:
+    choice = choose_setting(SAMPLES, [32], ["fast"], Machine(3.5), deadline=0.015)
+    assert str(choice) == "64 samples, horizon 32, physics fast: 8.17 ms of 15 ms; 128 would take 15.3 ms"
+    assert str(choose_setting([64], [8], [None], Machine(1.0), deadline=0.02)) == (
+        "64 samples, horizon 8: 1.51 ms of 20 ms"
+    )
+
+
+def test_a_shorter_horizon_comes_before_other_physics_and_both_only_if_necessary() -> None:
+    physics = ["exact", "fast"]
+    assert choose_setting(SAMPLES, [32, 16], physics, Machine(10.0, fast=10.0), deadline=0.015).setting == (
+        RealTimeSetting(32, 32, "exact")
+    )
+    assert choose_setting(SAMPLES, [32, 16], physics, Machine(30.0, fast=10.0), deadline=0.015).setting == (
+        RealTimeSetting(16, 16, "exact")
+    )
+    machine = Machine(120.0, fast=24.0)
+    choice = choose_setting(SAMPLES, [32, 16], physics, machine, deadline=0.015)
+    assert choice.setting == RealTimeSetting(64, 32, "fast")
+    assert machine.measured[:2] == [RealTimeSetting(16, 32, "exact"), RealTimeSetting(16, 16, "exact")]
+
+
+def test_without_a_setting_in_time_the_fastest_is_replanned_less_often() -> None:
+    choice = choose_setting(SAMPLES, [32, 16], [None], Machine(100.0), deadline=0.01)
+    assert choice.setting == RealTimeSetting(16, 16) and choice.replan_every == 4  # 26.6 ms are 3.3 times 8 ms
+    assert str(choice) == (
+        "no setting meets the deadline; 16 samples, horizon 16: 26.6 ms of 10 ms, so there is a plan every 40 ms"
+    )
+
+
+def test_a_measurement_takes_real_plans_and_restores_the_plant(shared_env: SharedEnv) -> None:
+    plant = shared_env("point_mass", autoreset=False)
+    plant.rand_reset(5)
+    before = plant.get_state()
+    planner = StepPlanner(plant, seconds=0.003)
+    assert planning_time(plant, planner) >= 0.003
+    assert len(planner.shifts) >= 4 and torch.equal(plant.get_state(), before)
