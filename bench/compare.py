@@ -38,9 +38,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PROBE = ROOT / "bench" / "probes" / "checkout.py"
 PACKAGE = "lyceum_warp"
 PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "numpy")
-"""Packages that both checkouts use; --out stores their versions."""
+"""Packages whose versions --out stores; both checkouts use the same ones."""
 LINES = 12
-"""Number of differences of a unit that are printed; the file of --out holds all."""
+"""Maximum number of differences printed per unit; the file of --out holds all of them."""
 
 Part = Literal["env", "plans", "learners", "commands"]
 PARTS: tuple[Part, ...] = ("env", "plans", "learners", "commands")
@@ -65,7 +65,8 @@ class Options:
     new: tyro.conf.Positional[str] = str(ROOT)
     """The revision or folder to compare with; by default this working tree."""
     tasks: tuple[str, ...] = ()
-    """Tasks; by default all. Of these, learners and commands use a few, or all if none of the few is given."""
+    """Tasks; by default all. The parts learners and commands compare only a few default tasks; if none of these is
+    given, they compare the given ones."""
     engines: tuple[Literal["mujoco", "warp"], ...] = ENGINES
     """Engines."""
     device: str = "cpu"
@@ -107,7 +108,7 @@ class Unit:
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """A difference between two arrays of one name, or between the checkouts themselves."""
+    """A difference between the old and the new array of a name, or a failure of a checkout."""
 
     name: str
     kind: Literal["numbers", "form", "added", "removed", "failure"]

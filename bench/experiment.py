@@ -33,7 +33,7 @@ import tyro
 
 FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
-NAMES = ("throughput", "npg", "learning", "mppi", "latency", "humanoid", "fidelity", "soak")
+NAMES = ("throughput", "npg", "learning", "mppi", "latency", "humanoid", "fidelity", "equivalence", "soak")
 """Names of the experiments."""
 
 SOFTWARE = ("python", "mujoco", "mujoco_warp", "warp_lang", "torch", "numpy", "gymnasium")
@@ -374,7 +374,7 @@ def run(experiment: Experiment, options: Options) -> int:
                 print(f"skipped: {result}", flush=True)
             skipped.add(str(result))
             continue
-        if isinstance(result, Exception):  # a failure must not stop the remaining cases
+        if isinstance(result, Exception):  # the remaining cases run in any case
             failed += 1
             traceback.print_exception(result)
             print(f"failed: {_text(case)}", file=sys.stderr, flush=True)

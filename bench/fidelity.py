@@ -5,7 +5,7 @@
 Worlds of both engines start in the same float32 states and get the same random actions. The C engine (float64) is
 compared with the Warp engine (float32), with itself when its state is rounded to float32 after every step, and with
 itself from an initial state perturbed by float32 rounding. The last two give the scale: chaos separates any two
-trajectories, so an engine is as faithful as its precision allows if it stays with the C engine for as long as these do.
+trajectories, so the Warp engine is as accurate as float32 allows if it diverges from the C engine no earlier than they.
 A difference is the largest difference of a world's observations, relative to the larger of 1 and the value. Contact
 forces are excluded, because a solver is accurate only to its tolerance. Worlds continue after the end of an episode,
 and are dropped at a fault.
@@ -38,7 +38,7 @@ ROUNDING = 2.0**-24
 """Largest relative error of rounding to float32."""
 
 APART = 0.01
-"""Difference of observations above which two trajectories count as apart."""
+"""Difference of observations above which two trajectories have diverged."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,7 +152,7 @@ def quantiles(error: torch.Tensor, shown: Sequence[int]) -> dict[str, list[float
 
 
 def half_apart(error: torch.Tensor) -> int | None:
-    """Return the number of steps after which half of the worlds are apart, or None if fewer are at the end."""
+    """Return the number of steps after which half of the worlds have diverged; None if fewer have at the end."""
     ever = (error > APART).cummax(0).values.double().mean(1) >= 0.5
     return int(ever.int().argmax()) + 1 if ever.any() else None
 

@@ -51,7 +51,7 @@ class Options(experiment.Options):
     algorithm: Literal["npg", "ppo"] | None = None
     """Algorithm; by default the task's."""
     settings: tuple[str, ...] = ("default",)
-    """Names of settings: default, desired_kl 0.01 (PPO only)."""
+    """Names of the settings to run: default, or "desired_kl 0.01" (PPO only)."""
     seconds: float = 300.0
     """Maximum duration of a run in seconds."""
 

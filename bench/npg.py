@@ -32,6 +32,7 @@ from gymnasium_rollout import TASKS, GymnasiumRollout, rates, vector
 from matplotlib.ticker import EngFormatter, NullFormatter
 
 import lyceum_warp as lw
+from lyceum_warp.support.intervals import mean_interval
 from lyceum_warp.viz.style import finish_axes, new_figure
 
 CONFIGS = {
@@ -51,7 +52,7 @@ CONTESTANTS = {
     "trpo_sb3": "TRPO, sb3-contrib",
     "npg_gpu": "NPG, lyceum_warp on a GPU",
     "ppo_gpu": "PPO, lyceum_warp on a GPU",
-    "ppo_rsl_rl": "rsl_rl's PPO, lyceum_warp on a GPU",  # stored results of an earlier commit
+    "ppo_rsl_rl": "rsl_rl's PPO, lyceum_warp on a GPU",  # only in stored results of an earlier commit
 }
 ON_CPU, ON_GPU, YARDSTICKS = tuple(CONTESTANTS)[:4], tuple(CONTESTANTS)[4:6], ("ppo_sb3", "trpo_sb3")
 
@@ -392,7 +393,7 @@ def ends(found: dict[str, dict[str, list[Row]]]) -> Table:
             lines.append([
                 task, CONTESTANTS[name] + (f" ({', '.join(modes)})" if modes else ""), str(len(group)),
                 f"{statistics.median(row.result['samples'] for row in group):,.0f}",
-                interval(comparison.mean_interval([row.result["mean_return"] for row in group])),
+                interval(mean_interval([row.result["mean_return"] for row in group])),
                 median_and_range([row.result["seconds"] for row in group], ".1f"),
                 f"{statistics.median(phases):.1f}" if phases else "",
                 median_and_range(ratios),
@@ -427,7 +428,7 @@ def agreement(task: str, same: dict[str, list[Row]]) -> Table | None:
     ours, fed, places = ours[:, there], fed[:, there], np.array(EVERY_100K)[there]
     p = comparison.permutation_test(ours, fed)
     lines = [
-        [f"{place:,}", interval(comparison.mean_interval(a)), interval(comparison.mean_interval(b)), f"{value:.3f}"]
+        [f"{place:,}", interval(mean_interval(a)), interval(mean_interval(b)), f"{value:.3f}"]
         for place, a, b, value in zip(places, ours.T, fed.T, p, strict=True)
     ]
     title = (
@@ -477,7 +478,7 @@ def draw(axes: Any, group: Sequence[Row], name: str, x: int) -> None:
     curves = [
         np.interp(grid, [p[x] for p in row.result["curve"]], [p[2] for p in row.result["curve"]]) for row in group
     ]
-    mean, half = np.array([comparison.mean_interval(values) for values in np.array(curves).T]).T
+    mean, half = np.array([mean_interval(values) for values in np.array(curves).T]).T
     # markers of coinciding curves must not cover each other
     every = (3 * list(CONTESTANTS).index(name), 16)
     axes.plot(grid, mean, color=color, linestyle=line, marker=marker, markevery=every, markersize=5, linewidth=1.5,

@@ -297,7 +297,7 @@ def tally(
     """Count faults after a step, and compare clean worlds with the twin's; launched over (nworld,)."""
     w = wp.tid()
     due = wp.where(pending_inout[w], 6, wp.where(kind_in[w] < 6, kind_in[w], 0))
-    pending_inout[w] = kind_in[w] == 6 and not done_in[w]  # no event happens in a world that restarts
+    pending_inout[w] = kind_in[w] == 6 and not done_in[w]  # a world that restarts gets no event in this step
     injected_inout[w, due] += 1
     for bit in range(wp.static(NBIT)):
         reasons_inout[w, due * wp.static(NBIT) + bit] += reason_in[w] >> bit & 1
@@ -317,7 +317,7 @@ def tally(
 def inject(case: Faults, options: Options) -> dict[str, Any]:
     """Step a task for a chunk with injected faults, together with a twin without faults."""
     torch.set_num_threads(1)
-    gc.collect()  # environments of the previous chunk
+    gc.collect()  # free the environments of the previous chunk
     before = case.state(options.work, case.chunk)
     if case.chunk and not before.exists():
         raise Skipped(f"there is no {before}: give the folder in which chunk {case.chunk - 1} ran as --work")

@@ -3,7 +3,7 @@
     python examples/plan.py
     python examples/plan.py --task half_cheetah --steps 200 --samples 64
 
-The command line does the same and more: ``lyceum-warp plan reach --real-time`` plans against the clock.
+The command line has more options: ``lyceum-warp plan reach --real-time`` controls the arm in real time.
 """
 
 import tyro

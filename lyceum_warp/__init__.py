@@ -23,7 +23,13 @@ if TYPE_CHECKING:
     from lyceum_warp.algos.policy_export import export_policy
     from lyceum_warp.algos.ppo import PPO
     from lyceum_warp.algos.ppo_config import PPOConfig
+    from lyceum_warp.algos.replay import Replay, Transitions
     from lyceum_warp.algos.rollout_buffer import Rollout
+    from lyceum_warp.algos.sac import SAC
+    from lyceum_warp.algos.sac_config import SACConfig
+    from lyceum_warp.algos.squashed_policy import SquashedPolicy
+    from lyceum_warp.algos.transfer import Transfer, transfer
+    from lyceum_warp.algos.twin_critic import TwinCritic
     from lyceum_warp.algos.value import ValueFunction
     from lyceum_warp.binding.registry import register, task_names
     from lyceum_warp.controllers.control_report import ControlReport, control_report
@@ -46,6 +52,7 @@ if TYPE_CHECKING:
     from lyceum_warp.kernels.task_helpers import (
         Sigmoid, all_inside, angle_between, body_velocity, grasp_terms, inside, local_velocity, put, put_upright,
         sum_squares, tolerance)
+    from lyceum_warp.mirror import Mirror
     from lyceum_warp.model_files import (
         ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, package_model, playground_model)
     from lyceum_warp.openloop import OpenLoop
@@ -57,16 +64,18 @@ if TYPE_CHECKING:
         tendon)
     from lyceum_warp.terrain import Terrain, height_field, scan_grid
     from lyceum_warp.training import train
+    from lyceum_warp.tuning.search import Tuning, tune
     from lyceum_warp.viewer.follow import RunViewer
     from lyceum_warp.viewer.show import view
 
 __all__ = [
-    "CEM", "MPPI", "NPG", "PPO", "ControlProgress", "ControlReport", "Controller", "Done", "Env", "EnvOptions",
-    "Episodes", "GaussianPolicy", "Iteration", "Learner", "MPPIConfig", "ModelFile", "NPGConfig", "OpenLoop",
+    "CEM", "MPPI", "NPG", "PPO", "SAC", "ControlProgress", "ControlReport", "Controller", "Done", "Env", "EnvOptions",
+    "Episodes", "GaussianPolicy", "Iteration", "Learner", "MPPIConfig", "Mirror", "ModelFile", "NPGConfig", "OpenLoop",
     "PPOConfig", "PhysicsOptions", "PlanSamples", "PlanUpdate", "Planner", "Planning", "PlanningController",
-    "PredictiveSampling", "Rollout", "Row", "RunViewer", "Sigmoid", "Task", "Terrain", "Trajectory", "ValueFunction",
-    "act", "actuator", "actuators", "all_inside", "angle_between", "bodies", "body", "body_velocity", "camera",
-    "control", "control_async", "control_report", "ctrl", "dof", "dofs", "equality", "evaluate", "export_policy",
+    "PredictiveSampling", "Replay", "Rollout", "Row", "RunViewer", "SACConfig", "Sigmoid", "SquashedPolicy", "Task",
+    "Terrain", "Trajectory", "Transfer", "Transitions", "Tuning", "TwinCritic", "ValueFunction", "act", "actuator",
+    "actuators", "all_inside", "angle_between", "bodies", "body", "body_velocity", "camera", "control",
+    "control_async", "control_report", "ctrl", "dof", "dofs", "equality", "evaluate", "export_policy",
     "follow_velocity", "follow_walk", "from_model", "geom", "geoms", "grasp_terms", "ground_distance", "ground_height",
     "ground_normal", "gymnasium_model", "gymnasium_robotics_model", "height_field", "height_scan", "inside", "joint",
     "joints", "lasting_memory", "load", "load_value", "local_velocity", "make", "memory", "menagerie_model", "mocap",
@@ -74,7 +83,8 @@ __all__ = [
     "qposes", "quat", "quat_angle", "quat_difference", "quat_from_axis_angle", "quat_from_euler", "quat_from_mat",
     "quat_from_rotvec", "quat_inverse", "quat_mul", "quat_random", "quat_rotate", "quat_rotate_inverse",
     "quat_to_euler", "quat_to_mat", "quat_to_rotvec", "register", "scan_grid", "sensor", "sensors", "site", "sites",
-    "start_on_terrain", "sum_squares", "task_names", "tendon", "tolerance", "train", "uniform", "vec10", "view"]
+    "start_on_terrain", "sum_squares", "task_names", "tendon", "tolerance", "train", "transfer", "tune", "uniform",
+    "vec10", "view"]
 
 _NAMES = {
     "model_actuators": "follow_velocity",
@@ -89,7 +99,13 @@ _NAMES = {
     "algos.policy_export": "export_policy",
     "algos.ppo": "PPO",
     "algos.ppo_config": "PPOConfig",
+    "algos.replay": "Replay Transitions",
     "algos.rollout_buffer": "Rollout",
+    "algos.sac": "SAC",
+    "algos.sac_config": "SACConfig",
+    "algos.squashed_policy": "SquashedPolicy",
+    "algos.transfer": "Transfer transfer",
+    "algos.twin_critic": "TwinCritic",
     "algos.value": "ValueFunction",
     "binding.registry": "register task_names",
     "controllers.control_report": "ControlReport control_report",
@@ -110,6 +126,7 @@ _NAMES = {
     "kernels.task_helpers":
         "Sigmoid all_inside angle_between body_velocity grasp_terms inside local_velocity put put_upright sum_squares "
         "tolerance",
+    "mirror": "Mirror",
     "model_files":
         "ModelFile gymnasium_model gymnasium_robotics_model menagerie_model package_model "
         "playground_model",
@@ -121,6 +138,7 @@ _NAMES = {
         "joint joints lasting_memory memory mocap part qpos qposes sensor sensors site sites tendon",
     "terrain": "Terrain height_field scan_grid",
     "training": "train",
+    "tuning.search": "Tuning tune",
     "viewer.follow": "RunViewer",
     "viewer.show": "view",
 }

@@ -15,7 +15,7 @@ import mujoco
 
 from lyceum_warp.model_files import ModelFile
 from lyceum_warp.support.docstrings import attribute_docs, document_attributes, listed
-from lyceum_warp.support.validate import check_flag, check_kind, described, positive_number, whole_number
+from lyceum_warp.support.validate import check_flag, check_kind, described, finite_number, positive_number, whole_number
 
 ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
 """The source of a model: a file or an MjSpec."""
@@ -27,6 +27,10 @@ INTEGRATORS = {
     "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
+JACOBIANS = {
+    "dense": mujoco.mjtJacobian.mjJAC_DENSE, "sparse": mujoco.mjtJacobian.mjJAC_SPARSE,
+    "auto": mujoco.mjtJacobian.mjJAC_AUTO,
+}  # fmt: skip
 SOLVER_LIMITS = {"iterations": 1, "ls_iterations": 1, "noslip_iterations": 0}
 """The limits of the constraint solver that ``solver`` accepts, with the smallest value of each."""
 
@@ -84,6 +88,10 @@ class PhysicsOptions:
     """Friction cone: pyramidal or elliptic."""
     integrator: str | None = None
     """Integrator: euler, rk4, implicit or implicitfast."""
+    jacobian: str | None = None
+    """Constraint Jacobian: dense, sparse or auto. It changes speed and memory, and results only by rounding."""
+    impratio: float | None = None
+    """Stiffness of contacts against slip, relative to their stiffness against penetration; for elliptic cones."""
     solver: Mapping[str, int] | None = None
     """Limits of the constraint solver: any of iterations, ls_iterations (of its line search) and noslip_iterations
     (0 turns the noslip solver off)."""
@@ -103,8 +111,11 @@ class PhysicsOptions:
             _whole(self, name, low)
         if self.timestep is not None:
             object.__setattr__(self, "timestep", positive_number("timestep", self.timestep, "seconds"))
+        if self.impratio is not None:
+            object.__setattr__(self, "impratio", finite_number("impratio", self.impratio, low=1e-15))
         _one_of("friction cone", self.cone, CONES)
         _one_of("integrator", self.integrator, INTEGRATORS)
+        _one_of("Jacobian", self.jacobian, JACOBIANS)
         _flags(self, "deterministic")
         if self.solver is not None:
             object.__setattr__(self, "solver", _checked_limits(self.solver) or None)

@@ -472,6 +472,9 @@ class Task:
     trace: ClassVar[str | None] = None
     """Name of the site or body whose path the viewer draws for a planner's samples. None: the centre of mass of a robot
     whose base moves freely, or the end of an arm."""
+    mirror: ClassVar[Any] = None
+    """The task's mirror image, ``lw.Mirror(...)``, or a static method ``mirror(model, p)`` that returns it, to learn
+    symmetric policies; None if there is none."""
     physics: ClassVar[Mapping[str, PhysicsOptions]] = {}
     """Physics to choose from by name, such as ``{"fast": lw.PhysicsOptions(integrator="implicitfast")}``, as in
     ``lw.make(task, physics="fast")``. The default, "exact", is the physics of the model and ``frame_skip``."""
@@ -484,6 +487,14 @@ class Task:
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Change the model before it is compiled, also one that was passed to ``make``. Default: keeps it."""
+
+    @staticmethod
+    def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
+        """What a robot needs to run a policy, for the metadata of ONNX files: JSON values by name. Default: nothing.
+
+        ``model`` is the compiled model, and ``p`` has the parameters as attributes.
+        """
+        return {}
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)

@@ -1,6 +1,7 @@
 """Train a learner and write its run folder, for the command line and for ``lw.train``."""
 
 import contextlib
+import functools
 import json
 import logging
 import math
@@ -11,18 +12,22 @@ from typing import Any
 
 from lyceum_warp.algos.evaluation import evaluation_seed
 from lyceum_warp.algos.learner import Iteration, Learner
+from lyceum_warp.algos.transfer import EXACT, task_physics
+from lyceum_warp.algos.transfer import transfer as judge_transfer
 from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.runs.configuration import Configuration, describe
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.lock import RunLock
 from lyceum_warp.runs.metrics_table import cut_rows
+from lyceum_warp.runs.replay_files import read_replay
 from lyceum_warp.runs.saving import Saver
 from lyceum_warp.runs.task_copy import note_changes, run_params, task_copy
+from lyceum_warp.support.files import replaced
 from lyceum_warp.support.interrupts import Interrupted, ending, postponed
 from lyceum_warp.support.validate import check_flag, check_function, check_kind, positive_number, whole_number
 from lyceum_warp.support.versions import versions
 from lyceum_warp.viz.cameras import CameraChoice, find_camera
-from lyceum_warp.viz.policy_videos import Videos
+from lyceum_warp.viz.policy_videos import Videos, one_line
 from lyceum_warp.viz.tensorboard import TensorBoard, check_tensorboard
 from lyceum_warp.viz.video import check_video
 
@@ -64,6 +69,7 @@ def train(
     tensorboard: bool = False,
     video_every: int = 0,
     camera: CameraChoice = None,
+    transfer: bool | None = None,
     resume: bool = False,
     take_over: bool = False,
     entries: Mapping[str, Any] | None = None,
@@ -95,6 +101,10 @@ def train(
             none. If a video fails, a warning is logged, and training continues without videos.
         camera: Camera of the videos: a camera of the model by name or index, a ``viz.cameras.FreeCamera``, or "free"
             for MuJoCo's default free camera.
+        transfer: Whether to judge the policy's transfer at the end, by ``lw.transfer``, and to write ``transfer.json``
+            into the folder. By default this costs seconds: worlds on a GPU are compared with the C engine, and physics
+            other than the task's exact one with the exact one. True also plays on the Warp engine after training on CPU
+            cores, and under each physics of the task.
         resume: Whether to continue the run in the folder. ``learner`` must be made with the same arguments.
         take_over: Whether to continue a run that another process has locked, on this or another host. The other process
             then ends at its next write.
@@ -119,6 +129,8 @@ def train(
     check_flag("resume", resume)
     check_flag("take_over", take_over)
     check_flag("tensorboard", tensorboard)
+    if transfer is not None:
+        check_flag("transfer", transfer)
     if target_return is not None and (not isinstance(target_return, (int, float)) or math.isnan(target_return)):
         raise ValueError(f"target_return must be a number, not {target_return!r}")
     limit = math.inf if minutes is None else 60 * positive_number("minutes", minutes, "minutes")
@@ -169,7 +181,32 @@ def train(
             if leads and saver.saved >= 0:
                 error.add_note(f"the run in {run.folder} is saved up to iteration {saver.saved}")
             raise
+        if leads:
+            _judge_transfer(run, learner, transfer, display)
     return run
+
+
+_PAIRS = 64
+"""Pairs of episodes of the verdict at the end of training."""
+
+
+def _judge_transfer(run: Run, learner: Learner, wanted: bool | None, display: Display) -> None:
+    """Write the verdict on the policy into the run, if it is wanted or costs only seconds."""
+    env, exact = learner.env, task_physics(learner.env)[1] == EXACT
+    on_gpu = env.device.is_cuda and env.engine.name == "warp"
+    if wanted is False or (wanted is None and exact and not on_gpu):
+        return
+    progress = functools.partial(display.work, "judging the policy's transfer", "steps")
+    try:
+        found = judge_transfer(
+            env, learner.policy, _PAIRS, seed=env.options.seed + 1, warp=on_gpu or wanted is True,
+            physics=wanted is True, progress=progress,
+        )  # fmt: skip
+    except Exception as error:  # of any kind: the training is worth more than its verdict
+        display.note(f"no verdict on transfer ({one_line(error)})")
+        return
+    with replaced(run.transfer) as temporary:
+        temporary.write_text(json.dumps({"iteration": learner.iteration, **found.to_dict()}, indent=2))
 
 
 def _learn(
@@ -227,6 +264,8 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
     note_changes(run, learner.env, note=note)
     try:
         learner.load_state_dict(content["state"])
+        if learner.replay is not None:
+            read_replay(run.replay, learner.replay, content["state"]["stored"], learner.own_worlds)
     except Exception as error:  # a damaged state may raise any error
         text = " ".join(str(error).split())
         raise ValueError(f"{run.checkpoint} does not fit the configuration beside it: {text}") from error

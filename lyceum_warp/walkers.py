@@ -4,6 +4,7 @@ The functions of ``(model, p)`` are for ``lw.from_model``: ``p`` has the paramet
 indices of joints and of sites. The base is the body of the first joint, which must be free.
 """
 
+import functools
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -12,6 +13,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
+
+from lyceum_warp.mirror import Mirror
 
 _JOINT, _SENSOR = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_SENSOR
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
@@ -46,13 +49,16 @@ def servos(model: mujoco.MjModel, p: Any) -> list[int]:
     """The actuator of each joint, (joints,).
 
     Raises:
-        ValueError: A joint has no actuator or several.
+        ValueError: A joint has no actuator of its own or several.
     """
     moved = np.where(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, model.actuator_trnid[:, 0], -1)
     found = [np.flatnonzero(moved == joint) for joint in p.joints]
     for joint, actuators in zip(p.joints, found, strict=True):
         if len(actuators) != 1:
-            raise ValueError(f"the joint {_name(model, _JOINT, joint)} has {len(actuators)} actuators: it needs one")
+            raise ValueError(
+                f"the joint {_name(model, _JOINT, joint)} has {len(actuators)} actuators of its own and needs one "
+                "(those of tendons do not count): change the model, or leave it out of the joints that act"
+            )
     return [int(actuators[0]) for actuators in found]
 
 
@@ -69,15 +75,20 @@ def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
     Raises:
         ValueError: A servo has no force limit.
     """
-    actuators = servos(model, p)
-    limits = np.where(
-        model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators, 1],
-        np.where(model.jnt_actfrclimited[p.joints], model.jnt_actfrcrange[p.joints, 1], 0.0),
-    )  # fmt: skip
+    limits = force_limits(model, p)
     if not limits.all():
         unlimited = _name(model, _JOINT, p.joints[int(np.argmin(limits))])
         raise ValueError(f"the servo of the joint {unlimited} has no force limit: give action_scale, in rad")
-    return 0.25 * limits / model.actuator_gainprm[actuators, 0]
+    return 0.25 * limits / model.actuator_gainprm[servos(model, p), 0]
+
+
+def force_limits(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """The largest force of each joint's servo, N m, (joints,); 0 without a limit."""
+    actuators = servos(model, p)
+    return np.where(
+        model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators, 1],
+        np.where(model.jnt_actfrclimited[p.joints], model.jnt_actfrcrange[p.joints, 1], 0.0),
+    )  # fmt: skip
 
 
 def home_qpos(model: mujoco.MjModel) -> np.ndarray:
@@ -94,6 +105,78 @@ def home_pose(model: mujoco.MjModel, p: Any) -> np.ndarray:
 def home_height(model: mujoco.MjModel, p: Any) -> float:
     """The height of the base in ``home_qpos``, m."""
     return float(home_qpos(model)[2])
+
+
+def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
+    """What a robot needs to run a policy of a velocity task, for ``lw.Task.deployment``; lists follow ``joints``."""
+    actuators, stages = servos(model, p), np.asarray(p.stages)
+    damping = model.dof_damping[joint_dof(model, p)].reshape(len(actuators), -1)[:, 0]  # the model's, part of the gain
+    yaw, lateral = float(stages[:, 3].max()), float(np.max(p.lateral_velocity))
+    return {
+        "base": model.body(base(model)).name,
+        "velocimeter": np.asarray(p.imu).tolist(),  # its position on the base, m
+        "joints": [model.joint(joint).name for joint in p.joints],
+        "default_pose": np.asarray(p.default_pose).tolist(),
+        "action_scale": np.asarray(p.action_scale).tolist(),
+        "stiffness": model.actuator_gainprm[actuators, 0].tolist(),
+        "damping": (damping - model.actuator_biasprm[actuators, 2]).tolist(),
+        "force_limit": force_limits(model, p).tolist(),
+        "commands": {
+            "forward_velocity": [float(stages[:, 1].min()), float(stages[:, 2].max())],
+            "lateral_velocity": [-lateral, lateral],
+            "yaw_rate": [-yaw, yaw],
+        },
+    }
+
+
+def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
+    """The mirror image of a velocity task in the plane y = 0 of the base, for ``lw.Task.mirror``.
+
+    With all joints at 0, the mirror image of a joint's position and axis is that of its partner, on the other side or
+    itself. Masses need not be symmetric.
+
+    Raises:
+        ValueError: A joint or a foot has no partner, or the default pose or the scale of actions is not symmetric.
+    """
+    data, name = _straight(model), functools.partial(_name, model, _JOINT)
+    flip, spin = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])
+    hinges = np.arange(1, model.njnt)
+    partner, sign = np.zeros(model.njnt, int), np.ones(model.njnt)
+    for joint in hinges:
+        distances = np.linalg.norm(data.xanchor[hinges] - flip * data.xanchor[joint], axis=1)
+        cosines = data.xaxis[hinges] @ (spin * data.xaxis[joint])
+        best = int(np.argmin(distances + (1.0 - np.abs(cosines))))
+        if distances[best] > 0.005 or abs(cosines[best]) < 0.999:
+            raise ValueError(f"the joint {name(joint)} has no mirror image on the other side of the robot")
+        partner[joint], sign[joint] = hinges[best], np.sign(cosines[best])
+    acting = [int(joint) for joint in p.joints]
+    if alone := [joint for joint in acting if partner[joint] not in acting]:
+        raise ValueError(f"the joint {name(alone[0])} acts, but {name(partner[alone[0]])}, its mirror image, does not")
+    joints = [acting.index(partner[joint]) for joint in acting], sign[acting]
+    for table, signs in (("default_pose", joints[1]), ("action_scale", 1.0)):
+        values = np.asarray(getattr(p, table))
+        if (np.abs(values - signs * values[joints[0]]) > 1e-3).any():
+            raise ValueError(f"{table} is not symmetric: {values.tolist()}")
+    places = data.site_xpos[np.asarray(p.feet)]
+    distances = np.linalg.norm(places[None] - (flip * places)[:, None], axis=2)
+    if distances.min(1).max() > 0.005:
+        raise ValueError("the feet are not symmetric: give each foot a site on the other side")
+    order = distances.argmin(1)
+    feet = order, np.ones(len(order))
+    vectors = (3 * order[:, None] + np.arange(3)).ravel(), np.tile(flip, len(order))
+    found: dict[str, Any] = {
+        "linear_velocity": flip, "angular_velocity": spin, "gravity": flip, "command": (1.0, -1.0, -1.0),
+        **dict.fromkeys(("joint_position", "joint_velocity", "last_action"), joints),
+        **dict.fromkeys(("foot_height", "foot_air_time", "foot_contact"), feet), "foot_force": vectors,
+        # states of the physics; the model's other joints are mirrored, too
+        "qpos": ([*range(7), *(partner[hinges] + 6)], [*flip, 1.0, *spin, *sign[hinges]]),
+        "qvel": ([*range(6), *(partner[hinges] + 5)], [*flip, *spin, *sign[hinges]]),
+    }  # fmt: skip
+    if hasattr(p, "scan"):
+        scan = np.asarray(p.scan)
+        rows = np.linalg.norm(scan[None] - scan[:, None] * flip[:2], axis=2).argmin(1)
+        found["height_scan"] = rows, np.ones(len(rows))
+    return Mirror(found)
 
 
 # legs

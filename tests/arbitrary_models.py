@@ -1,4 +1,4 @@
-"""XML models with every kind of element, and the rules whose results depend on the model."""
+"""Models in XML with every kind of element, and the rules whose results depend on the model."""
 
 from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import episode_rules as episodes

@@ -22,11 +22,14 @@ SAME_FUNCTIONS = (
 )  # fmt: skip
 """Tasks that share their functions with ``go1_velocity``, ``g1_velocity``, ``go1_rough_velocity`` or
 ``humanoid_stand``."""
+SAME_MODELS = ("adroit_door", "adroit_relocate", "humanoid_standup")
+"""Tasks with the hand or the humanoid of other tasks, which need no quick tests of the Warp engine."""
 
 
-def long_if_alike(tasks: Iterable[str]) -> list[Any]:
-    """Parameters of a test of every task; the tasks of ``SAME_FUNCTIONS`` are marked long."""
-    return [pytest.param(task, marks=pytest.mark.long) if task in SAME_FUNCTIONS else task for task in tasks]
+def long_if_alike(tasks: Iterable[str], *more: str) -> list[Any]:
+    """Return parameters for a test of every task; tasks of ``SAME_FUNCTIONS``, and ``more``, are marked long."""
+    alike = (*SAME_FUNCTIONS, *more)
+    return [pytest.param(task, marks=pytest.mark.long) if task in alike else task for task in tasks]
 
 
 SharedEnv = Callable[..., lw.Env]
@@ -140,7 +143,7 @@ def _task(item: pytest.Item) -> str | None:
 
 @functools.cache
 def _missing_model(task: str | None) -> str | None:
-    """Why a task's model is missing, and how to install it; None if it is there."""
+    """Return why a task's model is missing and how to install it; None if it is installed."""
     if task is None:
         return None
     try:

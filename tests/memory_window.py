@@ -1,4 +1,4 @@
-"""A window in memory that collects frames and sends a test's commands."""
+"""Replace the window process by an object that collects frames and sends a test's commands."""
 
 import time
 from collections import deque

@@ -52,7 +52,7 @@ class Grid:
 
 
 class Plain:
-    """A planner by its definition, in float64; only its standard normal numbers are given.
+    """A planner by its definition, in float64; the caller gives the standard normal numbers.
 
     Args:
         knots: Number of knots over the horizon, or None for an independent number at each step.

@@ -15,7 +15,7 @@ MODULE = wp.Module("term_calls", None)
 
 
 def kernel_of(function: wp.Function, number: int) -> wp.Kernel:
-    """A kernel that calls a function in every world, with arrays that have a first axis for the worlds."""
+    """Make a kernel that calls a function in every world; its arrays have a leading axis of worlds."""
     kinds = {
         argument: wp.array(dtype=kind.dtype, ndim=2) if is_row(kind) else wp.array(dtype=kind, ndim=1)
         for argument, kind in function.input_types.items()
@@ -35,12 +35,12 @@ KERNELS = {
     name: [(each, kernel_of(each, i)) for i, each in enumerate(overloads(getattr(terms, name)))]
     for name in terms.__all__
 }
-"""By a function's name, its overloads with their kernels."""
+"""The overloads of each function, with their kernels, by name."""
 
 
 @dataclasses.dataclass
 class Call:
-    """What a function returned in each world, (N, ...), and its arguments afterwards."""
+    """A function's return values, (N, ...), and its arguments after the call."""
 
     result: np.ndarray
     after: dict[str, np.ndarray]

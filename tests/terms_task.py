@@ -1,4 +1,4 @@
-"""A task for tests of terms: a ball on a rail that is paid for its speed and for a place."""
+"""A task for tests of terms: a ball on a rail with rewards for its speed and its position."""
 
 from typing import Any
 
@@ -101,6 +101,6 @@ class Terms(lw.Task):
 
 
 class Ordered(Terms):
-    """The same with other weights."""
+    """``Terms`` with different weights."""
 
     rewards = Terms.rewards | {"near": 3.0}

@@ -1,5 +1,6 @@
-"""Commands and Python on pages run, and links and file names in documents and project files are valid."""
+"""Run the commands and the Python of pages, and check links and file names in documents."""
 
+import dataclasses
 import re
 import runpy
 import shlex
@@ -14,6 +15,7 @@ from training_runs import TINY
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.runs.folder import Run
+from lyceum_warp.tuning import search
 from lyceum_warp.viewer import show as views
 from lyceum_warp.viz.video import NoVideoError, check_video
 
@@ -54,7 +56,7 @@ MISTAKES = WRONG.findall((ROOT / "docs" / "warp_for_python.md").read_text())
 
 
 @pytest.mark.parametrize("number", range(len(MISTAKES)))
-def test_a_mistake_of_the_page_about_warp_has_the_message_there(number: int, task_file: TaskFile) -> None:
+def test_a_mistake_on_the_page_about_warp_gives_the_message_shown_there(number: int, task_file: TaskFile) -> None:
     function, message = MISTAKES[number]
     task = python_of(ROOT / "docs" / "warp_for_python.md")
     assert task.count("class Measured") == 1
@@ -73,6 +75,7 @@ QUICK = {
     ),
     "train --resume": ["--iterations", "3", "--no-video"],
     "eval": ["--episodes", "2", "--no-video"],
+    "tune": ["--nworld", "8", "--episodes", "4"],
     "plan": ["--steps", "3", "--samples", "4", "--no-video"],
 }
 """Options added to a page's commands, so that they are quick."""
@@ -133,6 +136,12 @@ def short_views(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(views, "opened", opened)
 
 
+@pytest.fixture(autouse=True)
+def short_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let tune measure speeds for milliseconds."""
+    monkeypatch.setattr(search, "SHORT", dataclasses.replace(search.SHORT, repeats=2, block_seconds=0.005, steps=40))
+
+
 @pytest.fixture
 def empty_folder(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
     """Return an empty folder that has the same path in every run, so that Warp reuses compiled kernels."""
@@ -151,7 +160,7 @@ def test_commands_and_python_of_a_page_run_in_order(
 
 
 @pytest.mark.long
-def test_the_page_on_a_task_of_your_own_keeps_its_promises(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tasks_of_the_page_on_your_own_task_keep_the_rules(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         check_video()
     except NoVideoError as error:

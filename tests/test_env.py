@@ -1,4 +1,4 @@
-"""Fields, parameters, replicas and errors of environments, and environments in other processes."""
+"""Test fields, parameters, replicas and errors of environments, and environments in other processes."""
 
 import copy
 import gc

@@ -65,6 +65,15 @@ def test_random_search_gets_a_run_without_code_for_it(run, tmp_path: Path) -> No
     assert cli.main(["train", "--resume", "twice", "--iterations", "9"]) == 2  # the class is defined in a program
 
 
+def test_td3_learns_and_resumes_with_its_replay_buffer(run, tmp_path: Path) -> None:
+    ended = numbers(r": (\d+) episodes", run("td3.py", "--out", "once", "--iterations", "4"))
+    assert ended[0] > 50 > 25 > ended[-1]  # the policy keeps the pole up for longer
+    run("td3.py", "--out", "twice", "--iterations", "2")
+    lines = run("td3.py", "--out", "twice", "--iterations", "4", "--resume")
+    assert numbers(r"return ([\d.]+)", lines)[0] > 10.0
+    assert Run.open(tmp_path / "once").rows() == Run.open(tmp_path / "twice").rows()
+
+
 def test_plan_reaches_the_target_in_each_episode(run) -> None:
     lines = run("plan.py", "--episodes", "2")
     assert sum("success after" in line for line in lines) == 2
@@ -118,7 +127,7 @@ def test_torch_loop_learns_to_approach_the_target(run) -> None:
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
 def test_examples_are_short_and_use_public_names_only(path: Path) -> None:
     source = path.read_text()
-    most = {"commanded_speed.py": 180, "random_search.py": 80}
+    most = {"commanded_speed.py": 180, "random_search.py": 80, "td3.py": 150}
     assert len(source.splitlines()) < most.get(path.name, 60)
     modules = set(re.findall(r"^(?:from|import) (lyceum_warp[\w.]*)", source, re.MULTILINE))
     assert modules <= {"lyceum_warp", "lyceum_warp.testing"}

@@ -1,4 +1,4 @@
-"""A world's fault stays in that world; an error for a wrong argument names its value and the fix.
+"""Check that a fault affects only its world, and that errors for wrong arguments name the value and the fix.
 
 The conformance suite covers NaN, infinite and out-of-range states and actions for every task and engine. These faults
 need a particular model, and both engines can produce each kind. The C engine has no shared contact pool, so only the
@@ -104,7 +104,7 @@ def test_a_contact_overflow_of_the_warp_engine_is_a_fault_of_every_world_without
         assert torch.isfinite(env.get_state()).all()
 
 
-def test_any_other_overflow_of_the_warp_engine_is_an_engine_warning() -> None:
+def test_another_overflow_of_the_warp_engine_is_an_engine_warning() -> None:
     """A contact sensor has more matches than its buffer holds."""
 
     def make() -> lw.Env:

@@ -1,4 +1,4 @@
-"""The simulator's fields: their types, the stages that compute them, and their named elements."""
+"""Test the simulator's fields: their types, the stages that compute them, and their named elements."""
 
 import mujoco
 import numpy as np

@@ -21,7 +21,7 @@ def test_every_task_of_the_package_has_an_id() -> None:
     assert tasks >= set(package_task_names()) and "lyceum/HalfCheetah-v0" in OURS and "lyceum/Walker2d-v0" in OURS
 
 
-def test_registering_reads_no_task_and_warns_of_nothing() -> None:
+def test_registering_imports_no_task_and_gives_no_warning() -> None:
     program = """
 import sys, warnings
 warnings.simplefilter("error")

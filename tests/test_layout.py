@@ -1,6 +1,7 @@
 """Modules import only from lower rooms, private names stay private, and every room has tests."""
 
 import ast
+import functools
 import importlib
 import subprocess
 import sys
@@ -18,7 +19,7 @@ TESTS = Path(__file__).parent
 
 LEVELS = {
     "support": -2,
-    "model_files": -1,
+    "mirror": -1, "model_files": -1,
     "done": 0, "options": 0,
     "fields": 1, "kernels": 1, "model_actuators": 1, "model_fields": 1, "task": 1, "walkers": 1,
     "graphs": 2, "spaces": 2, "terms": 2, "terrain": 2,
@@ -29,12 +30,13 @@ LEVELS = {
     "openloop": 7,
     "algos": 8, "controllers": 8, "testing": 8,
     "runs": 9,
+    "tuning": 10,
     "viz": 11,
     "training": 12,
     "adapters": 13, "viewer": 13,
     "cli": 14, "gym": 14,
 }  # fmt: skip
-"""The floor of every room: a room imports from lower floors, or from itself."""
+"""The level of every room: a room imports only from lower levels and from itself."""
 
 TESTED_BY = {
     "done": "test_faults.py", "task": "binding", "testing": "conformance",
@@ -55,7 +57,11 @@ def module_name(path: Path) -> str:
 
 
 MODULES = {module_name(path): path for path in sorted(ROOT.rglob("*.py"))}
-TREES = {name: ast.parse(path.read_text()) for name, path in MODULES.items()}
+
+
+@functools.cache
+def trees() -> dict[str, ast.Module]:
+    return {name: ast.parse(path.read_text()) for name, path in MODULES.items()}
 
 
 def room(module: str) -> str:
@@ -65,7 +71,7 @@ def room(module: str) -> str:
 def imported_modules(name: str) -> set[str]:
     """Return the package's modules that a module imports, including imports under TYPE_CHECKING and in functions."""
     found = set()
-    for node in ast.walk(TREES[name]):
+    for node in ast.walk(trees()[name]):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -76,7 +82,9 @@ def imported_modules(name: str) -> set[str]:
     return {module for module in found if module in MODULES}
 
 
-IMPORTS = {name: imported_modules(name) for name in MODULES}
+@functools.cache
+def imports() -> dict[str, set[str]]:
+    return {name: imported_modules(name) for name in MODULES}
 
 
 def test_imports_point_to_lower_rooms() -> None:
@@ -84,13 +92,13 @@ def test_imports_point_to_lower_rooms() -> None:
     for name in MODULES:
         if (own := room(name)) in LEVELS:
             upward = {
-                other for other in IMPORTS[name] if room(other) != own and LEVELS.get(room(other), 99) >= LEVELS[own]
+                other for other in imports()[name] if room(other) != own and LEVELS.get(room(other), 99) >= LEVELS[own]
             }
             assert not upward, f"{name} imports {upward}"
         elif own == "tasks":
-            family = {other for other in IMPORTS[name] if other.startswith(f"{name.rpartition('.')[0]}.")}
+            family = {other for other in imports()[name] if other.startswith(f"{name.rpartition('.')[0]}.")}
             public = {"lyceum_warp", "lyceum_warp.terms", "lyceum_warp.walkers"}
-            assert IMPORTS[name] - family <= public, f"{name} imports more than the public package and its family"
+            assert imports()[name] - family <= public, f"{name} imports more than the public package and its family"
 
 
 def test_no_module_imports_itself_through_others() -> None:
@@ -99,7 +107,7 @@ def test_no_module_imports_itself_through_others() -> None:
     def visit(name: str, path: tuple[str, ...]) -> None:
         assert name not in path, " imports ".join([*path[path.index(name) :], name])
         if name not in finished:
-            for other in IMPORTS[name] - {"lyceum_warp"}:  # only tasks import the public names, and tasks have no users
+            for other in imports()[name] - {"lyceum_warp"}:  # only tasks import it, and nothing imports tasks
                 visit(other, (*path, name))
             finished.add(name)
 
@@ -119,7 +127,7 @@ def test_the_viewers_window_imports_neither_torch_nor_warp_nor_other_rooms() -> 
 
 def test_the_viewers_session_imports_nothing_of_its_window() -> None:
     session = [name for name in MODULES if name.startswith("lyceum_warp.viewer.session")]
-    imported = {other for name in session for other in IMPORTS[name]}
+    imported = {other for name in session for other in imports()[name]}
     assert session and not [name for name in imported if name.startswith("lyceum_warp.viewer.window")]
 
 
@@ -154,7 +162,7 @@ def defined_names(tree: ast.AST) -> Iterator[str]:
 
 
 PRIVATE = defaultdict(set)
-for module, tree in TREES.items():
+for module, tree in trees().items():
     for defined in filter(is_private, defined_names(tree)):
         PRIVATE[defined].add(module)
 
@@ -162,7 +170,7 @@ for module, tree in TREES.items():
 def test_no_module_uses_private_names_of_another_module() -> None:
     """Attributes are matched by name only, so private names of Warp, MuJoCo and torch do not count."""
     found = []
-    for name, tree in TREES.items():
+    for name, tree in trees().items():
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("lyceum_warp"):
                 found += [f"{name} imports {alias.name}" for alias in node.names if alias.name.startswith("_")]
@@ -173,7 +181,7 @@ def test_no_module_uses_private_names_of_another_module() -> None:
 
 PUBLIC = {
     alias.name: str(node.module)
-    for block in TREES["lyceum_warp"].body
+    for block in trees()["lyceum_warp"].body
     if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
     for node in ast.walk(block)
     if isinstance(node, ast.ImportFrom)
@@ -208,8 +216,8 @@ def private_names_of_others(tree: ast.AST) -> Iterator[str]:
             yield ast.unparse(node)
 
 
-def test_no_module_but_upstream_uses_private_names_of_other_packages() -> None:
-    found = {name: names for name, tree in TREES.items() if (names := set(private_names_of_others(tree)))}
+def test_only_upstream_uses_private_names_of_other_packages() -> None:
+    found = {name: names for name, tree in trees().items() if (names := set(private_names_of_others(tree)))}
     known = {"wp._src", "mujoco_warp._src.collision_sdf", "mujoco_warp._src.forward"}
     assert found == {UPSTREAM: known}, f"reach private names in {UPSTREAM}"
 
@@ -257,7 +265,7 @@ def test_every_room_has_tests_of_its_name() -> None:
         assert any(place.exists() for place in places), f"no tests of {own}: none of {', '.join(map(str, places))}"
 
 
-def test_every_folder_of_tests_belongs_to_a_room_or_goes_across_rooms() -> None:
+def test_every_folder_of_tests_belongs_to_a_room_or_is_listed() -> None:
     folders = {path.parent.relative_to(TESTS).as_posix() for path in TESTS.rglob("test_*.py")} - {"."}
     rooms = {path.parent.relative_to(ROOT).as_posix() for path in MODULES.values()}
     assert folders <= rooms | ACROSS | {"bench"}

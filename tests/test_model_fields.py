@@ -38,7 +38,7 @@ def fields_of(model: mujoco.MjModel) -> list[ModelField]:
     return found
 
 
-def test_constants_follow_where_mujoco_reads_a_field_for_them() -> None:
+def test_constants_are_derived_from_the_fields_that_mujoco_reads() -> None:
     read: frozenset[str] = frozenset(mujoco.MjModel._setconst_inputs)
     fields = [field for field in fields_of(ANT) if not field.option]
     assert len(fields) > 50
@@ -64,7 +64,7 @@ def test_a_field_that_all_worlds_share_is_refused(name: str, reason: str) -> Non
         describe_model_field(ANT, name)
 
 
-def test_a_field_that_all_worlds_share_is_read_where_it_has_rows_of_numbers() -> None:
+def test_a_shared_field_is_read_if_it_has_rows_of_numbers() -> None:
     assert describe_model_field(ANT, "actuator_ctrlrange", varies=False).dtype is wp.vec2
     for name, reason in (("nq", "make it a parameter"), ("opt", "rows"), ("timestep", "dt"), ("geom_type", "rows")):
         with pytest.raises(ValueError, match=f"{name!r} cannot be read in World: .*{reason}"):
@@ -80,7 +80,7 @@ def test_geoms_with_wrapped_tendons_have_constants() -> None:
     assert Constants.INERTIAL not in describe_model_field(ANT, "geom_pos").constants
 
 
-def test_the_inertia_of_a_simple_body_stays_where_it_is() -> None:
+def test_the_inertial_frame_of_a_simple_body_cannot_move() -> None:
     ball = mujoco.MjModel.from_xml_string(
         "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
     )

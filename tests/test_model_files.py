@@ -14,7 +14,7 @@ from lyceum_warp.binding.registry import find_task
 
 
 def write_robot(folder: Path) -> Path:
-    """Write scene.xml into a folder; returns its path."""
+    """Write scene.xml into a folder, and return its path."""
     folder.mkdir(parents=True)
     (folder / "scene.xml").write_text(lw.gymnasium_model("hopper.xml").spec().to_xml())
     return folder / "scene.xml"
@@ -62,7 +62,7 @@ def test_the_package_mujoco_menagerie_provides_robots_that_no_other_source_has(
         lw.menagerie_model("agility_cassie/scene.xml").path()
 
 
-def test_a_missing_file_of_menagerie_is_named_with_those_that_resemble_it(sources: dict[str, Path]) -> None:
+def test_a_missing_file_of_menagerie_is_named_with_similar_ones(sources: dict[str, Path]) -> None:
     with pytest.raises(FileNotFoundError, match=r"no model file 'leg/scone\.xml' in .*; it has leg/scene\.xml, arm"):
         lw.menagerie_model("leg/scone.xml").spec()
 
@@ -104,7 +104,7 @@ def test_a_missing_package_is_named_with_the_command_that_installs_it() -> None:
         lw.package_model("no_robots", "arm.xml", install="no-robots==3").path()
 
 
-def test_a_python_on_which_an_extra_installs_nothing_is_named_with_a_command_that_works_there() -> None:
+def test_an_unsupported_python_is_named_with_a_command_that_works_there() -> None:
     here = f"{sys.version_info.major}.{sys.version_info.minor}"
     with pytest.raises(FileNotFoundError, match="which is not installed: pip install 'lyceum-warp.robots.'$"):
         lw.package_model("no_robots", "arm.xml", install="lyceum-warp[robots]", before_python="3.99").path()
@@ -126,11 +126,11 @@ class Light(find_task("hopper")):  # type: ignore[misc]
                 geom.density /= 2
 
 
-def test_a_task_that_extends_another_has_not_its_gymnasium_environment() -> None:
+def test_a_subclass_of_a_task_does_not_inherit_its_gymnasium_environment() -> None:
     assert find_task("hopper").gymnasium == "Hopper-v5" and Light.gymnasium is None
 
 
-def test_a_task_edits_its_model_once_whatever_it_is_made_from() -> None:
+def test_a_task_edits_its_model_once_from_any_source() -> None:
     light, whole = lw.make(Light), lw.make("hopper")
     half = 0.5 * whole.model.body_mass[1:].sum()
     copy = light.replicate(nworld=2)

@@ -52,7 +52,7 @@ class Arm:
     qvel: Row[float]
     ctrl: Row[float]
     site_xpos: Row[wp.vec3]
-    kept: Row[float] = lw.memory(2)  # a sum over the steps, and the last step's random draw
+    kept: Row[float] = lw.memory(2)  # memory: a sum over the steps, and the last step's random draw
 
 
 @wp.struct
@@ -449,7 +449,7 @@ def test_a_fault_in_the_middle_is_reported_at_the_end(task: type[lw.Task]) -> No
     assert not run(loop, state, torch.full_like(actions, 9.81e-4))["fault"].any()
 
 
-def test_worlds_that_reset_and_bad_horizons_are_refused(shared_env: SharedEnv) -> None:
+def test_automatic_resets_and_bad_horizons_are_refused(shared_env: SharedEnv) -> None:
     with pytest.raises(ValueError, match=r"worlds that do not reset: make\(..., autoreset=False\)"):
         OpenLoop(shared_env("point_mass"), 5)
     env = shared_env("point_mass", autoreset=False)
@@ -459,7 +459,7 @@ def test_worlds_that_reset_and_bad_horizons_are_refused(shared_env: SharedEnv) -
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_several_states_share_the_worlds(engine: str) -> None:
+def test_several_states_divide_the_worlds_evenly(engine: str) -> None:
     env = lw.make("hopper", engine=engine, nworld=6, autoreset=False, seed=1)
     starts = lw.make("hopper", nworld=3, seed=5, autoreset=False).get_state()
     loop, alone = OpenLoop(env, 3, states=3), OpenLoop(lw.make("hopper", engine=engine, nworld=2, autoreset=False), 3)

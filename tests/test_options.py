@@ -1,4 +1,4 @@
-"""Options of environments and physics: checked when made, separated from parameters, suggested when misspelt."""
+"""Check options of environments and physics, separate them from parameters, and suggest similar names."""
 
 import dataclasses
 import inspect
@@ -25,6 +25,8 @@ from lyceum_warp.options import OPTION_DOCS, OPTIONS, EnvOptions, PhysicsOptions
         ({"frame_skip": 0}, "frame_skip must be a whole number from 1 .*, not 0"),
         ({"timestep": 0.0}, "timestep must be a positive number of seconds, not 0.0"),
         ({"timestep": float("inf")}, "timestep must be a positive number of seconds, not inf"),
+        ({"impratio": 0}, "impratio must be a finite number of at least 1e-15, not 0"),
+        ({"jacobian": "full"}, "there is no Jacobian 'full': use 'dense', 'sparse' or 'auto'"),
         ({"integrator": 1}, "no integrator 1: use"),
         ({"cone": "round"}, "there is no friction cone 'round': use 'pyramidal' or 'elliptic'"),
         ({"integrator": "rk5"}, "no integrator 'rk5': use 'euler', 'rk4', 'implicit' or 'implicitfast'"),
@@ -112,7 +114,7 @@ def test_a_replica_has_the_options_of_the_original_except_for_the_changes() -> N
         ("qqq", ""),
     ],
 )
-def test_suggestion_knows_every_option_and_words_of_other_packages(word: str, expected: str) -> None:
+def test_suggestion_knows_every_option_and_names_of_other_packages(word: str, expected: str) -> None:
     assert suggestion(word) == expected
 
 

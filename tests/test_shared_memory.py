@@ -1,4 +1,4 @@
-"""Memory that all worlds share: sums over worlds, its updates, and everything that copies it."""
+"""Test memory that all worlds share: sums over worlds, updates, and everything that copies it."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -187,7 +187,7 @@ def test_training_updates_shared_memory_and_resumes_to_the_bit(tmp_path: Path, e
     assert torch.equal(env.get_shared(), expected)
 
 
-def test_processes_combine_their_sums(env: lw.Env) -> None:
+def test_sums_are_added_over_processes(env: lw.Env) -> None:
     env.rand_reset(seed=7)
     env.set_shared(torch.zeros_like(env.get_shared()))
     _, ended = steps(env, 30)
@@ -195,7 +195,7 @@ def test_processes_combine_their_sums(env: lw.Env) -> None:
     assert env.shared["falls"].sum() == ended.sum()
 
 
-def test_rules_hold_for_a_task_with_shared_memory() -> None:
+def test_a_task_with_shared_memory_keeps_the_rules() -> None:
     check_task(Balance, nworld=4, steps=20)
 
 

@@ -63,7 +63,7 @@ MANY = """
 """
 
 
-def test_an_actuator_has_as_many_actions_as_controls_and_a_name_of_its_own() -> None:
+def test_an_actuator_has_as_many_actions_as_controls_and_its_own_name() -> None:
     space = action_space(mujoco.MjModel.from_xml_string(MANY), None)
     assert space.parts == {"actuator_2": slice(0, 1), "aim": slice(1, 4), "actuator_2_": slice(4, 5)}
     assert space.low is not None
@@ -82,7 +82,7 @@ def test_an_action_range_replaces_the_control_ranges() -> None:
     assert (space.low.tolist(), space.high.tolist()) == ([-1.0, -1.0], [1.0, 1.0])
 
 
-def test_control_scale_takes_the_ends_of_an_action_range_to_those_of_the_controls() -> None:
+def test_control_scale_maps_the_action_range_to_the_control_range() -> None:
     ranges, scale = control_ranges(model()), control_scale(model(), (-1.0, 3.0))
     for action, bound in ((-1.0, ranges[:, 0]), (3.0, ranges[:, 1])):
         np.testing.assert_allclose(scale[:, 0] * action + scale[:, 1], bound)

@@ -1,4 +1,4 @@
-"""Terrains are as described, both engines stand on them, and tasks scan them and climb their levels."""
+"""Check the shapes of terrains, contacts with them on both engines, height scans, and levels."""
 
 import mujoco
 import numpy as np
@@ -49,7 +49,7 @@ def test_stones_have_gaps_of_the_given_width_rounded_up(width: float, cells: int
 
 
 @pytest.mark.parametrize(("kind", "amount"), [("steps", 0.2), ("rough", 0.08), ("waves", 0.2)])
-def test_other_kinds_reach_their_amount_up_and_down(kind: str, amount: float) -> None:
+def test_other_terrains_reach_their_amount_up_and_down(kind: str, amount: float) -> None:
     heights = patch(kind)
     assert -amount <= heights.min() < -0.9 * amount and 0.9 * amount < heights.max() <= amount
 

@@ -1,3 +1,4 @@
+import json
 import os
 import shutil
 import signal
@@ -28,7 +29,7 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return six_iterations(tmp_path_factory.mktemp("runs") / "six")
 
 
-def test_a_run_of_python_has_the_numbers_of_the_command(six: Path, tmp_path: Path) -> None:
+def test_training_in_python_and_on_the_command_line_give_equal_numbers(six: Path, tmp_path: Path) -> None:
     options = ["--samples", "512", "--hidden", "8", "--value-hidden", "8", "--mean-every", "2", "--mean-episodes", "2"]
     out = tmp_path / "command"
     arguments = ["train", "point_mass", "--nworld", "2", "--iterations", "6", "--keep-every", "2", "--out", str(out)]
@@ -71,7 +72,7 @@ def test_python_resumes_the_same_task_on_the_same_engine(six: Path, env: lw.Env,
             lw.train(algorithm(given), folder, iterations=9, resume=True)
 
 
-def test_an_algorithm_that_has_iterated_begins_a_whole_run(six: Path, tmp_path: Path) -> None:
+def test_a_learner_that_has_iterated_begins_a_complete_run(six: Path, tmp_path: Path) -> None:
     npg, folder = algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run"
     for _ in range(3):
         next(npg)
@@ -142,7 +143,7 @@ def test_a_callback_sees_every_iteration_and_ends_training(env: lw.Env, tmp_path
     assert seen == [1, 2, 3] and run.read()["iteration"] == 3
 
 
-def test_an_error_in_the_callback_leaves_a_whole_run(six: Path, tmp_path: Path) -> None:
+def test_an_error_in_the_callback_leaves_a_complete_run(six: Path, tmp_path: Path) -> None:
     def callback(iteration: lw.Iteration) -> None:
         if iteration.iteration == 3:
             raise KeyError("mine")
@@ -156,7 +157,7 @@ def test_an_error_in_the_callback_leaves_a_whole_run(six: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, FloatingPointError])
-def test_what_ends_an_iteration_leaves_the_last_save(
+def test_an_interrupted_iteration_leaves_the_last_save(
     error: type[BaseException], six: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Worlds and networks may have changed since."""
@@ -271,9 +272,7 @@ def test_a_run_continues_from_the_last_complete_state_to_the_same_numbers(six: P
         assert torch.equal(mean_action(lw.load(folder, which=which)), mean_action(lw.load(six, which=which)))
 
 
-def test_a_command_begins_with_the_policy_of_a_run(
-    six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_train_from_a_run_starts_with_its_policy(six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The new run has the old run's settings except one parameter; its first samples come from the old policy."""
     out = tmp_path / "out"
     arguments = ["train", "--from", str(six), "--which", "4", "--param", "success_distance=0.5", "--iterations", "1"]
@@ -300,7 +299,7 @@ def test_a_command_begins_with_the_policy_of_a_run(
     assert not (tmp_path / "no").exists()
 
 
-def test_flags_with_the_defaults_of_new_runs_replace_the_settings_of_the_other_run(
+def test_flags_with_default_values_replace_the_settings_of_the_other_run(
     six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old, out = Path(shutil.copytree(six, tmp_path / "old")), tmp_path / "out"
@@ -321,7 +320,7 @@ def test_flags_with_the_defaults_of_new_runs_replace_the_settings_of_the_other_r
     refused(capsys, "has gamma 0.9, not 0.995")
 
 
-def test_evaluations_and_training_with_one_seed_draw_other_states(env: lw.Env) -> None:
+def test_evaluations_and_training_with_one_seed_draw_different_states(env: lw.Env) -> None:
     env.rand_reset(1)
     trained_on = env.obs.clone()
     seen: list[torch.Tensor] = []
@@ -345,3 +344,18 @@ def test_ppo_trains_by_the_same_loop_from_the_shell(six: Path, tmp_path: Path) -
     config = Run.open(tmp_path / "parts").config
     assert config["algorithm"] == "ppo" and config["ppo"]["hidden"] == [8] and "npg" not in config
     assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # PPO does not take NPG's settings
+
+
+def test_a_run_gets_a_verdict_on_its_policys_transfer(env: lw.Env, tmp_path: Path) -> None:
+    """By default only if the worlds' physics are not exact, because the other engine's kernels may take minutes."""
+    run = lw.train(algorithm(env), tmp_path / "exact", iterations=1)
+    assert not run.transfer.exists()
+    coarse = algorithm(lw.make("point_mass", nworld=2, frame_skip=2, horizon=20))
+    run = lw.train(coarse, tmp_path / "coarse", iterations=1)
+    found = json.loads(run.transfer.read_text())
+    (pair,) = found["comparisons"]
+    assert (found["iteration"], found["episodes"], pair["second"]) == (1, 64, "own physics")
+    lengths = pair["differences"][1]
+    assert (lengths["first"], lengths["second"], lengths["verdict"]) == (20.0, 20.0, "same")
+    assert found["line"].startswith(f"own physics against exact physics: {pair['verdict']} (return ")
+    assert not lw.train(coarse, tmp_path / "unwanted", iterations=2, transfer=False).transfer.exists()

@@ -1,4 +1,4 @@
-"""Tables of walking robots, compared with MuJoCo's kinematics and contacts, and models prepared for walking."""
+"""Compare tables of walking robots with MuJoCo's kinematics and contacts, and prepare models for walking."""
 
 from types import SimpleNamespace
 
@@ -102,7 +102,7 @@ def test_tables_give_the_positions_and_contacts_of_feet(shape: str) -> None:
 
 
 @pytest.mark.parametrize("shape", ["cylinder", "ellipsoid"])
-def test_other_shapes_touch_with_the_corners_of_their_boxes(shape: str) -> None:
+def test_feet_of_other_shapes_touch_with_the_corners_of_their_boxes(shape: str) -> None:
     """The corners reach at least as low as the shape."""
     model, p = made(shape)
     soles = walkers.soles(model, p)
@@ -126,7 +126,7 @@ def test_models_without_a_base_or_legs_are_refused() -> None:
     with pytest.raises(ValueError, match="no sensor 'ankle_force' of a contact's force: prepare_walker adds it"):
         walkers.foot_forces(model, p)
     p.joints = [model.joint("hip_x").id]
-    with pytest.raises(ValueError, match="joint 'hip_x' has 0 actuators: it needs one"):
+    with pytest.raises(ValueError, match="joint 'hip_x' has 0 actuators of its own and needs one"):
         walkers.controls(model, p)
     p.joints = [model.joint("peg").id]
     with pytest.raises(ValueError, match="servo of the joint 'peg' has no force limit: give action_scale"):
@@ -173,7 +173,7 @@ def test_motors_become_critically_damped_servos_with_the_same_limits() -> None:
         walkers.use_servos(spec, ["peg"])
 
 
-def test_feet_are_added_where_an_element_of_their_body_says() -> None:
+def test_feet_are_added_at_an_element_of_their_body() -> None:
     spec = mujoco.MjSpec.from_string(XML.format(shape="box"))
     walkers.add_feet(spec, {"a": ("shin", (0.0, 0.0, -0.1)), "b": ("peg", (0.0, 0.0, 0.1)), "c": ("end", (0.0,) * 3)})
     model = spec.compile()
@@ -197,7 +197,7 @@ def test_round_feet_have_the_lowest_plane_and_the_friction_of_their_boxes() -> N
     assert (model.geom_friction[geoms] == model.geom_friction[box]).all() and (model.geom_priority[geoms] == 1).all()
     place = [walkers.spheres_of(model, data, geom) for geom in geoms]
     inside = (np.concatenate(place)[:, :3] - data.geom_xpos[box]) @ data.geom_xmat[box].reshape(3, 3)
-    # the ends of the capsules touch the sides and the lowest face of the box, 0.03 x 0.04 x 0.02
+    # the ends of the capsules touch the sides and the bottom of the box, whose half-sizes are 0.03, 0.04 and 0.02
     np.testing.assert_allclose(sorted(map(tuple, abs(inside).round(9))), 4 * [(0.02, 0.03, 0.01)], atol=1e-9)
     assert (inside[:, 2] < 0.0).all()
     with pytest.raises(ValueError, match=r"'ankle' is 0\.06 m wide: give a smaller radius"):

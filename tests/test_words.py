@@ -104,7 +104,7 @@ def found_in(text: str, exempt: tuple[str, ...] = ()) -> list[str]:
     return [f"{line}: {phrase!r} (write: {replacement})" for line, phrase, replacement in sorted(found)]
 
 
-def test_no_word_is_used_that_was_settled_against() -> None:
+def test_no_excluded_word_is_used() -> None:
     found = [
         f"{name}:{entry}"
         for name in NAMES

@@ -56,8 +56,11 @@ def outcomes_with_faults(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_rows_that_lanes_share_have_the_numbers_of_one_lane(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a GPU a warp's lanes share a world's rows, and each group has its own threads; here they run in turn."""
+def test_rows_shared_by_lanes_equal_rows_of_one_lane(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a GPU the lanes of a warp share a world's rows, and each observation group has its own threads.
+
+    On the CPU these lanes and threads run one after another.
+    """
 
     def launch_three(kernel: wp.Kernel, nworld: int, args: list[Any], device: wp.Device) -> None:
         wp.launch(kernel, (nworld, 3), [*args, 3, 0], device=device)
@@ -70,7 +73,7 @@ def test_rows_that_lanes_share_have_the_numbers_of_one_lane(engine: str, monkeyp
     assert all(torch.equal(a, b) for a, b in zip(one, three, strict=True))
 
 
-def test_parts_of_the_worlds_have_the_numbers_of_all_worlds_together(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_of_the_worlds_equal_all_worlds_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each of three threads replays the launches around the C engine for a part of the four worlds."""
     together, counts = outcomes_with_faults("mujoco")
     monkeypatch.setattr(capture, "SECONDS_A_THREAD", 1e-9)
@@ -122,7 +125,7 @@ def test_a_held_success_needs_its_steps_in_a_row_within_an_episode(engine: str) 
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_state_goes_on_with_the_steps_of_a_success_and_a_reset_does_not(engine: str) -> None:
+def test_a_state_keeps_its_success_steps_and_a_reset_clears_them(engine: str) -> None:
     goals = np.array([0.0, 99.0, 99.0])
     env = lw.make(Held, engine=engine, nworld=3, horizon=0, autoreset=False, success_distance=goals)
     for _ in range(2):
@@ -146,7 +149,7 @@ def test_a_state_goes_on_with_the_steps_of_a_success_and_a_reset_does_not(engine
     assert not env.success.any()
 
 
-def test_rollouts_and_plans_do_not_depend_on_the_steps_of_a_success() -> None:
+def test_rollouts_and_plans_do_not_depend_on_success_steps() -> None:
     held, plain = held_and_plain("mujoco", nworld=4, autoreset=False)
     actions = torch.rand(5, 4, 2, generator=torch.Generator().manual_seed(0))
     rewards, plans = [], []
@@ -165,7 +168,7 @@ def test_rollouts_and_plans_do_not_depend_on_the_steps_of_a_success() -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_parameters_that_become_one_a_world_reach_captured_graphs(engine: str) -> None:
+def test_parameters_that_become_per_world_reach_captured_graphs(engine: str) -> None:
     env = lw.make("hopper", nworld=2, engine=engine)
     action = torch.ones(2, 3)
     for _ in range(3):
@@ -176,7 +179,7 @@ def test_parameters_that_become_one_a_world_reach_captured_graphs(engine: str) -
     torch.testing.assert_close(env.reward[0] - env.reward[1], torch.tensor(3.0))
 
 
-def test_streams_depend_on_the_number_of_a_world_among_all_processes() -> None:
+def test_random_streams_depend_on_a_worlds_index_over_all_processes() -> None:
     whole, part = lw.make("point_mass", nworld=4), lw.make("point_mass", nworld=2, first_world=2)
     for env in (whole, part):
         env.rand_reset(7)

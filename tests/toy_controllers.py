@@ -84,7 +84,7 @@ class SimulatedClock:
 
 
 class SimulatedPlans:
-    """Plans that take a fixed simulated time, one after the other, each from the newest state."""
+    """A planner on the simulated clock: each plan takes a fixed time and starts from the newest state."""
 
     def __init__(
         self, controller: Any, clock: SimulatedClock, seconds: float, first: tuple[torch.Tensor, torch.Tensor]

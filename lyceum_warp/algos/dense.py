@@ -148,8 +148,12 @@ class DensePolicy:
 
     @staticmethod
     def of(policy: GaussianPolicy) -> "DensePolicy | None":
-        """Wrap a policy; None if its network is unsupported or partly frozen, or if the policy is a subclass."""
-        plain = type(policy) is GaussianPolicy and type(policy.normalizer) in (Normalizer, nn.Identity)
+        """Wrap a policy; None if its network is unsupported or partly frozen, or if it is a subclass or mirrored."""
+        plain = (
+            type(policy) is GaussianPolicy
+            and policy.mirror is None
+            and type(policy.normalizer) in (Normalizer, nn.Identity)
+        )
         if not plain or _hooked(policy) or _hooked(policy.normalizer):
             return None
         if not all(parameter.requires_grad for parameter in policy.network.parameters()):

@@ -145,6 +145,44 @@ class Team:
             raise SystemExit(2)
 
 
+class Captured:
+    """Calls a function that consists of torch operations and communication; on a GPU as a CUDA graph.
+
+    The first call runs directly, which allocates what the function keeps. The second call is captured and then
+    replayed. A graph stores addresses, so the function must update tensors in place.
+
+    Args:
+        function: The function.
+        team: The processes.
+        device: Device of the tensors.
+    """
+
+    def __init__(self, function: Callable[[], object], team: Team, device: torch.device) -> None:
+        self.function, self.team, self.device = function, team, device
+        self.enabled = device.type == "cuda" and team.captures
+        self.forget()
+
+    def forget(self) -> None:
+        """Discard the graph because its tensors were replaced."""
+        self._warm = False
+        self.graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self) -> None:
+        """Call the function, or replay its graph."""
+        if not self.enabled:
+            self.function()
+            return
+        with torch.cuda.device(self.device):
+            if not self._warm:
+                with side_stream():
+                    self.function()
+                self._warm = True
+                return
+            if self.graph is None:
+                self.graph = self.team.capture(self.function)
+            self.graph.replay()
+
+
 @contextlib.contextmanager
 def side_stream() -> Iterator[None]:
     """Run a block on a non-default CUDA stream, as torch requires before a capture."""

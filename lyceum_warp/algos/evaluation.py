@@ -1,6 +1,7 @@
 """Evaluate policies in whole episodes, without exploration noise."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -38,6 +39,8 @@ class Episodes:
     """The evaluation metric at the end of each episode."""
     success: torch.Tensor
     """Whether the goal was met at the end of each episode: 1.0 or 0.0."""
+    terminated: torch.Tensor
+    """Whether the task ended each episode, not the time limit or a fault: 1.0 or 0.0."""
     metrics: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
     """Sums of the task's metrics, by name."""
 
@@ -85,10 +88,10 @@ def evaluate(
     if not env.autoreset:
         raise ValueError("evaluate needs an environment that resets automatically: make it with autoreset=True")
     act, each = acting(policy), -(-episodes // env.nworld)
-    check_fit(8 * (5 + len(env.episode_metrics)) * each, env.nworld, env.device, model=f"{each} episodes")
+    check_fit(8 * (6 + len(env.episode_metrics)) * each, env.nworld, env.device, model=f"{each} episodes")
     env.rand_reset(None if seed is None else evaluation_seed(seed))
     metrics = list(env.episode_metrics.values())
-    results = torch.zeros(5 + len(metrics), each, env.nworld, device=env.obs.device)
+    results = torch.zeros(6 + len(metrics), each, env.nworld, device=env.obs.device)
     count = torch.zeros(env.nworld, dtype=torch.long, device=env.obs.device)
     total = torch.zeros(env.nworld, device=env.obs.device)
     worlds = torch.arange(env.nworld, device=env.obs.device)
@@ -97,7 +100,8 @@ def evaluate(
         env.action.copy_(act(env.obs) if t else _first_actions(act, env))
         env.step()
         total += env.reward
-        now = torch.stack([total, length, env.reward, env.eval, env.success.float(), *metrics])
+        ends = (env.success.float(), env.terminated.float())
+        now = torch.stack([total, length, env.reward, env.eval, *ends, *metrics])
         slot = count.clamp_max(each - 1)
         wanted = env.done & (count < each)
         results[:, slot, worlds] = torch.where(wanted, now, results[:, slot, worlds])
@@ -108,8 +112,9 @@ def evaluate(
                 progress(t + 1, each * env.horizon)
             if bool((count >= each).all()):
                 break
-    returns, lengths, rewards, evals, success, *sums = results.flatten(1).cpu()
-    return Episodes(returns, lengths, rewards, evals, success, dict(zip(env.episode_metrics, sums, strict=True)))
+    returns, lengths, rewards, evals, success, terminated, *sums = results.flatten(1).cpu()
+    named = dict(zip(env.episode_metrics, sums, strict=True))
+    return Episodes(returns, lengths, rewards, evals, success, terminated, named)
 
 
 def _first_actions(act: Callable[[torch.Tensor], torch.Tensor], env: Env) -> torch.Tensor:
@@ -168,6 +173,12 @@ class MeanPolicyEvaluation:
             means.copy_(torch.stack([part.mean() for part in parts]))
         self.team.copy_leader([means])
         return dict(zip(MEAN_STATISTICS, means.tolist(), strict=True))
+
+    def added(self, statistics: Mapping[str, Any], policy: torch.nn.Module, *, due: bool) -> dict[str, Any]:
+        """Add the evaluation's statistics, or None for each if it is not due, to those of the samples."""
+        mean: dict[str, Any] = self(policy) if due else dict.fromkeys(MEAN_STATISTICS)
+        success = self.env.task.functions["success"] is not None
+        return {**statistics, **mean} | ({} if success else {"success": math.nan, "mean_success": None})
 
 
 MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")

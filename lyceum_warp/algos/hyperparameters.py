@@ -33,9 +33,10 @@ def check_fields(config: Any, bounds: Mapping[str, float | tuple[float, float]])
             continue
         if kind is bool:
             check_flag(name, value)
-        elif typing.get_origin(kind) is Literal:
-            check_word(name, value, arguments)
-        elif kind == tuple[int, ...]:
+        elif words := [word for one in (kind, *arguments) if typing.get_origin(one) is Literal
+                       for word in typing.get_args(one)]:  # fmt: skip
+            check_word(name, value, words)
+        elif tuple[int, ...] in (kind, *arguments):
             value = tuple(layer_sizes(value, name))
         elif str in arguments:
             if not isinstance(value, str):

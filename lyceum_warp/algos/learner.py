@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.distributed import Team
+from lyceum_warp.algos.replay import Replay
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
@@ -113,6 +114,11 @@ class Learner(abc.ABC):
     """The processes that learn together."""
     generator: torch.Generator | None = None
     """The random generator, if the algorithm has one."""
+    replay: Replay | None = None
+    """The replay buffer, if the algorithm has one. ``state_dict`` does not contain it, because it may be large: a run
+    keeps it in files of its own, which are updated step by step."""
+    own_worlds: slice
+    """This process's worlds among those of all processes."""
     iteration: int
     """Number of complete iterations."""
     samples: int
@@ -123,11 +129,11 @@ class Learner(abc.ABC):
         self.team = team = team or Team()
         self.iteration = self.samples = 0
         n = env.nworld
-        self._own = slice(team.rank * n, (team.rank + 1) * n)
-        if team.size > 1 and env.first_world != self._own.start:
+        self.own_worlds = slice(team.rank * n, (team.rank + 1) * n)
+        if team.size > 1 and env.first_world != self.own_worlds.start:
             raise ValueError(
                 f"process {team.rank} of {team.size} with {n} worlds needs an environment with "
-                f"first_world={self._own.start}, not {env.first_world}"
+                f"first_world={self.own_worlds.start}, not {env.first_world}"
             )
         if not env.autoreset:
             raise ValueError(
@@ -154,12 +160,17 @@ class Learner(abc.ABC):
         """
         return "return_mean" if getattr(self.config, "mean_every", None) == 0 else "mean_return"
 
+    @property
+    def title(self) -> str:
+        """Name of the algorithm in messages, with what a user should know of it."""
+        return self.algorithm
+
     def settings(self) -> dict[str, Any]:
         """The hyperparameters for a run's config.json."""
         return dataclasses.asdict(self.config)
 
     def state_dict(self) -> dict[str, Any]:
-        """Copy the complete state, including the worlds of all processes, to resume from.
+        """Copy the complete state except ``replay``, including the worlds of all processes, to resume from.
 
         The state consists of tensors, numbers, strings, dicts and lists. All processes must call this method. Any
         number of processes can resume from the state.
@@ -175,6 +186,8 @@ class Learner(abc.ABC):
             state["value"] = self.value.state_dict()
         if self.generator is not None:
             state["generator"] = self.generator.get_state()
+        if self.replay is not None:
+            state["stored"] = self.replay.stored
         return copy.deepcopy(state)  # a module's state_dict shares memory with its parameters
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -193,6 +206,6 @@ class Learner(abc.ABC):
             self.generator.set_state(state["generator"].cpu())
         if "shared" in state:  # earlier releases had none
             self.env.set_shared(state["shared"].to(self.env.obs.device))
-        self.env.set_state(state["env"][self._own].to(self.env.obs.device))
+        self.env.set_state(state["env"][self.own_worlds].to(self.env.obs.device))
         self.iteration = whole_number("iteration", state["iteration"], low=0)
         self.samples = whole_number("samples", state["samples"], low=0, high=2**63 - 1)

@@ -6,13 +6,19 @@ from collections.abc import Callable, Iterator, Mapping
 
 import torch
 
-from lyceum_warp.algos.distributed import Team, side_stream
+from lyceum_warp.algos.distributed import Captured, Team
 
 Samples = Mapping[str, torch.Tensor]
 """Tensors by name, each with one row per sample."""
 
 _SURE = 6.0
 """Capacity for a process's samples in a mini-batch, in standard deviations above their mean number."""
+
+
+def room(batch: int, team: Team) -> int:
+    """Capacity for a process's samples in a mini-batch of ``batch`` samples of all processes."""
+    share = batch / team.size
+    return min(batch, math.ceil(share + _SURE * math.sqrt(share)))
 
 
 class Minibatches:
@@ -22,8 +28,7 @@ class Minibatches:
     tensor of fixed size that is padded with rows of weight 0. The size is six standard deviations above the mean number
     of samples; excess samples are dropped.
 
-    On a GPU the first epoch runs directly, which allocates Adam's moments. The second epoch is captured and then
-    replayed. Graphs store addresses, so ``learn`` must update tensors in place.
+    On a GPU an epoch is ``Captured``, so ``learn`` must update tensors in place.
 
     Args:
         learn: Called with the process's samples of a mini-batch and their weights, (samples,), which sum to 1 over all
@@ -42,18 +47,11 @@ class Minibatches:
         self.learn, self.nworld, self.count, self.team = learn, nworld, count, team
         self.samples = steps * nworld * team.size
         self.batch = self.samples // count
-        share = self.batch / team.size
-        self.room = min(self.batch, math.ceil(share + _SURE * math.sqrt(share)))
-        self.captures = device.type == "cuda" and team.captures
+        self.room = room(self.batch, team)
         self.weight = torch.zeros(count, self.room, device=device)
         self.order = torch.zeros(count * self.room, dtype=torch.long, device=device)
         self._parts: dict[str, torch.Tensor] = {}
-        self.forget()
-
-    def forget(self) -> None:
-        """Discard the graph because its tensors were replaced."""
-        self._warm = False
-        self._graph: torch.cuda.CUDAGraph | None = None
+        self.epoch = Captured(self._epoch, team, device)
 
     @torch.no_grad()
     def shuffle(self, samples: Samples, generator: torch.Generator) -> dict[str, torch.Tensor]:
@@ -83,25 +81,11 @@ class Minibatches:
     def run(self, epochs: int) -> None:
         """Learn from the shuffled samples for a number of epochs."""
         for _ in range(epochs):
-            if self.captures:
-                with torch.cuda.device(self.weight.device):
-                    self._run_captured()
-            else:
-                self._epoch()
+            self.epoch()
 
     def _epoch(self) -> None:
         for i in range(self.count):
             self.learn({name: rows[i] for name, rows in self._parts.items()}, self.weight[i])
-
-    def _run_captured(self) -> None:
-        if not self._warm:
-            with side_stream():
-                self._epoch()
-            self._warm = True
-            return
-        if self._graph is None:
-            self._graph = self.team.capture(self._epoch)
-        self._graph.replay()
 
 
 @contextlib.contextmanager

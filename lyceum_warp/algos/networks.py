@@ -20,10 +20,11 @@ Module = TypeVar("Module", bound=nn.Module)
 Activation: TypeAlias = Literal["tanh", "relu", "leaky_relu", "elu", "selu", "gelu", "silu", "softplus"]
 """Names of the activations of hidden layers."""
 
-_ACTIVATIONS: dict[str, type[nn.Module]] = {
+ACTIVATIONS: dict[str, type[nn.Module]] = {
     "tanh": nn.Tanh, "relu": nn.ReLU, "leaky_relu": nn.LeakyReLU, "elu": nn.ELU, "selu": nn.SELU, "gelu": nn.GELU,
     "silu": nn.SiLU, "softplus": nn.Softplus,
 }  # fmt: skip
+"""Modules of the activations, by name."""
 
 
 def check_memory(sizes: Sequence[int], **arguments: Any) -> None:
@@ -62,7 +63,7 @@ def mlp(
     """
     check_word("activation", activation, get_args(Activation))
     check_kind("generator", generator, torch.Generator | None, "as torch.Generator()")
-    kind = _ACTIVATIONS[activation]
+    kind = ACTIVATIONS[activation]
     layers: list[nn.Module] = []
     for i, (n, m) in enumerate(itertools.pairwise(sizes)):
         linear = nn.Linear(n, m)
@@ -77,7 +78,7 @@ def mlp(
 
 
 @torch.no_grad()
-def initialize_as_torch(network: nn.Module, generator: torch.Generator) -> None:
+def initialize_as_torch(network: nn.Module, generator: torch.Generator | None) -> None:
     """Draw the weights of all linear layers as ``nn.Linear`` does by default: uniform in +-1 / sqrt(inputs)."""
     for layer in network.modules():
         if isinstance(layer, nn.Linear):

@@ -213,7 +213,7 @@ class NPG(OnPolicyLearner):
         with one_thread():
             self.noise.normal_(generator=self.generator)
             self._dense = DensePolicy.of(self.policy)
-            self.rollout.collect(self._dense or self.policy, self.noise[:, self._own])
+            self.rollout.collect(self._dense or self.policy, self.noise[:, self.own_worlds])
             self.env.update_shared(self.team.sum)
 
     @torch.no_grad()

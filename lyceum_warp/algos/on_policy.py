@@ -1,14 +1,13 @@
 """Implement what NPG and PPO share: networks, rollouts, advantages, evaluation and checkpoints."""
 
 import dataclasses
-import math
 from typing import Any, ClassVar
 
 import torch
 import warp as wp
 
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
+from lyceum_warp.algos.evaluation import MeanPolicyEvaluation
 from lyceum_warp.algos.learner import Learner
 from lyceum_warp.algos.networks import LIMIT, initialize_as_torch, trainable
 from lyceum_warp.algos.policy import GaussianPolicy
@@ -119,12 +118,7 @@ class OnPolicyLearner(Learner):
     def _with_mean_policy(self, statistics: dict[str, Any]) -> dict[str, Any]:
         """Add statistics of the mean policy, which is evaluated every ``mean_every`` iterations."""
         every = self.config.mean_every
-        mean: dict[str, Any] = dict.fromkeys(MEAN_STATISTICS)
-        if every and self.iteration % every == 0:
-            mean = self._evaluate_mean(self.policy)
-        if self.env.task.functions["success"] is None:
-            statistics["success"], mean["mean_success"] = math.nan, None
-        return statistics | mean
+        return self._evaluate_mean.added(statistics, self.policy, due=every > 0 and self.iteration % every == 0)
 
     def settings(self) -> dict[str, Any]:
         """The hyperparameters with the sizes of the networks, for a run's config.json."""
@@ -144,4 +138,4 @@ class OnPolicyLearner(Learner):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume from a state of ``state_dict``; see ``Learner``."""
         super().load_state_dict(state)
-        self.rollout.running_return.copy_(state["returns"][self._own])
+        self.rollout.running_return.copy_(state["returns"][self.own_worlds])

@@ -217,7 +217,7 @@ class Planner:
             self._value_in_torch = True
             try:
                 self._torch_values()
-            except RuntimeError as error:  # its weights are on another device, or its input has another size
+            except (RuntimeError, TypeError) as error:  # other weights, another size, or critics of actions
                 observations = described(self._value_obs)
                 raise ValueError(f"value cannot take observations {observations}: {error}") from error
 

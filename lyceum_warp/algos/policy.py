@@ -8,6 +8,8 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.networks import LIMIT, Activation, Normalized, check_memory, mlp
+from lyceum_warp.algos.symmetry import PolicyMirror
+from lyceum_warp.mirror import Reflection
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import described, finite_number, layer_sizes, whole_number
 
@@ -32,6 +34,8 @@ class GaussianPolicy(Normalized):
         log_std: Initial logarithm of the standard deviations.
         normalize: Whether to normalise observations by their running mean and variance.
         limit: Normalised observations are clipped to [-limit, limit]; inf for no limit.
+        mirror: Reflections of observations and actions (``algos.symmetry.reflections``). Mean actions are then averages
+            with those of the mirror image.
         generator: Draws the initial weights.
 
     Raises:
@@ -53,6 +57,7 @@ class GaussianPolicy(Normalized):
         log_std: float = -0.5,
         normalize: bool = False,
         limit: float = LIMIT,
+        mirror: Mapping[str, Reflection] | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
         nobs, nact = whole_number("nobs", nobs, low=1), whole_number("nact", nact, low=1)
@@ -77,6 +82,18 @@ class GaussianPolicy(Normalized):
         self.log_std = nn.Parameter(
             torch.full((nact,), finite_number("log_std", log_std, low=-_LARGEST, high=_LARGEST))
         )
+        self.mirror: PolicyMirror | None = None
+        if mirror is not None:
+            self.use_mirror(mirror)
+
+    def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:
+        """Average mean actions with those of the mirror image from now on.
+
+        Args:
+            reflections: The reflections of ``obs`` and ``action`` (``algos.symmetry.reflections``).
+        """
+        self.mirror = PolicyMirror(reflections).to(self.log_std.device)
+        self.shape["mirror"] = self.mirror.reflections
 
     @staticmethod
     def like(shape: Mapping[str, Any]) -> "GaussianPolicy":
@@ -95,7 +112,11 @@ class GaussianPolicy(Normalized):
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Compute mean actions, (..., nact)."""
-        return self.network(self.normalizer(obs))
+        return self._mean(obs) if self.mirror is None else self.mirror.average(self._mean, obs)
+
+    def _mean(self, obs: torch.Tensor) -> torch.Tensor:
+        mean: torch.Tensor = self.network(self.normalizer(obs))
+        return mean
 
     def act(self, obs: torch.Tensor) -> torch.Tensor:
         """Compute actions without noise, (..., nact): the mean actions."""

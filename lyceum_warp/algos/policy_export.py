@@ -3,14 +3,18 @@
 import contextlib
 import copy
 import importlib.util
+import json
 import logging
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import torch
 
+from lyceum_warp.algos.networks import Normalizer
+from lyceum_warp.env import Env
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.validate import described
 
@@ -20,7 +24,7 @@ EXTRA = "pip install 'lyceum-warp[export]'"
 _SUFFIXES = (".onnx", ".pt2")
 
 
-def export_policy(policy: torch.nn.Module, path: str | Path) -> Path:
+def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None = None) -> Path:
     """Export a policy's ``act`` to a file that runs without this package.
 
     The file maps observations, (n, nobs) float32 for any n, to actions without noise, and includes the normaliser.
@@ -39,6 +43,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path) -> Path:
     Args:
         policy: The policy, on any device: a module with the method ``act`` and the attribute ``nobs``.
         path: The file; an existing file is replaced.
+        env: An environment of the policy's task, whose ``deployment_metadata`` an ONNX file gets.
 
     Returns:
         The file's path.
@@ -61,6 +66,9 @@ def export_policy(policy: torch.nn.Module, path: str | Path) -> Path:
                 program = torch.onnx.export(
                     program, input_names=["obs"], output_names=["action"], dynamo=True, verbose=False
                 )
+                if env is not None:
+                    metadata = deployment_metadata(policy, env)
+                    program.model.metadata_props.update({name: json.dumps(value) for name, value in metadata.items()})
     except Exception as error:  # torch raises many types of errors
         first = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
         raise ValueError(f"the policy's network cannot be exported to {path.suffix} ({first})") from error
@@ -72,6 +80,42 @@ def export_policy(policy: torch.nn.Module, path: str | Path) -> Path:
             with temporary.open("wb") as file:
                 torch.export.save(program, file)
     return path
+
+
+def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
+    """Describe what a program needs to run a policy on a robot or in another simulator; JSON values by name.
+
+    ================  ===================================================================================
+    ``task``          name of the task
+    ``timestep``      seconds between two actions
+    ``substep``       seconds between two steps of the physics
+    ``observations``  the parts of an observation in order: name, size, and the normaliser's offset and
+                      scale of each column; the file applies them: (obs - offset) * scale
+    ``actions``       the parts of an action in order: name and size
+    ``actuators``     names of the model's actuators, in order
+    ================  ===================================================================================
+
+    A task adds entries of its own (``lw.Task.deployment``); ``walkers.deployment`` lists those of velocity tasks.
+
+    Args:
+        policy: The policy.
+        env: An environment of its task.
+    """
+    task, model = env.task, env.task.model
+    parts = [{"name": name, "size": part.stop - part.start} for name, part in env.obs_space.parts.items()]
+    normalizer: Any = getattr(policy, "normalizer", None)
+    if isinstance(normalizer, Normalizer):
+        for entry, part in zip(parts, env.obs_space.parts.values(), strict=True):
+            entry |= {"offset": normalizer.shift[part].tolist(), "scale": normalizer.scale[part].tolist()}
+    return {
+        "task": task.name,
+        "timestep": env.timestep,
+        "substep": model.opt.timestep,
+        "observations": parts,
+        "actions": [{"name": name, "size": part.stop - part.start} for name, part in env.action_space.parts.items()],
+        "actuators": [model.actuator(i).name or f"actuator_{i}" for i in range(model.nactuator)],
+        **task.task.deployment(model, SimpleNamespace(**task.params)),
+    }
 
 
 class _Acting(torch.nn.Module):

@@ -28,6 +28,7 @@ from lyceum_warp.algos.rollout_statistics import (
     metric_means,
     metric_sums,
 )
+from lyceum_warp.algos.symmetry import PolicyMirror, Reflected, reflections
 from lyceum_warp.algos.timing import PhaseTimer, one_thread
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env
@@ -119,6 +120,7 @@ class PPO(OnPolicyLearner):
         # with a last layer near zero, as in NPG, the adaptive learning rate would start much too high
         limit = math.inf if config.normalize else LIMIT
         self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)
+        self._make_mirror()
         self._make_rollout(steps)
         self.noise = torch.empty(steps, env.nworld * team.size, env.action_space.size, device=device)
         self._mean = torch.empty_like(self.rollout.action)
@@ -148,6 +150,22 @@ class PPO(OnPolicyLearner):
         self.rollout.restart()
         if config.stagger:
             self.rollout.stagger(self.generator, team)
+
+    def _make_mirror(self) -> None:
+        """Set the mirror images of observations and actions, if the policy is to be symmetric."""
+        config, env = self.config, self.env
+        if self.policy.mirror is not None:  # of another run
+            config = self.config = dataclasses.replace(config, symmetry="exact")
+        self._mirror: PolicyMirror | None = None
+        if config.symmetry == "none":
+            return
+        found = reflections(env)
+        self._mirror = PolicyMirror(found).to(env.obs.device)
+        if config.symmetry == "exact":
+            self.policy.use_mirror(found)
+        elif config.symmetry == "augment":
+            value = reflections(env, group=self.value.group)["obs"]
+            self._mirror_value = Reflected(value).to(env.obs.device)
 
     def __next__(self) -> PPOIteration:
         config, rollout, team = self.config, self.rollout, self.team
@@ -223,7 +241,7 @@ class PPO(OnPolicyLearner):
         env, rollout, std = self.env, self.rollout, self.policy.log_std.exp()
         with one_thread():
             self.noise.normal_(generator=self.generator)
-            noise = self.noise[:, self._own]
+            noise = self.noise[:, self.own_worlds]
             rollout.begin()
             for t in range(rollout.steps):
                 self._mean[t] = self.policy(env.obs)
@@ -283,6 +301,8 @@ class PPO(OnPolicyLearner):
             weight: Weights of the samples, (samples,), which sum to 1 over all processes.
         """
         config, clip = self.config, self.config.clip
+        if config.symmetry == "augment":
+            samples, weight = self._with_images(samples), torch.cat([weight, weight]) / 2.0
         mean, log_std = self.policy(samples["obs"]), self._log_std()
         ratio = torch.exp(log_density(samples["action"], mean, log_std) - samples["log_prob"])
         advantage = samples["advantage"]
@@ -295,6 +315,10 @@ class PPO(OnPolicyLearner):
         entropy = (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
         losses = torch.stack([(weight * error).sum(), (weight * surrogate).sum(), weight.sum() * entropy])
         loss = config.value_coef * losses[0] + losses[1] - self._entropy_coef * losses[2]
+        if config.symmetry == "loss":
+            assert self._mirror is not None
+            image = self._mirror.action(self.policy(self._mirror.obs(samples["obs"])))
+            loss = loss + config.symmetry_coef * (weight * (mean - image).square().mean(-1)).sum()
         # not backward(), which accumulates gradients on the stream of the first call
         gradients = torch.autograd.grad(loss, self._parameters)
 
@@ -309,6 +333,18 @@ class PPO(OnPolicyLearner):
             self.optimizer.step()
             self._losses += self._sums[-3:]
 
+    def _with_images(self, samples: Samples) -> dict[str, torch.Tensor]:
+        """Append the mirror images of samples.
+
+        The mirror image of the sampling policy would have drawn an image with the density of its sample.
+        """
+        assert self._mirror is not None
+        images = dict(samples)
+        for name, image in (("obs", self._mirror.obs), ("value_obs", self._mirror_value),
+                            ("action", self._mirror.action), ("mean", self._mirror.action)):  # fmt: skip
+            images[name] = image(samples[name])
+        return {name: torch.cat([part, images[name]]) for name, part in samples.items()}
+
     def _adapt(self, kl: torch.Tensor) -> None:
         """Adapt the learning rate to a KL divergence, without waiting for the device."""
         wanted = self.config.desired_kl
@@ -319,8 +355,12 @@ class PPO(OnPolicyLearner):
     def _log_std(self) -> torch.Tensor:
         """Logarithms of the standard deviations, (nact,)."""
         if self.config.std_type == "log":
-            return self.std.clamp_min(math.log(_SMALLEST_STD))
-        return self.std.clamp_min(_SMALLEST_STD).log()
+            log_std = self.std.clamp_min(math.log(_SMALLEST_STD))
+        else:
+            log_std = self.std.clamp_min(_SMALLEST_STD).log()
+        if self.policy.mirror is None:
+            return log_std
+        return 0.5 * (log_std + self.policy.mirror.action.swapped(log_std))
 
     @torch.no_grad()
     def _apply_std(self) -> None:
@@ -359,4 +399,4 @@ class PPO(OnPolicyLearner):
             self.std.copy_(state["std"])
         self._recent.clear()
         self._recent.extend(state["recent"])
-        self.minibatches.forget()  # the graph stores the addresses of the old moments
+        self.minibatches.epoch.forget()  # the graph stores the addresses of the old moments

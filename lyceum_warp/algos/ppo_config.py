@@ -11,7 +11,7 @@ from lyceum_warp.support.validate import whole_number
 _BOUNDS: dict[str, float | tuple[float, float]] = {
     "num_steps": 1, "epochs": 1, "minibatches": 1, "mean_every": 0, "mean_episodes": 1, "gamma": (0.0, 1.0),
     "lam": (0.0, 1.0), "clip": 0.0, "value_coef": 0.0, "entropy_coef": 0.0, "final_entropy_coef": 0.0,
-    "learning_rate": 0.0, "desired_kl": 0.0, "max_grad_norm": 0.0, "log_std": (-13.8, 13.8),
+    "learning_rate": 0.0, "symmetry_coef": 0.0, "desired_kl": 0.0, "max_grad_norm": 0.0, "log_std": (-13.8, 13.8),
 }  # fmt: skip
 
 
@@ -74,6 +74,12 @@ class PPOConfig:
     """Activation of the value function's hidden layers."""
     value_group: str | None = None
     """Group of observations for the value function; by default "critic" if the task has this group, else "policy"."""
+    symmetry: Literal["none", "exact", "loss", "augment"] = "none"
+    """How to use the mirror image that a task declares (``lw.Mirror``): "exact" averages the policy with its mirror
+    image; "loss" adds symmetry_coef times the squared difference between both; "augment" learns from the mirror images
+    of all samples, too."""
+    symmetry_coef: float = 1.0
+    """Coefficient of the loss of symmetry "loss"."""
     normalize: bool = True
     """Whether to normalise observations by their running mean and variance, updated in every step."""
     stagger: bool = True

@@ -17,16 +17,12 @@ Scalar: TypeAlias = Any
 
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class OnPolicyIteration(Iteration):
-    """Statistics of one iteration of NPG or PPO.
+class SampledIteration(Iteration):
+    """Statistics of one iteration of NPG, PPO or SAC.
 
     Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended.
     """
 
-    kl: float
-    """KL divergence from the old to the new policy, averaged over the samples."""
-    std_mean: float
-    """Mean standard deviation of the policy's actions."""
     faults: int
     """Number of faults in this iteration, over all worlds."""
     time_sample: float
@@ -40,6 +36,17 @@ class OnPolicyIteration(Iteration):
         """Convert to a row of metrics.csv: numbers by column, including None."""
         names = [field.name for field in dataclasses.fields(self) if field.name not in NESTED]
         return {name: getattr(self, name) for name in names} | super().row()
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OnPolicyIteration(SampledIteration):
+    """Statistics of one iteration of NPG or PPO."""
+
+    kl: float
+    """KL divergence from the old to the new policy, averaged over the samples."""
+    std_mean: float
+    """Mean standard deviation of the policy's actions."""
 
 
 class EpisodeSums(NamedTuple):

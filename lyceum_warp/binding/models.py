@@ -14,7 +14,7 @@ import numpy as np
 from lyceum_warp.fields import ON_DEMAND, SENSED
 from lyceum_warp.model_fields import MOVED_INERTIA
 from lyceum_warp.model_files import ModelFile, gymnasium_model, read_spec
-from lyceum_warp.options import CONES, INTEGRATORS, ModelSource, PhysicsOptions
+from lyceum_warp.options import CONES, INTEGRATORS, JACOBIANS, ModelSource, PhysicsOptions
 from lyceum_warp.support.mujoco_log import quiet
 
 log = logging.getLogger(__name__)
@@ -109,7 +109,7 @@ def compile_model(
     Args:
         spec: The model; changed in place.
         fields: Names of the fields that will be read.
-        physics: Time step, cone, integrator and solver limits that replace the model's own.
+        physics: Options of the solver and the integrator that replace the model's own.
         varied: Names of the model fields that will differ between worlds.
 
     Raises:
@@ -130,6 +130,10 @@ def compile_model(
         spec.option.cone = CONES[physics.cone]
     if physics.integrator is not None:
         spec.option.integrator = INTEGRATORS[physics.integrator]
+    if physics.jacobian is not None:
+        spec.option.jacobian = JACOBIANS[physics.jacobian]
+    if physics.impratio is not None:
+        spec.option.impratio = physics.impratio
     for name, limit in (physics.solver or {}).items():
         setattr(spec.option, name, limit)
     for sensor in sorted({ON_DEMAND[name] for name in fields if name in ON_DEMAND}, key=int):

@@ -1,4 +1,4 @@
-"""Find tasks by name, by file or by class, and register those of users."""
+"""Find tasks by name, by file or by class, and register users' tasks."""
 
 import ast
 import difflib

@@ -22,7 +22,7 @@ _STATE = {"s": "s", "s1": "s", "p": "p"}
 """The same in a termination, which sees one state."""
 
 _OWN = ("weights", "metrics", "total")
-"""Further names of the generated text."""
+"""Other names that the generated source uses."""
 
 _HEAD = "s0: World, action: Row[float], s1: World, p: Params, weights: Row[float]"
 

@@ -21,6 +21,7 @@ _COMMANDS = {
     "eval": ("evaluate", "Eval", "Evaluate a run's policy, and print statistics of its episodes."),
     "export": ("export", "Export", "Write a run's policy to an ONNX or .pt2 file."),
     "plan": ("plan", "Plan", "Control a task with a planner, and report rewards, success and planning times."),
+    "tune": ("tune", "Tune", "Measure physics options of a task, and find the fastest with the same returns."),
     "view": ("view", "View", "Show a task, a policy, a planner or saved episodes in a browser."),
     "bench": ("bench", "Bench", "Run an experiment or another program of bench/."),
 }
@@ -36,6 +37,7 @@ $ lyceum-warp train hopper --iterations 100
 $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
 $ lyceum-warp export runs/hopper-20260101-120000 --to policy.onnx
 $ lyceum-warp plan reach --real-time
+$ lyceum-warp tune humanoid --short
 $ lyceum-warp view reach --mppi
 $ lyceum-warp bench throughput --short
 

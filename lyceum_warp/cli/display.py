@@ -64,7 +64,7 @@ class Display(training.Display):
         self.console.print(
             f"[bold]{env.task.name}[/]: {env.obs_space.size} observations, {env.action_space.size} actions; "
             f"{env.nworld} worlds{processes}, {env.engine.name} engine on {env.options.device or 'cpu'}, "
-            f"{learner.algorithm}; run in {escape(str(run.folder))}", soft_wrap=True,
+            f"{learner.title}; run in {escape(str(run.folder))}", soft_wrap=True,
         )  # fmt: skip
         self.total = iterations
         self.bar = self.progress.add_task("", total=iterations, completed=learner.iteration, text="")

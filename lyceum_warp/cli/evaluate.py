@@ -6,10 +6,12 @@ from typing import Annotated, Any
 
 import rich.box
 import tyro
+from rich.console import Console
 from rich.table import Table
 
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.policy import Policy, acting
+from lyceum_warp.algos.transfer import Transfer, transfer
 from lyceum_warp.binding.registry import find_task, task_name
 from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, Trust, given, parameters
 from lyceum_warp.cli.display import make_console, note, policy_video, tried
@@ -36,6 +38,7 @@ class Eval:
 
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
     $ lyceum-warp eval runs/hopper-20260101-120000 --video --camera track=torso --camera azimuth=45
+    $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --transfer
     $ lyceum-warp eval runs/humanoid-20260101-120000 --physics exact
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 8 --episodes-to runs/hopper-episodes
     """
@@ -57,6 +60,9 @@ class Eval:
     video: bool = False
     """Whether to write a video of one episode, eval.mp4 in the run's folder."""
     camera: CameraWords = ()
+    transfer: bool = False
+    """Whether to play the episodes on both engines, and under each of the task's physics, and to print the differences
+    with a verdict. The Warp engine runs on --device, by default on a GPU if there is one."""
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder for one file per episode, in the format of lyceum-warp plan: episode-000.npz and so on."""
     trust: Trust = False
@@ -67,6 +73,8 @@ class Eval:
         """Run the command, and return the exit code."""
         if self.episodes < 1 or self.nworld < 1:
             raise ValueError(f"eval needs at least 1 episode and 1 world, not {self.episodes} and {self.nworld}")
+        if self.transfer and self.env.engine is not None:
+            raise ValueError("--transfer plays on both engines: omit --engine")
         camera = parsed_camera(self.camera)
         if self.video:
             check_video()
@@ -102,6 +110,12 @@ class Eval:
         console.print(table)
         if env.task.functions["success"] is not None:
             console.print(f"success: {episodes.success.mean().item():.0%}")
+        if self.transfer:
+            with LongWork("judging the policy's transfer", "steps", make_console()) as work:
+                verdict = transfer(
+                    env, policy, max(2, self.episodes), seed=self.seed, device=self.env.device, progress=work
+                )
+            _print_transfer(verdict, console)
         if self.episodes_to is not None:
             paths = _save_episodes(env, policy, self, origin)
             console.print(f"episodes: {paths}", soft_wrap=True, markup=False)
@@ -111,6 +125,22 @@ class Eval:
             )  # fmt: skip
             console.print(f"video: {video}", soft_wrap=True, markup=False)
         return 0
+
+
+def _print_transfer(verdict: Transfer, console: Console) -> None:
+    """Print a table of the differences of each comparison, and its verdict."""
+    for comparison in verdict.comparisons:
+        table = Table(box=rich.box.SIMPLE)
+        for heading in ("", comparison.first, comparison.second, "difference", "95 % interval", "margin", "verdict"):
+            table.add_column(heading, justify="right" if heading else "left")
+        for one in comparison.differences:
+            numbers = (f"{one.first:.6g}", f"{one.second:.6g}", f"{one.second - one.first:+.3g}")
+            interval = f"{one.low:+.3g} to {one.high:+.3g}"
+            table.add_row(one.quantity, *numbers, interval, f"{one.margin:.3g}", one.verdict)
+        console.print(f"{comparison.second} against {comparison.first}: {comparison.verdict}", soft_wrap=True)
+        console.print(table)
+        if any(comparison.faults):
+            console.print(f"faults: {comparison.faults[0]} and {comparison.faults[1]}")
 
 
 def run_worlds(

@@ -7,8 +7,13 @@ from typing import Annotated
 import tyro
 
 from lyceum_warp.algos.policy_export import check_export, export_policy
-from lyceum_warp.cli.display import make_console
+from lyceum_warp.cli.arguments import Trust
+from lyceum_warp.cli.display import make_console, note
+from lyceum_warp.engines.placement import options_on_cores
+from lyceum_warp.env import Env
+from lyceum_warp.runs.configuration import Configuration
 from lyceum_warp.runs.folder import Run, load
+from lyceum_warp.runs.task_copy import run_env
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -16,7 +21,8 @@ class Export:
     """Write a run's policy, including its observation normaliser, to a file that runs without lyceum_warp.
 
     An .onnx file has the input "obs", (n, observations) float32 for any n, and the output "action", the mean actions.
-    Writing it needs pip install 'lyceum-warp[export]'. torch loads a .pt2 file: torch.export.load(file).module()(obs).
+    Its metadata describe the robot: parts of observations, joints, gains, control interval and more. Writing it needs
+    pip install 'lyceum-warp[export]'. torch loads a .pt2 file: torch.export.load(file).module()(obs).
 
     $ lyceum-warp export runs/hopper-20260101-120000
     $ lyceum-warp export runs/hopper-20260101-120000 --which best --to robot/policy.onnx
@@ -28,13 +34,25 @@ class Export:
     """The file, .onnx or .pt2; by default policy.onnx in the run's folder. An existing file is replaced."""
     which: str = "last"
     """Which policy: last, best, or the number of a saved iteration."""
+    trust: Trust = False
 
     def run(self) -> int:
         """Run the command, and return the exit code."""
         path = self.to or self.folder / "policy.onnx"
         check_export(path)
-        policy = load(Run.open(self.folder), which=self.which)
-        export_policy(policy, path)
+        run = Run.open(self.folder)
+        policy = load(run, which=self.which)
+        export_policy(policy, path, env=self._env(run) if path.suffix == ".onnx" else None)
         text = f"{path}: {policy.nobs} observations, {policy.nact} actions, {path.stat().st_size / 1e3:.1f} kB"
         make_console().print(text, soft_wrap=True, markup=False)
         return 0
+
+    def _env(self, run: Run) -> Env | None:
+        """A world of the run's task, for the metadata; None, with a message, if it cannot be made."""
+        try:
+            saved = Configuration.of(run)
+            options = saved.options.changed({"nworld": 1} | options_on_cores())
+            return run_env(run, options, saved.params, note=note, trust=self.trust)
+        except (ValueError, FileNotFoundError, ImportError) as error:
+            note(f"the file has no metadata on the robot: {error}")
+            return None

@@ -15,7 +15,7 @@ from lyceum_warp.binding.models import compile_model
 from lyceum_warp.binding.registry import find_task, package_task_names, snake_case
 from lyceum_warp.cli.display import make_console
 from lyceum_warp.cli.task_text import literal, task_text
-from lyceum_warp.cli.velocity_text import Walker, velocity_text
+from lyceum_warp.cli.velocity_text import TRAINING, Walker, velocity_text
 from lyceum_warp.model_files import ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, read_spec
 from lyceum_warp.options import PhysicsOptions
 from lyceum_warp.support.files import replaced
@@ -55,12 +55,12 @@ class New:
     """velocity: a task of the family of walking robots, which follow velocity commands. The robot needs a base that
     moves freely, and legs of hinges with an actuator each. Its file is short, because functions, rewards and most
     numbers are the family's."""
-    feet: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAMES")] = ()
+    feet: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
     """With --template velocity: sites, geoms or bodies that are feet. By default, the ends of the legs that reach
     lowest."""
-    joints: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAMES")] = ()
-    """With --template velocity: joints that act. By default, all joints of the legs with an actuator; others keep their
-    pose."""
+    joints: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
+    """With --template velocity: joints that act, with an actuator each. By default, all joints of the legs with an
+    actuator; others keep their pose."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -95,8 +95,8 @@ class New:
         console = make_console()
         console.print(f"{path}: {sizes}; check and train it with", soft_wrap=True, markup=False)
         for command in ("check", "train"):
-            algorithm = " --algorithm ppo" if (self.template, command) == ("velocity", "train") else ""
-            console.print(f"  lyceum-warp {command} {path}{algorithm}", soft_wrap=True, markup=False)
+            options = f" {TRAINING}" if (self.template, command) == ("velocity", "train") else ""
+            console.print(f"  lyceum-warp {command} {path}{options}", soft_wrap=True, markup=False)
         return 0
 
     def _walker(self, spec: mujoco.MjSpec) -> Walker:

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import datetime
+import json
 import signal
 from pathlib import Path
 from typing import Annotated, Any
@@ -30,7 +31,6 @@ from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import read_checkpoint
 from lyceum_warp.runs.configuration import ALGORITHMS, Configuration, saved_networks
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.metrics_table import read_metrics
 from lyceum_warp.runs.task_copy import note_changes
 from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.training import train
@@ -55,7 +55,7 @@ _KEPT = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Train:
-    """Train a policy on a task, with the natural policy gradient or with PPO.
+    """Train a policy on a task, with the natural policy gradient, PPO or SAC.
 
     The command writes config.json, versions.json, metrics.csv (one row per iteration), policy.pt, best.pt,
     checkpoint.pt, curve.png and video.mp4 into the run's folder. Ctrl-C saves and ends the run after the current
@@ -68,6 +68,7 @@ class Train:
     $ lyceum-warp train --resume runs/mine --iterations 200
     $ lyceum-warp train my_changed_task.py --from runs/mine --which best
     $ lyceum-warp train hopper --algorithm ppo --iterations 300 --learning-rate 3e-4
+    $ lyceum-warp train half_cheetah --algorithm sac --iterations 1000
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
     The processes of torchrun share the worlds, even across machines. With --device cuda each process uses the GPU of
@@ -78,8 +79,8 @@ class Train:
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
-    algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo")] = None
-    """npg (the default), the natural policy gradient; or ppo."""
+    algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac")] = None
+    """npg (the default), the natural policy gradient; ppo; or sac, soft actor-critic with a replay buffer."""
     iterations: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 100)")] = None
     """Iterations in total, including those before --resume."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
@@ -106,9 +107,9 @@ class Train:
     tensorboard: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to also write metrics for TensorBoard into the run's folder."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Total number of worlds of all processes; by default 64, or 4096 per GPU. With npg, each world makes samples /
-    nworld steps per iteration: whole episodes if they fit (as in the paper, with 10 worlds, 10,000 samples and episodes
-    of 1,000 steps), otherwise segments of episodes."""
+    """Total number of worlds of all processes; by default 64 (8 with sac), or 4096 per GPU. With npg, each world makes
+    samples / nworld steps per iteration: whole episodes if they fit (as in the paper, with 10 worlds, 10,000 samples
+    and episodes of 1,000 steps), otherwise segments of episodes."""
     threads: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 1)")] = None
     """Number of torch threads on the CPU. Small networks gain little from more threads. Runs are identical bit for bit
     only with the same number. --nthread sets the threads of the mujoco engine."""
@@ -118,6 +119,11 @@ class Train:
     video_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Iterations between two videos of the mean policy, videos/000100.mp4 and so on in the run's folder; 0 for none."""
     camera: CameraWords = ()
+    transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
+    """Whether to judge at the end whether the policy does the same on the other engine, and write transfer.json. By
+    default worlds on a GPU are compared with the C engine, and physics other than the task's own with those. With
+    --transfer the Warp engine also judges a policy trained on CPU cores, after minutes of compilation if its kernels
+    are cold, and each physics of the task is compared."""
     trust: Trust = False
     take_over: bool = False
     """Continue a run that another process has locked, on this or another host. The other process ends at its next
@@ -162,8 +168,8 @@ class Train:
                 with RunViewer(folder) if self.view and leads else contextlib.nullcontext():
                     run = train(
                         learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
-                        take_over=self.take_over, minutes=self.minutes, entries=entries, display=Display(console),
-                        **settings,
+                        take_over=self.take_over, minutes=self.minutes, transfer=self.transfer, entries=entries,
+                        display=Display(console), **settings,
                     )  # fmt: skip
             except Interrupted as signalled:
                 if leads and (path := folder / "policy.pt").exists():
@@ -192,7 +198,8 @@ class Train:
             if value is not None:
                 words[name] = value
         if source is None:
-            nworld = 4096 * team.size if (self.env.device or "cpu").startswith("cuda") else 64
+            few = 8 if self.algorithm == "sac" else 64  # each of SAC's worlds has an update per step
+            nworld = 4096 * team.size if (self.env.device or "cpu").startswith("cuda") else few
             options = EnvOptions(nworld=nworld, device="cpu")
             base = Configuration(task=self.task, options=options, algorithm="npg", hyperparameters=None)
         else:
@@ -247,7 +254,7 @@ class Train:
     def _report(self, run: Run, learner: Learner, console: Console) -> int:
         """Print the table, evaluate the policy, make the plot and the video; return the exit code."""
         env, policy, seed = learner.env, learner.policy, learner.env.options.seed + 1
-        console.print(curve_table(read_metrics(run.metrics)))
+        console.print(curve_table(run.rows()))
         few = evaluation_worlds(env, _FINAL_EPISODES)
         with LongWork("evaluating the mean policy", "steps", console) as work:
             returns = evaluate(few, moved(policy, few), _FINAL_EPISODES, seed=seed, progress=work).returns
@@ -261,6 +268,8 @@ class Train:
             every = "" if learner.best_by == "return_mean" else " (of the evaluated ones)"
             console.print(f"best policy: return {best[1]:.1f} in iteration {best[0]}{every}", soft_wrap=True)
             paths["best"] = str(run.best)
+        if run.transfer.is_file():
+            console.print(f"transfer: {json.loads(run.transfer.read_text())['line']}", soft_wrap=True, markup=False)
         if self.plot:
             paths["curve"] = tried(learning_curve, run)
         if self.video:

@@ -10,6 +10,9 @@ import numpy as np
 from lyceum_warp import walkers
 from lyceum_warp.cli.task_text import literal
 
+TRAINING = "--algorithm ppo --device cuda --iterations 800"
+"""Options of lyceum-warp train with which robots learn to walk on one GPU."""
+
 _STEP = 0.02
 """Seconds in a step."""
 
@@ -28,7 +31,7 @@ _Kind = mujoco.mjtObj
 @dataclasses.dataclass
 class _Foot:
     name: str
-    """Name of the site, of the model or new."""
+    """Name of the foot's site, which the model has or the task adds."""
     body: int
     element: str = ""
     """A body, joint or geom in the foot's body; empty if the model has the site."""
@@ -66,7 +69,7 @@ class Walker:
         self.joints = list(joints) or self._leg_joints()
         for name in self.joints:
             if mujoco.mj_name2id(self.model, _Kind.mjOBJ_JOINT, name) < 0:
-                raise ValueError(f"the model has no joint {name!r}: --joints takes names of joints")
+                raise ValueError(f"the model has no joint {name!r}: --joints takes names, separated by spaces")
         ids = [self.model.joint(name).id for name in self.joints]
         self.servos = walkers.servos(self.model, _Joints(ids))
         self.pose = [float(self.data.qpos[self.model.jnt_qposadr[joint]]) for joint in ids]
@@ -110,7 +113,7 @@ class Walker:
                 if kind == _Kind.mjOBJ_SITE:
                     return _Foot(name, int(bodies[i]), height=float(self.data.site_xpos[i, 2]))
                 return self._foot(int(bodies[i]), f"{name}_foot")
-        raise ValueError(f"the model has no site, geom or body {name!r}: --feet takes their names")
+        raise ValueError(f"the model has no site, geom or body {name!r}: --feet takes their names, separated by spaces")
 
     def _foot(self, body: int, name: str) -> _Foot:
         """A foot at the middle of a body's sole: a site that is there, or a new one."""
@@ -138,13 +141,21 @@ class Walker:
 
     def _leg_joints(self) -> list[str]:
         chains = [walkers.leg_of(self.model, foot.body) for foot in self.feet]
-        moved = set(self.model.actuator_trnid[self.model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0].tolist())
-        joints = [joint for joint in dict.fromkeys(joint for chain in chains for joint in chain) if joint in moved]
+        moved = self._moved()
+        joints = [joint for joint in dict.fromkeys(joint for chain in chains for joint in chain) if moved[joint]]
         names = [mujoco.mj_id2name(self.model, _Kind.mjOBJ_JOINT, joint) for joint in joints]
         if not joints or not all(names):
             what = "a joint of the legs has no name" if joints else "no actuator moves a joint of the legs"
             raise ValueError(f"{what}: name the joints in the model, or give --joints")
         return names
+
+    def _moved(self) -> np.ndarray:
+        """Whether an actuator moves each joint, (njnt,), also through a tendon, which ``walkers.servos`` refuses."""
+        m, d = self.model, self.data
+        mujoco.mj_forward(m, d)
+        moment = np.zeros((m.nu, m.nv))
+        mujoco.mju_sparse2dense(moment, d.actuator_moment, d.moment_rownnz, d.moment_rowadr, d.moment_colind)
+        return np.any(moment, axis=0)[m.jnt_dofadr]
 
     @property
     def has_motors(self) -> bool:
@@ -188,7 +199,7 @@ def velocity_text(file: str, class_name: str, source: str, title: str, walker: W
         sites = [f"    {literal(foot.name)}: ({literal(foot.element)}, {foot.position})," for foot in new]
         head += ["NEW_SITES = {  # a body, or a joint or geom in it, and a position there", *sites, "}"]
     return _TEXT.format(
-        file=file, class_name=class_name, title=title, kind="Biped" if biped else "Velocity",
+        file=file, class_name=class_name, title=title, training=TRAINING, kind="Biped" if biped else "Velocity",
         params_class="BipedParams" if biped else "Params", feet="\n".join(head),
         joints="\n".join(_wrapped("JOINTS = [", [literal(name) for name in walker.joints], "]", 0)),
         params=_indented(params, 4), settings=_indented(settings, 4), edits=_indented(edits, 8),
@@ -210,7 +221,10 @@ def _indented(lines: Sequence[str], indent: int) -> str:
 
 _TEXT = '''"""{class_name}: {title} walks at a commanded velocity.
 
-``lyceum-warp check {file}`` checks this task, and ``lyceum-warp train {file} --algorithm ppo`` trains it.
+``lyceum-warp check {file}`` checks this task. This trains it; docs/velocity.md has settings for a CPU:
+
+    lyceum-warp train {file} {training}
+
 Every other number is a parameter of the family: see lyceum_warp/tasks/velocity/walking.py.
 """
 

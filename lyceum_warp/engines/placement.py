@@ -123,7 +123,7 @@ def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device 
     On a GPU a step of a few worlds takes nearly as long as a step of thousands. With engine="auto" they therefore run
     on the C engine, on CPU cores and in double precision.
     """
-    return _on_cpu_cores() if engine == "auto" and engine_name(engine, device) == "warp" else {}
+    return options_on_cores() if engine == "auto" and engine_name(engine, device) == "warp" else {}
 
 
 def options_for_plant(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
@@ -133,7 +133,7 @@ def options_for_plant(engine: str | EngineFactory, device: str | wp.Device | Non
     """
     name = device.alias if isinstance(device, wp.Device) else device
     on_gpu = engine in ("auto", "warp") and find_device(name).is_cuda
-    return _on_cpu_cores() if on_gpu else {}
+    return options_on_cores() if on_gpu else {}
 
 
 def place_samples(
@@ -163,10 +163,10 @@ def place_samples(
     enough = _SAMPLES_PER_CORE * min(_MOST_CORES, nthread or cpu_cores())
     if samples >= enough and (samples >= _NOSLIP * enough or not has_noslip()):
         return {"engine": "warp", "nthread": None}
-    return _on_cpu_cores()
+    return options_on_cores()
 
 
-def _on_cpu_cores() -> dict[str, Any]:
+def options_on_cores() -> dict[str, Any]:
     """The options that move an environment to the C engine; options that this engine does not have become None."""
     known = _options_of(_engine_class("mujoco", wp.get_device("cpu"), False)) or []
     defaults = EnvOptions().for_engine()

@@ -15,6 +15,8 @@ from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig
 from lyceum_warp.algos.ppo import PPO
 from lyceum_warp.algos.ppo_config import PPOConfig
+from lyceum_warp.algos.sac import SAC
+from lyceum_warp.algos.sac_config import SACConfig
 from lyceum_warp.binding.registry import spelled_task
 from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.env import Env
@@ -27,7 +29,9 @@ from lyceum_warp.support.machine import cpu_cores
 
 log = logging.getLogger(__name__)
 
-ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig)}
+ALGORITHMS: dict[str, tuple[Any, Any]] = {
+    "npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig), "sac": (SAC, SACConfig)
+}  # fmt: skip
 """The algorithms of the command line and config.json, by name: the classes of the learner and its hyperparameters."""
 
 

@@ -43,8 +43,11 @@ class Run:
     ``metrics.csv``     one row per iteration
     ``policy.pt``       the last policy, and its value function
     ``best.pt``         the policy with the best return
-    ``policies/``       the policy of every n-th iteration, with ``keep_every`` ``checkpoint.pt``   the complete state
-    to resume from exactly, at the same iteration as ``policy.pt`` ``previous.pt``     the checkpoint before it
+    ``policies/``       the policy of every n-th iteration, with ``keep_every``
+    ``checkpoint.pt``   the complete state to resume from exactly, at the same iteration as ``policy.pt``
+    ``previous.pt``     the checkpoint before it
+    ``replay/``         the replay buffer of the checkpoint, for algorithms that have one
+    ``transfer.json``   the verdict of ``lw.transfer`` on the last policy
     ``task/``           copies of the task's file, modules and model, unless they are part of the package
     =================== ======================================================================================
 
@@ -59,10 +62,14 @@ class Run:
     """Path of the checkpoint."""
     previous: Path
     """Path of the previous checkpoint."""
+    replay: Path
+    """Path of the folder with the replay buffer."""
     policy: Path
     """Path of the last policy."""
     best: Path
     """Path of the best policy."""
+    transfer: Path
+    """Path of the verdict on the last policy's transfer."""
     task_folder: Path
     """Path of the folder with the copies of the task's file and model."""
 
@@ -71,6 +78,8 @@ class Run:
         self.metrics, self.task_folder = folder / "metrics.csv", folder / _TASK
         self.checkpoint, self.previous = folder / "checkpoint.pt", folder / "previous.pt"
         self.policy, self.best = folder / "policy.pt", folder / "best.pt"
+        self.replay = folder / "replay"
+        self.transfer = folder / "transfer.json"
 
     @property
     def task_name(self) -> str:
@@ -338,6 +347,8 @@ def load(
 
 def load_value(run: str | Path | Run, *, which: str | int = "last", device: str | torch.device = "cpu") -> Any:
     """Load a run's value function, a ``ValueFunction``: ``value(obs, step)`` predicts discounted returns.
+
+    A run of SAC has a ``TwinCritic`` instead: ``value(obs, unit_action)``.
 
     Args:
         run: A run's folder, or a file in it with a value function.

@@ -10,6 +10,7 @@ from lyceum_warp.runs.checkpoints import policy_content, write_content
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.lock import RunLock
 from lyceum_warp.runs.metrics_table import append_row
+from lyceum_warp.runs.replay_files import clean_replay, write_replay
 
 log = logging.getLogger(__name__)
 
@@ -18,6 +19,9 @@ SAVE_SECONDS = 30.0
 
 SHARE = 100
 """A run is saved earlier once it has trained for this multiple of the last save's duration."""
+
+LONG = 20
+"""A run is saved later if a save takes long: once it has trained for this multiple of the last save's duration."""
 
 
 class Saver:
@@ -61,6 +65,7 @@ class Saver:
         self._best = -math.inf if best is None else best[1]
         self._before = policy_content(learner.iteration, learner.policy, learner.value)
         self._seconds, self._when = 0.0, time.perf_counter()
+        self._stored = learner.replay.stored if learner.replay is not None and saved >= 0 else 0
 
     def write(self, iteration: Iteration) -> float | None:
         """Write an iteration's row, and its policy if it is the best so far or is to be numbered.
@@ -69,8 +74,7 @@ class Saver:
             The return that selects the best policy; None if the iteration has no return.
         """
         assert self.run is not None
-        if self._lock is not None:
-            self._lock.check()
+        self._check()
         append_row(self.run.metrics, iteration.row())
         learner, name = self.learner, self.learner.best_by
         score = getattr(iteration, name)
@@ -96,17 +100,27 @@ class Saver:
         """Whether it is time to save."""
         if self.save_every:
             return self.learner.iteration % self.save_every == 0
-        return time.perf_counter() - self._when >= min(SAVE_SECONDS, SHARE * self._seconds)
+        wait = max(min(SAVE_SECONDS, SHARE * self._seconds), LONG * self._seconds)
+        return time.perf_counter() - self._when >= wait
 
     def save(self) -> None:
         """Save the last policy and the complete state."""
         start = time.perf_counter()
-        learner = self.learner
+        learner, run, replay = self.learner, self.run, self.learner.replay
         state = learner.state_dict()  # gathers the worlds of all ranks
+        if replay is not None:
+            write_replay(None if run is None else run.replay, replay, learner.team, self._stored, self._check)
         with learner.team.together():
-            if self.run is not None:
-                if self._lock is not None:
-                    self._lock.check()
-                self.run.save(policy_content(learner.iteration, learner.policy, learner.value), state)
+            if run is not None:
+                self._check()
+                run.save(policy_content(learner.iteration, learner.policy, learner.value), state)
+                if replay is not None:
+                    clean_replay(run.replay, replay)
+        self._stored = 0 if replay is None else replay.stored
         self.saved, self._when = learner.iteration, time.perf_counter()
         self._seconds = self._when - start
+
+    def _check(self) -> None:
+        """Check that no other process has taken the run over."""
+        if self._lock is not None:
+            self._lock.check()

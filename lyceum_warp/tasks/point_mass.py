@@ -61,3 +61,4 @@ class PointMass(lw.Task):
     model = "point_mass.xml"
     obs = {"position": 2, "velocity": 2, "target": 2}
     horizon = 256
+    mirror = lw.Mirror({**dict.fromkeys(("position", "velocity", "target"), (1, -1)), "x": (1,), "y": (-1,)})

@@ -57,9 +57,9 @@ class Unchecked(Exception):  # noqa: N818
 class CheckedFunctions:
     """The checked copies of some functions, with a kernel for each.
 
-    A kernel gets the report, (places, 3) int32, and for each argument of its function the values of all worlds: a
-    ``Batch`` for the task's World, (nworld,) or (1,) for Params, (nworld, size) for a row. The report has one row per
-    place: how often its index was out of range, the first such index, and the size.
+    A kernel's arguments are the report and, for each argument of the function, the values of all worlds: a ``Batch``
+    for World, (nworld,) or (1,) for Params, (nworld, size) for a row. The report, (places, 3) int32, has a row per
+    indexing expression: how often its index was out of range, the first such index, and the size of the array.
 
     Raises:
         Unchecked: A function can't be copied.

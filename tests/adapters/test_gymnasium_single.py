@@ -49,7 +49,7 @@ def test_gymnasiums_checker_has_no_complaint(hopper: gymnasium.Env, draws: bool)
     assert not [text for text in said if not any(known in text for known in THEIRS)]
 
 
-def test_a_step_has_the_numbers_of_the_environment_behind_it() -> None:
+def test_a_step_returns_the_numbers_of_the_wrapped_environment() -> None:
     env, twin = GymnasiumEnv(Full), lw.make(Full, autoreset=False)
     obs, info = env.reset(seed=7)
     twin.rand_reset(7)
@@ -84,7 +84,7 @@ def test_gymnasiums_own_vector_environments_take_it() -> None:
     envs.step(envs.action_space.sample())
 
 
-def test_a_maximal_number_of_steps_is_gymnasiums(hopper: gymnasium.Env) -> None:
+def test_max_episode_steps_of_make_truncates_episodes(hopper: gymnasium.Env) -> None:
     env = gymnasium.make("lyceum_warp.gym:lyceum/Hopper-v0", max_episode_steps=2)
     env.reset(seed=0)
     ends = [env.step(np.zeros(3, dtype=np.float32))[3] for _ in range(2)]

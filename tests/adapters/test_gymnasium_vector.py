@@ -83,7 +83,7 @@ def by_hand(env: lw.Env) -> list[dict[str, np.ndarray]]:
 
 
 @pytest.mark.parametrize("tensors", [False, True], ids=["numpy", "torch"])
-def test_a_step_has_the_numbers_of_the_environment_behind_it(
+def test_a_step_returns_the_numbers_of_the_wrapped_environment(
     tensors: bool, vector: Callable[..., GymnasiumVectorEnv]
 ) -> None:
     envs = vector(torch=tensors)
@@ -217,7 +217,7 @@ def test_an_ignored_action_never_faults(tensors: bool, vector: Callable[..., Gym
     assert ends > 3 and envs.env.fault_counts == faults
 
 
-def test_a_seed_gives_the_same_worlds_and_no_seed_others(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_a_seed_gives_the_same_worlds_and_no_seed_different_ones(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector()
     first, again = (envs.reset(seed=2**40 + 3)[0]["policy"] for _ in range(2))
     other, going_on = envs.reset(seed=4)[0]["policy"], envs.reset()[0]["policy"]
@@ -226,7 +226,7 @@ def test_a_seed_gives_the_same_worlds_and_no_seed_others(vector: Callable[..., G
     assert len(np.unique(first[:, 0])) == N
 
 
-def test_the_first_reset_without_a_seed_draws_one(hopper: GymnasiumVectorEnv) -> None:
+def test_the_first_reset_without_a_seed_draws_a_seed(hopper: GymnasiumVectorEnv) -> None:
     def first(**options: Any) -> np.ndarray:
         return GymnasiumVectorEnv("hopper", 2, **options).reset()[0]
 

@@ -1,4 +1,4 @@
-"""Errors of the adapters if a library is missing or has an unsupported version."""
+"""Test the errors of the adapters if a library is missing or has an unsupported version."""
 
 import importlib
 import sys

@@ -49,7 +49,7 @@ def test_observations_survive_the_next_step(env: lw.Env) -> None:
         assert all(torch.equal(obs[group], before[group]) for group in ("policy", "critic"))
 
 
-def test_assigned_clocks_move_the_time_limit(env: lw.Env) -> None:
+def test_assigned_episode_lengths_move_the_time_limit(env: lw.Env) -> None:
     worlds = RslRlVecEnv(env)
     worlds.episode_length_buf = torch.tensor([0, 9, 8, 3])
     *_, extras = worlds.step(torch.zeros(4, 1))
@@ -64,7 +64,7 @@ def test_assigned_clocks_move_the_time_limit(env: lw.Env) -> None:
     (torch.zeros(4), "must be whole numbers of shape"),
     (torch.tensor([0, 1, 10, 2]), "must be from 0 to 9, not from 0 to 10"),
 ])  # fmt: skip
-def test_clocks_that_do_not_fit_are_refused(env: lw.Env, steps: torch.Tensor, message: str) -> None:
+def test_episode_lengths_that_do_not_fit_are_refused(env: lw.Env, steps: torch.Tensor, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         RslRlVecEnv(env).episode_length_buf = steps
 

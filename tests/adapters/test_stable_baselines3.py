@@ -31,7 +31,7 @@ def hopper() -> StableBaselines3VecEnv:
     return StableBaselines3VecEnv("hopper", N)
 
 
-def test_a_step_has_the_numbers_of_the_environment_behind_it(full: StableBaselines3VecEnv) -> None:
+def test_a_step_returns_the_numbers_of_the_wrapped_environment(full: StableBaselines3VecEnv) -> None:
     twin = lw.make(Full, nworld=N)
     full.seed(9)
     np.testing.assert_array_equal(full.reset(), (twin.rand_reset(9), twin.obs.numpy())[1])
@@ -116,7 +116,7 @@ def test_a_seed_gives_the_same_worlds(hopper: StableBaselines3VecEnv) -> None:
     assert (first != other).any() and len(np.unique(first[:, 0])) == N
 
 
-def test_attributes_and_methods_are_those_of_the_worlds() -> None:
+def test_attributes_and_methods_reach_the_worlds() -> None:
     env = StableBaselines3VecEnv("hopper", N, ctrl_cost_weight=0.5)
     assert env.get_attr("render_mode") == [None] * N and env.has_attr("timestep") and not env.has_attr("colour")
     assert env.get_attr("ctrl_cost_weight", indices=[0, 2]) == [0.5, 0.5]
@@ -149,7 +149,7 @@ def test_an_attribute_without_effect_is_refused(name: str, message: str, hopper:
     hopper.set_attr("render_mode", hopper.render_mode)
 
 
-def test_groups_of_observations_are_a_dict_on_demand(full: StableBaselines3VecEnv) -> None:
+def test_observation_groups_are_a_dict_on_request(full: StableBaselines3VecEnv) -> None:
     assert full.observation_space.shape == (3,)
     env = StableBaselines3VecEnv(full.env, dict_obs=True)
     obs = env.reset()

@@ -31,7 +31,7 @@ def wrapped(mode: str, *, tensors: bool, task: Any) -> Any:
 
 
 @pytest.mark.parametrize("mode, tensors, task", CASES)
-def test_a_rollout_has_the_numbers_of_the_environment_behind_it(mode: str, tensors: bool, task: Any) -> None:
+def test_a_rollout_returns_the_numbers_of_the_wrapped_environment(mode: str, tensors: bool, task: Any) -> None:
     env, twin = wrapped(mode, tensors=tensors, task=task), lw.make(task, nworld=N)
     check_env_specs(env)
     key, group = ("critic", "critic") if task is Full else ("observation", "policy")

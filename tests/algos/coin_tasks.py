@@ -72,6 +72,6 @@ class TossedAfterWithControl(TossedAfter):
 
 
 class TossedBefore(TossedAfter):
-    """The coin toss that decides the reward was made in the previous step and is stored in memory."""
+    """The coin of the reward was tossed in the previous step, and is stored in memory."""
 
     reward = paid_by_coin_before_action

@@ -1,4 +1,4 @@
-"""Compare hand-written passes with torch's modules and autograd."""
+"""Compare hand-written forward and backward passes with torch's modules and autograd."""
 
 import pytest
 import torch
@@ -27,7 +27,7 @@ def policy_of(activation: str, hidden: tuple[int, ...] = (8, 6), **options: obje
 
 @pytest.mark.parametrize("activation", ["tanh", "relu", "elu"])
 @pytest.mark.parametrize("hidden", [(), (8,), (8, 6), (3, 16, 4)])
-def test_written_out_products_equal_autograds(activation: str, hidden: tuple[int, ...]) -> None:
+def test_hand_written_products_equal_autograds(activation: str, hidden: tuple[int, ...]) -> None:
     policy = policy_of(activation, hidden)
     dense = DensePolicy.of(policy)
     assert dense is not None
@@ -44,7 +44,7 @@ def test_written_out_products_equal_autograds(activation: str, hidden: tuple[int
             torch.testing.assert_close(plain(direction), written(direction), rtol=1e-4, atol=1e-5)
 
 
-def test_a_frozen_log_std_is_left_out() -> None:
+def test_a_frozen_log_std_has_no_gradient() -> None:
     policy = policy_of("tanh")
     policy.log_std.requires_grad_(False)
     dense = DensePolicy.of(policy)
@@ -55,7 +55,7 @@ def test_a_frozen_log_std_is_left_out() -> None:
     torch.testing.assert_close(plain(gradients[0]), written(gradients[0]), rtol=1e-4, atol=1e-5)
 
 
-def test_samples_and_predictions_equal_those_of_the_modules() -> None:
+def test_samples_and_predictions_equal_the_modules() -> None:
     policy, generator = policy_of("tanh"), torch.Generator().manual_seed(0)
     dense = DensePolicy.of(policy)
     obs, noise = torch.randn(6, 5, generator=generator), torch.randn(6, 2, generator=generator)
@@ -95,13 +95,13 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("kind", OTHERS)
-def test_other_networks_are_left_to_autograd(kind: str) -> None:
+def test_other_networks_use_autograd(kind: str) -> None:
     assert DensePasses.of(OTHERS[kind]()) is None
     if kind != "shared layer":
         assert DensePolicy.of(lw.GaussianPolicy(5, 2, network=OTHERS[kind]())) is None
 
 
-def test_a_policy_of_a_class_of_its_own_or_with_frozen_layers_is_left_to_autograd() -> None:
+def test_a_policy_subclass_or_frozen_layers_use_autograd() -> None:
     class Policy(lw.GaussianPolicy):
         pass
 

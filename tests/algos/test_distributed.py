@@ -1,4 +1,4 @@
-"""NPG in several processes: same worlds, same update, and a run that any number of processes can continue."""
+"""Train in several processes: the worlds and updates equal one process's, and any number of processes can resume."""
 
 import csv
 import os
@@ -64,7 +64,7 @@ def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
     """Compare the tables' last rows and the checkpoints, up to rounding."""
     row, expected = table(one)[-1], table(other)[-1]
     for name in expected:
-        bound = tolerance * (10.0 if name.startswith("mean_") else 1.0)  # of whole episodes after the update
+        bound = tolerance * (10.0 if name.startswith("mean_") else 1.0)  # episodes amplify rounding
         np.testing.assert_allclose(row[name], expected[name], rtol=bound, atol=bound, err_msg=name)
     state, wanted = (Run.open(folder).read()["state"] for folder in (one, other))
     assert torch.equal(state["generator"], wanted["generator"])
@@ -73,10 +73,11 @@ def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
         for name, tensor in wanted[part].items():
             torch.testing.assert_close(state[part][name], tensor, **close)
     torch.testing.assert_close(state["returns"], wanted["returns"], **close, equal_nan=True)
-    if tolerance < 1e-3:  # afterwards a foot may touch the ground a step earlier
+    if tolerance < 1e-3:  # with a larger tolerance a foot may touch the ground a step earlier
         torch.testing.assert_close(state["env"], wanted["env"], **close)
 
 
+@pytest.mark.long
 def test_two_machines_make_the_same_update_as_one_process(tmp_path: Path) -> None:
     """Two torchrun commands stand in for two machines; a single process then continues their run."""
     two, one = tmp_path / "two", tmp_path / "one"
@@ -102,29 +103,60 @@ def test_two_machines_make_the_same_update_as_one_process(tmp_path: Path) -> Non
 
 PPO = ["--algorithm", "ppo", "--nworld", "12", "--num-steps", "20", "--minibatches", "7", "--hidden", "8",
        "--value-hidden", "8", "--mean-every", "1", "--mean-episodes", "2"]  # fmt: skip
-"""Unfinished episodes, a normaliser, an adaptive learning rate, leftover samples, an evaluation."""
+"""Settings with unfinished episodes, a normaliser, an adaptive learning rate, leftover samples and an evaluation."""
 
 
-@pytest.mark.parametrize("minibatches", [[], ["--whiten-minibatches", "--std-type", "log"]])
-def test_two_processes_make_the_same_update_of_ppo_as_one(minibatches: list[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("settings", "tolerance"),
+    [
+        pytest.param(OPTIONS, 2e-4, id="npg"),
+        pytest.param(PPO, 2e-3, id="ppo"),  # Adam turns rounding errors of small gradients into steps
+        pytest.param(
+            [*PPO, "--whiten-minibatches", "--std-type", "log"], 2e-3, id="whitened ppo", marks=pytest.mark.long
+        ),
+    ],
+)
+def test_two_processes_make_the_same_update_as_one(settings: list[str], tolerance: float, tmp_path: Path) -> None:
     two, one = tmp_path / "two", tmp_path / "one"
-    arguments = ["train", "hopper", *PPO, *minibatches, *QUIET, "--iterations", "1", "--out"]
+    arguments = ["train", "hopper", *settings, *QUIET, "--iterations", "1", "--out"]
     launch = ["--standalone", "--nproc-per-node=2", "--monitor-interval=0.1", "--local-addr=127.0.0.1"]
     process = torchrun(*arguments, str(two), options=launch)
     assert cli.main([*arguments, str(one)]) == 0
     [(code, out, error)] = ended([process])
     assert code == 0 and "6 worlds each in 2 processes" in out, error
-    assert_equal_runs(two, one, tolerance=2e-3)  # Adam turns rounding errors of small gradients into steps
+    assert_equal_runs(two, one, tolerance=tolerance)
     assert cli.main(["train", "--resume", str(two), "--iterations", "2", *QUIET]) == 0
+
+
+SAC = ["--algorithm", "sac", "--nworld", "12", "--num-steps", "20", "--updates", "4", "--actor-every", "2", "--n-step",
+       "2", "--batch", "64", "--warmup", "60", "--replay", "120", "--hidden", "8", "--value-hidden", "8",
+       "--mean-every", "1", "--mean-episodes", "2"]  # fmt: skip
+"""A replay buffer that is full after 10 steps, a normaliser, a warm-up, an evaluation."""
+
+
+@pytest.mark.long
+def test_two_processes_make_the_same_updates_of_sac_as_one(tmp_path: Path) -> None:
+    two, one = tmp_path / "two", tmp_path / "one"
+    arguments = ["train", "hopper", *SAC, *QUIET, "--iterations", "1", "--out"]
+    launch = ["--standalone", "--nproc-per-node=2", "--monitor-interval=0.1", "--local-addr=127.0.0.1"]
+    process = torchrun(*arguments, str(two), options=launch)
+    assert cli.main([*arguments, str(one)]) == 0
+    [(code, out, error)] = ended([process])
+    assert code == 0 and "6 worlds each in 2 processes" in out, error
+    assert Run.open(two).config == Run.open(one).config
+    assert_equal_runs(two, one, tolerance=2e-3)
+    for run in (one, two):  # a single process continues the run of two, with the replay buffer of both
+        assert cli.main(["train", "--resume", str(run), "--iterations", "2", *QUIET]) == 0
+    assert_equal_runs(two, one, tolerance=1e-2)
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
-@pytest.mark.parametrize("algorithm", ["npg", "ppo"])
+@pytest.mark.parametrize("algorithm", ["npg", "ppo", "sac"])
 def test_gpu_two_processes_make_the_same_update_as_one_and_end(algorithm: str, tmp_path: Path) -> None:
     """NCCL calls are captured in the graphs of the value fit and of PPO's epochs."""
     two, one = tmp_path / "two", tmp_path / "one"
-    options = OPTIONS if algorithm == "npg" else PPO
+    options = {"npg": OPTIONS, "ppo": PPO, "sac": SAC}[algorithm]
     arguments = ["train", "hopper", *options, *QUIET, "--device", "cuda", "--iterations", "1", "--out"]
     assert cli.main([*arguments, str(one)]) == 0
     [(code, _, error)] = ended([torchrun(*arguments, str(two), options=["--standalone", "--nproc-per-node=2"])])
@@ -180,7 +212,7 @@ sys.exit(main())
 
 @pytest.mark.long
 def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
-    """During learning they complete the iteration together; before it the run leaves no files."""
+    """A signal during training ends all processes after the iteration; an earlier signal leaves no files."""
     program, run = tmp_path / "interrupted.py", tmp_path / "learning"
     program.write_text(INTERRUPTED)
     arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations", "100000", "--out"]

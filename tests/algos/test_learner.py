@@ -1,4 +1,4 @@
-"""The contract of a learner: what the base class provides, and that no code outside an algorithm assumes more."""
+"""Test the contract of a learner: the base class is enough for a run, an export and a resumption."""
 
 import dataclasses
 from pathlib import Path
@@ -71,7 +71,7 @@ def test_a_learner_of_few_lines_resumes_to_the_bit(env: lw.Env) -> None:
         other.load_state_dict(saved | {"env": torch.zeros(3, 1)})
 
 
-def test_a_policy_other_than_a_gaussian_gets_a_run_and_an_export(env: lw.Env, tmp_path: Path) -> None:
+def test_a_policy_that_is_not_gaussian_is_saved_and_exported(env: lw.Env, tmp_path: Path) -> None:
     drift, shown = Drift(env), []
     run = lw.train(drift, tmp_path / "run", iterations=2, callback=shown.append, display=Display(make_console()))
     assert len(shown) == 2 and len(list(curve_table(run.rows()).columns)) == 2
@@ -89,7 +89,9 @@ def test_a_policy_other_than_a_gaussian_gets_a_run_and_an_export(env: lw.Env, tm
 @pytest.mark.parametrize("config, best_by", [
     (lw.NPGConfig(), "mean_return"), (lw.PPOConfig(mean_every=0), "return_mean"), (DriftConfig(), "mean_return"),
 ])  # fmt: skip
-def test_a_run_goes_by_the_returns_that_its_learner_reports(config: Any, best_by: str, env: lw.Env) -> None:
+def test_the_best_policy_is_chosen_by_the_returns_that_the_learner_reports(
+    config: Any, best_by: str, env: lw.Env
+) -> None:
     drift = Drift(env)
     drift.config = config
     assert drift.best_by == best_by

@@ -102,11 +102,11 @@ ON_WARP = ("reach", "stop", "value", "covariance", "model", "cem_smoothed", "lin
 
 
 @pytest.mark.parametrize("case, engine", [*((c, "mujoco") for c in CASES), *((c, "warp") for c in ON_WARP)])
-def test_plans_equal_those_of_the_plain_version(case: str, engine: str) -> None:
+def test_plans_equal_the_plain_versions(case: str, engine: str) -> None:
     check_against(Plain, engine, **CASES[case])
 
 
-def test_plans_for_reach_equal_those_of_mujoco_and_numpy_alone() -> None:
+def test_plans_for_reach_equal_plans_with_only_mujoco_and_numpy() -> None:
     check_against(PlainReach, "mujoco", **REACH)
 
 
@@ -135,7 +135,7 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
         plain(state, noises, shift)
         if task == "hopper" and call == 0:
             steps = {plain.ended[:, k].argmax() for k in plain.ended.any(axis=0).nonzero()[0]}
-            assert len(steps) > 1 and not plain.ended.all(axis=0).any(), "they should end at different times"
+            assert len(steps) > 1 and not plain.ended.all(axis=0).any(), "the episodes should end at different steps"
         assert torch.equal(action, plan.actions[0]) and action.data_ptr() != plan.actions.data_ptr()
         np.testing.assert_allclose(plan.sampled, plain.sampled, atol=2e-6, err_msg=f"samples of call {call}")
         np.testing.assert_allclose(plan.returns, plain.returns, atol=5e-5, rtol=5e-6, err_msg=f"returns of call {call}")
@@ -200,7 +200,7 @@ def test_equal_seeds_give_equal_plans_and_a_reset_starts_again(update: str) -> N
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("risk", ["mean", "worst"])
-def test_plans_in_several_models_equal_those_of_the_plain_version(risk: Any, engine: str) -> None:
+def test_plans_in_several_models_equal_the_plain_versions(risk: Any, engine: str) -> None:
     settings = dict(horizon=6, samples=8, noise=1.0, smoothing=(1, 0, 0), temperature=0.5, update="mppi", risk=risk)
     plan = MPPI(Weighed, engine=engine, models=3, seed=2, **settings)
     fields = {name: rows.numpy() for name, rows in plan.model_fields.items()}
@@ -218,7 +218,7 @@ def test_plans_in_several_models_equal_those_of_the_plain_version(risk: Any, eng
         plain.knots = plan.actions.double().numpy()
 
 
-def test_models_depend_on_the_seed_and_are_none_of_a_plants() -> None:
+def test_drawn_models_depend_on_the_seed_and_differ_from_the_plants() -> None:
     plan, twin, other = (MPPI(Varied, horizon=2, samples=3, models=4, seed=seed) for seed in (1, 1, 2))
     masses = plan.model_fields["body_mass"].clone()
     assert torch.equal(masses, twin.model_fields["body_mass"])
@@ -278,7 +278,7 @@ def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("update", ["mppi", "cem", "predictive_sampling"])
-def test_a_plan_whose_samples_all_fail_only_moves_forward(update: str, engine: str) -> None:
+def test_a_plan_whose_samples_all_fail_is_only_shifted(update: str, engine: str) -> None:
     plan = MPPI(Picky, engine=engine, horizon=5, samples=8, noise=0.1, limit=10.0, seed=3, update=update)
     plan(plan.state_of())
     for _ in range(3):
@@ -326,7 +326,7 @@ def test_actions_stay_within_the_bounds_of_the_controls() -> None:
 
 
 @pytest.mark.parametrize("fill", ["zero", "repeat", 0.5, [0.5, -0.25]])
-def test_plans_move_forward_by_the_steps_that_have_passed(fill: Any) -> None:
+def test_plans_shift_by_the_elapsed_steps(fill: Any) -> None:
     H = 6
     plan = MPPI("point_mass", horizon=H, samples=5, fill=fill)
     end = torch.zeros(2) if isinstance(fill, str) else torch.tensor(fill).expand(2)
@@ -343,7 +343,7 @@ def test_plans_move_forward_by_the_steps_that_have_passed(fill: Any) -> None:
 
 @pytest.mark.parametrize("spline", ["zero", "linear", "cubic"])
 @pytest.mark.parametrize("knots", [1, 3, 5, 8, 12])
-def test_a_plan_with_knots_that_moves_forward_keeps_its_actions(knots: int, spline: Any) -> None:
+def test_a_shifted_plan_with_knots_keeps_its_actions(knots: int, spline: Any) -> None:
     """The actions of the remaining steps stay the same, even if the shift is smaller than the distance of two knots."""
     plan = MPPI("point_mass", horizon=12, samples=4, knots=knots, spline=spline, fill="repeat", noise=0.3, seed=1)
     plan(plan.state_of())
@@ -356,7 +356,7 @@ def test_a_plan_with_knots_that_moves_forward_keeps_its_actions(knots: int, spli
     assert (plan.nominal == plan.nominal[0]).all(), "the last knot fills the plan"
 
 
-def test_steps_beyond_every_plan_leave_only_the_fill() -> None:
+def test_a_shift_beyond_the_horizon_leaves_only_the_fill() -> None:
     for knots in (None, 4):
         plan = MPPI("point_mass", horizon=8, samples=4, knots=knots, fill=0.25)
         plan(plan.state_of())
@@ -426,6 +426,7 @@ def test_a_value_function_must_fit_the_observations_of_its_group() -> None:
         (lambda obs: obs, r"value must return 7 numbers for \(7, 6\) observations, not .* \(7, 6\)"),
         (lambda obs: 0.0, "value must return 7 numbers for .*, not float 0.0"),
         (torch.nn.Linear(5, 1), r"value cannot take observations .* \(7, 6\)"),
+        (lw.TwinCritic(6, 2), r"value cannot take observations .* missing 1 required positional argument: 'action'"),
         (3.0, "value must be a function of observations, or None, not float 3.0"),
     ],
 )  # fmt: skip
@@ -488,10 +489,10 @@ def test_hopper_hops_without_falling() -> None:
 
 
 def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
-    """Return the mean sum of 100 rewards, and its standard deviation if the coins were tossed after the actions.
+    """Return the mean return over runs of 100 steps, and the standard deviation of this mean if coins are unknown.
 
-    Plant and planner have equal seeds. Given the actions, the sum of action times coin over 20 runs has the variance of
-    the sum of the squared actions: coins are independent of each other and of earlier actions.
+    Plant and planner have equal seeds. If no action depends on its coin, the variance of a return, the sum of action
+    times coin, is the sum of the squared actions.
     """
     plan = MPPI(task, engine="mujoco", horizon=4, noise=2.0, smoothing=(1, 0, 0))
     plant = lw.make(task, autoreset=False)
@@ -522,7 +523,7 @@ def test_a_coin_tossed_before_the_action_earns_a_planner_almost_everything() -> 
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [TossedAfter, TossedAfterWithControl])
-def test_every_sample_of_every_improvement_draws_its_own(task: type[lw.Task], engine: str) -> None:
+def test_every_sample_of_every_iteration_has_its_own_draws(task: type[lw.Task], engine: str) -> None:
     coins: list[torch.Tensor] = []
 
     def value(obs: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""The arguments of MPPI: the three parts of a task's planning, and how keyword arguments are sorted into them."""
+"""Sort keyword arguments of MPPI into settings, options and parameters, as a task's planning lists them."""
 
 import dataclasses
 import json
@@ -46,7 +46,7 @@ def arguments(task: Any, config: MPPIConfig | None = None, value: Any = None, pa
     return planner_arguments(find_task(task), config, words, params, value)
 
 
-def test_planning_gives_settings_options_and_parameters_and_words_replace_them() -> None:
+def test_planning_gives_settings_options_and_parameters_and_arguments_override_them() -> None:
     plan = MPPI("hopper", horizon=2, samples=2)
     assert plan.config == MPPIConfig(horizon=2, samples=2, noise=0.1).completed()
     assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
@@ -106,7 +106,7 @@ def test_flat_settings_replace_the_configuration_which_replaces_planning(
     assert arguments(task, config, **words)[0] == expected.completed()
 
 
-def test_words_are_sorted_into_settings_options_and_parameters() -> None:
+def test_arguments_are_sorted_into_settings_options_and_parameters() -> None:
     task = planned(settings={"noise": 0.2}, options={"integrator": "euler", "cone": "elliptic"}, params={"limit": 2.0})
     config, options, params = arguments(task, samples=3, integrator="rk4", nthread=2, wrong=5.0)
     assert config == MPPIConfig(noise=0.2, samples=3).completed()
@@ -116,7 +116,7 @@ def test_words_are_sorted_into_settings_options_and_parameters() -> None:
     assert arguments(task, physics=physics)[1].physics == physics
 
 
-def test_a_word_that_is_a_setting_and_a_parameter_must_be_given_explicitly() -> None:
+def test_a_name_of_both_a_setting_and_a_parameter_must_be_given_explicitly() -> None:
     message = (
         r"'noise' is a setting of MPPI and a parameter of the task 'noisy': give the setting as "
         r"config=lw.MPPIConfig\(noise=...\), or the parameter as params=\{'noise': ...\}"
@@ -153,13 +153,13 @@ def test_a_word_that_is_a_setting_and_a_parameter_must_be_given_explicitly() -> 
         ({"models": 4}, "models=4 needs a task that draws model fields, and 'reach' draws none: write them in its"),
     ],
 )  # fmt: skip
-def test_words_that_do_not_fit_are_refused_in_one_line(words: dict[str, Any], message: str) -> None:
+def test_wrong_arguments_are_refused_in_one_line(words: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message) as raised:
         MPPI("reach", **words)
     assert "\n" not in str(raised.value)
 
 
-def test_with_a_value_the_parameters_of_planning_do_not_apply() -> None:
+def test_with_a_value_function_planning_parameters_do_not_apply() -> None:
     """A value function was fitted to the task's own rewards."""
     plan = MPPI("hopper", horizon=2, samples=2, value=lambda obs: obs[:, 0])
     assert plan.env.task.params["healthy_reward"] == 1.0 and plan.env.task.params["forward_reward_weight"] == 1.0
@@ -177,7 +177,7 @@ def test_with_a_value_the_parameters_of_planning_do_not_apply() -> None:
         ({"config": MPPIConfig(discount=0.7)}, 0.9, 0.7),
     ],
 )
-def test_the_discount_is_the_given_one_or_else_that_of_the_value_function(
+def test_the_discount_defaults_to_the_value_functions(
     words: dict[str, Any], fitted: float | None, expected: float
 ) -> None:
     value = lw.ValueFunction(6)
@@ -185,14 +185,14 @@ def test_the_discount_is_the_given_one_or_else_that_of_the_value_function(
     assert arguments(planned(settings={"discount": 0.8}), value=value, **words)[0].discount == expected
 
 
-def test_another_update_than_the_tasks_drops_the_settings_of_the_tasks_update() -> None:
+def test_a_different_update_drops_the_settings_of_the_tasks_update() -> None:
     task = planned(settings={"update": "cem", "elites": 5, "min_noise": 0.1, "samples": 20})
     assert (arguments(task)[0].elites, arguments(task)[0].min_noise) == (5, 0.1)
     other = arguments(task, update="predictive_sampling")[0]
     assert (other.elites, other.min_noise, other.samples, other.include_plan) == (None, None, 20, True)
 
 
-def test_settings_that_are_left_out_follow_from_the_update() -> None:
+def test_omitted_settings_get_the_updates_defaults() -> None:
     def chosen(**words: Any) -> tuple[Any, ...]:
         config = arguments("reach", noise=[0.5] * 7, **words)[0]
         return config.include_plan, config.elites, config.min_noise
@@ -242,7 +242,7 @@ def test_auto_on_a_gpu_places_samples_by_their_number(
     assert options.physics.nconmax is None, "only the Warp engine takes sizes"
 
 
-def test_settings_are_what_json_can_hold() -> None:
+def test_settings_are_json_values() -> None:
     plan = MPPI(
         Picky, horizon=2, samples=2, noise=torch.tensor([[0.5]]), fill=[0.1], solver={"iterations": 3}, model=rail(),
         limit=np.array([1.0, 2.0]), wrong=torch.tensor(3.0), fields=["xpos"],

@@ -81,7 +81,7 @@ def test_arrays_and_tensors_become_tuples_of_floats() -> None:
     ("noise", np.eye(3), r"noise must be a standard deviation, 2 of them, or a positive definite covariance \(2, 2\)"),
     ("fill", [1], r"fill must be 'zero', 'repeat', a number or 2 of them, not \(1.0,"),
 ])  # fmt: skip
-def test_settings_for_another_number_of_actions_are_refused(name: str, value: Any, message: str) -> None:
+def test_settings_for_a_different_number_of_actions_are_refused(name: str, value: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         MPPI("point_mass", horizon=3, samples=4, **{name: value})
 

@@ -43,7 +43,7 @@ def states_of(task: Any, count: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("case, engine", [*((c, "mujoco") for c in CASES), *((c, "warp") for c in ON_WARP)])
-def test_plans_for_several_plants_are_those_of_single_planners(case: str, engine: str) -> None:
+def test_plans_for_several_plants_equal_single_planners(case: str, engine: str) -> None:
     settings = dict(horizon=6, samples=8, temperature=0.5, engine=engine) | CASES[case]
     states = states_of(settings["task"], 3)
     together = lw.MPPI(**settings, seed=5, plants=3)
@@ -66,7 +66,7 @@ def test_plans_for_several_plants_are_those_of_single_planners(case: str, engine
 
 
 @pytest.mark.parametrize("kind", ["torch", "warp", "fitted"])
-def test_values_are_those_of_every_plants_samples(kind: str) -> None:
+def test_a_value_function_gets_the_samples_of_every_plant(kind: str) -> None:
     generator = torch.Generator().manual_seed(0)
     fitted = lw.ValueFunction(6, time_orders=2)
     for weights in fitted.parameters():

@@ -8,7 +8,7 @@ from lyceum_warp.algos.networks import Activation, Normalizer, mlp
 
 
 @pytest.mark.parametrize("name", get_args(Activation))
-def test_every_activation_follows_the_hidden_layers_alone(name: Activation) -> None:
+def test_every_activation_follows_only_hidden_layers(name: Activation) -> None:
     network, obs = mlp([3, 5, 4, 2], activation=name), torch.randn(7, 3)
     function = getattr(torch.nn.functional, name) if name != "tanh" else torch.tanh
     expected = obs
@@ -24,7 +24,7 @@ def test_an_unknown_activation_is_refused_by_name() -> None:
             module()
 
 
-def test_npg_learns_with_activations_of_policy_and_value_apart() -> None:
+def test_npg_learns_with_different_activations_of_policy_and_value() -> None:
     env = lw.make("point_mass", nworld=4, horizon=25)
     config = lw.NPGConfig(samples=200, hidden=(8,), activation="elu", value_hidden=(8,), value_activation="relu")
     npg = lw.NPG(env, config=config)
@@ -33,7 +33,7 @@ def test_npg_learns_with_activations_of_policy_and_value_apart() -> None:
     assert iteration.kl == pytest.approx(0.5 * config.delta, rel=0.3)  # the Fisher products are correct
 
 
-def test_normalizer_has_mean_and_variance_of_all_portions_together() -> None:
+def test_normalizer_has_the_mean_and_variance_of_all_batches_together() -> None:
     obs = torch.randn(1000, 4) * torch.tensor([1.0, 10.0, 0.1, 3.0]) + torch.tensor([0.0, 5.0, -2.0, 100.0])
     normalizer = Normalizer(4)
     torch.testing.assert_close(normalizer(obs[:5, :1].expand(5, 4)), obs[:5, :1].expand(5, 4).clamp(-10, 10))

@@ -1,4 +1,4 @@
-"""NPG as a whole: correct step lengths, exact resumption, and a task that it learns."""
+"""Test NPG as a whole: correct step lengths, exact resumption, and a task that it learns."""
 
 import copy
 import dataclasses
@@ -98,7 +98,7 @@ def test_one_extreme_reward_is_bounded_and_counted(env: lw.Env) -> None:
     assert disturbed[-1].step_norm > 0.1 * plain[-1].step_norm
 
     def first(reward: torch.Tensor, iteration: int) -> None:
-        if iteration == 1:  # it does not set the scale
+        if iteration == 1:  # the outlier does not change the scale of the rewards
             reward[5, 2] = 1e10
 
     assert learned(env, 6, first)[-1].explained_variance > 0.5
@@ -115,7 +115,7 @@ def test_a_step_that_the_fisher_information_misjudges_is_shortened(env: lw.Env) 
     assert max(next(free).kl for _ in range(4)) > 0.2
 
 
-def test_statistics_of_observations_count_as_a_part_of_the_step() -> None:
+def test_changed_observation_statistics_count_towards_the_kl_limit() -> None:
     """In iteration 4 observations jump; the KL divergence between the sampling policies stays below its limit."""
     env = lw.make("hopper", nworld=16, seed=1, nthread=1)
     config = lw.NPGConfig(samples=1600, hidden=(16,), value_hidden=(16,), mean_every=0, log_std=-2.0)
@@ -142,7 +142,7 @@ def test_statistics_of_observations_count_as_a_part_of_the_step() -> None:
 
 
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
-def test_a_value_function_follows_returns_of_another_scale(factor: float) -> None:
+def test_a_value_function_follows_a_change_of_the_returns_scale(factor: float) -> None:
     """All new returns lie outside the old range, as after a change of the task."""
     value = lw.ValueFunction(3)
     returns = 50.0 + 10.0 * torch.randn(1000, generator=torch.Generator().manual_seed(0))
@@ -154,7 +154,7 @@ def test_a_value_function_follows_returns_of_another_scale(factor: float) -> Non
     assert value.shift.item() == pytest.approx(factor * 50.0, rel=0.1)
 
 
-def test_the_value_function_gets_the_group_critic_where_the_task_has_one() -> None:
+def test_the_value_function_gets_the_group_critic_if_the_task_has_it() -> None:
     env = lw.make(Full, nworld=4)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=40))
     it = next(npg)
@@ -172,7 +172,7 @@ def test_a_state_of_another_number_of_worlds_is_refused(env: lw.Env) -> None:
         lw.NPG(lw.make("point_mass", nworld=3), config=SMALL).load_state_dict(npg.state_dict())
 
 
-def test_segments_continue_where_the_last_ones_ended(env: lw.Env) -> None:
+def test_segments_continue_at_the_end_of_the_previous_ones(env: lw.Env) -> None:
     env.rand_reset(0)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=16 * 5, mean_every=0))
     assert npg.segments  # selected automatically: 5 steps are shorter than an episode of 12
@@ -189,7 +189,7 @@ def test_segments_continue_where_the_last_ones_ended(env: lw.Env) -> None:
 
 
 @pytest.mark.parametrize(("min_restarts", "begun"), [(None, 1), (2.0, 3), (0.0, 0)])
-def test_worlds_restart_where_too_few_begin_an_episode(min_restarts: float | None, begun: int) -> None:
+def test_worlds_restart_if_too_few_begin_an_episode(min_restarts: float | None, begun: int) -> None:
     """With evenly spread time limits, 40 * 5 / 128 = 1.6 worlds would begin an episode in an iteration of 5 steps."""
     env = lw.make("point_mass", nworld=40, horizon=128)
     config = lw.NPGConfig(samples=40 * 5, hidden=(8,), value_hidden=(8,), mean_every=0, min_restarts=min_restarts)
@@ -306,7 +306,7 @@ def test_rewards_whose_sums_exceed_float32_are_bounded(task_file: TaskFile) -> N
         assert all(math.isfinite(it.value_error) and it.kl > 1e-6 for it in iterations)
 
 
-def test_updates_that_are_not_finite_are_left_out_and_counted(task_file: TaskFile) -> None:
+def test_updates_that_are_not_finite_are_skipped_and_counted(task_file: TaskFile) -> None:
     npg = wild(task_file, {"chance": 0.002, "size": 1e30})
     skipped = []
     for _ in range(12):
@@ -320,7 +320,7 @@ def test_updates_that_are_not_finite_are_left_out_and_counted(task_file: TaskFil
     assert parameters(npg).isfinite().all()
 
 
-def test_many_updates_in_a_row_that_are_not_finite_end_a_run(task_file: TaskFile, tmp_path: Path) -> None:
+def test_many_consecutive_updates_that_are_not_finite_end_a_run(task_file: TaskFile, tmp_path: Path) -> None:
     npg = wild(task_file, {"chance": 0.9, "size": 1e30})
     before = mean_actions(npg.policy)
     with pytest.raises(FloatingPointError) as raised:
@@ -359,7 +359,7 @@ def on_gpu(**changes: object) -> lw.NPG:
 
 
 @pytest.mark.gpu
-def test_gpu_an_iteration_waits_for_one_copy_only(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gpu_an_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every other synchronizing call raises."""
     npg = on_gpu(normalize=True, min_restarts=2.0)
     copies = []
@@ -394,8 +394,10 @@ def test_gpu_a_resumed_run_continues() -> None:
 
 
 @pytest.mark.parametrize("kl_limit", [1.0, 1.5])  # with 1.0 many steps are shortened
-def test_written_out_and_parallel_iterations_equal_plain_ones(kl_limit: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plain version uses autograd, all rounds of the line search, and a value fit after the step."""
+def test_hand_written_and_parallel_iterations_equal_plain_ones(
+    kl_limit: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The plain version uses autograd, all rounds of the line search, and a value fit after the policy's step."""
     threads, learned = torch.get_num_threads(), []
     torch.set_num_threads(2)
     try:

@@ -41,7 +41,7 @@ def rollout() -> lw.Rollout:
 
 
 def part_of(rollout: lw.Rollout, worlds: slice) -> Any:
-    """Return the samples of some worlds in the form in which a process has them."""
+    """Return the samples of some worlds as one process would hold them."""
     return SimpleNamespace(
         **{name: getattr(rollout, name)[:, worlds] for name in NAMES},
         episode_metrics={name: sums[:, worlds] for name, sums in rollout.episode_metrics.items()},
@@ -49,7 +49,7 @@ def part_of(rollout: lw.Rollout, worlds: slice) -> Any:
     )
 
 
-def test_episode_statistics_are_those_of_the_episodes_that_ended(rollout: lw.Rollout) -> None:
+def test_episode_statistics_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
     """The statistics of one rollout equal those pooled from two parts of its worlds."""
     ended = rollout.done & ~rollout.episode_return.isnan()
     assert 6 < ended.sum() < rollout.done.sum()
@@ -67,7 +67,7 @@ def test_episode_statistics_are_those_of_the_episodes_that_ended(rollout: lw.Rol
     assert episode_statistics(parts) == pytest.approx(expected, rel=1e-5)
 
 
-def test_value_statistics_of_two_processes_equal_those_of_all_samples() -> None:
+def test_value_statistics_of_two_processes_equal_statistics_of_all_samples() -> None:
     returns, predicted = 3.0 + torch.randn(2, 50, dtype=torch.float64), 2.0 + torch.randn(2, 50, dtype=torch.float64)
     sums = [ValueSums(*(x.item() for x in prediction_sums(r, p))) for r, p in zip(returns, predicted, strict=True)]
     error = returns - predicted
@@ -79,7 +79,7 @@ def test_value_statistics_of_two_processes_equal_those_of_all_samples() -> None:
     )
 
 
-def test_metric_means_are_those_of_the_episodes_that_ended(rollout: lw.Rollout) -> None:
+def test_metric_means_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
     """The means of one rollout equal those pooled from two parts of its worlds; they are NaN if no episode ended."""
     ended = rollout.done & ~rollout.episode_return.isnan()
     expected = {name: sums[ended].mean().item() for name, sums in rollout.episode_metrics.items()}
@@ -121,7 +121,7 @@ def test_the_mean_reward_covers_all_samples_also_if_no_episode_ended() -> None:
     assert next(npg).reward_mean == pytest.approx(npg.rollout.reward.mean().item())
 
 
-def test_a_task_without_a_success_has_no_share_of_successes() -> None:
+def test_a_task_without_success_reports_no_success_rate() -> None:
     env = lw.make("hopper", nworld=2, horizon=10)
     config = lw.NPGConfig(samples=40, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2)
     iteration = next(lw.NPG(env, config=config))

@@ -109,7 +109,7 @@ def test_an_update_of_warp_launches_belongs_to_the_graph(engine: str) -> None:
     assert plan.summary["best_return"] == plan.returns[0]
 
 
-def test_a_plan_stays_where_all_samples_of_a_users_update_fail() -> None:
+def test_a_plan_stays_if_all_samples_of_a_users_update_fail() -> None:
     plan = lw.Planner(update=EliteMean(3), value=lambda obs: torch.full((len(obs),), torch.nan), **POINT)
     plan.actions.fill_(0.25)
     plan(plan.state_of(), shift=0)
@@ -129,7 +129,7 @@ def test_settings_show_a_users_update_with_its_attributes() -> None:
 
 
 class Returning(EliteMean):
-    """Return the weights instead of writing them."""
+    """An update that returns the weights instead of writing them."""
 
     def weigh(self, samples: lw.PlanSamples) -> Any:
         return torch.softmax(samples.returns, 1)

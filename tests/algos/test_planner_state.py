@@ -79,7 +79,7 @@ def test_a_state_that_is_not_finite_is_refused_by_its_part(part: str, number: fl
     assert torch.equal(point.actions, before)
 
 
-def test_one_row_of_states_is_one_state() -> None:
+def test_a_batch_of_one_state_plans_like_the_state() -> None:
     row, single = (lw.MPPI("point_mass", horizon=3, samples=4) for _ in range(2))
     state = row.state_of()
     assert torch.equal(row(state[None]), single(state))

@@ -1,4 +1,4 @@
-"""User-defined policy networks: NPG refuses unsuitable ones and learns the others like its own."""
+"""Test user-defined policy networks: NPG refuses unsuitable ones, and trains the others like its own."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -114,7 +114,7 @@ def test_the_check_accepts_usual_layers_and_changes_nothing(shared_env: SharedEn
     assert all(parameter.grad is None for parameter in policy.parameters())
 
 
-def test_npg_learns_a_network_of_the_users_own_as_its_own() -> None:
+def test_npg_trains_a_users_network_like_its_own() -> None:
     config = lw.NPGConfig(samples=200, hidden=(8,))
     own = mlp([6, 8, 2], last_scale=1e-2, generator=torch.Generator().manual_seed(3))
     policies = (
@@ -128,7 +128,7 @@ def test_npg_learns_a_network_of_the_users_own_as_its_own() -> None:
     assert iterations[0] == iterations[1]
 
 
-def test_a_policy_with_a_network_of_the_users_own_is_saved_and_filled(tmp_path: Path) -> None:
+def test_a_policy_with_a_users_network_is_saved_and_loaded(tmp_path: Path) -> None:
     torch.manual_seed(0)
     policy, obs = lw.GaussianPolicy(6, 2, network=Net(), normalize=True), torch.randn(5, 6)
     policy.normalizer.update(torch.randn(10, 6) + 3.0)
@@ -147,7 +147,7 @@ def test_a_policy_with_a_network_of_the_users_own_is_saved_and_filled(tmp_path: 
         lw.load(run, policy=lw.GaussianPolicy(6, 2, network=nn.Linear(6, 2), normalize=True))
 
 
-def test_a_policy_of_the_users_own_class_is_not_loaded_as_another(tmp_path: Path) -> None:
+def test_a_policy_of_a_users_class_is_not_loaded_as_another_class(tmp_path: Path) -> None:
     class Bounded(lw.GaussianPolicy):
         def forward(self, obs: torch.Tensor) -> torch.Tensor:
             return torch.tanh(super().forward(obs))

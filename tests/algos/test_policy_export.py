@@ -47,7 +47,7 @@ def compare(policy: lw.GaussianPolicy, path: Path, run: Run) -> None:
             expected = policy(torch.from_numpy(obs)).numpy()
         action = run(path, obs)
         assert action.shape == (n, 2) and action.dtype == np.float32
-        np.testing.assert_allclose(action, expected, rtol=1e-5, atol=1e-5)  # rounding in three layers
+        np.testing.assert_allclose(action, expected, rtol=1e-5, atol=1e-5)  # three layers of rounding
 
 
 @RUNS
@@ -59,7 +59,7 @@ def test_an_exported_policy_gives_the_same_actions(name: str, run: Run, tmp_path
 
 
 @pytest.mark.parametrize("activation", get_args(Activation))
-def test_every_activation_is_exported_in_silence(
+def test_every_activation_is_exported_without_warnings(
     activation: Activation, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     policy = trained(activation=activation)
@@ -78,7 +78,7 @@ class Own(nn.Module):
 
 
 @RUNS
-def test_a_network_of_the_users_own_is_exported(name: str, run: Run, tmp_path: Path) -> None:
+def test_a_users_network_is_exported(name: str, run: Run, tmp_path: Path) -> None:
     policy = trained(network=Own(), normalize=True)
     before, modes = [p.clone() for p in policy.parameters()], [m.training for m in policy.modules()]
     path = lw.export_policy(policy, tmp_path / name)
@@ -96,7 +96,7 @@ class Branch(nn.Module):
         return self.linear(obs) if obs.sum() > 0 else -self.linear(obs)
 
 
-def test_a_network_that_cannot_be_exported_is_one_line_and_no_file(tmp_path: Path) -> None:
+def test_a_network_that_cannot_be_exported_raises_one_line_and_writes_no_file(tmp_path: Path) -> None:
     path = tmp_path / "policy.onnx"
     path.write_bytes(b"older")
     with pytest.raises(ValueError, match=r"^the policy's network cannot be exported to \.onnx \(.*\)$") as caught:
@@ -105,7 +105,7 @@ def test_a_network_that_cannot_be_exported_is_one_line_and_no_file(tmp_path: Pat
     assert path.read_bytes() == b"older" and len(list(tmp_path.iterdir())) == 1
 
 
-def test_wrong_arguments_and_a_missing_package_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_arguments_and_a_missing_package_raise_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     policy = lw.GaussianPolicy(5, 2)
     with pytest.raises(ValueError, match=r"policy\.jit must end with \.onnx or \.pt2$"):
         lw.export_policy(policy, tmp_path / "policy.jit")

@@ -1,4 +1,4 @@
-"""PPO as a whole: it learns, bootstraps truncated episodes, follows its schedules, and resumes exactly."""
+"""Test PPO as a whole: it learns, bootstraps truncated episodes, follows its schedules, and resumes exactly."""
 
 import copy
 import dataclasses
@@ -64,7 +64,7 @@ def test_a_run_is_reproducible_and_resumes_to_the_bit(changes: dict[str, Any], e
     torch.manual_seed(2)  # torch's global generators stay unchanged
     again = fresh(1)
     np.testing.assert_equal([numbers(next(again)) for _ in range(4)], first + rest)
-    resumed = fresh(2, learning_rate=1e-4)  # the state holds the rate
+    resumed = fresh(2, learning_rate=1e-4)  # the state holds the learning rate
     next(resumed)
     resumed.load_state_dict(saved)
     np.testing.assert_equal([numbers(next(resumed)) for _ in range(2)], rest)
@@ -72,7 +72,7 @@ def test_a_run_is_reproducible_and_resumes_to_the_bit(changes: dict[str, Any], e
         assert torch.equal(part, weights(resumed)[name]), name
 
 
-def test_statistics_are_those_of_the_samples(shared_env: SharedEnv) -> None:
+def test_statistics_equal_the_samples_statistics(shared_env: SharedEnv) -> None:
     """Every episode has 10 steps; an episode with a random start does not count."""
     ppo = made(shared_env(Metered, nworld=4, horizon=10, far=1e3))
     found: list[float] = []
@@ -92,7 +92,7 @@ def test_statistics_are_those_of_the_samples(shared_env: SharedEnv) -> None:
     assert it.kl == pytest.approx(torch.distributions.kl_divergence(old, new).sum(-1).mean().item(), rel=1e-4)
 
 
-def test_an_episode_that_is_cut_off_is_worth_the_value_of_its_final_observation(env: lw.Env) -> None:
+def test_a_truncated_episode_bootstraps_from_its_final_observation(env: lw.Env) -> None:
     """In the first step, world 0 continues, 1 reaches its time limit, 2 has a fault, and 3 terminates."""
     ppo = made(env, num_steps=3, normalize=False, minibatches=1)
     state = env.get_state()
@@ -161,7 +161,7 @@ def test_the_weight_of_the_entropy_falls_linearly(env: lw.Env) -> None:
     assert stds[1][0] == pytest.approx(stds[0][0]) and stds[1][2] > stds[0][2] + 0.02
 
 
-def test_it_goes_on_with_given_networks_and_a_network_of_the_users_own(env: lw.Env) -> None:
+def test_training_continues_from_given_networks_and_a_users_network(env: lw.Env) -> None:
     npg = lw.NPG(env, config=lw.NPGConfig(samples=80, hidden=(8,), value_hidden=(8,), time_orders=2, mean_every=0))
     next(npg)
     policy, value = copy.deepcopy(npg.policy).requires_grad_(False), copy.deepcopy(npg.value).requires_grad_(False)
@@ -191,7 +191,7 @@ def test_it_goes_on_with_given_networks_and_a_network_of_the_users_own(env: lw.E
     assert not torch.equal(own.network.weight, before)
 
 
-def test_a_run_has_the_files_of_every_run_and_continues(tmp_path: Path) -> None:
+def test_a_run_has_all_files_and_resumes(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     for iterations, resume in ((2, False), (4, True)):
         env = lw.make(Metered, nworld=4, horizon=10)

@@ -16,7 +16,7 @@ def threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def test_an_error_in_either_waits_for_the_other() -> None:
+def test_an_error_in_one_call_is_raised_after_the_other_ends() -> None:
     torch.set_num_threads(2)
     go, done = threading.Event(), threading.Event()
 

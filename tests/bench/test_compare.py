@@ -87,7 +87,7 @@ def test_a_package_that_cannot_be_imported_is_reported(tmp_path: Path, capsys: p
     assert "    package: new failed: RuntimeError: no package" in capsys.readouterr().out.splitlines()
 
 
-def test_a_name_of_neither_folder_nor_revision_is_refused() -> None:
+def test_a_name_that_is_neither_folder_nor_revision_is_refused() -> None:
     with pytest.raises(ValueError, match="'no_such_revision' is neither a folder with lyceum_warp/ nor a revision"):
         compare.run(compare.Options("no_such_revision", str(ROOT)))
 
@@ -113,14 +113,14 @@ def test_numbers_differ_in_any_bit(
     assert compare.difference("a", np.array(old, np.float32), np.array(old, np.float32)) is None
 
 
-def test_form_and_text_are_compared() -> None:
+def test_shape_type_and_text_are_compared() -> None:
     assert compare.difference("a", np.zeros(2), np.zeros(3)).text == "float64 (2,) -> float64 (3,)"
     assert compare.difference("a", np.zeros(2), np.zeros(2, np.float32)).kind == "form"
     assert compare.difference("a", np.array("ab"), np.array("abc")).text == "ab -> abc"
     assert compare.difference("a", np.array("ab"), np.array("ab")) is None
 
 
-def test_names_of_one_checkout_alone_are_added_or_removed() -> None:
+def test_names_in_only_one_checkout_are_added_or_removed() -> None:
     zero = np.zeros(1)
     found = compare.differences("u", {"both": zero, "gone": zero}, {"new": zero, "both": zero}, {})
     assert [(each.name, each.kind) for each in found] == [("u/gone", "removed"), ("u/new", "added")]

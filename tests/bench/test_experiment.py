@@ -1,12 +1,14 @@
 import dataclasses
 import json
 import os
+import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import experiment
+import overview
 import plot
 import pytest
 import tables
@@ -93,7 +95,7 @@ def test_stopped_run_continues_without_measuring_again(
     assert toy.main("--out", path, "--contestants", "ours") == 0 and not toy.measured
 
 
-def test_results_of_other_machines_and_versions_do_not_count(
+def test_results_of_other_machines_and_versions_are_not_reused(
     toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, options = tmp_path / "toy.jsonl", ("--contestants", "ours", "--tasks", "hop", "--repeats", 1)
@@ -109,10 +111,17 @@ def test_results_of_other_machines_and_versions_do_not_count(
         row = lines(path)[-1]
 
 
-def test_failing_case_leaves_the_others(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failing_case_does_not_stop_the_others(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "toy.jsonl"
     assert toy.main("--out", path, "--contestants", "ours", "--seeds", 14) == 1
     assert len(lines(path)) == 3 and "failed: task=walk repeat=0 contestant=ours" in capsys.readouterr().err
+
+
+def test_overview_lists_the_experiments(capsys: pytest.CaptureFixture[str]) -> None:
+    overview.main()
+    out = capsys.readouterr().out
+    assert "--short" in out and "lyceum-warp bench plot" in out
+    assert all(re.search(rf"^{name} +\S", out, re.MULTILINE) for name in experiment.NAMES)
 
 
 def test_dry_run_prints_cases_and_measures_nothing(
@@ -150,9 +159,7 @@ def test_bad_input_of_an_experiment_gets_one_line(
     assert error.startswith(f"{name}: ") and message in error and error.count("\n") == 1
 
 
-def test_figures_and_tables_come_from_results_alone(
-    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_figures_and_tables_need_only_results(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     toy.main("--out", tmp_path / "toy.jsonl")
     toy.measured.clear()
     assert plot.main(plot.Options(("toy",), tmp_path)) == 0
@@ -216,7 +223,7 @@ def measure(case, options):
 """
 
 
-def test_cases_apart_are_processes_on_cores_of_their_own(
+def test_cases_run_in_subprocesses_on_separate_cores(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "apart_toy.py").write_text(TOY)

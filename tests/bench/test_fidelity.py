@@ -31,7 +31,7 @@ def test_short_mode_compares_trajectories(tmp_path: Path, capsys: pytest.Capture
     assert f"| {TASK} | 3 |" in capsys.readouterr().out
 
 
-def test_other_dynamics_are_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_different_dynamics_diverge(monkeypatch: pytest.MonkeyPatch) -> None:
     make = fidelity.lw.make
 
     def replaced(task: str, **words: Any) -> lw.Env:
@@ -43,7 +43,7 @@ def test_other_dynamics_are_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     assert pairs["engines"]["half_apart"] <= 4 and pairs["moved"]["half_apart"] is None
 
 
-def test_half_apart_counts_worlds_that_were_ever_apart() -> None:
+def test_half_apart_counts_worlds_that_have_ever_diverged() -> None:
     error = torch.zeros(6, 4)
     error[2:, 0], error[4:, 1], error[3, 2] = 1.0, 1.0, 1.0  # worlds drift apart after 3, 5 and 4 steps, and never
     assert fidelity.half_apart(error) == 4

@@ -32,7 +32,7 @@ def test_a_robot_that_stands_has_tracking_errors(monkeypatch: pytest.MonkeyPatch
     assert 0.1 < found["velocity_error"] < 2.0 and found["falls_per_world_second"] >= 0.0
 
 
-def test_figure_needs_results_alone(tmp_path: Path) -> None:
+def test_figure_needs_only_results(tmp_path: Path) -> None:
     rows = experiment.read(experiment.RESULTS / "learning.jsonl")
     walkers = [row for row in rows if row.case["task"] == "go1_velocity"]
     learning.figure(walkers).savefig(tmp_path / "learning.png")

@@ -45,7 +45,7 @@ def test_gymnasium_fills_the_buffer_with_the_numbers_of_our_environments() -> No
     fed.collect(policy, noise)
     for world in range(nworld):
         ends = ours.done[:, world].nonzero()
-        assert len(ends), "no episode ended in these steps, so that this test shows too little"
+        assert len(ends), "no episode ended in these steps, so no restart was compared"
         until = int(ends[0]) + 1  # the next episode begins in a different state
         for name in ("obs", "action", "final_obs", "reward", "step", "terminated", "done", "episode_length"):
             mine, theirs = (getattr(rollout, name)[:until, world] for rollout in (ours, fed))
@@ -80,14 +80,14 @@ def test_a_run_yields_a_curve(contestant: str) -> None:
     assert (result.get("mode") in ("sync", "async")) == (contestant == "npg_gymnasium")
 
 
-def test_a_yardstick_ends_when_its_time_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_peers_learner_ends_when_its_time_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("stable_baselines3")
     monkeypatch.setitem(npg.LIMITS, "ppo_sb3", 1e-2)
     result = npg.measure(dataclasses.replace(case("ppo_sb3"), samples=1_000_000), npg.Options(short=True))
     assert result["samples"] < 256 and [point[0] for point in result["curve"]] == [0, result["samples"]]
 
 
-def test_tables_and_figure_come_from_results_alone(tmp_path: Path) -> None:
+def test_tables_and_figure_need_only_results(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     rows = []
     for name, slower in (("npg", 1.0), ("npg_gymnasium", 3.0), ("ppo_sb3", 20.0)):

@@ -1,4 +1,4 @@
-"""A task in which a function that is chosen by a parameter writes before or behind its array."""
+"""A task in which one function writes before or behind its array; a parameter chooses the function."""
 
 import warp as wp
 

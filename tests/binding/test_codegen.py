@@ -20,13 +20,13 @@ def test_the_same_functions_share_their_kernels(tmp_path: Path) -> None:
     assert kernels(f"{file}:Tiny") is kernels(f"{file}:Slower") is kernels(f"{file}:Tiny")
 
 
-def test_another_function_makes_other_kernels(tmp_path: Path) -> None:
+def test_a_different_function_makes_different_kernels(tmp_path: Path) -> None:
     other = f"{tiny_task.with_function(EVALUATE.replace('evaluate', 'height'))}\nclass Other(Tiny):\n"
     file = tiny_task.write(tmp_path, f"{other}    evaluate = height\n")
     assert kernels(f"{file}:Tiny") is not kernels(f"{file}:Other")
 
 
-def test_a_module_of_kernels_has_the_same_name_until_its_task_is_made_again(tmp_path: Path) -> None:
+def test_a_kernel_module_keeps_its_name_until_its_task_file_changes(tmp_path: Path) -> None:
     """Warp caches compiled kernels by the module's name."""
     file = tiny_task.write(tmp_path, tiny_task.TINY)
     first = kernels(file).judge.module.name

@@ -13,7 +13,7 @@ from lyceum_warp.task import FUNCTIONS, Task
 MEANT = {
     name: f"def {function.signature}:\n    {function.default or 'obs[0] = 1.0'}"
     for name, function in FUNCTIONS.items()
-    if name not in ("tally", "share")  # they come together, with structs of their own
+    if name not in ("tally", "share")  # the functions with shared memory need each other and structs of their own
 }
 """Every function of the table, as written in a task's file."""
 
@@ -40,7 +40,7 @@ def test_a_function_with_other_arguments_is_refused_with_the_line_to_write(name:
     assert str(caught.value) == f"{name} of the task 'tiny' must be written as {FUNCTIONS[name].signature}{more}"
 
 
-WRITTEN_OTHERWISE = {
+WRONG_SIGNATURES = {
     "another result": (
         "def terminated(s: World, p: Params) -> float:\n    return 1.0",
         r"terminated of the task 'tiny' must be written as terminated\(s: World, p: Params\) -> bool",
@@ -52,8 +52,10 @@ WRITTEN_OTHERWISE = {
 }
 
 
-@pytest.mark.parametrize(("function", "message"), WRITTEN_OTHERWISE.values(), ids=WRITTEN_OTHERWISE)
-def test_a_function_written_otherwise_is_refused(function: str, message: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("function", "message"), WRONG_SIGNATURES.values(), ids=WRONG_SIGNATURES)
+def test_a_function_with_another_result_or_missing_argument_is_refused(
+    function: str, message: str, tmp_path: Path
+) -> None:
     with pytest.raises(ValueError, match=message):
         source_of(tmp_path, tiny_task.with_function(function))
 
@@ -121,7 +123,7 @@ USERS = {
 
 
 @pytest.mark.parametrize("user", USERS)
-def test_a_function_that_looks_like_that_of_a_group_must_be_used_in_its_module(user: str, tmp_path: Path) -> None:
+def test_a_function_named_like_a_groups_must_be_called_in_its_module(user: str, tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, tiny_task.changed(("class Tiny", f"{CRITIC}class Tiny")) + USERS[user])
     task = find_task(f"{file}:Tiny")
     source = TaskSource(task, task_name(task))

@@ -14,7 +14,7 @@ def write(folder: Path, files: dict[str, str]) -> None:
         (folder / name).write_text(text)
 
 
-def test_modules_are_found_through_each_other_without_running_them(tmp_path: Path) -> None:
+def test_modules_are_found_through_imports_without_running_them(tmp_path: Path) -> None:
     write(tmp_path, {
         "task.py": "import json, numpy.linalg\nfrom aaa_first import one\ndef later():\n    import aaa_pkg.deep.leaf\n",
         "aaa_first.py": "import aaa_second as other, task\n1 / 0\n",
@@ -71,7 +71,7 @@ def test_a_module_that_changed_is_read_again(tmp_path: Path) -> None:
     assert (find_task(file).frame_skip, first.frame_skip) == (17, 6)
 
 
-def test_a_module_that_fails_leaves_those_from_before(tmp_path: Path) -> None:
+def test_a_module_that_fails_leaves_the_loaded_modules(tmp_path: Path) -> None:
     file = shared(tmp_path, 8)
     first, module = find_task(file), sys.modules["aaa_size"]
     (tmp_path / "aaa_size.py").write_text("from aaa_inner.number import SKIP\n1 / 0\n")

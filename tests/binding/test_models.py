@@ -124,11 +124,14 @@ def test_the_energy_is_turned_on_if_it_is_read() -> None:
 
 def test_physics_options_replace_the_models_own() -> None:
     solver = {"iterations": 7, "ls_iterations": 9}
-    physics = PhysicsOptions(timestep=0.015, cone="elliptic", integrator="implicitfast", solver=solver)
+    physics = PhysicsOptions(
+        timestep=0.015, cone="elliptic", integrator="implicitfast", solver=solver, jacobian="sparse", impratio=10
+    )  # fmt: skip
     option = compile_model(ball('cone="pyramidal" integrator="RK4"'), (), physics).opt
     assert option.timestep == 0.015 and option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     assert (option.iterations, option.ls_iterations) == (7, 9)
+    assert (option.jacobian, option.impratio) == (mujoco.mjtJacobian.mjJAC_SPARSE, 10.0)
 
 
 def test_a_field_that_needs_a_sensor_gets_one() -> None:

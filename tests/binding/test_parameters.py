@@ -1,4 +1,4 @@
-"""The values of a task's parameters: defaults, checks, and the array for the kernels."""
+"""Test the values of a task's parameters: defaults, checks, and the array for the kernels."""
 
 from pathlib import Path
 from typing import Any
@@ -61,7 +61,7 @@ def test_defaults_come_from_the_struct_and_dt_from_the_timestep(model: mujoco.Mj
     assert list(values["offset"]) == [0.0, 0.0, 0.5]
 
 
-def test_named_elements_become_their_places_in_the_model(model: mujoco.MjModel) -> None:
+def test_named_elements_become_their_indices_in_the_model(model: mujoco.MjModel) -> None:
     values = parameters(model).values
     assert (values["tip"], values["elbow"]) == (0, 1)
     for elbow in ("shoulder", lw.dof("shoulder"), 0):
@@ -211,7 +211,9 @@ def test_a_table_of_named_elements_has_their_indices(model: mujoco.MjModel) -> N
         (lw.sites("tip"), "joints of 'arm' can't have an element of 'site_xpos': it has elements of 'qvel'"),
     ],
 )
-def test_a_table_of_other_elements_is_refused(joints: list[Any], message: str, model: mujoco.MjModel) -> None:
+def test_a_table_with_elements_of_another_kind_is_refused(
+    joints: list[Any], message: str, model: mujoco.MjModel
+) -> None:
     with pytest.raises(ValueError, match=message):
         parameters(model, Named, joints=joints)
 

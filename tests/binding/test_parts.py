@@ -1,4 +1,4 @@
-"""Parts of memory and of observations have names: their order, sizes and types, and mistakes in them."""
+"""Test named parts of memory and of observations: order, sizes, types, and mistakes."""
 
 from pathlib import Path
 from typing import Any
@@ -102,7 +102,7 @@ def test_parts_have_their_order_sizes_and_values_in_states_and_observations(engi
     assert env.obs[:, 5].tolist() == [6.0, 7.0]
 
 
-def test_a_table_sets_sizes_which_no_later_value_changes() -> None:
+def test_a_table_sets_the_sizes_of_parts_permanently() -> None:
     env = lw.make(Marked, places=[1.0, 2.0])
     assert env.obs.shape == (1, 5)
     env.set_params(places=[3.0, 4.0])
@@ -165,7 +165,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize(("changes", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_in_a_part_is_one_line_that_names_it(
+def test_a_mistake_in_a_part_raises_one_line_that_names_it(
     changes: list[tuple[str, str]], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=f"^{message}") as caught:
@@ -174,7 +174,7 @@ def test_a_mistake_in_a_part_is_one_line_that_names_it(
 
 
 def test_a_function_that_others_call_writes_no_group(tmp_path: Path) -> None:
-    """Its name has the prefix of a group's function, but ``observe`` calls it as a helper."""
+    """Its name begins like a group's function, but ``observe`` calls it as a helper."""
     helper = struct_of(PART, "observe_all(s, p, obs)").replace(
         "@wp.func\n",
         "@wp.func\ndef observe_all(s: World, p: Params, obs: Policy):\n    obs.x[0] = s.qpos[0]\n\n@wp.func\n",

@@ -78,7 +78,7 @@ def test_a_name_of_another_file_or_of_the_package_is_taken(load: Load) -> None:
 # files
 
 
-def test_a_file_is_found_by_text_and_by_path(tmp_path: Path) -> None:
+def test_a_file_is_found_by_string_and_by_path(tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, tiny_task.TINY)
     assert find_task(file) is find_task(str(file)) is find_task(f"{file}:Tiny")
 

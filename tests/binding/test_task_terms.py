@@ -33,7 +33,7 @@ def stepped(env: lw.Env, steps: int = 12) -> list[dict[str, np.ndarray]]:
 
 
 @ENGINES
-def test_rewards_metrics_and_ends_are_those_of_the_formulas(engine: str) -> None:
+def test_rewards_metrics_and_ends_equal_their_formulas(engine: str) -> None:
     env = lw.make(Terms, nworld=6, engine=engine, autoreset=False, seed=1)
     ended = np.zeros(6, dtype=bool)
     for s in stepped(env, 40):
@@ -55,7 +55,7 @@ def test_rewards_metrics_and_ends_are_those_of_the_formulas(engine: str) -> None
 
 
 @ENGINES
-def test_weights_are_set_as_parameters_are_also_for_each_world(engine: str) -> None:
+def test_weights_are_set_like_parameters_also_per_world(engine: str) -> None:
     env, other = (lw.make(Terms, nworld=2, engine=engine, seed=1, **words) for words in ({}, {"near": 2.0, "fast": 0}))
     action = torch.ones((2, env.action_space.size))
     start = env.get_state()
@@ -76,7 +76,7 @@ def test_weights_are_set_as_parameters_are_also_for_each_world(engine: str) -> N
 
 
 @ENGINES
-def test_a_rollout_pays_what_steps_pay(engine: str) -> None:
+def test_a_rollout_has_the_rewards_of_steps(engine: str) -> None:
     env = lw.make(Terms, nworld=3, engine=engine, autoreset=False, horizon=0, near=[1.0, 2.0, 3.0])
     loop = OpenLoop(lw.make(Terms, nworld=3, engine=engine, autoreset=False, near=[1.0, 2.0, 3.0]), 4)
     loop.state.copy_(env.get_state()[0])
@@ -90,13 +90,13 @@ def test_a_rollout_pays_what_steps_pay(engine: str) -> None:
         assert torch.equal(loop.terminated[t], env.terminated)
 
 
-def test_a_variant_of_weights_shares_the_kernels() -> None:
+def test_a_variant_with_other_weights_shares_the_kernels() -> None:
     plain, other = lw.make(Terms), lw.make(Ordered)
     assert plain.task.kernels is other.task.kernels
     assert (plain.task.params["near"], other.task.params["near"]) == (1.0, 3.0)
 
 
-def test_the_text_calls_each_function_once_and_is_shown() -> None:
+def test_reward_text_calls_each_function_once() -> None:
     text = lw.make(Terms).task.reward_text
     reward = text[text.index("def reward") : text.index("def score")]
     assert "    total = weights[0] * near_\n    total += weights[1] * fast_\n" in reward
@@ -190,7 +190,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
 
 
 @pytest.mark.parametrize(("changes", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_in_a_term_is_one_line_that_names_it(
+def test_a_mistake_in_a_term_raises_one_line_that_names_it(
     changes: list[tuple[str, str]], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=f"^{message}") as caught:
@@ -204,7 +204,7 @@ def test_a_task_with_terms_keeps_every_rule(engine: str) -> None:
     assert not check_task(Terms, engine=engine, steps=40, checks=quick).unused
 
 
-def test_parts_without_use_are_named(tmp_path: Path) -> None:
+def test_unused_fields_and_terms_are_named(tmp_path: Path) -> None:
     source = tiny_task.changed(
         *term(
             "def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):\n"

@@ -45,11 +45,8 @@ def test_writes_out_of_range_are_refused_and_leave_the_heap_intact() -> None:
     cases, messages = [], []
     for name, (number, size, row, declared) in ROWS.items():
         function, into, of = name.split()[0], row and f" into {row}", row and f" of {row}"
-        for index, text in (
-            (size, f"{size + 1} numbers{into}"),
-            (size + 999, f"{size + 1000} numbers{into}"),
-            (-size - 1, f"at index {-size - 1}{of}"),
-        ):
+        far = [] if cases else [(size + 999, f"{size + 1000} numbers{into}")]
+        for index, text in ((size, f"{size + 1} numbers{into}"), (-size - 1, f"at index {-size - 1}{of}"), *far):
             cases.append(f"{number} {index}")
             messages.append(f"{function} of the task 'out_of_range' writes {text}, but {declared}")
     run = subprocess.run(
@@ -60,7 +57,7 @@ def test_writes_out_of_range_are_refused_and_leave_the_heap_intact() -> None:
 
 
 @pytest.mark.parametrize("index", [0, 5, -1, -6])
-def test_indices_within_a_row_are_accepted_from_both_ends(index: int) -> None:
+def test_positive_and_negative_indices_within_a_row_are_accepted(index: int) -> None:
     env = lw.make(str(TASK), function=10, index=index)
     env.reset()
     assert env.field("qpos")[0, index] == 1.0

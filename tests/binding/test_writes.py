@@ -182,7 +182,7 @@ def uses_rows(s: Uses, p: Params):
     poke(s.by_native)
 
 
-def test_a_row_that_cannot_be_followed_counts_as_written() -> None:
+def test_a_row_that_cannot_be_traced_counts_as_written() -> None:
     assert {write.field for write in find_writes(uses_rows) if write.use is not None} == {*Uses.vars}
 
 
@@ -221,7 +221,7 @@ def made_with(row_name: str, helper: Any) -> Any:
     return enclosing
 
 
-def test_enclosed_names_are_followed() -> None:
+def test_functions_in_closures_are_analysed() -> None:
     assert written_fields(made_with("qvel", fill)) == {"memory", "qvel"}
     assert written_fields(made_with("other", fill_any)) == {"memory", "qpos"}
 
@@ -304,7 +304,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("name", "function", "message"), REFUSED.values(), ids=REFUSED)
-def test_a_write_that_the_form_does_not_allow_is_one_line(name: str, function: Any, message: str) -> None:
+def test_a_write_that_the_task_form_forbids_raises_one_line(name: str, function: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         check_writes("mine", {name: function}, RIGHTS)
     assert "\n" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""The viewer in a real browser: what a page shows, and how it responds to input."""
+"""Test the viewer in a real browser: what a page shows, and how it responds to input."""
 
 import contextlib
 import http.server
@@ -326,6 +326,7 @@ def test_an_episode_is_scrubbed_and_played(tab: Tab) -> None:
     tab.press("Space", lambda: viewer.status.step < STEPS / 2)
 
 
+@pytest.mark.long
 def test_another_browser_controls_after_one_is_closed_or_killed(
     viewer: Viewer, launch: Callable[[], Browser], context: BrowserContext, shared_tab: Tab
 ) -> None:
@@ -368,7 +369,7 @@ def test_pages_of_other_sites_cannot_reach_the_viewer(viewer: Viewer, context: B
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        for host in ("localhost", "127.0.0.1"):  # the second one is the same site
+        for host in ("localhost", "127.0.0.1"):  # the second page belongs to the viewer's site
             page = context.new_page()
             page.goto(f"http://{host}:{server.server_address[1]}/")
             assert not page.evaluate(opens, f"{base.replace('http', 'ws')}state")

@@ -38,7 +38,7 @@ def test_a_parameter_is_read_with_its_type(text: str, value: object) -> None:
         ("mass=heavy", "the value in 'mass=heavy' must be a number, true or false"),
     ],
 )
-def test_a_parameter_written_in_another_way_is_refused(text: str, message: str) -> None:
+def test_a_malformed_parameter_is_refused(text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parameter(text)
 
@@ -58,7 +58,7 @@ class Flags:
     extra: int = 4
 
 
-def test_flags_are_the_fields_of_the_options_and_none_unless_given() -> None:
+def test_flags_are_the_fields_of_the_options_and_default_to_none() -> None:
     assert [field.name for field in dataclasses.fields(Flags)] == ["size", "name", "fast", "safe", "limits", "extra"]
     unset = {"size": None, "name": None, "fast": None, "safe": None, "limits": (), "extra": 4}
     assert vars(tyro.cli(Flags, args=[])) == unset and given(Flags()) == {}
@@ -90,7 +90,7 @@ def test_an_option_among_the_parameters_is_refused(name: str) -> None:
         parameters(["mass=1", f"{name}=any"], Train())
 
 
-def test_parameters_are_read_in_order_and_name_the_flag_that_stands_for_an_option() -> None:
+def test_the_last_value_of_a_parameter_counts_and_an_option_names_its_flag() -> None:
     assert parameters(["mass=1", "size=1,2", "mass=3"], Train()) == {"mass": 3, "size": [1, 2]}
     with pytest.raises(ValueError, match="horizon is an option, not a parameter of the task: use --steps"):
         parameters(["horizon=9"], Train(), instead={"horizon": "--steps"})

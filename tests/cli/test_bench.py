@@ -5,6 +5,7 @@ import pytest
 from lyceum_warp.cli import main
 
 
+@pytest.mark.long
 def test_bench_lists_the_experiments(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["bench"]) == 0
     out = capfd.readouterr().out

@@ -28,7 +28,7 @@ def first(npg: lw.NPG) -> lw.Iteration:
 
 @contextlib.contextmanager
 def shown_on(console: Console, npg: lw.NPG, total: int = 10) -> Iterator[display.Display]:
-    """Show the display of a run after its first line."""
+    """Return the display of a run that has printed its first line."""
     shown = display.Display(console)
     with shown.training(Run(Path("run"), {}), npg, total):
         console.file.truncate(0)
@@ -52,12 +52,12 @@ def line(npg: lw.NPG, iteration: lw.Iteration, **changes: object) -> str:
     return console.file.getvalue()
 
 
-def test_the_first_line_shows_the_reward_where_no_episode_has_ended(npg: lw.NPG, first: lw.Iteration) -> None:
+def test_the_first_line_shows_the_reward_if_no_episode_has_ended(npg: lw.NPG, first: lw.Iteration) -> None:
     assert math.isnan(first.return_mean)
     assert line(npg, first, reward_mean=-0.8125) == "iteration    1/10  reward -0.812 a step 29.4k samples/s\n"
 
 
-def test_a_line_shows_what_there_is(npg: lw.NPG, first: lw.Iteration) -> None:
+def test_a_line_shows_only_known_numbers(npg: lw.NPG, first: lw.Iteration) -> None:
     common = {"return_mean": 3072.4, "mean_return": 3117.2}
     assert line(npg, first, **common) == "iteration    1/10  return 3072 (mean policy 3117) 29.4k samples/s\n"
     assert "(mean policy 3117) success 25% 29.4k" in line(npg, first, **common, success=0.25)
@@ -94,7 +94,7 @@ def test_the_table_of_a_run_has_at_most_15_rows_with_evaluations_first() -> None
     assert [line[0] for line in lines if line and line[0].isdigit()] == list(map(str, [1, *range(10, 101, 10)]))
 
 
-def test_the_table_leaves_out_what_the_task_does_not_have(first: lw.Iteration) -> None:
+def test_the_table_omits_empty_columns(first: lw.Iteration) -> None:
     row = first.row()  # HalfCheetah has no success, and no episode has ended
     shown = table([row])
     assert "reward" in shown and f"{first.reward_mean:.3g}" in shown

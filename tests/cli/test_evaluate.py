@@ -52,14 +52,16 @@ def test_eval_prints_statistics_of_the_seeds_episodes(trained: Path, capsys: pyt
     assert "success:" in lines
 
 
-def test_eval_refuses_no_episodes_and_folders_without_a_run(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_eval_refuses_zero_episodes_and_folders_without_a_run(
+    trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["eval", str(trained), "--episodes", "0"]) == 2
     refused(capsys, "at least 1 episode")
     assert cli.main(["eval", str(trained.parent)]) == 2
     refused(capsys, "there is no run in")
 
 
-def test_a_folder_may_have_the_name_of_markup(
+def test_a_folder_name_may_look_like_rich_markup(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = Path(shutil.copytree(trained, tmp_path / "[" / "bold]x"))
@@ -112,3 +114,14 @@ def test_a_video_is_made_with_the_camera_that_is_named(
         assert cli.main(["eval", str(trained), "--episodes", "1", *flags]) == 2
         refused(capsys, message)
     assert len(cameras) == 3
+
+
+def test_eval_compares_both_engines(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["eval", str(trained), "--episodes", "4", "--horizon", "20", "--transfer"]
+    assert cli.main(arguments) == 0
+    shown = capsys.readouterr().out
+    assert "Warp engine on cpu against C engine: same" in shown
+    rows = [line.split() for line in shown.splitlines() if line.split()[:1] == ["length"]]
+    assert rows[-1] == ["length", "20", "20", "+0", "+0", "to", "+0", "1", "same"]
+    assert cli.main([*arguments, "--engine", "warp"]) == 2
+    refused(capsys, "--transfer plays on both engines: omit --engine")

@@ -26,7 +26,7 @@ def test_export_writes_a_policy_that_onnx_runtime_runs(run: Path, capsys: pytest
     np.testing.assert_allclose(action, lw.load(run)(torch.from_numpy(obs)).numpy(), rtol=1e-6, atol=1e-6)
 
 
-def test_export_writes_where_it_is_asked_to(run: Path, tmp_path: Path) -> None:
+def test_export_writes_to_the_given_path(run: Path, tmp_path: Path) -> None:
     assert main(["export", str(run), "--to", str(tmp_path / "robot" / "policy.pt2")]) == 0
     obs = torch.randn(3, 11)
     action = torch.export.load(tmp_path / "robot" / "policy.pt2").module()(obs)
@@ -40,7 +40,7 @@ def test_export_writes_where_it_is_asked_to(run: Path, tmp_path: Path) -> None:
         (["--which", "best"], ["best"]),
     ],
 )
-def test_export_refuses_in_one_line(
+def test_export_refuses_bad_input_in_one_line(
     run: Path, options: list[str], words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["export", str(run), *options]) == 2

@@ -51,7 +51,7 @@ def test_tasks_are_listed_with_their_sizes_and_models(capsys: pytest.CaptureFixt
     assert "    hop forward on one leg (Gymnasium's Hopper-v5)" in out.splitlines()
 
 
-def test_listed_sizes_are_those_of_an_environment(capsys: pytest.CaptureFixture[str]) -> None:
+def test_listed_sizes_equal_an_environments(capsys: pytest.CaptureFixture[str]) -> None:
     cli.main(["tasks", "gymnasium"])
     found = rows(capsys.readouterr().out)
     for name in ("hopper", "humanoid", "pusher"):
@@ -100,7 +100,7 @@ def test_a_task_whose_extra_is_missing_is_listed_with_all_that_is_known_without_
         (7, "obs of the task 'hopper' is 7: add the parts of its observation"),
     ],
 )
-def test_a_broken_task_is_listed_with_its_mistake_and_ends_no_list(
+def test_a_broken_task_is_listed_with_its_mistake(
     broken: object, shown: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(find_task("hopper"), "obs", broken)
@@ -110,8 +110,8 @@ def test_a_broken_task_is_listed_with_its_mistake_and_ends_no_list(
     assert shown in out
 
 
-def test_a_list_that_is_read_in_part_ends_quietly() -> None:
-    """The reader of the pipe ends before the first line."""
+def test_a_closed_pipe_ends_the_list_quietly() -> None:
+    """The reader closes the pipe before the first line."""
     command = f"{sys.executable} -m lyceum_warp.cli tasks hopper | true"
     done = subprocess.run(command, shell=True, capture_output=True, text=True)
     assert done.stderr == ""

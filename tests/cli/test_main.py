@@ -6,7 +6,7 @@ import pytest
 import lyceum_warp as lw
 from lyceum_warp import cli
 
-COMMANDS = ("tasks", "new", "check", "train", "eval", "export", "plan", "view", "bench")
+COMMANDS = ("tasks", "new", "check", "train", "eval", "export", "plan", "tune", "view", "bench")
 
 
 def test_help_lists_commands_with_examples(capsys: pytest.CaptureFixture[str]) -> None:

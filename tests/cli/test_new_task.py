@@ -86,7 +86,7 @@ def test_a_new_task_observes_the_state_and_those_sensors_that_measure_it(folder:
     assert env.reward.tolist() == [0.0, 0.0]
 
 
-def test_a_model_whose_sensors_measure_every_joint_is_observed_through_them_alone(folder: Path) -> None:
+def test_a_model_whose_sensors_measure_every_joint_is_observed_only_through_them(folder: Path) -> None:
     task = find_task(new("sensed", SENSED))
     assert task.obs == {"sensors": 7}
     unsensed = SENSED.replace('<gyro site="imu"/>', '<gyro site="end"/>')  # no sensor measures the floating body
@@ -107,7 +107,7 @@ def test_any_model_gets_a_task_that_fits_it(model: str, folder: Path) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("model", [*MOVING.values(), *SENSING.values()], ids=[*MOVING, *SENSING])
-def test_a_new_task_of_any_model_keeps_the_rules(model: str, engine: str, folder: Path) -> None:
+def test_a_new_task_for_any_model_keeps_the_rules(model: str, engine: str, folder: Path) -> None:
     file = new("walk", model)
     check_task(str(file), engine=engine, nworld=2, steps=10, horizon=6, frame_skip=2, checks=QUICK_CHECKS)
 
@@ -125,12 +125,12 @@ def package_models() -> list[Path]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("model", package_models(), ids=lambda path: f"{path.parent.name}-{path.stem}")
-def test_a_new_task_of_a_package_s_model_keeps_the_rules(model: Path, folder: Path) -> None:
+def test_a_new_task_for_a_packages_model_keeps_the_rules(model: Path, folder: Path) -> None:
     assert cli.main(["new", "walk", "--model", str(model)]) == 0
     check_task("walk.py", engine="mujoco", nworld=2, steps=10, horizon=6, frame_skip=2, checks=QUICK_CHECKS)
 
 
-def test_functions_in_comments_work_once_they_are_taken_in(folder: Path) -> None:
+def test_commented_functions_work_once_they_are_uncommented(folder: Path) -> None:
     file = new("everything", RICH)
     head, body = file.read_text().split("# Three more functions that most tasks have:\n#\n")
     commented, tail = body.split("\n\n@lw.register")
@@ -159,7 +159,7 @@ def test_new_files_are_formatted(folder: Path) -> None:
         assert done.returncode == 0, done.stdout
 
 
-def test_the_model_s_path_is_written_relative_to_the_task_file(folder: Path) -> None:
+def test_the_models_path_is_written_relative_to_the_task_file(folder: Path) -> None:
     for made in ("models", "tasks"):
         Path(made).mkdir()
     model = Path("models", "robot.xml")

@@ -37,6 +37,7 @@ SLED = """
       </body>
     </body>
   </worldbody>
+  <tendon><fixed name="left"><joint joint="left_hip" coef="1"/></fixed></tendon>
   <actuator>
     <position name="right_hip" joint="right_hip" kp="40" kv="2"/>
     <position name="left_hip" joint="left_hip" kp="40" kv="2"/>
@@ -93,7 +94,7 @@ def test_a_robot_learns_for_an_iteration(folder: Path, tmp_path: Path) -> None:
     assert cli.main(["train", "ant_walk.py", "--out", str(tmp_path / "run"), *words, "--no-video"]) == 0
 
 
-def test_feet_and_joints_are_those_of_the_legs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_feet_and_joints_are_found_on_the_legs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """New sites are in the middle of the soles; a site that is there stays; other joints keep their pose."""
     assert new("sled_walk", "--model", "sled.xml") == 0
     assert capsys.readouterr().out.startswith("sled_walk.py: feet foot_1, toe; joints left_hip, right_hip; check")
@@ -117,12 +118,14 @@ def test_options_name_feet_and_joints(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "options", "words"),
     [
-        ((), ["--feet", "tow"], "sled.xml: the model has no site, geom or body 'tow': --feet takes their names"),
-        ((), ["--joints", "hip"], "sled.xml: the model has no joint 'hip': --joints takes names of joints"),
+        ((), ["--feet", "tow"], "sled.xml: the model has no site, geom or body 'tow': --feet takes"),
+        ((), ["--joints", "hip"], "sled.xml: the model has no joint 'hip': --joints takes names, separated"),
         (("<freejoint/>", ""), [], "sled.xml: the first joint of the model is not a free joint"),
         (('<geom name="floor" type="plane" size="5 5 .1"/>', ""), [], "sled.xml: the model has no floor"),
         (('<position name="left_hip" joint="left_hip" kp="40" kv="2"/>', ""), ["--joints", "left_hip"],
-         "sled.xml: the joint 'left_hip' has 0 actuators: it needs one"),
+         "sled.xml: the joint 'left_hip' has 0 actuators of its own and needs one"),
+        (('<position name="left_hip" joint="left_hip" kp="40" kv="2"/>', '<motor tendon="left" ctrlrange="-1 1"/>'), [],
+         "sled.xml: the joint 'left_hip' has 0 actuators of its own and needs one (those of tendons do not count)"),
     ],
 )  # fmt: skip
 def test_a_robot_without_legs_is_refused(
@@ -138,7 +141,7 @@ def test_feet_without_the_template_are_refused(folder: Path, capsys: pytest.Capt
     assert "--feet and --joints belong to --template velocity" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("task", ["g1_velocity", "spot_velocity"])
+@pytest.mark.parametrize("task", ["spot_velocity", pytest.param("g1_velocity", marks=pytest.mark.long)])
 def test_robots_of_menagerie_become_tasks(task: str, folder: Path) -> None:
     model = {"g1_velocity": "unitree_g1/scene_mjx.xml", "spot_velocity": "boston_dynamics_spot/scene.xml"}[task]
     assert new("walk", "--model", f"menagerie:{model}") == 0

@@ -32,7 +32,7 @@ def plan(out: Path, *options: str, task: str = "point_mass") -> int:
     return cli.main(["plan", task, "--out", str(out), *SMALL, *options])
 
 
-def test_a_folder_may_have_the_name_of_markup(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_name_may_look_like_rich_markup(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "[" / "bold]x"
     assert plan(out, "--steps", "2", "--no-video", "--no-plot") == 0
     assert f"files in {out}" in capsys.readouterr().out
@@ -89,7 +89,7 @@ def test_a_video_is_made_of_the_first_episode(tmp_path: Path, capsys: pytest.Cap
     assert Path(video).read_bytes()[4:8] == b"ftyp"
 
 
-def test_real_time_keeps_the_rate_of_the_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_real_time_keeps_the_rate_of_the_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(tmp_path / "run", *QUIET, "--real-time") == 0
     assert "async" in capsys.readouterr().out
     report = json.loads((tmp_path / "run" / "report.json").read_text())
@@ -175,7 +175,7 @@ def test_a_value_function_of_a_run_changes_plans(tmp_path: Path, capsys: pytest.
     refused(capsys, f"--value {run} is a run of the task 'point_mass', not of 'reach'")
 
 
-def test_a_planner_param_changes_the_planner_alone(tmp_path: Path) -> None:
+def test_a_planner_param_changes_only_the_planner(tmp_path: Path) -> None:
     options = ["--param", "success_distance=0.2", "--planner-param", "success_distance=0.1"]
     assert plan(tmp_path / "run", *QUIET, *options) == 0
     config = json.loads((tmp_path / "run" / "config.json").read_text())
@@ -184,10 +184,10 @@ def test_a_planner_param_changes_the_planner_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("options, name, integrator", [
-    ([], "euler", mujoco.mjtIntegrator.mjINT_EULER),  # as the task suggests
+    ([], "euler", mujoco.mjtIntegrator.mjINT_EULER),  # the task's planning sets it
     (["--integrator", "implicitfast"], "implicitfast", mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
 ])  # fmt: skip
-def test_options_of_the_physics_change_the_planner_alone(
+def test_physics_options_change_only_the_planner(
     options: list[str], name: str, integrator: int, tmp_path: Path, made_envs: list[lw.Env]
 ) -> None:
     out = tmp_path / "run"
@@ -203,7 +203,7 @@ def test_options_of_the_physics_change_the_planner_alone(
     assert (settings["integrator"], settings["deterministic"]) == (name, True)
 
 
-def test_every_update_plans_and_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_update_is_saved_and_printed_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flags = ["--knots", "4", "--spline", "linear", "--include-plan", "True", "--replan-every", "3", "--steps", "9"]
     shown = {
         ("cem", "--elites", "3", "--min-noise", "0.02"): "CEM, 8 samples",
@@ -251,7 +251,7 @@ def test_every_update_plans_and_is_named(tmp_path: Path, capsys: pytest.CaptureF
     (["--camera", "track=elbow"], ["the camera cannot track the body 'elbow'"]),
     (["--no-video", "--camera", "0"], ["--camera has no effect with --no-video"]),
 ])  # fmt: skip
-def test_an_option_out_of_range_is_one_line_and_leaves_no_folder(
+def test_an_option_out_of_range_prints_one_line_and_leaves_no_folder(
     options: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert plan(tmp_path / "run", *options) == 2
@@ -269,7 +269,7 @@ def test_a_folder_that_is_not_empty_is_refused(tmp_path: Path, capsys: pytest.Ca
     assert "--resume" not in (error := capsys.readouterr().err) and "holds a run: give another folder" in error
 
 
-def test_an_interrupt_keeps_whole_episodes(tmp_path: Path) -> None:
+def test_an_interrupt_keeps_complete_episodes(tmp_path: Path) -> None:
     out = tmp_path / "run"
     argv = ["plan", "point_mass", "--out", str(out), *SMALL, *QUIET, "--episodes", "100000"]
     program = f"{TAKE_SIGINT}import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"
@@ -316,7 +316,7 @@ def test_fill_is_a_word_or_one_number_or_an_action(words: list[str], fill: objec
     assert json.loads((tmp_path / "run" / "config.json").read_text())["planner"]["fill"] == fill
 
 
-def test_settings_that_are_not_given_are_those_of_the_task(tmp_path: Path) -> None:
+def test_settings_default_to_the_tasks(tmp_path: Path) -> None:
     argv = ["plan", "reach", "--out", str(tmp_path / "run"), *QUIET, "--steps", "1", "--samples", "7"]
     assert (
         cli.main([*argv, "--noise", "0.3", "0.4", "0.5", "0.6", "0.7", "0.8", "0.9", "--smoothing", "1", "0", "0"]) == 0

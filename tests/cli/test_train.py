@@ -77,7 +77,7 @@ def test_a_task_file_is_trained_and_evaluated(
     assert f"video: {video if video.exists() else 'none: '}" in capsys.readouterr().out
 
 
-def test_a_video_that_fails_is_one_line_of_a_successful_run(
+def test_a_video_that_fails_prints_one_line_and_the_run_succeeds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(*args: object, **words: object) -> None:
@@ -128,7 +128,7 @@ def test_resume_refuses_other_settings(trained: Path, tmp_path: Path, capsys: py
     refused(capsys, "there is no run in")
 
 
-def test_a_resumed_run_shows_the_same(tmp_path: Path) -> None:
+def test_a_resumed_run_keeps_its_tensorboard_and_video_settings(tmp_path: Path) -> None:
     out = tmp_path / "run"
     pytest.importorskip("tensorboard")
     assert train(out, "--iterations", "1", "--tensorboard", "--video-every", "50") == 0
@@ -153,16 +153,16 @@ def physics(env: lw.Env) -> tuple[int, int, int, bool]:
 def test_a_run_keeps_its_physics(tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     options = ["--integrator", "euler", "--solver", "iterations=7", "--solver", "ls_iterations=9", "--deterministic"]
-    assert train(out, "--iterations", "1", *options, task="hopper") == 0  # its own integrator is RK4
+    assert train(out, "--iterations", "1", "--no-transfer", *options, task="hopper") == 0  # its own integrator is RK4
     solver = {"iterations": 7, "ls_iterations": 9}
     given = {"integrator": "euler", "solver": solver, "deterministic": True}
     assert Run.open(out).config["physics"] == given
-    resume = ["train", "--resume", str(out), *QUIET, "--iterations"]
+    resume = ["train", "--resume", str(out), *QUIET, "--no-transfer", "--iterations"]
     assert cli.main([*resume, "2"]) == 0
     assert cli.main([*resume, "3", "--solver", "iterations=7", "--integrator", "euler"]) == 0
     assert cli.main(["eval", str(out), "--episodes", "2", "--video"]) == 0
     assert {physics(env) for env in made_envs} == {(mujoco.mjtIntegrator.mjINT_EULER, 7, 9, True)}
-    assert {env.nworld for env in made_envs} == {1, 2, 32}  # a video, all iterations and eval, the final evaluation
+    assert {env.nworld for env in made_envs} == {1, 2, 32}  # the video; training and eval; the evaluation at the end
     capsys.readouterr()
     for other, words in [
         (["--integrator", "rk4"], "has integrator euler, not rk4"),
@@ -232,10 +232,11 @@ def test_a_flag_of_the_other_algorithm_is_refused(capsys: pytest.CaptureFixture[
     for words, message in (
         (
             ["--learning-rate", "3"],
-            "--learning-rate is a setting of ppo, not of npg: omit it, or give --algorithm",
+            "--learning-rate is a setting of ppo or sac, not of npg: omit it, or give --algorithm",
         ),
         (["--no-stagger"], "--stagger is a setting of ppo, not of npg"),
         (["--algorithm", "ppo", "--samples", "9"], "--samples is a setting of npg, not of ppo"),
+        (["--algorithm", "sac", "--clip", "0.1"], "--clip is a setting of ppo, not of sac"),
     ):
         assert cli.main(["train", "hopper", *words]) == 2
         refused(capsys, message)
@@ -245,7 +246,7 @@ def test_hyperparameters_are_shown_by_help_with_their_algorithms(capsys: pytest.
     with pytest.raises(SystemExit):
         cli.main(["train", "--help"])
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    for words in ("--whiten, --no-whiten", "(npg 0.995, ppo 0.99)", "(npg 64 64, ppo 512 256 128)", "(ppo 24)"):
+    for words in ("--whiten, --no-whiten", "(npg 0.995, ppo 0.99, sac)", "sac 0.0003)", "(ppo 24, sac)"):
         assert words in shown
 
 
@@ -256,7 +257,7 @@ def test_hyperparameters_are_shown_by_help_with_their_algorithms(capsys: pytest.
     (lambda config: config.update(nworld="many"), "not 'many'"),
     (lambda config: config.pop("params"), "'params'"),
 ])  # fmt: skip
-def test_a_configuration_that_does_not_fit_is_one_line(
+def test_a_configuration_that_does_not_fit_prints_one_line(
     change: Any, words: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(changed_config(trained, tmp_path / "run", change)) == 2
@@ -300,7 +301,7 @@ def test_a_broken_checkpoint_falls_back_to_the_one_before_it(
     assert metrics(out) == metrics(trained)
 
 
-def test_a_broken_best_policy_is_replaced_with_a_line(
+def test_a_broken_best_policy_is_replaced_with_a_message(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     resume = changed_config(trained, tmp_path / "run", lambda config: None)
@@ -341,7 +342,7 @@ def test_train_refuses_to_overwrite_a_run(trained: Path, capsys: pytest.CaptureF
         ("point_mass", ["--solver", "iterations"], ["'iterations'", "NAME=VALUE"]),
     ],
 )
-def test_a_bad_option_is_one_line_and_leaves_no_folder(
+def test_a_bad_option_prints_one_line_and_leaves_no_folder(
     task: str, options: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert train(tmp_path / "run", *options, task=task) == 2
@@ -354,19 +355,22 @@ def test_train_without_a_task_is_refused(capsys: pytest.CaptureFixture[str]) -> 
     refused(capsys, "train needs a task", "hopper")
 
 
-def test_a_return_that_is_too_small_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_return_below_require_return_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert train(tmp_path / "easy", "--iterations", "1", "--require-return", "-1e6") == 0
     assert train(tmp_path / "hard", "--iterations", "1", "--require-return", "1e6") == 1
     assert "--require-return demands more than 1e+06" in capsys.readouterr().err
     assert (tmp_path / "hard" / "checkpoint.pt").exists()
 
 
-def test_the_default_number_of_worlds_depends_on_the_device() -> None:
+def test_the_default_number_of_worlds_depends_on_the_device_and_the_algorithm() -> None:
     found = []
     for device, size, nworld in (("cpu", 2, None), ("cuda:0", 1, None), ("cuda", 2, None), ("cuda", 2, 96)):
         options = Train(task="hopper", env=EnvFlags(device=device), nworld=nworld)
         found.append(options.configuration(None, Team(0, size)).options.nworld)
     assert found == [64, 4096, 8192, 96]
+    for device, nworld in (("cpu", 8), ("cuda", 4096)):
+        options = Train(task="hopper", algorithm="sac", env=EnvFlags(device=device))
+        assert options.configuration(None, Team()).options.nworld == nworld
 
 
 # interruptions
@@ -443,3 +447,13 @@ def test_a_killed_run_continues(trained: Path, tmp_path: Path) -> None:
     assert cli.main(["train", "--resume", str(out), "--iterations", str(total), *QUIET]) == 0
     assert metrics(out)[:4] == metrics(trained)[:4]
     assert len(metrics(out)) == total
+
+
+def test_the_verdict_on_transfer_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--iterations", "1", "--horizon", "20"]
+    assert train(tmp_path / "exact", *options) == 0
+    assert "transfer:" not in capsys.readouterr().out
+    assert train(tmp_path / "coarse", *options, "--frame-skip", "2") == 0
+    assert "transfer: own physics against exact physics: " in capsys.readouterr().out
+    assert train(tmp_path / "both", *options, "--transfer") == 0
+    assert "transfer: Warp engine on cpu against C engine: same (return " in capsys.readouterr().out

@@ -100,7 +100,7 @@ def test_episodes_are_played_back(opened: Opened, files: list[Path]) -> None:
         (["point_mass", "--param", "nworld=3"], ["nworld is an option"]),
     ],
 )
-def test_a_mistake_is_one_line(
+def test_a_mistake_prints_one_line(
     opened: Opened, capsys: pytest.CaptureFixture[str], words: list[str], messages: list[str]
 ) -> None:
     assert cli.main(["view", *words]) == 2

@@ -163,7 +163,7 @@ def test_fields_of_some_models_are_the_same_on_both_engines_and_in_mujoco() -> N
 
 
 def test_an_equality_constraint_is_switched_on_at_a_reset_alike_on_both_engines() -> None:
-    """The engine accepts boolean fields, too."""
+    """The engine accepts boolean values, too."""
     ends = []
     for engine in ("mujoco", "warp"):
         env = lw.make(moving(RICH), engine=engine, nworld=2, fields=["eq_active"])
@@ -184,7 +184,7 @@ def test_an_equality_constraint_is_switched_on_at_a_reset_alike_on_both_engines(
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_a_field_of_no_numbers_rolls_out(engine: str) -> None:
+def test_an_empty_field_rolls_out(engine: str) -> None:
     env = lw.make(sensing(SENSING["no sensors"]), engine=engine, nworld=2, autoreset=False, seed=1)
     rollout = lw.OpenLoop(env, 3)
     rollout.state.copy_(env.get_state()[0])

@@ -1,7 +1,7 @@
 """Every task of the package obeys the rules on both engines, and some tasks also on a toy engine."""
 
 import pytest
-from conftest import long_if_alike, settle
+from conftest import SAME_FUNCTIONS, SAME_MODELS, settle
 from toy_engine import ToyEngine
 
 import lyceum_warp as lw
@@ -10,12 +10,16 @@ from lyceum_warp.testing import CHECKS, check_task
 from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import state_rules as state
 from lyceum_warp.testing.episode_rules import check_memory
+from lyceum_warp.testing.fault_rules import check_not_finite
 from lyceum_warp.testing.physics_rules import check_dynamics
 
-EVERY_RULE = ("hopper", "humanoid", "adroit_pen", "soft_ball")
-"""Tasks for which all rules are checked on both engines; together they use most features of models."""
-OF_THE_TASK = tuple(check for check in CHECKS if check is not check_memory)
-"""Rules for other tasks on the C engine, without the slow memory rule, which depends little on the task."""
+EVERY_RULE = {
+    "mujoco": ("hopper", "humanoid", "adroit_pen", "soft_ball"),
+    "warp": ("hopper", "adroit_pen", "soft_ball"),
+}
+"""Tasks for which all rules are checked, by engine; together they use most features of models."""
+OF_THE_TASK = tuple(check for check in CHECKS if check not in (check_memory, check_not_finite))
+"""Rules for other tasks on the C engine, without two slow rules, which depend little on the task."""
 OF_THE_STATE = (
     buffers.check_addresses, buffers.check_getters, state.check_restoring, state.check_purity, state.check_determinism,
     state.check_reset,
@@ -35,24 +39,32 @@ def options(task: str, engine: str) -> dict[str, int]:
 
     On a CPU a step of the Warp engine takes milliseconds, so other tasks take few steps there.
     """
+    every = task in EVERY_RULE[engine]
     if engine == "mujoco":
-        return {"steps": 1000 if task == "hopper" else 300 if task in EVERY_RULE else 150}
+        return {"steps": 1000 if task == "hopper" else 300 if every else 100}
     if task == "hopper":
         return {"steps": 300}
-    return {"steps": 100 if task in EVERY_RULE else 40, "frame_skip": min(2, find_task(task).frame_skip)}
+    return {"steps": 100 if every else 40, "frame_skip": min(2, find_task(task).frame_skip)}
 
 
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-@pytest.mark.parametrize("task", long_if_alike(PACKAGE))
+@pytest.mark.parametrize(
+    ("engine", "task"),
+    [
+        pytest.param(engine, task, marks=pytest.mark.long if task in alike else ())
+        for engine, alike in (("mujoco", SAME_FUNCTIONS), ("warp", (*SAME_FUNCTIONS, *SAME_MODELS)))
+        for task in PACKAGE
+    ],
+)
 def test_a_task_keeps_the_rules(task: str, engine: str) -> None:
-    checks = CHECKS if task in EVERY_RULE else OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
+    checks = CHECKS if task in EVERY_RULE[engine] else OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
     report = check_task(task, engine=engine, checks=checks, **options(task, engine))
     assert list(report.seconds) == [check.__name__.removeprefix("check_") for check in checks]
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-@pytest.mark.parametrize("task", [task for task in PACKAGE if task not in EVERY_RULE])
+@pytest.mark.parametrize(
+    ("task", "engine"), [(task, engine) for engine in EVERY_RULE for task in PACKAGE if task not in EVERY_RULE[engine]]
+)
 def test_a_task_keeps_the_other_rules(task: str, engine: str) -> None:
     done = OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
     checks = [check for check in CHECKS if check not in done]

@@ -213,7 +213,7 @@ def test_a_task_with_every_feature_keeps_the_rules(task: type[lw.Task]) -> None:
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("task", [Weighed, Practiced, Gifted])
-def test_a_task_that_observes_what_outlives_resets_keeps_the_rules(task: type[lw.Task], engine: str) -> None:
+def test_a_task_that_observes_lasting_values_keeps_the_rules(task: type[lw.Task], engine: str) -> None:
     checks = [check for check in CHECKS if engine == "mujoco" or check.__name__ == "check_reset"]
     check_task(task, engine=engine, nworld=3, steps=60, frame_skip=1, checks=checks)
 

@@ -117,7 +117,7 @@ def test_settings_are_described_as_json_holds_them(env: lw.Env, tmp_path: Path) 
     assert Trajectory.load(episode.save(tmp_path / "a.npz")).controller == episode.controller
 
 
-def test_a_task_with_a_part_of_several_actions_is_controlled(shared_env: SharedEnv) -> None:
+def test_a_task_with_an_action_of_several_numbers_is_controlled(shared_env: SharedEnv) -> None:
     env = shared_env("go1_velocity", engine="mujoco", autoreset=False)
     trajectory = control(env, lambda state, obs: torch.zeros(12), steps=2, seed=0)
     assert trajectory.actions.shape == (2, 12)

@@ -97,7 +97,7 @@ def test_an_empty_list_is_refused() -> None:
         control_report([])
 
 
-def test_episodes_of_different_kinds_are_refused(env: lw.Env) -> None:
+def test_episodes_with_different_settings_are_refused(env: lw.Env) -> None:
     one = control(env, SamplingPlanner(0), steps=2)
     with pytest.raises(ValueError, match="differ in their mode"):
         control_report([one, dataclasses.replace(one, mode="async")])
@@ -108,7 +108,7 @@ def test_episodes_of_different_kinds_are_refused(env: lw.Env) -> None:
         control_report([one, dataclasses.replace(one, params={**one.params, "success_distance": 1.0})])
 
 
-def test_episodes_with_equal_nan_parameters_are_of_one_kind(env: lw.Env) -> None:
+def test_episodes_with_equal_nan_parameters_make_one_report(env: lw.Env) -> None:
     one = control(env, SamplingPlanner(0), steps=2)
     odd = dataclasses.replace(one, params={**one.params, "odd": math.nan})
     assert control_report([odd, dataclasses.replace(odd, params={**one.params, "odd": float("nan")})]).episodes == 2

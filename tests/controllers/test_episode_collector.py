@@ -1,4 +1,4 @@
-"""The common part of both control loops: limits, progress, and the trajectory of an interrupted episode."""
+"""Test the common part of both control loops: limits, progress, and the trajectory of an interrupted episode."""
 
 import time
 from collections.abc import Callable
@@ -36,7 +36,7 @@ def test_unsuitable_environments_are_refused(run: Run, shared_env: SharedEnv) ->
 
 
 @BOTH
-def test_arguments_without_a_run_are_refused(run: Run, env: lw.Env) -> None:
+def test_control_refuses_bad_arguments(run: Run, env: lw.Env) -> None:
     control(env, towards)
     for arguments, message in (
         ({"steps": 0}, "steps must be a whole number from 1 to .*, not 0"),
@@ -92,7 +92,7 @@ def test_on_abort_is_not_called_before_the_first_step(run: Run, env: lw.Env) -> 
         run(env, fails, on_abort=lambda part: pytest.fail("there was no step"))
 
 
-def test_an_interrupted_step_is_left_out(env: lw.Env, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_step_is_omitted(env: lw.Env, monkeypatch: pytest.MonkeyPatch) -> None:
     step, calls, parts = env.step, [], []
 
     def stop() -> None:

@@ -12,7 +12,7 @@ def env() -> lw.Env:
     return lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
 
 
-def test_control_returns_the_whole_episode(env: lw.Env) -> None:
+def test_control_returns_the_complete_episode(env: lw.Env) -> None:
     episode = control(env, towards, seed=3)
     assert episode.steps == 40 and episode.truncated and not episode.terminated
     assert episode.states.shape == (41, env.state_space.size) and episode.states.dtype == torch.float64
@@ -21,7 +21,7 @@ def test_control_returns_the_whole_episode(env: lw.Env) -> None:
     assert episode.mode == "sync" and episode.period == episode.timestep == env.timestep
 
 
-def test_each_action_comes_from_a_plan_of_its_own_state(env: lw.Env) -> None:
+def test_each_action_comes_from_a_plan_for_its_state(env: lw.Env) -> None:
     episode = control(env, towards, seed=3)
     assert torch.equal(episode.plan_of, torch.arange(40)) and not episode.age_steps.any() and not episode.late.any()
     assert torch.allclose(episode.actions[7], towards(episode.states[7], episode.obs[7]))
@@ -78,7 +78,7 @@ def test_replanning_every_n_steps_applies_the_actions_of_the_plan_in_between(env
     assert episode.age_steps.tolist() == [0, 1, 2, 0, 1, 2, 0, 1] and (episode.ages.diff()[:2] > 0).all()
     assert lw.control_report(episode).plans == 2
     control(env, planner, steps=4, reset=False, replan_every=3)
-    assert planner.shifts[3:] == [2, 1], "plans of the steps 8, the first of the run, and 9"
+    assert planner.shifts[3:] == [2, 1], "the second call plans at step 8, its first, and at step 9"
 
 
 def test_replanning_counts_steps_of_the_plant(env: lw.Env) -> None:

@@ -17,7 +17,7 @@ def env() -> lw.Env:
     return lw.make("hopper", nworld=3, horizon=60, autoreset=False)
 
 
-def test_they_are_the_episodes_that_are_evaluated(env: lw.Env, shared_env: SharedEnv) -> None:
+def test_policy_episodes_equals_evaluate(env: lw.Env, shared_env: SharedEnv) -> None:
     counts: list[tuple[int, int]] = []
     evaluated = lw.evaluate(shared_env("hopper", nworld=3, horizon=60), push, 5, seed=2)  # type: ignore[arg-type]
     progress = lambda *count: counts.append(count)  # noqa: E731
@@ -40,7 +40,7 @@ def test_they_are_the_episodes_that_are_evaluated(env: lw.Env, shared_env: Share
     ]
 
 
-def test_an_episode_can_be_stepped_again_to_the_bit(env: lw.Env) -> None:
+def test_an_episode_can_be_replayed_to_the_bit(env: lw.Env) -> None:
     episode = list(policy_episodes(env, push, 2, seed=1))[1]
     one = lw.make("hopper", horizon=60, autoreset=False)
     one.set_state(episode.states[:1])

@@ -1,4 +1,4 @@
-"""The real-time loop: on a simulated clock with exact times, and with a thread on the real clock."""
+"""Test the real-time loop, on a simulated clock with exact times and with a thread on the real clock."""
 
 import math
 import subprocess
@@ -90,7 +90,7 @@ def test_a_slow_planner_in_a_thread_plans_while_the_plant_steps(env: lw.Env) -> 
         assert torch.equal(env.get_state()[0], episode.states[k + 1])
 
 
-def test_mppi_in_a_thread_makes_the_same_plans_as_without(env: lw.Env) -> None:
+def test_mppi_makes_the_same_plans_in_a_thread(env: lw.Env) -> None:
     mppi = lw.MPPI("point_mass", horizon=6, samples=4, nthread=1)
     episode = control_async(env, mppi, period=0.004, seed=5)
     mppi.reset(5)
@@ -201,7 +201,7 @@ def test_another_clock_works_while_the_plant_waits(env: lw.Env) -> None:
     assert np.diff(waited) == pytest.approx(0.01) and len(waited) == episode.steps + 1
 
 
-def test_the_real_clock_never_waits_too_short() -> None:
+def test_the_real_clock_never_waits_too_briefly() -> None:
     clock = Clock()
     for wait in (-1.0, 0.0, 0.0002, 0.004):
         moment = clock.now() + wait

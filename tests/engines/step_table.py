@@ -293,7 +293,7 @@ def singles() -> Iterator[Case]:
 
 @functools.cache
 def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
-    """Return cases that together contain each combination of two (or three, ...) levels of different factors.
+    """Return cases that together contain each combination of one, two, three, ... levels of different factors.
 
     A greedy search: each case starts with a combination that is still missing, and the other factors take the level
     that adds the most missing combinations. Refused combinations are omitted.
@@ -316,7 +316,7 @@ def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
 
 
 def _completed(case: Case, rng: random.Random, missing: Mapping[Any, None], strength: int) -> Case | None:
-    """Complete a case: the other factors, in random order, take the level that adds the most missing combinations."""
+    """Complete a case: in random order, each other factor takes the level that adds the most missing combinations."""
     rest = [name for name in FACTORS if name not in case]
     rng.shuffle(rest)
     for name in rest:

@@ -1,4 +1,4 @@
-"""Model fields that differ between worlds, inputs, initial states and settling, on every engine."""
+"""Test model fields that differ between worlds, inputs, initial states and settling, on every engine."""
 
 import copy
 from collections.abc import Mapping
@@ -71,7 +71,7 @@ def make(
 
 
 def worlds(nworld: int = N, *chosen: int) -> wp.array:
-    """Return a mask of the chosen worlds; without any, of all worlds."""
+    """Return a mask of the chosen worlds, or of all worlds if none is chosen."""
     return wp.array([not chosen or w in chosen for w in range(nworld)], dtype=bool)
 
 
@@ -110,7 +110,7 @@ def state_of(engine: Engine) -> wp.array:
 
 
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
-def test_constants_equal_those_of_a_recompiled_model(engine: type[Engine]) -> None:
+def test_constants_equal_a_recompiled_models(engine: type[Engine]) -> None:
     made = make(engine, "body_mass", "body_inertia", "body_ipos", "dof_armature", "actuator_gear", "geom_size")
     draw(made)
     for w in range(N):
@@ -140,7 +140,7 @@ def test_worlds_run_as_plain_mujoco_does_on_their_models(engine: type[Engine]) -
     draw(made)
     draw(plain)
     steps = [(run(made, 1), run(plain, 1)) for _ in range(5)]
-    assert np.ptp(steps[-1][1], axis=0).max() > 0.01  # the models differ in effect
+    assert np.ptp(steps[-1][1], axis=0).max() > 0.01  # the models move differently
     for got, expected in steps:
         if engine is MujocoEngine:
             np.testing.assert_array_equal(got, expected)
@@ -188,7 +188,7 @@ def test_a_change_in_one_world_alters_no_other(engine: type[Engine]) -> None:
     assert (got[1] != expected[1]).any()
 
 
-def test_worlds_of_the_nominal_model_are_those_of_an_engine_without_dynamics() -> None:
+def test_worlds_of_the_nominal_model_equal_an_engine_without_dynamics() -> None:
     np.testing.assert_array_equal(run(make(MujocoEngine, *DRAWN)), run(make(MujocoEngine)))
 
 
@@ -300,7 +300,7 @@ def test_models_are_applied_and_worlds_settled_within_graphs() -> None:
 
     for engine, enabled in ((captured, True), (direct, False)):
         calls = Graphs(CPU, enabled=enabled).sequence(phases(engine))
-        for seed in range(4):  # the first pass runs the launches, the second captures them
+        for seed in range(4):  # the first iteration runs the launches, the second captures them
             rng = np.random.default_rng(seed)
             for name in engine.dynamics:
                 array = engine.arrays[name].numpy()
@@ -368,7 +368,7 @@ SLIDERS = """<mujoco><worldbody>
 </worldbody></mujoco>"""
 
 
-def test_inverse_weights_of_bodies_that_only_slide_or_turn_are_those_of_a_compiled_model() -> None:
+def test_inverse_weights_of_bodies_that_only_slide_or_turn_equal_a_compiled_models() -> None:
     """MuJoCo gives weight 0 to directions in which a body cannot move, unlike MuJoCo Warp's ``set_const``."""
     model = mujoco.MjModel.from_xml_string(SLIDERS)
     engine = make(WarpEngine, "body_mass", nworld=2, model=model)

@@ -241,7 +241,7 @@ def test_the_deterministic_option_changes_nothing_on_the_cpu() -> None:
         env.step()
 
 
-def test_the_contact_pool_has_room_for_one_world_in_which_everything_touches() -> None:
+def test_the_contact_pool_has_room_for_one_world_with_all_contacts() -> None:
     env = lw.make("humanoid", engine="warp", nworld=4)
     engine = env.engine
     assert isinstance(engine, WarpEngine)

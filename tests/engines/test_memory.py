@@ -27,7 +27,7 @@ def test_check_fit_names_the_largest_number_of_worlds(monkeypatch: pytest.Monkey
     check_fit(1000, 10**9, CPU)
 
 
-def test_check_fit_first_frees_what_torch_keeps_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_check_fit_first_frees_torchs_cached_gpu_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     free, gpu = [1000], types.SimpleNamespace(is_cuda=True, alias="cuda:0")
     monkeypatch.setattr(memory, "free_memory", lambda device: free[0])
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: free.__setitem__(0, 5000))
@@ -36,7 +36,7 @@ def test_check_fit_first_frees_what_torch_keeps_on_a_gpu(monkeypatch: pytest.Mon
         check_fit(100, 46, gpu)  # type: ignore[arg-type]
 
 
-def test_the_warp_engine_s_estimate_covers_its_arrays() -> None:
+def test_the_warp_engines_memory_estimate_covers_its_arrays() -> None:
     """The estimate includes MuJoCo Warp's data, the refresh group, and temporary arrays."""
     for task in ("hopper", "humanoid"):
         env = lw.make(task, engine="warp", nworld=64)
@@ -63,7 +63,7 @@ def resident() -> int:
 
 
 @pytest.mark.parametrize("fields", [(), ("xpos",)])
-def test_the_c_engine_s_estimate_covers_a_world_that_has_no_mjdata_of_its_own(fields: tuple[str, ...]) -> None:
+def test_the_c_engines_memory_estimate_covers_a_world_without_an_mjdata(fields: tuple[str, ...]) -> None:
     """An MjData takes 165 kB even for a small model."""
     env = lw.make("hopper", fields=fields, nthread=2)
     own = 4 * (2 * env.obs_space.size + 2 * env.action_space.size) + 8 * env.state_space.size

@@ -1,4 +1,4 @@
-"""Devices by name, engine="auto", options of engines, and where few worlds and a planner's samples run."""
+"""Resolve device names and engine="auto", and place few worlds and a planner's samples."""
 
 import types
 from typing import Any

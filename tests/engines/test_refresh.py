@@ -281,8 +281,8 @@ def test_the_sensor_of_a_limit_that_ended_is_zero(kind: type[Engine]) -> None:
 
 
 def test_fields_of_two_states_do_not_mix_in_an_mjdata_that_worlds_use_in_turn() -> None:
-    """The post-step stage runs in a shared MjData; fields that it does not compute hold another world's values
-    there."""
+    """The stage after the step runs in an MjData that worlds share. Fields that it does not compute hold another
+    world's values."""
     model, device = model_of(SENSORS["mixed"]), wp.get_device("cpu")
     for lagged, current in ((), ("xpos",)), (("cvel",), ("xpos",)), (("cvel", "xpos"), ("sensordata",)):
         fields = [describe(model, name, lagged=name in lagged) for name in (*lagged, *current, "qacc", "qvel")]

@@ -57,7 +57,9 @@ class Welded(lw.Task):
 '''
 
 
-def test_welds_that_a_task_activates_have_room(task_file: TaskFile, caplog: pytest.LogCaptureFixture) -> None:
+def test_buffers_have_room_for_welds_that_a_task_activates(
+    task_file: TaskFile, caplog: pytest.LogCaptureFixture
+) -> None:
     env = lw.make(task_file("welded.py", TASK), engine="warp", nworld=2)
     assert env.engine.njmax >= 8 * 6  # type: ignore[attr-defined]
     for _ in range(2):
@@ -66,15 +68,15 @@ def test_welds_that_a_task_activates_have_room(task_file: TaskFile, caplog: pyte
     assert not caplog.messages
 
 
-def test_first_states_without_room_are_warned_of(task_file: TaskFile, caplog: pytest.LogCaptureFixture) -> None:
+def test_buffers_too_small_for_first_states_log_a_warning(
+    task_file: TaskFile, caplog: pytest.LogCaptureFixture
+) -> None:
     lw.make(task_file("welded.py", TASK), engine="warp", nworld=2, njmax=8)
     (message,) = caplog.messages
     assert "begin with up to 48 constraints" in message and "njmax=8 and nconmax=" in message
 
 
-def test_contacts_that_follow_from_drawn_fields_are_warned_of(
-    task_file: TaskFile, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_drawn_fields_that_add_contacts_log_a_warning(task_file: TaskFile, caplog: pytest.LogCaptureFixture) -> None:
     drawing = TASK.replace("        s.eq_active[i] = True\n", "        s.geom_size[i][0] = 0.05\n")
     lw.make(task_file("drawing.py", drawing), engine="warp", nworld=2)
     (message,) = caplog.messages
@@ -107,7 +109,7 @@ def test_an_inactive_constraint_of_any_type_adds_its_rows(kind: str) -> None:
     assert probe_sizes(model)[1] - probe_sizes(without)[1] == -(-10 * EQUALITIES[kind] // 8) * 8
 
 
-def test_drawn_ranges_may_bring_every_limit() -> None:
+def test_drawn_ranges_count_every_limit() -> None:
     joints = "".join(
         f'<body pos="{i} 0 0"><joint range="-900 900" limited="true"/><geom size=".1"/></body>' for i in range(20)
     )

@@ -155,7 +155,7 @@ _NEW = ("--trust", "--out", "case/new", "--iterations", "1", "--no-video", "--no
 
 
 class RefusedError(Exception):
-    """A command exited with 2 and printed one line to stderr."""
+    """Raised if a command exits with 2 and prints one line to stderr."""
 
 
 def command(*words: object) -> None:

@@ -1,4 +1,4 @@
-"""Tests that need a GPU: no step waits for the host, graphs equal direct launches, runs are reproducible."""
+"""Test on a GPU that no step waits for the host, graphs equal direct launches, and runs are reproducible."""
 
 import contextlib
 import gc
@@ -117,7 +117,7 @@ def run(env: lw.Env, steps: int) -> list[torch.Tensor]:
     return results
 
 
-def test_a_graph_of_torch_that_is_no_longer_used_leaves_a_capture_unharmed() -> None:
+def test_an_unused_torch_graph_does_not_break_a_capture() -> None:
     """Python deletes it during any garbage collection, and CUDA forbids that during a capture."""
     env = lw.make("hopper", nworld=8, device=CUDA)
     env.step()
@@ -147,7 +147,7 @@ def test_deterministic_graphs_equal_direct_launches(task: str) -> None:
         assert torch.equal(a, b)
 
 
-def test_a_capture_leaves_running_graphs_unharmed() -> None:
+def test_a_capture_does_not_break_running_graphs() -> None:
     """Graphs share memory, which a capture clears; nothing else waits for the device in between."""
     replayed, direct = (
         lw.make("humanoid", nworld=1024, device=CUDA, deterministic=True, graphs=graphs) for graphs in (True, False)

@@ -1,4 +1,4 @@
-"""Worlds with different models on a GPU, in graphs, compared with the C engine."""
+"""Compare worlds with different models, in graphs on a GPU, with the C engine."""
 
 import mujoco
 import numpy as np
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.gpu
 
 DRAWN = "body_mass body_inertia geom_friction geom_quat dof_damping dof_armature actuator_gear gravity".split()
 N = 200
-CHOSEN = [0, 3, *range(50, 150)]  # more than one refresh group holds
+CHOSEN = [0, 3, *range(50, 150)]  # more worlds than one refresh group
 
 
 def draws(model: mujoco.MjModel, turn: int) -> dict[str, np.ndarray]:

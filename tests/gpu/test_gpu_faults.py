@@ -1,4 +1,4 @@
-"""Faults under load: some of many worlds on a GPU get faults at random steps."""
+"""Inject faults into some of many worlds on a GPU, at random steps."""
 
 import pytest
 import torch

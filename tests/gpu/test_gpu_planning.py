@@ -31,7 +31,7 @@ def plant(task: str) -> lw.Env:
 
 
 @pytest.mark.parametrize("task, horizon", [("reach", 16), ("half_cheetah", 8), ("cartpole_swingup", 20)])
-def test_plans_agree_with_those_of_the_cpu(task: str, horizon: int) -> None:
+def test_plans_agree_with_the_cpus(task: str, horizon: int) -> None:
     env = plant(task)
     # at a low temperature rounding could choose between samples
     gpu, cpu = (
@@ -49,7 +49,7 @@ def test_plans_agree_with_those_of_the_cpu(task: str, horizon: int) -> None:
 
 
 @pytest.mark.parametrize("update", ["mppi with knots", "cem"])
-def test_plans_for_several_plants_are_those_of_single_planners(update: str) -> None:
+def test_plans_for_several_plants_equal_single_planners(update: str) -> None:
     settings: dict[str, Any] = dict(task="reach", device=CUDA, engine="warp", samples=40, **UPDATES[update])
     states = lw.make("reach", nworld=5, autoreset=False, seed=3).get_state()
     together = lw.MPPI(**settings, seed=5, plants=5)
@@ -72,7 +72,7 @@ def test_plans_for_several_plants_are_those_of_single_planners(update: str) -> N
 
 
 @pytest.mark.parametrize("of_plants, of_plan", [(CUDA, "cpu"), ("cpu", CUDA)])
-def test_actions_lie_where_the_states_do(of_plants: str, of_plan: str) -> None:
+def test_actions_are_on_the_device_of_the_states(of_plants: str, of_plan: str) -> None:
     env = lw.make("point_mass", nworld=3, device=of_plants, engine="warp", autoreset=False, seed=1)
     plan = lw.MPPI("point_mass", plants=3, horizon=8, samples=32, device=of_plan, engine="warp")
     before = env.get_state()

@@ -1,4 +1,4 @@
-"""PPO on a GPU: captured epochs equal direct ones, no synchronization, and exact resumption."""
+"""Test PPO on a GPU: captured epochs equal direct ones, nothing synchronizes, and resumption is exact."""
 
 from pathlib import Path
 from typing import Any
@@ -22,11 +22,11 @@ def made(**changes: Any) -> lw.PPO:
 @pytest.mark.parametrize("changes", [
     {}, {"std_type": "log", "whiten_minibatches": True, "minibatches": 5, "clip_value_loss": False},
 ])  # fmt: skip
-def test_captured_epochs_have_the_numbers_of_direct_ones(changes: dict[str, Any]) -> None:
+def test_captured_epochs_equal_direct_ones(changes: dict[str, Any]) -> None:
     """The entropy weight changes between iterations; the graph must read it on the device."""
     changes = {"schedule": "fixed", "final_entropy_coef": 0.1, "entropy_decay": (1, 4)} | changes
     captured, direct = made(**changes), made(**changes)
-    direct.minibatches.captures = False
+    direct.minibatches.epoch.enabled = False
     for _ in range(5):
         one, other = next(captured), next(direct)
         for name in ("kl", "std_mean", "surrogate_loss", "entropy", "value_loss"):
@@ -34,7 +34,7 @@ def test_captured_epochs_have_the_numbers_of_direct_ones(changes: dict[str, Any]
         for module, same in ((captured.policy, direct.policy), (captured.value, direct.value)):
             for name, part in module.state_dict().items():
                 torch.testing.assert_close(part, same.state_dict()[name], rtol=2e-2, atol=2e-3, msg=name)
-    assert captured.minibatches._graph is not None and direct.minibatches._graph is None
+    assert captured.minibatches.epoch.graph is not None and direct.minibatches.epoch.graph is None
 
 
 def test_the_learning_rate_adapts_within_a_graph() -> None:
@@ -54,7 +54,7 @@ def test_an_iteration_waits_for_the_device_only_at_its_end() -> None:
         ppo.divergence()
 
 
-def test_a_state_is_continued_after_other_graphs() -> None:
+def test_a_loaded_state_continues_with_new_graphs() -> None:
     one = made()
     for _ in range(3):
         next(one)

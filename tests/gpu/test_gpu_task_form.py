@@ -1,4 +1,4 @@
-"""A task with every feature of the task form on a GPU: rules, the C engine's numbers, and no synchronization."""
+"""Test a task with every feature on a GPU: rules, equal numbers on the C engine, and no synchronization."""
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ def test_a_task_with_every_feature_keeps_the_rules_on_a_gpu() -> None:
     check_task(Full, device="cuda", steps=50)
 
 
-def test_worlds_on_a_gpu_have_the_numbers_of_the_c_engine() -> None:
+def test_worlds_on_a_gpu_equal_the_c_engines() -> None:
     gpu, cpu = (lw.make(Full, nworld=200, device=device, seed=3) for device in ("cuda", "cpu"))
     generator = torch.Generator().manual_seed(0)
     for _ in range(50):

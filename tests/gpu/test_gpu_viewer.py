@@ -14,7 +14,7 @@ def pushing(obs: torch.Tensor) -> torch.Tensor:
     return 0.5 * torch.sign(obs[:, :3])
 
 
-def test_steps_and_frames_are_asked_for_without_waiting() -> None:
+def test_steps_and_frames_do_not_wait_for_the_device() -> None:
     env = lw.make("hopper", nworld=1024, device="cuda")
     session = Session(env, controllers={"policy": lw.GaussianPolicy(11, 3)}, seed=0)
     session.obey(SetWorld(3))
@@ -28,7 +28,7 @@ def test_steps_and_frames_are_asked_for_without_waiting() -> None:
         session.stage.live.request((4, 5), 4)
 
 
-def test_any_world_is_shown_a_frame_later() -> None:
+def test_any_world_is_shown_after_one_frame() -> None:
     env = lw.make("hopper", nworld=4096, device="cuda")
     session = Session(env, controllers={"policy": pushing}, seed=0)
     session.obey(SetWorld(3000))
@@ -54,7 +54,7 @@ def test_any_world_is_shown_a_frame_later() -> None:
     assert np.isfinite(session.stage.frame().samples).all() and all("fault" not in message for message in messages)
 
 
-def test_going_on_after_stepping_back_gives_the_same_numbers_to_the_bit() -> None:
+def test_continuing_after_stepping_back_gives_the_same_numbers_to_the_bit() -> None:
     env = lw.make("hopper", nworld=64, device="cuda", deterministic=True)
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=1)
     states = [env.get_state()]

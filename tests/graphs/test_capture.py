@@ -69,7 +69,7 @@ def follow(digit: int, number_inout: wp.array[int], first: int):
     number_inout[w] = 10 * number_inout[w] + digit
 
 
-def test_threads_have_a_part_of_the_worlds_each_in_phases_that_allow_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_thread_steps_a_part_of_the_worlds_in_phases_that_allow_it(monkeypatch: pytest.MonkeyPatch) -> None:
     digits, sizes = wp.zeros(5, dtype=int, device="cpu"), []
     launch = wp.launch
 
@@ -145,7 +145,7 @@ def add_tiles(number: int, sum_out: wp.array[int]):
     sum_out[i] = number * total
 
 
-def test_kernels_with_tiles_have_their_own_tiles_in_every_thread() -> None:
+def test_kernels_with_tiles_have_separate_tiles_in_every_thread() -> None:
     rounds, wrong = 300, []
 
     def phase(number: int, sums: wp.array) -> Phase:
@@ -175,7 +175,7 @@ def test_without_graphs_every_phase_is_called_directly() -> None:
     assert calls == tuple(phase.run for phase in phases)
 
 
-def test_forget_captures_again_what_the_phases_launch_now() -> None:
+def test_forget_captures_changed_launches_again() -> None:
     digits, made = Digits(), graphs()
     digit = [1]
     calls = made.sequence([Phase("digit", lambda: wp.launch(append, 1, [digit[0], digits.number], device="cpu"))])
@@ -186,7 +186,7 @@ def test_forget_captures_again_what_the_phases_launch_now() -> None:
     assert [digits.after(calls) for _ in range(3)] == [2] * 3
 
 
-def test_what_is_no_longer_used_is_deleted_after_a_capture() -> None:
+def test_unused_objects_are_deleted_after_a_capture() -> None:
     """Deleting a torch graph during a capture would make the capture fail."""
     digits, captures, deleted = Digits(), 0, []
 

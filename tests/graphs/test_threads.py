@@ -56,10 +56,10 @@ def check(times: int, envs: int) -> None:
             assert all(map(torch.equal, own, alone)), case
 
 
-def test_environments_in_threads_have_the_numbers_of_one_thread() -> None:
+def test_environments_in_threads_equal_environments_in_one_thread() -> None:
     check(times=1, envs=1)
 
 
 @pytest.mark.long
-def test_environments_in_threads_have_the_numbers_of_one_thread_every_time() -> None:
+def test_environments_in_threads_equal_environments_in_one_thread_every_time() -> None:
     check(times=20, envs=2)

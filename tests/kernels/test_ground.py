@@ -1,4 +1,4 @@
-"""Compare the look-up of heights with MuJoCo's rays, and the rule of levels with its definition."""
+"""Compare heights of a height field with MuJoCo's rays, and changes of the level with their definition."""
 
 import mujoco
 import numpy as np
@@ -66,7 +66,7 @@ def cells() -> tuple[np.ndarray, np.ndarray]:
     return corners, np.array([x[1] - x[0], y[1] - y[0]])
 
 
-def test_heights_and_normals_in_both_triangles_of_every_cell_are_those_of_rays(
+def test_heights_and_normals_in_both_triangles_of_every_cell_equal_mujocos_rays(
     model: mujoco.MjModel, ground: wp.array
 ) -> None:
     corners, sides = cells()
@@ -82,7 +82,7 @@ def test_heights_and_normals_in_both_triangles_of_every_cell_are_those_of_rays(
     assert found[:, 4].all()
 
 
-def test_heights_at_points_on_edges_and_diagonals_are_those_of_rays(model: mujoco.MjModel, ground: wp.array) -> None:
+def test_heights_on_edges_and_diagonals_equal_mujocos_rays(model: mujoco.MjModel, ground: wp.array) -> None:
     corners, sides = cells()
     along = np.array([(0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5), (0.25, 0.25), (1.0, 1.0)])
     points = (corners[:, None] + sides * along).reshape(-1, 2)
@@ -115,7 +115,7 @@ def scan(
 
 
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.6, -0.5)])
-def test_scan_has_the_distances_of_rays_on_a_grid_that_turns_with_the_yaw(
+def test_scan_equals_rays_on_a_grid_that_turns_with_the_yaw(
     model: mujoco.MjModel, ground: wp.array, tilt: tuple[float, float]
 ) -> None:
     grid, base, yaw = lw.scan_grid(0.8, 0.4, spacing=0.2), np.array([0.6, -0.3, 1.4]), 0.7
@@ -155,6 +155,6 @@ def test_levels_rise_and_fall_with_the_distance_walked(
     assert (next_levels(level, walked, commanded) == wanted).all()
 
 
-def test_after_the_last_level_follows_a_random_one() -> None:
+def test_a_random_level_follows_the_last_one() -> None:
     counts = np.bincount(next_levels(4, 4.1, 10.0), minlength=5)
     assert len(counts) == 5 and (abs(counts - 400) < 90).all()

@@ -1,4 +1,4 @@
-"""Spline plans: interpolation between knots, and the grid on which the horizon moves."""
+"""Test spline plans: interpolation between knots, and the grid on which the horizon moves."""
 
 import numpy as np
 import pytest

@@ -45,7 +45,7 @@ def test_noise_is_standard_normal_and_independent(many: MPPI) -> None:
             assert abs(product) < 5 / np.sqrt(16 * (4000 - lag)), f"samples {lag} apart are correlated"
 
 
-def test_samples_have_keys_of_their_own_and_none_of_a_plant() -> None:
+def test_samples_have_distinct_random_keys_that_differ_from_a_plants() -> None:
     """Planner and plant have equal seeds and world indices."""
     n = 256
     found, plants = [], []

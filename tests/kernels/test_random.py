@@ -1,4 +1,4 @@
-"""Counter-based random streams: draws depend only on (seed, world, episode, step)."""
+"""Test counter-based random streams: draws depend only on (seed, world, episode, step)."""
 
 import itertools
 

@@ -88,20 +88,20 @@ def check(found: np.ndarray, expected: np.ndarray, tolerance: float = 2e-6) -> N
     np.testing.assert_allclose(found.reshape(expected.shape), expected, atol=tolerance, rtol=tolerance)
 
 
-def test_products_inverses_and_matrices_are_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
+def test_products_inverses_and_matrices_equal_mujocos(found: dict[str, np.ndarray]) -> None:
     a, b, _, _ = inputs()
     check(found["mul"], mju(mujoco.mju_mulQuat, 4, a, b))
     check(found["inverse"], mju(mujoco.mju_negQuat, 4, a))
     check(found["to_mat"].reshape(N, 9), mju(mujoco.mju_quat2Mat, 9, a))
 
 
-def test_rotated_vectors_are_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
+def test_rotated_vectors_equal_mujocos(found: dict[str, np.ndarray]) -> None:
     a, _, v, _ = inputs()
     check(found["rotate"], mju(mujoco.mju_rotVecQuat, 3, v, a), 5e-6)
     check(found["rotate_inverse"], mju(mujoco.mju_rotVecQuat, 3, v, mju(mujoco.mju_negQuat, 4, a)), 5e-6)
 
 
-def test_quaternions_from_axis_and_angle_are_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
+def test_quaternions_from_axis_and_angle_equal_mujocos(found: dict[str, np.ndarray]) -> None:
     _, _, v, angle = inputs()
     length = np.linalg.norm(v.astype(float), axis=1)
     axis = v / np.maximum(length, 1e-30)[:, None]
@@ -110,7 +110,7 @@ def test_quaternions_from_axis_and_angle_are_those_of_mujoco(found: dict[str, np
     assert found["from_axis_angle"][0].tolist() == found["from_rotvec"][0].tolist() == [1, 0, 0, 0]
 
 
-def test_rotation_vectors_are_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
+def test_rotation_vectors_equal_mujocos(found: dict[str, np.ndarray]) -> None:
     a, b, _, _ = inputs()
     check(found["to_rotvec"], mju(lambda row, q: mujoco.mju_quat2Vel(row, q, 1.0), 3, a), 1e-5)
     difference = mju(mujoco.mju_subQuat, 3, a, b)
@@ -137,7 +137,7 @@ def test_a_matrix_gives_its_quaternion_back(found: dict[str, np.ndarray]) -> Non
     check(sign * found["from_mat"], a.astype(float))
 
 
-def test_euler_angles_are_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
+def test_euler_angles_equal_mujocos(found: dict[str, np.ndarray]) -> None:
     a, _, v, _ = inputs()
 
     def from_euler(angles: np.ndarray) -> np.ndarray:
@@ -212,7 +212,7 @@ class Floating(lw.Task):
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_a_velocity_in_a_bodys_frame_is_what_a_velocimeter_measures(engine: str) -> None:
+def test_a_velocity_in_a_bodys_frame_equals_a_velocimeters(engine: str) -> None:
     env = lw.make(Floating, engine=engine, nworld=8)
     put_at_random(env, np.random.default_rng(0), 1.0, 2.0)
     env.step()

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import SharedEnv, long_if_alike
+from conftest import SAME_MODELS, SharedEnv, long_if_alike
 from form_tasks import Drawn, Pushed
 
 import lyceum_warp as lw
@@ -138,7 +138,7 @@ def device(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-@pytest.fixture(scope="module", params=long_if_alike(TASKS))
+@pytest.fixture(scope="module", params=long_if_alike(TASKS, *SAME_MODELS))
 def engines(request: pytest.FixtureRequest, device: str, shared_env: SharedEnv) -> Iterator[Engines]:
     task = request.param
     options = {"nworld": NWORLD, "cone": "elliptic", "frame_skip": 1, "autoreset": False, "horizon": 0}
@@ -204,7 +204,7 @@ def test_both_engines_have_the_same_spaces(engines: Engines) -> None:
     assert engines.c.timestep == engines.warp.timestep
 
 
-def test_the_same_field_values_are_judged_alike(engines: Engines) -> None:
+def test_equal_field_values_give_equal_results(engines: Engines) -> None:
     """The values are random, near those of simulated states."""
     rng = torch.Generator().manual_seed(0)
     numpy_rng = np.random.default_rng(1)
@@ -229,7 +229,7 @@ def test_the_same_field_values_are_judged_alike(engines: Engines) -> None:
     assert 0 < fallen < 4 * NWORLD or engines.c.task.functions["terminated"] is None
 
 
-def test_the_same_positions_and_velocities_are_observed_alike(engines: Engines) -> None:
+def test_equal_positions_and_velocities_give_equal_observations(engines: Engines) -> None:
     """Each engine computes all other fields from positions and velocities."""
     parts = {name: part for name, part in engines.c.obs_space.parts.items() if name in FORCE_PARTS}
     largest = 0.0
@@ -247,7 +247,7 @@ def test_the_same_positions_and_velocities_are_observed_alike(engines: Engines) 
     assert largest >= 1.0 or not parts, "no state has a contact, so nothing was compared"
 
 
-def test_one_substep_leaves_the_engines_a_rounding_apart(engines: Engines) -> None:
+def test_after_one_substep_the_engines_differ_by_rounding(engines: Engines) -> None:
     """States and actions are equal; ONE_STEP holds the bounds."""
     assert engines.task in ONE_STEP, f"add bounds of {engines.task} to ONE_STEP; pytest -rP shows the differences"
     rng = np.random.default_rng(3)
@@ -275,7 +275,7 @@ def test_one_substep_leaves_the_engines_a_rounding_apart(engines: Engines) -> No
     [(Pushed, {}), (Pushed, {"reach": 0.0}), (Pushed, {"force": 0.0}), (Drawn, {}), (Drawn, {"spread": 0.0})],
     ids=["pushes_and_moves", "pushes", "moves_a_mocap_body", "draws", "draws_gravity"],
 )
-def test_fifty_steps_leave_the_engines_a_rounding_apart_whatever_the_task_writes(
+def test_after_fifty_steps_the_engines_differ_by_rounding_also_if_the_task_writes_inputs(
     task: type[lw.Task], params: dict[str, float], device: str
 ) -> None:
     """``control`` writes inputs; masses, frictions and gravity are random; the steps take 150 substeps."""

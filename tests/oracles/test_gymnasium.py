@@ -206,7 +206,7 @@ def test_every_named_environment_is_registered() -> None:
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_a_thousand_steps_have_gymnasiums_numbers(task: str) -> None:
+def test_a_thousand_steps_equal_gymnasiums(task: str) -> None:
     """Some of the random actions are beyond the control range."""
     pair = Pair(make_ours(task), make_theirs(task))
     assert pair.ours.timestep == pytest.approx(pair.theirs.dt, rel=1e-12)
@@ -311,8 +311,8 @@ RANGES = [(task, name) for task in HEALTHY for name in inspect.signature(unchang
 
 
 @pytest.mark.parametrize(("task", "bounded"), [*((task, None) for task in HEALTHY), *RANGES])
-def test_a_state_is_terminal_where_gymnasium_says_so(task: str, bounded: str | None) -> None:
-    """States are random, on both sides of all bounds, or of one range while the others are wide."""
+def test_a_state_is_terminal_if_it_is_in_gymnasium(task: str, bounded: str | None) -> None:
+    """Random states lie on both sides of all bounds, or on both sides of one range while all other ranges are wide."""
     wide = {name: (-1e6, 1e6) for other, name in RANGES if other == task and bounded not in (None, name)}
     if bounded is not None and math.isinf(max(keywords(task)[bounded])):
         wide[bounded] = (keywords(task)[bounded][0], 2.0)
@@ -338,7 +338,7 @@ def share_of_ill_states(ours: lw.Env, theirs: Any, spread: float) -> float:
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_the_first_observation_is_gymnasiums_of_the_same_state(task: str) -> None:
+def test_the_first_observation_equals_gymnasiums_in_the_same_state(task: str) -> None:
     """Both the random and the fixed reset are compared."""
     ours, theirs = make_ours(task, nworld=16), make_theirs(task)
     for start in (ours.rand_reset, ours.reset):
@@ -510,7 +510,7 @@ def test_every_parameter_of_gymnasium_has_its_default(task: str) -> None:
 
 
 @pytest.mark.parametrize(("task", "name", "variant"), cases())
-def test_a_parameter_has_the_effect_of_gymnasiums(task: str, name: str, variant: Any) -> None:
+def test_a_parameter_has_the_same_effect_as_in_gymnasium(task: str, name: str, variant: Any) -> None:
     """Compare the effect on results and on the size of the observation.
 
     Some ranges exclude the initial state, which Gymnasium checks only after a step, so worlds reset automatically.
@@ -550,7 +550,7 @@ def halve_timestep(root: ET.Element) -> None:
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_a_changed_model_file_has_the_effect_of_gymnasiums(task: str, tmp_path: Path) -> None:
+def test_a_changed_model_file_has_the_same_effect_as_in_gymnasium(task: str, tmp_path: Path) -> None:
     """The option ``model`` accepts a modified copy of the file, as Gymnasium's ``xml_file`` does."""
     tree = ET.parse(make_theirs(task).fullpath)
     halve_timestep(tree.getroot())

@@ -82,7 +82,7 @@ class Pair:
     def __init__(self, ours: lw.Env, theirs: Any) -> None:
         self.ours, self.theirs = ours, theirs
         self.places = {field: getattr(theirs.model, field).copy() for field in ("body_pos", "body_quat", "site_pos")}
-        """Fields of their model before random resets change them."""
+        """Fields of their model, copied before random resets change them."""
         self.theirs.reset(seed=0)
         self.rng = np.random.default_rng(0)
         self.goals = 0
@@ -266,7 +266,7 @@ def test_the_registered_environment_agrees_until_contacts_differ(make_pair: Make
 
 
 @pytest.mark.parametrize("reward_type", ["dense", "sparse"])
-def test_bonuses_and_success_are_theirs(make_pair: MakePair, task: str, reward_type: str) -> None:
+def test_bonuses_and_success_equal_theirs(make_pair: MakePair, task: str, reward_type: str) -> None:
     pair = make_pair(oracle_class(task)(reward_type=reward_type), sparse=reward_type == "sparse")
     assert task in SPECIAL, "add states that reach the bonuses and success"
     rewards, successes = set(), 0
@@ -284,7 +284,7 @@ def test_bonuses_and_success_are_theirs(make_pair: MakePair, task: str, reward_t
     assert reward_type == "dense" or rewards == {10.0, -0.1}
 
 
-def test_spaces_and_parameters_are_theirs(shared_env: SharedEnv, task: str) -> None:
+def test_spaces_and_parameters_equal_theirs(shared_env: SharedEnv, task: str) -> None:
     ours, theirs = shared_env(task, autoreset=False, horizon=0, nthread=1), registered(task)
     low, high = theirs.action_space.low, theirs.action_space.high
     assert ours.obs.shape == (1, *theirs.observation_space.shape)
@@ -316,7 +316,7 @@ def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, 
     return found
 
 
-def test_model_is_theirs_except_for_edits(shared_env: SharedEnv, task: str) -> None:
+def test_model_equals_theirs_except_for_edits(shared_env: SharedEnv, task: str) -> None:
     """The models may differ only in bodies that a reset moves, duplicate pairs, and the order of sensor sites."""
     ours, theirs = shared_env(task, autoreset=False, horizon=0, nthread=1).model, registered(task).model
     moved = mocap_bodies(ours)
@@ -332,7 +332,7 @@ def test_model_is_theirs_except_for_edits(shared_env: SharedEnv, task: str) -> N
         assert getattr(ours.opt, name) == getattr(theirs.opt, name), name
 
 
-def test_fixed_resets_put_everything_where_the_model_does(make_pair: MakePair, task: str) -> None:
+def test_fixed_resets_give_the_initial_positions_of_their_model(make_pair: MakePair, task: str) -> None:
     """Positions equal those of their model before any reset."""
     pair = make_pair(registered(task))
     pair.ours.reset()
@@ -344,7 +344,7 @@ def test_fixed_resets_put_everything_where_the_model_does(make_pair: MakePair, t
 
 
 @pytest.mark.usefixtures("freed")
-def test_random_resets_are_distributed_as_theirs(task: str) -> None:
+def test_random_resets_have_their_distribution(task: str) -> None:
     """Compare each number of the first observations by a Kolmogorov-Smirnov test, and their correlations."""
     n, m = 400, 1000
     env, original = lw.make(task, engine="mujoco", nworld=m, nthread=1), registered(task)

@@ -126,11 +126,11 @@ def test_terms_of_the_reward_equal_mjlabs(env: lw.Env, term: str) -> None:
     assert np.unique(wanted).size > 5
 
 
-def test_weights_are_mjlabs() -> None:
+def test_weights_equal_mjlabs() -> None:
     assert find_task("go1_velocity").rewards == {term: STORED[f"weight/{term}"] for term in TERMS}
 
 
-def test_falls_are_mjlabs(env: lw.Env) -> None:
+def test_terminations_equal_mjlabs(env: lw.Env) -> None:
     state = mjlabs_states(env, heading=False)
     assert np.array_equal(env.get_terminated(state).numpy(), STORED["env/fell"])
 

@@ -66,7 +66,7 @@ def theirs(ppo: lw.PPO, given: dict[str, torch.Tensor]) -> Any:
     {"whiten_minibatches": True, "clip_value_loss": False, "std_type": "log"},
     {"schedule": "fixed", "minibatches": 5, "epochs": 3, "value_coef": 0.5},
 ])  # fmt: skip
-def test_an_update_gives_rsl_rls_parameters(
+def test_an_update_gives_the_same_parameters_as_rsl_rl(
     changes: dict[str, Any], shared_env: SharedEnv, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = lw.PPOConfig(**{"hidden": (16, 8), "value_hidden": (8,), "num_steps": STEPS, "normalize": False} | changes)

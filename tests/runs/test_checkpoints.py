@@ -1,4 +1,4 @@
-"""Broken, foreign and missing files of policies and states."""
+"""Read broken, foreign and missing files of policies and states."""
 
 from pathlib import Path
 from random import Random
@@ -119,7 +119,7 @@ def test_a_policy_of_any_class_is_saved_without_a_value_function(tmp_path: Path)
         load_value(run)
 
 
-def test_a_module_of_the_package_is_made_again_by_its_class_and_its_shape(tmp_path: Path) -> None:
+def test_a_module_of_the_package_is_rebuilt_from_its_class_and_shape(tmp_path: Path) -> None:
     """A value function in place of a policy represents policies of later releases."""
     run = Run.create(tmp_path / "run", {})
     run.save(policy_content(1, ValueFunction(3, (4,))), {})
@@ -128,7 +128,7 @@ def test_a_module_of_the_package_is_made_again_by_its_class_and_its_shape(tmp_pa
 
 
 @pytest.mark.parametrize("name", ["os.system", "lyceum_warp.cli.__main__.main", "lyceum_warp.algos.npg.NPG"])
-def test_a_file_makes_only_modules_of_the_package(name: str, run: Run) -> None:
+def test_a_file_can_make_only_modules_of_the_package(name: str, run: Run) -> None:
     content = read_checkpoint(run.policy, parts=("iteration", "policy"))
     content["policy"]["class"] = name
     torch.save(content, run.policy)

@@ -23,7 +23,7 @@ def read(config: dict[str, Any]) -> Configuration:
 
 
 @pytest.mark.parametrize("kind", ["npg", "ppo"])
-def test_a_learner_is_made_again_from_its_description(kind: str) -> None:
+def test_a_learner_is_rebuilt_from_its_description(kind: str) -> None:
     learner_class, config_class = ALGORITHMS[kind]
     env = lw.make(
         "hopper", nworld=2, seed=3, horizon=20, integrator="euler", solver={"iterations": 7}, fields=["xpos"],
@@ -68,12 +68,12 @@ def test_options_among_the_parameters_of_an_earlier_run_are_options() -> None:
     }  # fmt: skip
 
 
-def test_the_configuration_of_another_programs_learner_has_no_hyperparameters() -> None:
+def test_the_configuration_of_a_users_learner_has_no_hyperparameters() -> None:
     found = read(BASE | {"algorithm": "mine"})
     assert found.hyperparameters is None and found.options.nworld == 3
 
 
-def test_processes_of_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_on_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     """The number of threads is not saved with the run, so a different number of processes may continue it."""
     monkeypatch.setattr("lyceum_warp.runs.configuration.cpu_cores", lambda: 6)
     learner = read(BASE | {"nworld": 4}).learner(Team(1, 2, "cpu", neighbours=2))
@@ -81,7 +81,7 @@ def test_processes_of_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatc
     assert describe(learner)["nworld"] == 4 and describe(learner)["options"] == {}
 
 
-def test_a_seed_of_the_algorithm_alone_is_kept() -> None:
+def test_a_separate_seed_of_the_algorithm_is_kept() -> None:
     env = lw.make("point_mass", nworld=2)
     assert "npg_seed" not in describe(algorithm(env))
     config = describe(algorithm(env, seed=3))

@@ -82,7 +82,7 @@ def test_the_lock_of_a_killed_process_is_taken_over(tmp_path: Path, caplog: pyte
     assert caplog.messages == [gone]
 
 
-def test_a_later_process_of_the_same_number_does_not_hold_a_lock(tmp_path: Path) -> None:
+def test_a_later_process_with_the_same_pid_does_not_hold_a_lock(tmp_path: Path) -> None:
     held(tmp_path, started="1")
     with RunLock(tmp_path):
         pass
@@ -97,7 +97,7 @@ def test_a_lock_without_a_heartbeat_is_taken_over(tmp_path: Path, caplog: pytest
         assert "which has been silent for 180 s" in caplog.text
 
 
-def test_a_lock_is_touched_while_it_is_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_held_lock_gets_a_heartbeat(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lock, "BEAT", 0.01)
     with RunLock(tmp_path):
         os.utime(tmp_path / "lock", (0.0, 0.0))
@@ -147,7 +147,7 @@ def test_a_writer_whose_lock_was_taken_over_writes_nothing_more(
     takers[0].__exit__()
 
 
-def test_one_of_many_takers_gets_a_free_lock(tmp_path: Path) -> None:
+def test_only_one_of_many_processes_gets_a_free_lock(tmp_path: Path) -> None:
     for _ in range(20):
         held(tmp_path, started="1")
         ready, got = threading.Barrier(8), []

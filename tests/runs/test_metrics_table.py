@@ -23,7 +23,7 @@ def test_a_new_column_is_empty_in_earlier_rows(table: Path) -> None:
     ]
 
 
-def test_rows_come_back_with_every_digit(table: Path) -> None:
+def test_rows_are_read_with_every_digit(table: Path) -> None:
     rows = [{"iteration": i, "value": i / 3, "mean": None if i % 2 else 1e-30, "bad": float("nan")} for i in (1, 2, 3)]
     for row in rows:
         append_row(table, row)
@@ -36,7 +36,7 @@ def test_rows_come_back_with_every_digit(table: Path) -> None:
     assert [row["mean"] for row in read] == [None, 1e-30, None]
 
 
-def test_cut_drops_rows_without_a_checkpoint(table: Path) -> None:
+def test_cut_rows_drops_rows_after_the_checkpoint(table: Path) -> None:
     cut_rows(table, 2)  # without a table
     for i in (1, 2, 3):
         append_row(table, {"iteration": i, "value": 0.5})

@@ -1,4 +1,4 @@
-"""Runs of earlier releases load, are evaluated and resume."""
+"""Load, evaluate and resume runs of earlier releases."""
 
 import shutil
 from pathlib import Path
@@ -61,8 +61,8 @@ def test_the_value_function_of_an_old_run_keeps_its_scale(gamma: float, old_run:
 
 @pytest.fixture(params=["command", "python", "task_file"])
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A run of two iterations of release 0.1: of the command, of Python with a model of its own, and of a task's file
-    with a model, a mesh and a table, which are only in the run's copy."""
+    """A run of two iterations by release 0.1: by the command, in Python with the user's model, and of a task file whose
+    model, mesh and table are only in the run's copy."""
     return Path(shutil.copytree(DATA / "runs_0_1" / request.param, tmp_path / "run"))
 
 
@@ -88,7 +88,7 @@ def test_a_run_of_0_1_resumes_and_another_begins_with_it(run: Path, tmp_path: Pa
 
 @pytest.fixture
 def rsl_rl_run(tmp_path: Path) -> Path:
-    """A run of the former algorithm rsl-rl, by rsl_rl's PPO."""
+    """A run that rsl_rl's PPO trained, under the former algorithm name rsl-rl."""
     return Path(shutil.copytree(RSL_RL, tmp_path / "rsl_rl"))
 
 

@@ -1,4 +1,4 @@
-"""Decide when a run is saved, and save what is possible if its folder cannot be written."""
+"""Decide when a run is saved; a folder that cannot be written ends the run and keeps its last save."""
 
 import os
 import resource
@@ -14,7 +14,7 @@ from training_runs import QUIET, algorithm, metrics, refused, six_iterations
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.saving import SAVE_SECONDS, SHARE, Saver
+from lyceum_warp.runs.saving import LONG, SAVE_SECONDS, SHARE, Saver
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return six_iterations(tmp_path_factory.mktemp("runs") / "six")
 
 
-@pytest.mark.parametrize("seconds, wait", [(0.02, SHARE * 0.02), (1.0, SAVE_SECONDS)])
+@pytest.mark.parametrize("seconds, wait", [(0.02, SHARE * 0.02), (1.0, SAVE_SECONDS), (9.0, LONG * 9.0)])
 def test_saves_take_a_small_share_of_the_time(seconds: float, wait: float, npg: lw.NPG, tmp_path: Path) -> None:
     saver = Saver(Run.create(tmp_path / "run", {}), npg)
     saver.save()
@@ -67,7 +67,7 @@ def test_a_file_that_cannot_be_written_ends_the_run_and_leaves_its_last_save(six
     assert metrics(folder) == metrics(six)
 
 
-def test_a_row_that_was_written_in_part_does_not_stop_a_resumed_run(six: Path, tmp_path: Path) -> None:
+def test_an_incomplete_row_does_not_stop_a_resumed_run(six: Path, tmp_path: Path) -> None:
     folder, limits = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def limit() -> None:

@@ -1,4 +1,4 @@
-"""A run's copies of its task: what is copied, and which files later commands use after a move or an edit."""
+"""Copy a run's task, and test which files later commands use after a move or an edit."""
 
 import shutil
 from pathlib import Path
@@ -101,7 +101,7 @@ def returns(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return next(line for line in output.out.splitlines() if line.strip().startswith("return"))
 
 
-def test_a_run_goes_on_after_its_task_has_moved(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_resumes_after_its_task_has_moved(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The model's includes and meshes and the tables move with the task."""
     out = trained(folder)
     before = returns(capsys, str(out))
@@ -173,7 +173,7 @@ def test_all_files_of_a_model_are_copied(kind: str, folder: Path) -> None:
     assert kept["model"] == {"attached": "robot/whole.xml", "urdf": "robot/arm.urdf", "python": "robot/model.xml"}[kind]
 
 
-def test_an_edited_task_is_named_and_the_runs_own_copy_used(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_edited_task_is_reported_and_the_runs_copy_is_used(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = trained(folder)
     before = returns(capsys, str(out))
     file = folder / "mine" / "slide.py"
@@ -190,7 +190,7 @@ def test_an_edited_task_is_named_and_the_runs_own_copy_used(folder: Path, capsys
     assert capsys.readouterr().err == ""
 
 
-def test_modules_that_a_task_imports_are_kept_with_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_modules_that_a_task_imports_are_copied_with_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mine = folder / "mine"
     source = SOURCE.replace("import warp as wp\n", "import warp as wp\nfrom slide_terms.goal import miss\n", 1)
     source = source.replace("-wp.abs(s1.qpos[0] - p.goal[0])", "-miss(s1.qpos[0], p.goal[0])")
@@ -215,7 +215,9 @@ def test_modules_that_a_task_imports_are_kept_with_it(folder: Path, capsys: pyte
         shutil.rmtree(folder / "moved")
 
 
-def test_an_edited_model_is_named_and_the_runs_own_copy_used(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_edited_model_is_reported_and_the_runs_copy_is_used(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = trained(folder)
     before = returns(capsys, str(out))
     (folder / "mine" / "robot" / "parts" / "block.xml").write_text(
@@ -255,7 +257,7 @@ def test_a_run_that_begins_with_another_uses_its_copy_of_the_model(
         assert env.model.body_mass[-1] == 9.0
 
 
-def test_a_run_of_python_keeps_a_model_that_was_made_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_keeps_a_model_that_was_made_in_python(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec = lw.gymnasium_model("hopper.xml").spec()
     spec.option.gravity = [0.0, 0.0, -30.0]
     env = lw.make("hopper", nworld=2, model=spec, horizon=20)
@@ -266,7 +268,7 @@ def test_a_run_of_python_keeps_a_model_that_was_made_there(tmp_path: Path, capsy
     assert cli.main(["train", "--resume", str(tmp_path / "run"), "--iterations", "2", *QUIET]) == 0
 
 
-def test_python_names_a_task_and_a_model_that_have_changed(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_resuming_in_python_reports_a_changed_task_and_model(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     """The changed files are used, because the algorithm was made from them."""
     file, table, out = folder / "mine" / "slide.py", folder / "mine" / "goal.npy", folder / "run"
 
@@ -286,7 +288,9 @@ def test_python_names_a_task_and_a_model_that_have_changed(folder: Path, caplog:
     assert caplog.messages == [f"{file} {changed}", f"the model of the task 'slide' {changed}"]
 
 
-def test_a_task_of_a_program_is_evaluated_with_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_task_defined_in_a_program_is_evaluated_from_a_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=SMALL), tmp_path / "run", iterations=1)
     Run.open(tmp_path / "run").amend(task=None)  # as saved for a class of a notebook
     assert cli.main(["eval", str(tmp_path / "run")]) == 2
@@ -319,7 +323,7 @@ EDITS = [
 """Edits of a task's files during training; None deletes a file."""
 
 
-def test_a_run_keeps_to_the_source_that_it_was_started_with(folder: Path) -> None:
+def test_a_run_copies_the_source_that_it_started_with(folder: Path) -> None:
     mine = folder / "mine"
     original = {mine / "slide.py": EDITED, mine / "slide_terms.py": LOCAL}
     for file, text in original.items():

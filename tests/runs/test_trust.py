@@ -98,7 +98,7 @@ def test_a_foreign_run_is_refused_until_it_is_trusted(
     arguments = [word if word != "2" else "3" for word in command]
     assert cli.main(arguments) == 0  # trusted from now on
     (theirs / "task" / "told.py").write_text(SOURCE + "\n")
-    assert cli.main(command) == 2  # but not with changed content
+    assert cli.main(command) == 2  # a changed copy is not trusted
 
 
 def outside(folder: Path) -> Path:
@@ -166,7 +166,7 @@ def test_a_run_of_a_named_task_is_refused_once_it_names_a_file(
     with pytest.raises(ValueError, match=r"was not made by you .*--trust") as refusal:
         run_env(run, saved.options, saved.params)
     assert str(file) in str(refusal.value) and not witness.exists()
-    if attack in (names_a_table, names_a_model):  # the task is given, but what it reads is the folder's
+    if attack in (names_a_table, names_a_model):  # the given task reads a table that the folder names
         with pytest.raises(ValueError, match=r"was not made by you .*--trust"):
             run_env(run, saved.options, saved.params, task="point_mass")
 
@@ -176,7 +176,7 @@ def test_a_link_out_of_the_folder_is_refused(link: str, made: Path, witness: Pat
     folder = Path(shutil.copytree(made / "own", tmp_path / "own"))
     change(folder, task="/home/other/told.py:Told")
     kept = folder / "task" / "told.py"
-    if link == "file":  # its content is equal, but it may be replaced later
+    if link == "file":  # the linked file has the same content now, but may be replaced later
         kept.rename(tmp_path / "told.py")
         kept.symlink_to(tmp_path / "told.py")
     else:
@@ -213,7 +213,7 @@ def test_a_policy_is_loaded_and_exported_without_the_task(theirs: Path, witness:
     assert not witness.exists() and not (tmp_path / "state").exists()
 
 
-def test_training_goes_on_with_a_line_if_the_run_cannot_be_recorded(
+def test_training_continues_with_a_message_if_the_run_cannot_be_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").write_text("")

@@ -97,7 +97,7 @@ def test_a_next_step_reset_does_not_count_as_an_episode() -> None:
     assert envs.episode_count > N
 
 
-def test_an_end_goes_with_its_episode_without_automatic_resets() -> None:
+def test_a_reset_clears_the_end_of_the_previous_episode() -> None:
     env = GymnasiumEnv(Leave)
     for seed in range(8):
         _, info = env.reset(seed=seed)
@@ -107,7 +107,7 @@ def test_an_end_goes_with_its_episode_without_automatic_resets() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_check_gives_the_same_verdict_alone_and_among_all(seed: int) -> None:
+def test_a_rule_gives_the_same_result_alone_and_among_all(seed: int) -> None:
     rule = next(check for check in CHECKS if check.__name__ == "check_set_state_shows")
     check_task(Leave, steps=20, seed=seed, nworld=8)
     check_task(Leave, steps=20, seed=seed, nworld=8, checks=[rule])

@@ -1,4 +1,4 @@
-"""Tasks in a notebook: cells run one after another in one module, and may run again."""
+"""Define tasks in a notebook, whose cells run in one module and may run again."""
 
 import sys
 import types

@@ -135,14 +135,14 @@ def test_a_draw_that_cannot_be_simulated_is_a_fault_of_its_world(engine: str) ->
     assert env.fault_counts["model"] == 2
 
 
-def test_a_robots_state_has_the_nominal_model_unless_it_is_given() -> None:
+def test_state_of_gives_a_robots_state_the_nominal_model_by_default() -> None:
     plan = lw.MPPI(Faulty, samples=2, horizon=2)
     columns = plan.env.state_space.parts["body_mass"]
     assert plan.state_of(qpos=[0.0])[columns].tolist() == [0.0, 1.0]
     assert plan.state_of(body_mass=[0.0, 2.0])[columns].tolist() == [0.0, 2.0]
 
 
-def test_an_event_in_memory_leaves_the_physics_in_double_precision() -> None:
+def test_an_event_that_writes_memory_keeps_the_physics_in_double_precision() -> None:
     env = lw.make(Faulty, nworld=1, engine="mujoco", horizon=0)
     time = env.state_space.parts["time"]
     for _ in range(1000):

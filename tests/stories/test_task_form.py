@@ -83,7 +83,7 @@ def step_without_events(env: lw.Env, action: torch.Tensor) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_randomised_world_goes_on_in_another_environment(engine: str) -> None:
+def test_a_randomised_world_continues_in_another_environment(engine: str) -> None:
     first, other = (lw.make(Drawn, nworld=3, engine=engine, seed=seed) for seed in (1, 2))
     actions = random_actions(first, 12)
     for action in actions[:4]:
@@ -99,7 +99,7 @@ def test_a_randomised_world_goes_on_in_another_environment(engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_draws_do_not_compound_over_resets(engine: str) -> None:
+def test_draws_do_not_accumulate_over_resets(engine: str) -> None:
     env = lw.make(Drawn, nworld=4, engine=engine)
     masses = []
     for _ in range(1000 if engine == "mujoco" else 100):
@@ -195,7 +195,7 @@ def test_a_number_that_is_not_finite_is_a_fault_of_its_world(name: str, reason: 
     assert torch.isfinite(judged).all()
     env.set_params(**{name: value})
     assert torch.equal(env.get_reward(before, action, after)[others], judged[others])
-    assert env.get_reward(before, action, after)[1] != 0  # the fault has not persisted
+    assert env.get_reward(before, action, after)[1] != 0  # the fault ends with its episode
 
 
 def test_a_rejected_draw_changes_no_lasting_memory() -> None:
@@ -219,7 +219,7 @@ def test_startup_draws_lasting_memory_once_for_each_world() -> None:
     assert torch.equal(env.obs[:, 1], drawn)
 
 
-def test_a_planner_leaves_out_what_startup_drew_where_a_robot_is_known_by_its_measurements() -> None:
+def test_a_planners_state_has_no_startup_draws_of_memory() -> None:
     plan = lw.MPPI(Gifted, samples=4, horizon=2)
     columns = plan.env.state_space.parts["practice"]
     assert plan.env.get_state()[0, columns].item() >= 1
@@ -308,7 +308,7 @@ def test_inputs_that_a_reset_draws_act_in_steps_and_in_rollouts(engine: str) -> 
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_rollout_has_the_numbers_of_stepping_without_events(engine: str) -> None:
+def test_a_rollout_equals_steps_without_events(engine: str) -> None:
     env = lw.make(Full, nworld=3, engine=engine, autoreset=False, horizon=0)
     loop = OpenLoop(lw.make(Full, nworld=3, engine=engine, autoreset=False, seed=5), 4)
     for action in random_actions(env, 3, seed=1):
@@ -515,7 +515,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
 
 
 @pytest.mark.parametrize(("changes", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_in_the_form_is_one_line_that_names_it(
+def test_a_mistake_in_the_task_form_raises_one_line_that_names_it(
     changes: list[tuple[str, str]], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=message) as caught:

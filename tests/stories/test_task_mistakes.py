@@ -1,4 +1,4 @@
-"""Mistakes in a task file: the error is one line that names the mistake and its fix; the corrected file then loads.
+"""Test mistakes in a task file: one line names the mistake and its fix, and the corrected file then loads.
 
 tests/binding tests the same messages by module; these are the mistakes that newcomers made.
 """
@@ -86,7 +86,7 @@ MISTAKES: dict[str, tuple[tuple[str, str], str]] = {
 
 
 @pytest.mark.parametrize(("change", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_in_a_task_file_is_one_line_that_names_it(
+def test_a_mistake_in_a_task_file_raises_one_line_that_names_it(
     change: tuple[str, str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tiny_task.write(tmp_path, OTHER_FILE, "other_rewards.py")
@@ -117,7 +117,7 @@ def test_a_misspelt_keyword_is_refused_with_the_word_that_was_meant() -> None:
             lw.make("hopper", **{word: 4})
 
 
-def test_a_buffer_that_is_replaced_is_refused_with_the_way_to_write_into_it() -> None:
+def test_replacing_a_buffer_is_refused_with_how_to_write_into_it() -> None:
     env = lw.make("hopper", nworld=2)
     with pytest.raises(
         AttributeError, match=r"env\.action is a buffer of fixed address: write into it, as env\.action"

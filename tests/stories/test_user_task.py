@@ -1,4 +1,4 @@
-"""A user's task in its own file, with every feature that a task may use, on both engines."""
+"""Test a user's task in its own file, with every feature that a task may use, on both engines."""
 
 import importlib.util
 import sys
@@ -208,7 +208,7 @@ def test_the_task_keeps_the_rules(module: ModuleType, engine: str) -> None:
     check_task("follow_target", engine=engine, steps=100, frame_skip=2, gain=np.array([0.5, 1.0, 1.5, 2.0]))
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", ["mujoco", pytest.param("warp", marks=pytest.mark.long)])
 def test_scaled_actions_under_rk4_keep_the_rules(module: ModuleType, path: Path, engine: str) -> None:
     spec = mujoco.MjSpec.from_string(module.XML)
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
@@ -273,7 +273,7 @@ def test_acceleration_sensors_belong_to_the_last_substep(module: ModuleType, eng
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_further_field_of_the_acceleration_stage_joins_the_state(module: ModuleType, engine: str) -> None:
+def test_an_additional_field_of_the_acceleration_stage_joins_the_state(module: ModuleType, engine: str) -> None:
     plain, env = (lw.make("follow_target", engine=engine, nworld=2, fields=fields) for fields in ((), ["qacc"]))
     assert env.state_space.size == plain.state_space.size + 2
     acceleration = env.field("qacc")

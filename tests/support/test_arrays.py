@@ -7,9 +7,7 @@ from lyceum_warp.support.arrays import flat, launch_rows, launch_several_rows, t
 
 
 @pytest.mark.parametrize(("dtype", "shape", "columns"), [(float, (2, 3), 3), (wp.vec3, (2, 4), 12), (int, 2, 1)])
-def test_flat_has_a_row_of_numbers_a_world_in_the_same_memory(
-    dtype: type, shape: tuple[int, ...], columns: int
-) -> None:
+def test_flat_has_one_row_per_world_in_the_same_memory(dtype: type, shape: tuple[int, ...], columns: int) -> None:
     array = wp.zeros(shape, dtype=dtype, device="cpu")
     alias = flat(array)
     assert alias.shape == (2, columns)

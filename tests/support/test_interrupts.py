@@ -45,7 +45,7 @@ def test_signals_are_ignored_after_the_caller_raised_a_postponed_one() -> None:
         signal.raise_signal(signal.SIGTERM)
 
 
-def test_signals_after_an_empty_postponement_raise_again() -> None:
+def test_a_signal_after_postponed_without_signals_raises() -> None:
     with signals():
         with postponed():
             pass
@@ -80,7 +80,7 @@ def test_a_second_signal_raises_within_obeyed_and_a_third_is_ignored() -> None:
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
-def test_obeyed_keeps_what_a_shell_ignores_and_other_handlers() -> None:
+def test_obeyed_keeps_ignored_signals_and_other_handlers() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with signals():
         with pytest.raises(Interrupted):

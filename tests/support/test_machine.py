@@ -6,7 +6,7 @@ import warp as wp
 from lyceum_warp.support.machine import cpu_cores, free_memory
 
 
-def test_cpu_cores_counts_those_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cpu_cores_counts_the_cores_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 3, 5}, raising=False)
     assert cpu_cores() == 3
 

@@ -25,7 +25,7 @@ def test_warp_prints_the_remark_without_the_package() -> None:
     assert "CUDA" in printed("import warp as wp; wp.config.log_level = wp.LOG_WARNING; wp.init()")[1]
 
 
-def test_other_output_of_the_start_and_the_log_keep_everything() -> None:
+def test_other_output_at_the_start_of_warp_is_kept() -> None:
     program = """
 import logging, os, sys
 logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
@@ -45,7 +45,7 @@ assert warp_log.start_warp() == warp_log.start_warp()
     assert "Warp CUDA warning: no driver" in out.splitlines()
 
 
-def test_warp_starts_where_stderr_is_closed() -> None:
+def test_warp_starts_with_a_closed_stderr() -> None:
     program = "import os; os.close(2); from lyceum_warp.support import warp_log; print(warp_log.start_warp())"
     assert printed(program) == ("[]\n", "")
 

@@ -1,4 +1,4 @@
-"""Parameters and metrics of adroit_hammer, adroit_door and adroit_relocate.
+"""Test parameters and metrics of adroit_hammer, adroit_door and adroit_relocate.
 
 oracles/test_gymnasium_robotics.py compares the tasks with the originals.
 """
@@ -35,7 +35,7 @@ def test_metrics_add_up_to_the_reward(shared_env: SharedEnv, task: str) -> None:
     assert (env.metrics["bonus"] == 0).all()
 
 
-def test_palm_weight_turns_the_first_term_around(shared_env: SharedEnv, task: str) -> None:
+def test_palm_weight_sets_the_sign_of_the_first_term(shared_env: SharedEnv, task: str) -> None:
     """The planner's settings reward a near palm; the task itself, like the original, rewards a distant palm."""
     env, turned = (shared_env(task, nworld=4, nthread=1, palm_weight=weight) for weight in (0.1, -0.1))
     assert lw.MPPI(task, horizon=2, samples=2, nthread=1).env.task.params["palm_weight"] == -1.0

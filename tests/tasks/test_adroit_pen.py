@@ -1,4 +1,7 @@
-"""The adroit_pen task's parameters and memory. oracles/test_gymnasium_robotics.py compares it with the original."""
+"""Test the adroit_pen task's parameters and memory.
+
+oracles/test_gymnasium_robotics.py compares it with the original.
+"""
 
 import numpy as np
 import torch

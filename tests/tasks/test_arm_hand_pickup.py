@@ -1,4 +1,4 @@
-"""The arm_hand_pickup task: Jaco's arm and hand, Lyceum's formulas with the corrected goal distance, and a grasp."""
+"""Test the arm_hand_pickup task: Lyceum's formulas with the corrected goal distance, and a scripted grasp."""
 
 import importlib.util
 

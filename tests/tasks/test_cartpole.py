@@ -1,4 +1,7 @@
-"""The cartpole task: resets, success and the end of an episode. oracles/test_dm_control.py compares its rewards."""
+"""Test the cartpole task: resets, success and the end of an episode.
+
+oracles/test_dm_control.py compares its rewards.
+"""
 
 import numpy as np
 import torch

@@ -1,4 +1,4 @@
-"""The cartpole_swingup task: Lyceum's formulas and resets. oracles/test_dm_control.py compares its model."""
+"""Test the cartpole_swingup task: Lyceum's formulas and resets. oracles/test_dm_control.py compares its model."""
 
 import mujoco
 import numpy as np

@@ -1,4 +1,4 @@
-"""The go1_velocity task: formulas, contact timers, commands, pushes, random draws and curriculum.
+"""Test the go1_velocity task: formulas, contact timers, commands, pushes, random draws and curriculum.
 
 tests/oracles/test_mjlab.py compares it with mjlab.
 """
@@ -300,7 +300,7 @@ def test_actions_move_the_servos_targets_away_from_the_default_pose(shared_env: 
     assert env.model.actuator_forcerange[:3, 1].tolist() == [23.7, 23.7, 35.55]
 
 
-def test_both_engines_agree_over_a_step(shared_env: SharedEnv) -> None:
+def test_both_engines_agree_after_a_step(shared_env: SharedEnv) -> None:
     """Compare observations, memory and rewards from states along random steps."""
     mine, theirs = (shared_env("go1_velocity", engine=engine, nworld=4, **STILL) for engine in ("mujoco", "warp"))
     for action in random_steps(mine, 12):

@@ -1,4 +1,4 @@
-"""The herb_reach task: HERB's published numbers, formulas, resets, reachable targets, success."""
+"""Test the herb_reach task: HERB's published numbers, formulas, resets, reachable targets, success."""
 
 import mujoco
 import numpy as np
@@ -97,7 +97,7 @@ def test_model_has_the_published_inertias(shared_env: SharedEnv, side: str) -> N
         )
 
 
-def test_palms_are_where_the_published_chain_puts_them(shared_env: SharedEnv) -> None:
+def test_palms_have_the_positions_of_the_published_chain(shared_env: SharedEnv) -> None:
     """The transforms are Denavit-Hartenberg's, from the first joint on, at random angles."""
     model = shared_env("herb_reach").model
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
@@ -117,7 +117,7 @@ def test_palms_are_where_the_published_chain_puts_them(shared_env: SharedEnv) ->
             np.testing.assert_allclose(data.site(f"{side}/palm").xpos, pose[:3, 3], atol=1e-9)
 
 
-def test_arms_stay_where_they_are_without_torque(shared_env: SharedEnv) -> None:
+def test_arms_do_not_move_without_torque(shared_env: SharedEnv) -> None:
     """Gravity is compensated."""
     env = shared_env("herb_reach", nworld=2, autoreset=False)
     before = positions(env)[0]

@@ -1,4 +1,4 @@
-"""The panda_lift task: the robot, a scripted grasp, the reward terms (also of aloha_lift), resets and success."""
+"""Test the panda_lift task: robot, scripted grasp, reward terms (also of aloha_lift), resets and success."""
 
 import mujoco
 import numpy as np
@@ -44,7 +44,7 @@ def test_only_simple_shapes_collide(shared_env: SharedEnv) -> None:
     assert (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).any(), "meshes are drawn"
 
 
-def test_arm_without_commands_stands_still(shared_env: SharedEnv) -> None:
+def test_arm_without_actions_stands_still(shared_env: SharedEnv) -> None:
     """Gravity is compensated; an action of 1 moves a servo target by 1 rad/s."""
     env = shared_env("panda_lift", nworld=2, autoreset=False)
     before = positions(env)[0][:, :9]

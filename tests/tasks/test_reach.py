@@ -1,4 +1,4 @@
-"""The reach task: the published arm, Lyceum's formulas, resets, and success by the mean over ten steps."""
+"""Test the reach task: the published arm, Lyceum's formulas, resets, and success by the mean over ten steps."""
 
 import mujoco
 import numpy as np
@@ -67,7 +67,7 @@ def test_only_palm_and_table_collide(shared_env: SharedEnv) -> None:
     assert model.site("target").size[0] == 0.05
 
 
-def test_three_seconds_of_controls_end_where_the_original_arm_ended(shared_env: SharedEnv) -> None:
+def test_three_seconds_of_controls_end_in_the_original_arms_position(shared_env: SharedEnv) -> None:
     """Smooth controls push one joint against its limit. The expected numbers were computed with the original arm."""
     model = shared_env("reach").model
     data = mujoco.MjData(model)

@@ -1,4 +1,4 @@
-"""The soft_ball task: squeezing and lifting the ball, observations, rewards, resets and ends of episodes."""
+"""Test the soft_ball task: squeezing and lifting the ball, observations, rewards, resets and ends of episodes."""
 
 import mujoco
 import numpy as np

@@ -1,4 +1,4 @@
-"""The family of velocity tasks: feet, contacts and forces of every robot are MuJoCo's, and other joints keep still."""
+"""Compare feet, contacts and forces of every velocity task with MuJoCo's, and check that other joints keep still."""
 
 import mujoco
 import numpy as np
@@ -58,7 +58,7 @@ def test_heights_and_contacts_of_feet_are_mujocos(task: str, env: lw.Env) -> Non
 
 @pytest.mark.parametrize("task", ROBOTS)
 def test_velocities_of_feet_are_mujocos(task: str, env: lw.Env) -> None:
-    """The slip of feet in contact, times the weight and the step."""
+    """Compare the metric: the squared horizontal speed of feet in contact, times the weight and the step's duration."""
     random_steps(env, 12, 1.0)
     env.set_params(least_command=-1.0)
     random_steps(env, 1, 1.0)
@@ -78,8 +78,8 @@ def test_velocities_of_feet_are_mujocos(task: str, env: lw.Env) -> None:
 
 
 @pytest.mark.parametrize("task", ROBOTS)
-def test_a_standing_robot_weighs_on_its_feet(task: str, env: lw.Env) -> None:
-    """Upright at rest, the forces on the feet carry its weight, and joints that do not act keep the home pose."""
+def test_a_standing_robots_feet_carry_its_weight(task: str, env: lw.Env) -> None:
+    """At rest the forces on a robot's feet add up to its weight, and joints without actions keep the home pose."""
     total = []
     for _ in range(12):
         env.step(torch.zeros(env.action.shape))

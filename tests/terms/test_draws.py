@@ -1,4 +1,4 @@
-"""Draws of numbers and of model fields."""
+"""Check the distributions of drawn numbers and model fields."""
 
 import numpy as np
 from checks import check_uniform
@@ -8,7 +8,7 @@ RNG = np.random.default_rng(0)
 
 
 def centred(x: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Numbers from (low, high) as numbers from (-1, 1); the ends may be off by a rounding error."""
+    """Map numbers from (low, high) to (-1, 1); the ends may be off by a rounding error."""
     scaled = (x - (low + high) / 2) / ((high - low) / 2)
     assert np.abs(scaled).max() < 1.0 + 1e-4
     return np.clip(scaled, -1.0, 1.0)

@@ -1,4 +1,4 @@
-"""Clocks and swings of feet over many substeps."""
+"""Test clocks and swings of feet over many substeps."""
 
 import numpy as np
 from term_calls import N, call

@@ -21,7 +21,7 @@ def unit(rows: np.ndarray) -> np.ndarray:
 
 
 def clocks(steps: int) -> np.ndarray:
-    """Whole substeps; half of them are 0."""
+    """Draw whole numbers of substeps, half of them 0."""
     return SUBSTEP * RNG.integers(1, steps, (N, FEET)) * RNG.integers(0, 2, (N, FEET))
 
 
@@ -52,7 +52,7 @@ VALUES: dict[str, Any] = {
     "qpos": QPOS, "qvel": normal(12), "qacc": normal(12), "qfrc_actuator": normal(12), "row": normal(6),
     "sensordata": normal(24), "subtree_angmom": normal(4, 3), "base": 2, "site_xpos": normal(6, 3),
 }  # fmt: skip
-"""A value of each argument, for all worlds or for each."""
+"""Return a value of each argument, for all worlds or per world."""
 
 
 def total(rows: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A ring in memory against a list."""
+"""Compare a ring buffer in task memory with a list."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ WIDTH = 3
 
 
 @pytest.mark.parametrize("length", [1, 2, 4])
-def test_a_history_has_the_last_values_and_repeats_the_first(length: int) -> None:
+def test_a_history_has_the_last_values_and_starts_with_the_first_repeated(length: int) -> None:
     rng, values = np.random.default_rng(0), []
     history = np.zeros((N, 1 + length * WIDTH))
     assert call("history_length", history=history, width=WIDTH).result[0] == length

@@ -1,4 +1,4 @@
-"""Changed inertias against clouds of points, which are mapped one by one."""
+"""Compare changed inertias with clouds of point masses that are mapped one by one."""
 
 import mujoco
 import numpy as np

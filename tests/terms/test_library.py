@@ -1,4 +1,4 @@
-"""The library as a whole: its arguments, and its use in a task."""
+"""Check the arguments of all library functions, and use the library in a task."""
 
 from collections import defaultdict
 
@@ -19,11 +19,11 @@ def test_an_argument_has_one_type_and_a_meaning_in_all_functions() -> None:
         for function, _ in overloads:
             for argument, kind in function.input_types.items():
                 kinds[argument].add(str(kind))
-    assert {argument for argument, found in kinds.items() if len(found) > 1} == {"row"}  # of numbers or of vectors
+    assert {argument for argument, found in kinds.items() if len(found) > 1} == {"row"}  # numbers or vectors
     assert {*kinds} == {*terms.ARGUMENTS}
 
 
-# writes are those of the fields that a call passes
+# a library function writes the fields that its caller passes
 
 
 @wp.struct
@@ -103,7 +103,7 @@ def robots(s: World, rng: Row[wp.uint32]):
         (robots, "encoder_bias body_mass body_ipos body_inertia body_iquat"),
     ],
 )
-def test_a_function_writes_the_fields_that_it_passes(function: wp.Function, fields: str) -> None:
+def test_a_function_that_passes_fields_to_be_written_writes_them(function: wp.Function, fields: str) -> None:
     assert written_fields(function) == {*fields.split()}
     assert {write.use for write in find_writes(function)} <= {None}
 
@@ -192,7 +192,7 @@ def test_a_task_draws_robots_and_pushes_them_with_library_functions(task_file: T
     assert np.isfinite(env.reward.numpy()).all()
 
 
-def test_a_library_function_may_not_write_what_its_caller_may_not(task_file: TaskFile) -> None:
+def test_a_library_function_may_write_only_what_its_caller_may(task_file: TaskFile) -> None:
     source = TASK.replace("{further}", "terms.push(s.qpos, s.qvel, wp.vec3(0.5), wp.vec3(0.5), rng)")
     with pytest.raises(ValueError, match=r"observe of the task .* writes s\.qvel in push \(pushes\.py, line \d+\)"):
         lw.make(str(task_file("library_push.py", source)), nworld=1)

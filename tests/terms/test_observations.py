@@ -1,4 +1,4 @@
-"""Observations of listed joints, and noise."""
+"""Check observations of listed joints, and observation noise."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Velocity commands: their draws, timers and headings."""
+"""Check velocity commands: their draws, timers and headings."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from term_calls import N, call
 
 
 def near(share: np.ndarray, wanted: float) -> bool:
-    """Whether a share of N draws is within five standard errors."""
+    """Return whether a share of N draws is within five standard errors."""
     return bool(abs(share.mean() - wanted) < 5.0 * np.sqrt(wanted * (1.0 - wanted) / len(share)))
 
 

@@ -1,4 +1,4 @@
-"""Viewers that follow a run while it trains."""
+"""View a run while it trains."""
 
 import contextlib
 import importlib
@@ -51,7 +51,7 @@ def test_a_file_that_cannot_be_read_is_a_message(tmp_path: Path) -> None:
     assert follower.update() == []
 
 
-def test_a_run_that_does_not_come_is_reported(tmp_path: Path) -> None:
+def test_a_run_that_does_not_start_is_reported(tmp_path: Path) -> None:
     for message in ("there is no run in", "has no policy"):
         with pytest.raises(FileNotFoundError, match=message):
             wait_for_run(tmp_path, seconds=0.1)
@@ -59,7 +59,7 @@ def test_a_run_that_does_not_come_is_reported(tmp_path: Path) -> None:
 
 
 def trained(folder: Path, callback: Callable[[lw.Iteration], object] | None = None) -> tuple[list[Any], list[Any]]:
-    """Return a run's rows without measured times, and its policy."""
+    """Return a run's metrics without measured times, and its policy."""
     env = lw.make("point_mass", nworld=2, engine="mujoco", seed=3)
     npg = lw.NPG(env, config=lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,)), seed=3)
     run = lw.train(npg, folder, iterations=4, callback=callback)
@@ -98,7 +98,7 @@ viewer.close()
 
 
 def runs(process: int) -> bool:
-    """Whether a process runs; one that ended and is not waited for does not."""
+    """Return whether a process is running; a zombie does not count."""
     with contextlib.suppress(FileNotFoundError):
         return Path(f"/proc/{process}/cmdline").read_bytes() != b""
     return False

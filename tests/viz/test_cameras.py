@@ -50,7 +50,7 @@ def test_an_unknown_camera_is_refused_with_the_models_cameras(model: mujoco.MjMo
         find_camera(mujoco.MjModel.from_xml_string("<mujoco/>"), 0)
 
 
-def test_a_free_camera_has_the_given_pose_and_otherwise_mujocos(model: mujoco.MjModel) -> None:
+def test_a_free_camera_has_the_given_pose_or_mujocos_default(model: mujoco.MjModel) -> None:
     default = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, default)
     for choice in ("free", FreeCamera()):
@@ -76,7 +76,7 @@ def test_a_wrong_pose_is_refused(model: mujoco.MjModel, pose: dict[str, object],
         find_camera(model, FreeCamera(**pose))  # type: ignore[arg-type]
 
 
-def test_words_of_a_shell_describe_a_camera() -> None:
+def test_command_line_arguments_describe_a_camera() -> None:
     assert parsed_camera([]) is None
     assert parsed_camera(["side"]) == "side"
     words = ["azimuth=90", "elevation=-20", "lookat=0,0.5,1", "distance=2", "track=torso"]
@@ -90,6 +90,6 @@ def test_words_of_a_shell_describe_a_camera() -> None:
     (["azimuth=left"], "azimuth must be a number, not 'left'"),
     (["lookat=1,2"], "lookat must be X,Y,Z, not '1,2'"),
 ])  # fmt: skip
-def test_other_words_are_refused(words: list[str], message: str) -> None:
+def test_other_command_line_arguments_are_refused(words: list[str], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parsed_camera(words)

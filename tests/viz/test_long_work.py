@@ -5,7 +5,7 @@ from rich.console import Console
 from lyceum_warp.viz.long_work import LongWork
 
 
-def test_long_work_prints_a_line_now_and_then() -> None:
+def test_long_work_prints_its_progress_regularly() -> None:
     console = Console(file=io.StringIO(), width=120)
     with LongWork("drawing the video", "frames", console) as work:
         work(1, 500)

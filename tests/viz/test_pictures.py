@@ -50,7 +50,7 @@ def test_a_picture_shows_the_model_of_its_world(env: lw.Env, pictures: WorldPict
     env.set_dynamics(geom_size=sizes[0])
 
 
-def test_a_closed_process_is_started_again(pictures: WorldPictures) -> None:
+def test_a_closed_process_is_restarted(pictures: WorldPictures) -> None:
     before = pictures()
     pictures.close()
     for picture, again in zip(before, pictures(), strict=True):

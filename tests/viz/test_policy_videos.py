@@ -42,7 +42,7 @@ def test_python_gets_the_videos_of_the_command_line(npg: lw.NPG, tmp_path: Path)
     assert [path.name for path in (run.folder / "videos").iterdir()] == ["000002.mp4"]
 
 
-def test_training_in_python_goes_on_where_no_video_can_be_drawn(
+def test_training_in_python_continues_if_no_video_can_be_drawn(
     npg: lw.NPG, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     pytest.importorskip("imageio_ffmpeg")

@@ -1,4 +1,4 @@
-"""Curves for TensorBoard, read back with TensorBoard's own reader."""
+"""Write curves for TensorBoard, and read them with TensorBoard's own reader."""
 
 import dataclasses
 import math
@@ -98,7 +98,7 @@ def test_a_full_disk_is_an_error_of_the_call(first: lw.Iteration, tmp_path: Path
     assert [step for step, _ in curve(tmp_path, "policy/kl")] == [96 * i for i in range(1, i + 1)]
 
 
-def test_a_missing_package_is_one_line_with_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_raises_one_line_with_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"need the package tensorboard: pip install 'lyceum-warp\[tensorboard\]'$"):
         TensorBoard(tmp_path / "run")

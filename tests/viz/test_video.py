@@ -1,4 +1,4 @@
-"""Videos."""
+"""Write videos of states, and draw single shots."""
 
 import os
 import signal
@@ -37,7 +37,7 @@ def model() -> mujoco.MjModel:
 
 
 def drawable(make: Callable[[], Path]) -> Path:
-    """The result of a function that draws; skips the test on a machine that cannot draw."""
+    """Return the result of a function that renders; skip the test on a machine that cannot render."""
     pytest.importorskip("imageio_ffmpeg")
     try:
         return make()
@@ -86,7 +86,7 @@ def test_a_video_has_the_model_fields_of_its_states(tmp_path: Path) -> None:
     assert sizes.unique().numel() == 2
     out = tmp_path / "video.mp4"
     path = drawable(lambda: video.write_video(env, states, out, size=(160, 120), speed=0.01))
-    areas = np.array(video_frames.read(path)["red"], dtype=float)  # of the red ball, which is seen from a fixed place
+    areas = np.array(video_frames.read(path)["red"], dtype=float)  # the red ball, seen by a fixed camera
     assert len(areas) == len(states) and areas.min() > 0
     ratio = areas[len(first) :].mean() / areas[: len(first)].mean()
     assert ratio == pytest.approx((sizes[-1] / sizes[0]).item() ** 2, rel=0.25)
@@ -138,7 +138,7 @@ def test_a_wrong_argument_is_refused(env: lw.Env, tmp_path: Path, options: dict[
 
 
 def shot(x: float, **changes: Any) -> Shot:
-    """The ball at some place of its rail."""
+    """Return a state with the ball at a position on its rail."""
     none = np.zeros((0, 3)), np.zeros((0, 4))
     values: dict[str, Any] = dict(pose=(np.array([x]), *none), model_fields={}, ghosts=[], lines=[], frames=1)
     return Shot(**values | changes)

@@ -406,6 +406,7 @@ class Velocity(lw.Task):
     }
     metrics = ("velocity_error", "yaw_rate_error")
     terminations = ("fell_over", "too_low")
+    deployment, mirror = staticmethod(walkers.deployment), staticmethod(walkers.mirror)
     cleared = ("sensordata",)  # zero before the first substep; mjlab computes it for the first state
 
 

@@ -164,7 +164,9 @@ class Session:
         """Account for a step of the plant."""
         self.stage.live.stepped()
         self.stage.steps += 1
-        if time.perf_counter() - self._last_work > 1 / _FPS:  # a plant that is late or fast never waits
+        if (
+            time.perf_counter() - self._last_work > 1 / _FPS
+        ):  # a late or fast plant never waits, so `work` is not called
             self._work()
 
     def _work(self) -> None:

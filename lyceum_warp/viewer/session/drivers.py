@@ -131,7 +131,7 @@ class WorldControl:
         """Call the controller.
 
         Raises:
-            ControllerError: It raised an exception, or another run has begun.
+            ControllerError: The controller raised an exception, or another run has begun.
         """
         with self._busy:  # a call of an interrupted run may still be in progress
             if run != self._run:

@@ -1,4 +1,4 @@
-"""The main loop, with real worlds and a window in memory."""
+"""Test the session's main loop, with real worlds and a window in memory."""
 
 import socket
 import threading
@@ -18,7 +18,7 @@ from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viz.video import Recorder
 
 
-def test_speed_and_pause_hold(shared_env: SharedEnv) -> None:
+def test_speed_and_pause_are_kept(shared_env: SharedEnv) -> None:
     window = run(
         Session(shared_env("point_mass")),
         [protocol.SetSpeed(8.0)],

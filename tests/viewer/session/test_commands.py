@@ -1,4 +1,4 @@
-"""The effect of each command."""
+"""Check the effect of each command of the viewer."""
 
 from collections.abc import Callable
 
@@ -33,7 +33,7 @@ def test_a_push_ends_when_another_world_is_shown(shared_env: SharedEnv) -> None:
 
 @pytest.mark.parametrize("branch", [Perturb(0 * FORCES, qpos=np.full(6, 0.1)), SetMode("passive"),
                                     SetMode("controller", "other"), protocol.SetWorld(1), StepBy(3)])  # fmt: skip
-def test_a_push_that_is_restored_ends_when_the_world_goes_on(shared_env: SharedEnv, branch: protocol.Command) -> None:
+def test_a_restored_push_ends_when_the_world_continues(shared_env: SharedEnv, branch: protocol.Command) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, controllers={"policy": pushing, "other": pushing}, paused=True)
     for command in (PUSH, StepBy(4), RELEASE, StepBy(2), StepBy(-4)):
@@ -43,7 +43,7 @@ def test_a_push_that_is_restored_ends_when_the_world_goes_on(shared_env: SharedE
     assert not pushed(env, 0)
 
 
-def test_a_push_that_ends_in_the_past_does_not_stay_in_the_present(shared_env: SharedEnv) -> None:
+def test_a_push_that_ended_in_the_past_is_absent_in_the_present(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True)
     for command in (StepBy(2), PUSH, StepBy(2), StepBy(-4), RELEASE, StepBy(2)):
@@ -53,7 +53,7 @@ def test_a_push_that_ends_in_the_past_does_not_stay_in_the_present(shared_env: S
     assert not pushed(env, 0) and session.stage.live.past.ahead == 0
 
 
-def test_a_planner_does_not_foresee_a_push_and_the_push_goes_on() -> None:
+def test_a_planner_does_not_see_a_push_and_the_push_continues() -> None:
     env = lw.make("hopper", nworld=2)
     seen = []
 

@@ -1,4 +1,4 @@
-"""The contents of frames."""
+"""Check the contents of frames."""
 
 import math
 
@@ -12,7 +12,7 @@ from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.session.clock import Session
 
 
-def test_other_worlds_and_the_past_are_shown_as_ghosts(shared_env: SharedEnv) -> None:
+def test_other_worlds_and_past_states_are_shown_as_ghosts(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=4)
     session = Session(env, paused=True, seed=0)
     session.stage.advance(10)

@@ -1,4 +1,4 @@
-"""Steps, the history of worlds, and their returns."""
+"""Check steps, the history of worlds, and their returns."""
 
 import pytest
 import torch
@@ -39,7 +39,7 @@ def test_steps_back_and_forth_restore_the_states_to_the_bit(shared_env: SharedEn
     assert session.stage.live.past.ahead == 0 and not torch.equal(env.get_state(), restored)
 
 
-def test_the_history_is_bounded_and_a_message_says_where_it_ends(shared_env: SharedEnv) -> None:
+def test_the_history_is_bounded_and_its_end_is_reported(shared_env: SharedEnv) -> None:
     env = shared_env("hopper")
     session = Session(env, paused=True)
     past = session.stage.live.past

@@ -1,4 +1,4 @@
-"""Controllers of one world in real time, and controllers that are slow or fail."""
+"""Control one world in real time, also with controllers that are slow or fail."""
 
 import threading
 import time

@@ -1,4 +1,4 @@
-"""Playback of episodes."""
+"""Play back episodes."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def test_a_playback_is_sought_reversed_and_looped(shared_env: SharedEnv, traject
     assert session.stage.frame().status.step == 5
     session.obey(protocol.SetBackwards(True))
     session.stage.advance(6)
-    assert session.stage.frame().status.step == 20  # after the first step the last one
+    assert session.stage.frame().status.step == 20  # played backwards, the last step follows the first
     session.obey(protocol.SetMode("playback", episode=1))
     frame = session.stage.frame()
     assert frame.status.step == 15 and frame.status.steps == 15 and frame.status.episode == 1
@@ -51,7 +51,7 @@ def test_a_playback_is_sought_reversed_and_looped(shared_env: SharedEnv, traject
     assert len(past) == 1 and len(ghosts) == 5
 
 
-def test_worlds_go_on_from_the_state_of_a_playback(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:
+def test_worlds_continue_from_the_state_of_a_playback(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:
     env = shared_env("point_mass")
     session = Session(env, episodes={"first": trajectories[0]}, paused=True)
     session.obey(protocol.Seek(20))

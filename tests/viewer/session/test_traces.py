@@ -1,4 +1,4 @@
-"""Paths of a planner's samples."""
+"""Trace the paths of a planner's samples."""
 
 import mujoco
 import numpy as np
@@ -67,4 +67,4 @@ def test_paths_are_those_that_the_samples_take(shared_env: SharedEnv) -> None:
             np.testing.assert_allclose(point, site, atol=1e-6)
     qpos = plant.get_state()[0, plant.state_space.parts["qpos"]]
     np.testing.assert_allclose(traces.final.qpos, qpos, atol=1e-6)
-    assert control.look() is None  # nothing new
+    assert control.look() is None  # unchanged

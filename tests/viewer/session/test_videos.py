@@ -1,4 +1,4 @@
-"""Videos of the viewer."""
+"""Write videos in the viewer."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""The window process: what it serves, and how it ends."""
+"""Test the window process: what it serves, and how it ends."""
 
 import contextlib
 import os
@@ -104,7 +104,7 @@ def test_ctrl_c_does_not_end_the_window(shared_window: Window) -> None:
 # frames
 
 
-def test_show_never_waits_for_a_window_that_hangs(shared_window: Window) -> None:
+def test_show_does_not_wait_for_a_window_that_hangs(shared_window: Window) -> None:
     os.kill(process_of(shared_window), signal.SIGSTOP)
     try:
         frame = frame_of(MODEL, DATA, samples=np.ones((1, 3)), messages=("end",))
@@ -156,7 +156,7 @@ def test_process_that_ends_while_it_is_sent_frames_is_an_error(number: signal.Si
     with Window(scene_of(MODEL)) as window:
         os.kill(process_of(window), signal.SIGSTOP)
         frame = frame_of(MODEL, DATA, samples=np.zeros((20_000, 3)))
-        for _ in range(5):  # fills the connection
+        for _ in range(5):  # fills the pipe
             window.show(frame)
             time.sleep(0.02)
         os.kill(process_of(window), number)

@@ -33,7 +33,7 @@ def hold(bench: Bench, *, paused: bool) -> list[Perturb]:
     return bench.sent[before:]  # type: ignore[return-value]
 
 
-def test_dragged_body_is_pushed_until_it_is_left(bench: Bench) -> None:
+def test_dragged_body_is_pushed_until_the_release(bench: Bench) -> None:
     (push,) = drag(bench, "ball", paused=False)
     assert push.forces[bench.model.body("ball").id, 0] > 0
     assert push.qpos is None and push.mocap_pos is None
@@ -56,7 +56,7 @@ def test_dragged_body_is_placed_while_paused_and_only_when_it_moves(bench: Bench
 
 
 @pytest.mark.parametrize("paused", [False, True])
-def test_push_ends_when_its_person_has_left(bench: Bench, paused: bool) -> None:
+def test_push_ends_when_its_browser_disconnects(bench: Bench, paused: bool) -> None:
     """A browser that is closed during a drag never releases the button."""
     drag(bench, "ball", paused=paused)
     bench.sent.clear()

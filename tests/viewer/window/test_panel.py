@@ -1,4 +1,4 @@
-"""The panel in a viewer without a screen: frames, windows, keys and cameras."""
+"""Test the panel in a viewer without a screen: frames, windows, keys and cameras."""
 
 import mujoco
 import numpy as np
@@ -20,7 +20,7 @@ def bench() -> Bench:
 
 
 def pressed(bench: Bench, key: str, **status: object) -> list[object]:
-    """The commands that follow from a key."""
+    """Return the commands that a key causes."""
     bench.show(status_of(**status))
     KEYS[key].action(bench.panel.actions)
     return list(bench.sent)
@@ -37,7 +37,7 @@ def test_panel_draws_every_mode_with_all_windows_open(bench: Bench, mode: str) -
         samples=np.array([[0.0, 1.0, np.nan], [0.1, 2.0, 3.0]]), messages=("world 3: terminated",),
     )  # fmt: skip
     assert bench.sent == [Opened("http://here")]
-    assert bench.draw() == bench.draw(frame) == bench.draw() == []  # before the first frame, with it and after it
+    assert bench.draw() == bench.draw(frame) == bench.draw() == []  # before, with and after the first frame
     small = Bench(bench.model, scene_of(bench.model, nworld=1, controllers=(), episodes=(), curves=()))
     small.panel.actions.windows |= set(WINDOWS)
     assert small.draw(frame_of(small.model, small.data, status_of(controller=None, world=0))) == []
@@ -122,7 +122,7 @@ def test_fixed_camera_of_the_model_can_be_chosen(bench: Bench) -> None:
 # models that differ between worlds
 
 
-def test_world_of_another_size_gets_a_model_of_its_own(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_world_with_other_sizes_gets_a_separate_model(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lyceum_warp.viewer.window.panel.SWAP_TIME", 0.0)
     sizes = np.array(bench.model.geom_size)
     sizes[1, 0] = 0.3

@@ -1,4 +1,4 @@
-"""The proxy: what it forwards, and the attacks that it refuses."""
+"""Test the proxy: what it forwards, and the attacks that it refuses."""
 
 import contextlib
 import http.client
@@ -271,7 +271,7 @@ def test_pages_are_forwarded_without_the_clients_headers(proxy: Proxy, upstream:
         assert b"Cookie" not in received and b"X-Forwarded-For" not in received
 
 
-def test_an_endless_head_is_refused_without_being_kept(proxy: Proxy) -> None:
+def test_an_endless_head_is_refused_without_buffering_it(proxy: Proxy) -> None:
     with socket.create_connection(("127.0.0.1", proxy.port), timeout=10) as client:
         sent = 0
         with contextlib.suppress(OSError):
@@ -311,7 +311,7 @@ def test_silent_connections_leave_room_for_others(proxy: Proxy, monkeypatch: pyt
         assert silent[0].recv(1) == b""  # the oldest ones were closed
 
 
-def test_a_client_that_takes_nothing_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_that_does_not_read_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "WRITE_SECONDS", 0.3)
     size = 64 * 2**20
     upstream = Upstream(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n" % size + bytes(size))
@@ -397,7 +397,7 @@ def test_a_tab_that_disappears_is_noticed_by_the_private_server(echo: Echo) -> N
     wait_until(lambda: not opened)
 
 
-def test_a_browser_that_controls_and_falls_silent_is_reported(monkeypatch: pytest.MonkeyPatch, echo: Echo) -> None:
+def test_a_silent_controlling_browser_is_reported(monkeypatch: pytest.MonkeyPatch, echo: Echo) -> None:
     monkeypatch.setattr(module, "QUIET_SECONDS", 0.5)
     proxy, _, quiet = echo
     with open_tab(proxy) as tab:
@@ -413,7 +413,7 @@ def test_a_browser_that_controls_and_falls_silent_is_reported(monkeypatch: pytes
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
-def test_other_machines_are_given_an_address_and_the_ssh_line(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_remote_viewer_prints_an_address_and_the_ssh_line(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for connection, shown in (("198.51.100.7 50000 203.0.113.9 22", "203.0.113.9"), ("", socket.gethostname())):
         monkeypatch.setenv("SSH_CONNECTION", connection)
         with Proxy(host=host) as proxy:

@@ -1,4 +1,4 @@
-"""Studio's interface, as far as the viewer uses it: these tests fail if a new version changes it."""
+"""Check that mujoco.studio has the interface that the viewer uses; a new version may change it."""
 
 import ast
 import socket

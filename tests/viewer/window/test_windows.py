@@ -15,7 +15,7 @@ def test_curves_keep_the_newest_points_in_order() -> None:
     np.testing.assert_array_equal(curves.rows, ramp(10_000, 30_000))
 
 
-def test_time_that_goes_back_drops_the_points_from_there_on() -> None:
+def test_a_time_that_decreases_drops_later_points() -> None:
     curves = Curves(1)
     curves.add(ramp(0, 10))
     curves.add(ramp(6, 7))

@@ -1,0 +1,424 @@
+"""Learn policies by soft actor-critic (SAC).
+
+The algorithm of Haarnoja et al. (2018, "Soft Actor-Critic Algorithms and Applications"): twin critics, their slowly
+moving targets, and a temperature that is adapted to a wanted entropy. With many worlds and large batches it is close to
+FastSAC (Seo et al. 2025, "Learning Sim-to-Real Humanoid Locomotion in 15 Minutes").
+"""
+
+import copy
+import dataclasses
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+
+from lyceum_warp.algos.distributed import Captured, Team
+from lyceum_warp.algos.evaluation import MeanPolicyEvaluation
+from lyceum_warp.algos.learner import Learner
+from lyceum_warp.algos.minibatches import precision, room
+from lyceum_warp.algos.networks import trainable
+from lyceum_warp.algos.replay import Replay, Transitions, default_capacity
+from lyceum_warp.algos.rollout_buffer import Rollout
+from lyceum_warp.algos.rollout_statistics import (
+    EpisodeSums,
+    SampledIteration,
+    episode_statistics,
+    finished,
+    metric_means,
+    metric_sums,
+)
+from lyceum_warp.algos.sac_config import SACConfig
+from lyceum_warp.algos.squashed_policy import SquashedPolicy
+from lyceum_warp.algos.timing import PhaseTimer
+from lyceum_warp.algos.twin_critic import TwinCritic
+from lyceum_warp.algos.value import value_group
+from lyceum_warp.env import Env
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import check_kind
+
+_EPS = 1e-2
+"""Added to the normalisers' standard deviations, as in PPO."""
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SACIteration(SampledIteration):
+    """Statistics of one iteration of SAC; losses, values and entropy are means over its updates, NaN without any.
+
+    Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended. The worlds'
+    first episodes start at a random step and are not counted.
+    """
+
+    critic_loss: float
+    """Loss of the two critics: the sum of their mean squared errors."""
+    q_mean: float
+    """Mean of the critics' predictions."""
+    actor_loss: float
+    """Loss of the actor."""
+    entropy: float
+    """Entropy of the policy, in unit actions."""
+    temperature: float
+    """Weight of the entropy after the iteration."""
+    time_update: float
+    """Seconds for the updates."""
+
+
+@document_attributes
+class SAC(Learner):
+    """Learns a policy by SAC; an infinite iterator of ``SACIteration``.
+
+    An iteration makes ``num_steps`` steps of every world, each followed by ``updates`` updates. On a GPU all updates
+    after a step are one CUDA graph, including the choice of their samples.
+
+    Example:
+        >>> for it in SAC(env):
+        ...     print(it.return_mean)
+
+    Args:
+        env: The environment; do not step it between iterations.
+        policy: The policy; a new one by default. A given one also acts during the warm-up.
+        value: The critics; new ones by default.
+        config: Hyperparameters.
+        seed: Seed of new networks and of the noise.
+        team: The processes that learn together, each with its share of the worlds and of the replay buffer. All
+            processes must make the same calls with the same arguments, and get the same statistics.
+
+    Raises:
+        ValueError: The environment does not reset automatically, or an argument does not fit.
+        FloatingPointError: A loss, or a parameter of a network, is not finite after an iteration.
+    """
+
+    algorithm = "sac"
+    """The name of the algorithm in a run's config.json."""
+    policy: SquashedPolicy
+    """The policy, or actor."""
+    value: TwinCritic
+    """The critics."""
+    target: TwinCritic
+    """The target critics, which share the critics' normaliser."""
+    config: Any
+    """Hyperparameters, an ``SACConfig`` without None."""
+    replay: Replay
+    """The replay buffer, with the samples of this process's worlds."""
+    generator: torch.Generator
+    """The random generator for actions and updates."""
+    rollout: Rollout
+    """The samples of the last iteration, for statistics."""
+    log_temperature: torch.Tensor
+    """Logarithm of the temperature."""
+
+    def __init__(
+        self,
+        env: Env,
+        policy: SquashedPolicy | None = None,
+        value: TwinCritic | None = None,
+        config: SACConfig | None = None,
+        *,
+        seed: int = 0,
+        team: Team | None = None,
+    ) -> None:
+        check_kind("env of SAC", env, Env, "as lw.make(...) makes it")
+        check_kind("config of SAC", config, SACConfig | None, "as lw.SACConfig(hidden=(64, 64))")
+        check_kind("policy of SAC", policy, SquashedPolicy | None, "as lw.load(run) returns it for a run of SAC")
+        check_kind("value of SAC", value, TwinCritic | None, "as lw.load_value(run) returns it for a run of SAC")
+        super().__init__(env, seed=seed, team=team)
+        team, device, nworld = self.team, env.obs.device, env.nworld * self.team.size
+        given: Any = (config or SACConfig()).resolved(nworld)
+        nact, self._warms_up = env.action_space.size, policy is None
+
+        # networks
+        init = torch.Generator().manual_seed(self.seed)
+        options: dict[str, Any] = dict(normalize=given.normalize, generator=init)
+        low, high = action_bounds(env, given.action_limit)
+        group = value_group(env, given.value_group) if value is None else value.group
+        self.policy = policy or SquashedPolicy(
+            env.obs_space.size, nact, given.hidden, low=low, high=high, activation=given.activation, **options
+        )
+        self.value = value or TwinCritic(
+            env.obs_spaces[group].size, nact, given.value_hidden, activation=given.value_activation,
+            layer_norm=given.layer_norm, group=group, **options,
+        )  # fmt: skip
+        _check_sizes(self.policy, self.value, env, low, high)
+        trainable(self.policy.to(device)), trainable(self.value.to(device))
+        self.target = copy.deepcopy(self.value).requires_grad_(False)
+        self.target.normalizer = self.value.normalizer
+        self.log_temperature = torch.tensor(math.log(given.temperature), device=device, requires_grad=True)
+        rate = given.learning_rate
+        self.actor_step = GradientStep(self.policy.parameters(), rate, team)
+        self.critic_step = GradientStep(self.value.parameters(), rate, team)
+        self.temperature_step = GradientStep([self.log_temperature], rate, team)
+
+        # samples
+        (least,) = team.largest(-default_capacity(env, team.size))  # all processes have buffers of the same size
+        self.replay = Replay(env, -least if given.replay is None else -(-given.replay // team.size))
+        own, critics = self.policy.shape, self.value.shape
+        self.config = dataclasses.replace(
+            given, replay=self.replay.steps * nworld, hidden=tuple(own["hidden"]), activation=own["activation"],
+            normalize=own["normalize"], value_hidden=tuple(critics["hidden"]), value_activation=critics["activation"],
+            layer_norm=critics["layer_norm"],
+        )  # fmt: skip
+        self.rollout = Rollout(env, given.num_steps)
+        self.count = given.num_steps * nworld
+        # a separate seed, so that weights and noise are independent
+        self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
+        self._act_noise = torch.empty(nworld, nact, device=device)
+
+        # updates
+        share = room(given.batch, team)
+        self._index = torch.zeros(given.updates, share, dtype=torch.long, device=device)
+        self._weight = torch.full((given.updates, share), 1.0 / given.batch, device=device)
+        self._noise = torch.zeros(given.updates, share, 2 * nact, device=device)
+        self._sums = torch.zeros(4, device=device)
+        self._losses = [self.critic_loss, self.actor_loss]
+        if given.compiled:
+            self._losses = [torch.compile(loss) for loss in self._losses]
+        self._learn = Captured(self.learn, team, device)
+        self._evaluate_mean = MeanPolicyEvaluation(env, given.mean_episodes, team)
+        self.rollout.restart()
+        self.rollout.stagger(self.generator, team)
+
+    @property
+    def title(self) -> str:
+        """The algorithm, with the size of its replay buffer."""
+        size = self.replay.nbytes * self.team.size / 1e9
+        return f"{self.algorithm} with a replay buffer of {self.config.replay:,d} samples ({size:.2g} GB)"
+
+    def __next__(self) -> SACIteration:
+        config, rollout, team = self.config, self.rollout, self.team
+        timer, updates = PhaseTimer(self.env.obs.device), 0
+        self._sums.zero_()
+        rollout.begin()
+        with precision(tf32=config.tf32 and self.env.obs.device.type == "cuda"):
+            for _ in range(config.num_steps):
+                # 1. Step the worlds, and store the transitions in the replay buffer.
+                self.sample()
+                timer.mark()
+
+                # 2. Update critics, actor and temperature on samples of the buffer.
+                if self.replay.stored * self._act_noise.shape[0] >= config.warmup:
+                    self.draw()
+                    self._learn()
+                    updates += config.updates
+                timer.mark()
+        self.env.update_shared(team.sum)
+
+        # One copy transfers the statistics of all processes to the host.
+        parameters = [self.log_temperature, *self.policy.parameters(), *self.value.parameters()]
+        finite = torch.stack([numbers.isfinite().all() for numbers in (self._sums, *parameters)]).all()
+        numbers = [
+            *finished(rollout), *metric_sums(rollout), rollout.reward.double().mean(), rollout.faults.sum(), finite,
+            self.log_temperature.detach().exp(), *self._sums,
+        ]  # fmt: skip
+        processes = team.gather(torch.stack([number.double() for number in numbers])[None]).tolist()
+        times = timer.seconds()
+        split = len(EpisodeSums._fields)
+        end = split + 2 * len(self.env.metrics)
+        episodes = [EpisodeSums(*process[:split]) for process in processes]
+        metrics, sums = [process[split:end] for process in processes], [process[end:] for process in processes]
+        _, _, finite, temperature, *losses = sums[0]
+        if not finite:
+            raise FloatingPointError(
+                f"the updates of iteration {self.iteration + 1} are not finite: make learning_rate, or the rewards, "
+                "smaller"
+            )
+        critic_loss, q_mean, actor_loss, entropy = (number / updates if updates else math.nan for number in losses)
+
+        # 3. Every few iterations, evaluate the mean policy in whole episodes.
+        self.iteration += 1
+        self.samples += self.count
+        timer, every = PhaseTimer(self.env.obs.device), config.mean_every
+        due = every > 0 and self.iteration % every == 0
+        statistics = self._evaluate_mean.added(episode_statistics(episodes), self.policy, due=due)
+        timer.mark()
+
+        time_sample, time_update = sum(times[::2]), sum(times[1::2])
+        return SACIteration(
+            iteration=self.iteration,
+            samples=self.samples,
+            reward_mean=sum(process[0] for process in sums) / len(sums),
+            **statistics,
+            critic_loss=critic_loss,
+            q_mean=q_mean,
+            actor_loss=actor_loss,
+            entropy=entropy,
+            temperature=temperature,
+            faults=round(sum(process[1] for process in sums)),
+            time_sample=time_sample,
+            time_update=time_update,
+            time_mean=timer.seconds()[0],
+            samples_per_second=self.count / (time_sample + time_update),
+            **metric_means(sum(part.episodes for part in episodes), metrics, list(self.env.metrics)),
+        )
+
+    @torch.no_grad()
+    def sample(self) -> None:
+        """Step every world with an action of the policy, or with a random action during the warm-up."""
+        env, noise = self.env, self._act_noise
+        if self._warms_up and self.replay.stored * len(noise) < self.config.warmup:
+            noise.uniform_(-1.0, 1.0, generator=self.generator)
+            unit = noise[self.own_worlds]
+        else:
+            noise.normal_(generator=self.generator)
+            unit, _ = self.policy.sample(env.obs, noise[self.own_worlds])
+        env.action.copy_(self.policy.scaled(unit))
+        self.rollout.store_inputs()
+        self.replay.step()
+        self.rollout.store_outputs()
+        self.policy.observe(env.obs, self.team, eps=_EPS)
+        self.value.observe(env.obs_groups[self.value.group], self.team, eps=_EPS)
+
+    @torch.no_grad()
+    def draw(self) -> None:
+        """Draw the samples and the noise of the updates after a step, for all processes; keep this process's part."""
+        team, nworld, batch = self.team, self.env.nworld, self.config.batch
+        shape = len(self._index), batch
+        random: dict[str, Any] = dict(generator=self.generator, device=self._index.device)
+        index = torch.randint(self.replay.count * nworld * team.size, shape, **random)
+        noise = torch.randn((*shape, self._noise.shape[-1]), **random)
+        if team.size > 1:  # as in Minibatches: move own samples to the front, and drop the few that exceed the room
+            index, own = team.locate(index, nworld)
+            first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self._index.shape[1]]
+            index, noise = index.gather(1, first), noise.gather(1, first[..., None].expand(-1, -1, noise.shape[-1]))
+            torch.mul(own.gather(1, first), 1.0 / batch, out=self._weight)
+        self._index.copy_(index)
+        self._noise.copy_(noise)
+
+    def learn(self) -> None:
+        """Make the updates after a step, on the samples of ``draw``."""
+        config, nact = self.config, self.policy.nact
+        critic_loss, actor_loss = self._losses
+        for i in range(config.updates):
+            batch, weight = self.replay.at(self._index[i], n_step=config.n_step, gamma=config.gamma), self._weight[i]
+            next_noise, noise = self._noise[i].split(nact, dim=-1)
+            with torch.autocast(weight.device.type, torch.bfloat16, enabled=config.bf16):
+                loss, *numbers = critic_loss(batch, weight, next_noise)
+            self._sums[:2] += self.critic_step(loss, *numbers)
+            if (i + 1) % config.actor_every == 0:
+                with torch.autocast(weight.device.type, torch.bfloat16, enabled=config.bf16):
+                    loss, *numbers = actor_loss(batch, weight, noise)
+                actor_loss_mean, entropy = self.actor_step(loss, *numbers)
+                self._sums[2:] += config.actor_every * torch.stack([actor_loss_mean, entropy])
+                # the temperature rises while the entropy is below its target
+                share = (entropy - config.target_entropy * nact) / self.team.size
+                self.temperature_step(self.log_temperature * share)
+            with torch.no_grad():
+                for target, own in zip(self.target.parameters(), self.value.parameters(), strict=True):
+                    target.lerp_(own, config.tau)
+
+    def critic_loss(
+        self, batch: Transitions, weight: torch.Tensor, noise: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compute the critics' squared errors, and the mean of their predictions.
+
+        Args:
+            batch: Transitions.
+            weight: Weights of the transitions, (batch,), which sum to 1 over all processes.
+            noise: Standard normal numbers, (batch, nact).
+        """
+        group = self.value.group
+        with torch.no_grad():
+            action, log_prob = self.policy.sample(batch.next_obs["policy"], noise)
+            entropy = -self.log_temperature.exp() * log_prob
+            value = self._bound(self.target(batch.next_obs[group], action)) + entropy
+            target = batch.reward + batch.discount * value
+        values = self.value(batch.obs[group], self.policy.unit(batch.action))
+        return (weight * (values - target).square()).sum(), (weight * values.detach().mean(0)).sum()
+
+    def actor_loss(
+        self, batch: Transitions, weight: torch.Tensor, noise: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compute the actor's loss, and its entropy.
+
+        Args:
+            batch: Transitions.
+            weight: Weights of the transitions, (batch,), which sum to 1 over all processes.
+            noise: Standard normal numbers, (batch, nact).
+        """
+        action, log_prob = self.policy.sample(batch.obs["policy"], noise)
+        value = self._bound(self.value(batch.obs[self.value.group], action))
+        loss = self.log_temperature.detach().exp() * log_prob - value
+        return (weight * loss).sum(), -(weight * log_prob.detach()).sum()
+
+    def _bound(self, values: torch.Tensor) -> torch.Tensor:
+        """The value of an action, (rows,), from the two critics' predictions, (2, rows)."""
+        return values.amin(0) if self.config.critic_bound == "min" else values.mean(0)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Copy the complete state except ``replay``; see ``Learner``."""
+        own = {
+            "target": self.target.state_dict(),
+            "temperature": self.log_temperature.detach(),
+            "returns": self.team.gather(self.rollout.running_return),
+            "optimizers": [step.optimizer.state_dict() for step in self._steps],
+        }
+        return super().state_dict() | copy.deepcopy(own)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Resume from a state of ``state_dict``; see ``Learner``."""
+        super().load_state_dict(state)
+        self.target.load_state_dict(state["target"])
+        with torch.no_grad():
+            self.log_temperature.copy_(state["temperature"])
+        self.rollout.running_return.copy_(state["returns"][self.own_worlds])
+        for step, saved in zip(self._steps, state["optimizers"], strict=True):
+            step.optimizer.load_state_dict(saved)
+        self._learn.forget()  # the graph stores the addresses of the old moments
+
+    @property
+    def _steps(self) -> "tuple[GradientStep, ...]":
+        return self.actor_step, self.critic_step, self.temperature_step
+
+
+class GradientStep:
+    """Makes steps of Adam on some parameters, with gradients summed over all processes.
+
+    Args:
+        parameters: The parameters; frozen ones stay as they are.
+        rate: Learning rate.
+        team: The processes.
+    """
+
+    def __init__(self, parameters: Iterable[torch.Tensor], rate: float, team: Team) -> None:
+        self.parameters, self.team = [p for p in parameters if p.requires_grad], team
+        cuda = self.parameters[0].is_cuda
+        self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=cuda)
+
+    def __call__(self, loss: torch.Tensor, *numbers: torch.Tensor) -> torch.Tensor:
+        """Make a step; return the loss and the numbers, summed over all processes, (1 + len(numbers),)."""
+        # not backward(), which accumulates gradients on the stream of the first call
+        gradients = torch.autograd.grad(loss, self.parameters)
+        parts = [*gradients, *(number.detach() for number in (loss, *numbers))]
+        sums = self.team.sum(torch.cat([part.reshape(-1).float() for part in parts]))
+        sizes = [p.numel() for p in self.parameters]
+        for parameter, part in zip(self.parameters, sums.split([*sizes, 1 + len(numbers)]), strict=False):
+            parameter.grad = part.view_as(parameter)
+        self.optimizer.step()
+        return sums[sum(sizes) :]
+
+
+def action_bounds(env: Env, limit: float) -> tuple[list[float], list[float]]:
+    """Lower and upper bounds of actions, each (nact,); where the task has none, -limit and limit."""
+    space = env.action_space
+    assert space.low is not None and space.high is not None
+    return tuple(  # type: ignore[return-value]
+        [float(x) if math.isfinite(x) else sign * limit for x in bounds]
+        for bounds, sign in ((space.low, -1.0), (space.high, 1.0))
+    )
+
+
+def _check_sizes(policy: SquashedPolicy, value: TwinCritic, env: Env, low: list[float], high: list[float]) -> None:
+    """Check that given networks fit the environment."""
+    name, nact = env.task.name, env.action_space.size
+    for module, space in ((policy, env.obs_space), (value, env.obs_spaces[value_group(env, value.group)])):
+        sizes, wanted = (module.shape["nobs"], module.shape["nact"]), (space.size, nact)
+        if sizes != wanted:
+            raise ValueError(
+                f"the {type(module).__name__} takes {sizes[0]} observations and {sizes[1]} actions, but the task "
+                f"{name!r} has {wanted[0]} and {wanted[1]}"
+            )
+    if (policy.shape["low"], policy.shape["high"]) != (low, high):
+        raise ValueError(
+            f"the policy's actions are from {policy.shape['low']} to {policy.shape['high']}, and those of the task "
+            f"{name!r} from {low} to {high}"
+        )

@@ -1,0 +1,126 @@
+"""Define and check the hyperparameters of SAC."""
+
+import dataclasses
+from typing import Any, Literal
+
+from lyceum_warp.algos.hyperparameters import LEAST, check_fields
+from lyceum_warp.algos.networks import Activation
+from lyceum_warp.support.docstrings import document_attributes
+
+_BOUNDS: dict[str, float | tuple[float, float]] = {
+    "num_steps": 1, "replay": 1, "warmup": 0, "updates": 1, "actor_every": 1, "batch": 1, "n_step": 1, "mean_every": 0,
+    "mean_episodes": 1, "gamma": (0.0, 1.0), "tau": (0.0, 1.0), "learning_rate": 0.0, "temperature": 1e-6,
+    "target_entropy": LEAST, "action_limit": 1e-6,
+}  # fmt: skip
+
+MANY_WORLDS = 256
+"""From this number of worlds on, the defaults are those for many worlds."""
+
+_FEW: dict[str, Any] = {
+    "batch": 256, "actor_every": 1, "gamma": 0.99, "tau": 0.005, "temperature": 1.0, "target_entropy": -1.0,
+    "critic_bound": "min", "hidden": (256, 256), "value_hidden": (256, 256),
+}  # fmt: skip
+"""Defaults for few worlds, of Haarnoja et al. (2018)."""
+
+_MANY: dict[str, Any] = {
+    "batch": 8192, "actor_every": 4, "gamma": 0.97, "tau": 0.125, "temperature": 1e-3, "target_entropy": 0.0,
+    "critic_bound": "mean", "hidden": (512, 256, 128), "value_hidden": (512, 512, 512),
+}  # fmt: skip
+"""Defaults for many worlds, close to those of Seo et al. (2025) for humanoids."""
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SACConfig:
+    """Hyperparameters of SAC.
+
+    A value of None is chosen by the number of worlds (``resolved``): below 256 worlds as in Haarnoja et al. (2018,
+    "Soft Actor-Critic Algorithms and Applications"), and from there on close to Seo et al. (2025, "Learning Sim-to-Real
+    Humanoid Locomotion in 15 Minutes").
+
+    Raises:
+        ValueError: A value is of the wrong type, out of range or not finite.
+    """
+
+    num_steps: int | None = None
+    """Steps of every world per iteration. The default is 50, or 1,000 samples if that is more."""
+    replay: int | None = None
+    """Capacity of the replay buffer in samples. The default is a million, or 1,024 steps of every world if that is
+    more, but at most 30 % of the device's free memory."""
+    warmup: int | None = None
+    """Samples with random actions before the first update. The default is 5,000, or 10 steps of every world if that is
+    more."""
+    updates: int | None = None
+    """Updates of the critics after each step of all worlds. The default is one for every world, but at most 8."""
+    actor_every: int | None = None
+    """Updates of the critics for each update of the actor; divides ``updates``. The default is 1, or 4 with many
+    worlds."""
+    batch: int | None = None
+    """Samples in an update. The default is 256, or 8,192 with many worlds."""
+    n_step: int = 1
+    """Maximum number of rewards in a target."""
+    gamma: float | None = None
+    """Discount factor. The default is 0.99, or 0.97 with many worlds."""
+    tau: float | None = None
+    """Part of the way from the target critics to the critics that each update moves the targets (Polyak averaging). The
+    default is 0.005, or 0.125 with many worlds."""
+    critic_bound: Literal["min", "mean"] | None = None
+    """Whether the value of an action is the minimum or the mean of the two critics. The default is "min", or "mean"
+    with many worlds."""
+    learning_rate: float = 3e-4
+    """Learning rate of the actor, the critics and the temperature (Adam)."""
+    temperature: float | None = None
+    """Initial weight of the entropy, which is then learned. The default is 1, or 0.001 with many worlds."""
+    target_entropy: float | None = None
+    """Entropy of the policy that the temperature is adapted to, per unit action, which lies between -1 and 1. The
+    default is -1, or 0 with many worlds."""
+    action_limit: float = 1.0
+    """Bound of the actions to which the task gives none."""
+    hidden: tuple[int, ...] | None = None
+    """Widths of the policy's hidden layers. The default is 256 256, or 512 256 128 with many worlds."""
+    activation: Activation = "relu"
+    """Activation of the policy's hidden layers."""
+    value_hidden: tuple[int, ...] | None = None
+    """Widths of the critics' hidden layers. The default is 256 256, or 512 512 512 with many worlds."""
+    value_activation: Activation = "relu"
+    """Activation of the critics' hidden layers."""
+    value_group: str | None = None
+    """Group of observations for the critics; by default "critic" if the task has this group, else "policy"."""
+    layer_norm: bool = True
+    """Whether to normalise the critics' hidden layers."""
+    normalize: bool = True
+    """Whether to normalise observations by their running mean and variance, updated in every step."""
+    tf32: bool = True
+    """Whether matrix products on a GPU use TensorFloat-32."""
+    bf16: bool = False
+    """Whether the losses are computed in bfloat16 (torch.autocast)."""
+    compiled: bool = False
+    """Whether the losses are compiled by torch.compile, which takes about half a minute."""
+    mean_every: int = 10
+    """Iterations between evaluations of the mean policy; 0 for none."""
+    mean_episodes: int = 16
+    """Episodes in an evaluation of the mean policy."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        check_fields(self, _BOUNDS)
+
+    def resolved(self, nworld: int) -> "SACConfig":
+        """Choose the values that are None, except ``replay`` and ``value_group``.
+
+        Args:
+            nworld: Worlds of all processes.
+
+        Raises:
+            ValueError: ``actor_every`` does not divide ``updates``.
+        """
+        updates = min(nworld, 8)
+        rules = {"num_steps": max(50, -(-1_000 // nworld)), "warmup": max(5_000, 10 * nworld), "updates": updates}
+        defaults = rules | (_FEW if nworld < MANY_WORLDS else _MANY)
+        config = dataclasses.replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
+        assert config.updates is not None and config.actor_every is not None
+        if config.updates % config.actor_every:
+            raise ValueError(
+                f"updates must be a multiple of actor_every, as {config.actor_every}, not {config.updates}"
+            )
+        return config

@@ -1,0 +1,99 @@
+"""Define policies with bounded actions: the hyperbolic tangent of a Gaussian, as SAC learns them."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from lyceum_warp.algos.networks import LIMIT, Activation, Normalized, check_memory, initialize_as_torch, mlp
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import layer_sizes, whole_number
+
+_LOWEST, _HIGHEST = -5.0, 2.0
+"""Bounds of the logarithm of the Gaussian's standard deviations."""
+
+
+@document_attributes
+class SquashedPolicy(Normalized):
+    """Draws actions between bounds: low + (high - low) (1 + tanh(u)) / 2 with u from N(mean(obs), std(obs)^2).
+
+    A network computes the means and the logarithms of the standard deviations (Haarnoja et al. 2018, "Soft Actor-Critic
+    Algorithms and Applications", appendix C). Between the bounds, tanh(u) is the *unit action*.
+
+    Args:
+        nobs: Length of an observation.
+        nact: Length of an action.
+        hidden: Widths of the hidden layers.
+        low: Lower bounds of the actions, (nact,).
+        high: Upper bounds of the actions, (nact,).
+        activation: Activation of the hidden layers.
+        normalize: Whether to normalise observations by their running mean and variance.
+        limit: Normalised observations are clipped to [-limit, limit]; inf for no limit.
+        generator: Draws the initial weights.
+    """
+
+    shape: dict[str, Any]
+    """Arguments that make a policy with the same structure."""
+    low: torch.Tensor
+    """Lower bounds of the actions, (nact,)."""
+    width: torch.Tensor
+    """Differences between the bounds, (nact,)."""
+
+    def __init__(
+        self,
+        nobs: int,
+        nact: int,
+        hidden: Sequence[int] = (256, 256),
+        *,
+        low: Sequence[float],
+        high: Sequence[float],
+        activation: Activation = "relu",
+        normalize: bool = False,
+        limit: float = LIMIT,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        nobs, nact = whole_number("nobs", nobs, low=1), whole_number("nact", nact, low=1)
+        sizes = [nobs, *layer_sizes(hidden), 2 * nact]
+        check_memory(sizes, nobs=nobs, hidden=hidden, nact=nact)
+        super().__init__(nobs, normalize, limit)
+        self.nobs, self.nact = nobs, nact
+        self.shape = {
+            "nobs": nobs, "nact": nact, "hidden": layer_sizes(hidden), "low": [float(x) for x in low],
+            "high": [float(x) for x in high], "activation": activation, "normalize": normalize, "limit": limit,
+        }  # fmt: skip
+        self.network = mlp(sizes, activation=activation, generator=generator)
+        initialize_as_torch(self.network, generator)
+        self.register_buffer("low", torch.tensor(self.shape["low"]))
+        self.register_buffer("width", torch.tensor(self.shape["high"]) - torch.tensor(self.shape["low"]))
+
+    def forward(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compute the Gaussian's means and the logarithms of its standard deviations, each (..., nact)."""
+        mean, spread = self.network(self.normalizer(obs)).float().chunk(2, dim=-1)  # float32 also under autocast
+        return mean, _LOWEST + 0.5 * (_HIGHEST - _LOWEST) * (1.0 + torch.tanh(spread))
+
+    def act(self, obs: torch.Tensor) -> torch.Tensor:
+        """Compute actions without noise, (..., nact)."""
+        return self.scaled(torch.tanh(self(obs)[0]))
+
+    def sample(self, obs: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draw unit actions, (..., nact), and compute their log-densities, (...,).
+
+        Args:
+            obs: Observations, (..., nobs).
+            noise: Standard normal numbers, (..., nact).
+        """
+        mean, log_std = self(obs)
+        u = mean + log_std.exp() * noise
+        # log(1 - tanh(u)^2), without loss of precision for large u
+        slope = 2.0 * (math.log(2.0) - u - torch.nn.functional.softplus(-2.0 * u))
+        gaussian = -0.5 * noise.square() - log_std - 0.5 * math.log(2.0 * math.pi)
+        return torch.tanh(u), (gaussian - slope).sum(-1)
+
+    def scaled(self, unit: torch.Tensor) -> torch.Tensor:
+        """Convert unit actions, between -1 and 1, to actions."""
+        return self.low + 0.5 * self.width * (1.0 + unit)
+
+    def unit(self, action: torch.Tensor) -> torch.Tensor:
+        """Convert actions to unit actions."""
+        return 2.0 * (action - self.low) / self.width - 1.0

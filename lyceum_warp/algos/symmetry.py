@@ -1,0 +1,70 @@
+"""Mirror observations and actions, and average functions with their mirror images."""
+
+from collections.abc import Callable, Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from torch import nn
+
+from lyceum_warp.env import Env
+from lyceum_warp.mirror import Mirror, Reflection
+
+
+class Reflected(nn.Module):
+    """Computes the mirror image of rows, (..., size): ``signs * rows[..., order]``."""
+
+    order: torch.Tensor
+    signs: torch.Tensor
+
+    def __init__(self, reflection: Reflection) -> None:
+        super().__init__()
+        order, signs = reflection
+        self.register_buffer("order", torch.tensor(order), persistent=False)
+        self.register_buffer("signs", torch.tensor(signs), persistent=False)
+
+    def forward(self, rows: torch.Tensor) -> torch.Tensor:
+        """Compute the mirror image."""
+        return self.swapped(rows) * self.signs
+
+    def swapped(self, rows: torch.Tensor) -> torch.Tensor:
+        """Compute the mirror image of sizes, such as standard deviations, which have no sign."""
+        return rows.index_select(-1, self.order)
+
+
+class PolicyMirror(nn.Module):
+    """The mirror images of a policy's observations and actions.
+
+    Args:
+        reflections: The reflections of ``obs`` and ``action``.
+    """
+
+    def __init__(self, reflections: Mapping[str, Reflection]) -> None:
+        super().__init__()
+        self.reflections = {name: tuple(map(list, reflections[name])) for name in ("obs", "action")}
+        self.obs, self.action = Reflected(reflections["obs"]), Reflected(reflections["action"])
+
+    def average(self, function: Callable[[torch.Tensor], torch.Tensor], obs: torch.Tensor) -> torch.Tensor:
+        """Average the actions of a function of observations with the mirror image's.
+
+        The mirror images of a batch of observations give the mirror images of the actions, to the bit.
+        """
+        return 0.5 * (function(obs) + self.action(function(self.obs(obs))))
+
+
+def reflections(env: Env, *, group: str = "policy") -> dict[str, Reflection]:
+    """The reflections of a group of observations, ``obs``, and of actions, ``action``, of an environment's task.
+
+    Raises:
+        ValueError: The task declares no mirror, or none of a part.
+    """
+    task: Any = env.task.task
+    declared = task.mirror
+    if callable(declared):
+        declared = declared(env.task.model, SimpleNamespace(**env.task.params))
+    if not isinstance(declared, Mirror):
+        raise ValueError(f"the task {env.task.name!r} declares no mirror image: give it mirror = lw.Mirror(...)")
+    return {
+        "obs": declared.columns(env.obs_spaces[group].parts, task=env.task.name),
+        "action": declared.columns(env.action_space.parts, task=env.task.name, whole="action"),
+    }

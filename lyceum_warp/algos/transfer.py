@@ -1,0 +1,209 @@
+"""Compare a policy between engines and between physics, in pairs of episodes with equal starts."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from lyceum_warp.algos.evaluation import Episodes, evaluate, evaluation_worlds
+from lyceum_warp.algos.networks import moved
+from lyceum_warp.algos.policy import Policy
+from lyceum_warp.engines.placement import options_on_cores
+from lyceum_warp.env import Env
+from lyceum_warp.options import PhysicsOptions
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.intervals import mean_interval, share_interval
+from lyceum_warp.support.validate import check_kind, finite_number, whole_number
+
+EXACT = "exact"
+"""The name of a task's own physics."""
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Difference:
+    """The difference of a mean over episodes between two simulations, with its 95 % confidence interval."""
+
+    quantity: str
+    """Its name: return, length (steps) or terminated (share of episodes that the task ended; walking robots' falls)."""
+    first: float
+    """The mean in the first simulation."""
+    second: float
+    """The mean in the second simulation."""
+    low: float
+    """Lower end of the interval of second minus first."""
+    high: float
+    """Upper end of the interval."""
+    margin: float
+    """Differences up to this one are irrelevant."""
+
+    @property
+    def verdict(self) -> str:
+        """Whether the interval is within the margin ("same"), outside ("different") or neither ("not shown")."""
+        if -self.margin <= self.low and self.high <= self.margin:
+            return "same"
+        return "different" if self.low > self.margin or self.high < -self.margin else "not shown"
+
+    @property
+    def text(self) -> str:
+        """The interval, as "return +1.2 ± 0.5"."""
+        return f"{self.quantity} {0.5 * (self.low + self.high):+.3g} ± {0.5 * (self.high - self.low):.2g}"
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """The differences between two simulations of the same episodes."""
+
+    first: str
+    """The first simulation: "C engine", or "exact physics" on the C engine."""
+    second: str
+    """The second simulation: "Warp engine on cuda:0", or other physics on the C engine."""
+    faults: tuple[int, int]
+    """Number of faults in each."""
+    differences: tuple[Difference, ...]
+    """Differences of returns, lengths and, if the task ends episodes, shares of terminated episodes."""
+
+    @property
+    def verdict(self) -> str:
+        """Whether all differences are "same", any is "different", or neither ("not shown")."""
+        verdicts = {difference.verdict for difference in self.differences}
+        return "different" if "different" in verdicts else "same" if verdicts == {"same"} else "not shown"
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Transfer:
+    """The verdict on a policy: whether its returns, lengths and falls depend on the engine or on the physics."""
+
+    task: str
+    """Name of the task."""
+    episodes: int
+    """Number of pairs of episodes."""
+    seed: int
+    """Seed of the initial states."""
+    comparisons: tuple[Comparison, ...]
+    """One for each engine and physics that is compared."""
+
+    @property
+    def line(self) -> str:
+        """The verdicts in one line."""
+        found = []
+        for comparison in self.comparisons:
+            shown = ", ".join(difference.text for difference in comparison.differences)
+            found.append(f"{comparison.second} against {comparison.first}: {comparison.verdict} ({shown})")
+        return "; ".join(found)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert to JSON values, with the verdicts."""
+        made = dataclasses.asdict(self) | {"line": self.line}
+        for comparison, entry in zip(self.comparisons, made["comparisons"], strict=True):
+            entry["verdict"] = comparison.verdict
+            for difference, inner in zip(comparison.differences, entry["differences"], strict=True):
+                inner["verdict"] = difference.verdict
+        return made
+
+
+@torch.no_grad()
+def transfer(
+    env: Env,
+    policy: Policy,
+    episodes: int = 64,
+    *,
+    seed: int = 0,
+    margin: float = 0.05,
+    device: str | None = None,
+    warp: bool = True,
+    physics: bool = True,
+    progress: Callable[[int, int], object] | None = None,
+) -> Transfer:
+    """Play the same episodes on both engines, and under each physics of the task, and compare them in pairs.
+
+    The Warp engine is compared with the C engine under the environment's physics; each physics of the task, and the
+    environment's own, with the task's exact physics, on the C engine. The episodes of a pair have equal random numbers:
+    initial states, model fields, pushes and commands. Intervals of returns and lengths are Student's t over the pairs;
+    the interval of the terminated share is Agresti and Min's.
+
+    Args:
+        env: An environment of the task; its worlds stay unchanged.
+        policy: A module with a method ``act``, or a function; maps observations to actions, without noise.
+        episodes: Number of pairs, each in a world of its own.
+        seed: Seed of the initial states.
+        margin: Irrelevant difference, as a share of the mean absolute return and of the mean length in the first
+            simulation, and as a difference of the terminated share.
+        device: Device of the Warp engine; by default the environment's GPU, or else one of this machine, or else the
+            CPU, where its kernels may take minutes to compile.
+        warp: Whether to play on the Warp engine.
+        physics: Whether to play under each of the task's physics; otherwise only under the environment's and the exact.
+        progress: Called every 50 steps with the number of steps so far and the maximum number.
+
+    Raises:
+        ValueError: An argument is out of range, or the policy does not fit the task.
+    """
+    check_kind("env of transfer", env, Env, "as lw.make(...) makes it")
+    episodes, margin = whole_number("episodes", episodes, low=2), finite_number("margin", margin, low=0.0)
+    named, own = task_physics(env)
+    if not physics:
+        named = {name: named[name] for name in dict.fromkeys((EXACT, own))}
+    device = device or (env.device.alias if env.device.is_cuda else "cuda" if wp.is_cuda_available() else "cpu")
+    on_c = options_on_cores()
+    plays = {f"{name} physics": on_c | {"physics": options} for name, options in named.items()}
+    warp_name = f"Warp engine on {device}"
+    if warp:
+        plays[warp_name] = {"engine": "warp", "device": device, "nthread": None, "physics": env.options.physics}
+    played: dict[str, tuple[Episodes, int]] = {}
+    for number, (name, changes) in enumerate(plays.items()):
+        worlds = evaluation_worlds(env, episodes, **changes)
+        own_policy = moved(policy, worlds) if isinstance(policy, torch.nn.Module) else policy
+        shown = functools.partial(_show, progress, number, len(plays))
+        result = evaluate(worlds, own_policy, episodes, seed=seed, progress=shown)
+        played[name] = result, sum(worlds.fault_counts.values())
+    exact = f"{EXACT} physics"
+    pairs = [(exact, name) for name in plays if name not in (exact, warp_name)]
+    found = [_compared(*pair, played[pair[0]], played[pair[1]], margin) for pair in pairs]
+    if warp:
+        found.insert(0, _compared("C engine", warp_name, played[f"{own} physics"], played[warp_name], margin))
+    if env.task.functions["terminated"] is None and not env.task.task.terminations:
+        found = [dataclasses.replace(one, differences=one.differences[:2]) for one in found]
+    return Transfer(task=env.task.name, episodes=episodes, seed=seed, comparisons=tuple(found))
+
+
+def _show(progress: Callable[[int, int], object] | None, play: int, plays: int, step: int, steps: int) -> None:
+    if progress is not None:
+        progress(play * steps + step, plays * steps)
+
+
+def task_physics(env: Env) -> tuple[dict[str, PhysicsOptions], str]:
+    """The physics of an environment's task by name, the environment's own included, and the name of its own.
+
+    Options that only the Warp engine has are left out.
+    """
+    named = {EXACT: PhysicsOptions(), **env.task.task.physics}
+    given = dataclasses.replace(env.options.physics, nconmax=None, njmax=None, deterministic=False)
+    own = next((name for name, options in named.items() if options == given), "own")
+    return named | {own: given}, own
+
+
+def _compared(
+    first: str, second: str, one: tuple[Episodes, int], other: tuple[Episodes, int], margin: float
+) -> Comparison:
+    (a, faults), (b, other_faults) = one, other
+    differences = []
+    for quantity, before, after in (("return", a.returns, b.returns), ("length", a.lengths, b.lengths)):
+        x, y = before.double().numpy(), after.double().numpy()
+        centre, half = mean_interval(y - x)
+        differences.append(_difference(quantity, x, y, centre, half, margin * float(np.abs(x).mean())))
+    ends = a.terminated.numpy() > 0, b.terminated.numpy() > 0
+    differences.append(_difference("terminated", *ends, *share_interval(*ends), margin))
+    return Comparison(first=first, second=second, faults=(faults, other_faults), differences=tuple(differences))
+
+
+def _difference(quantity: str, x: np.ndarray, y: np.ndarray, centre: float, half: float, margin: float) -> Difference:
+    return Difference(
+        quantity=quantity, first=float(x.mean()), second=float(y.mean()), low=centre - half, high=centre + half,
+        margin=margin,
+    )  # fmt: skip

@@ -1,0 +1,163 @@
+"""Measure physics options of a task, and find the fastest with the same returns: lyceum-warp tune."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+import rich.box
+import torch
+import tyro
+from rich.table import Table
+
+from lyceum_warp.cli.arguments import ParamWords, Placement, TaskWord, parameters
+from lyceum_warp.cli.display import make_console, note
+from lyceum_warp.tuning.judgement import Difference
+from lyceum_warp.tuning.search import Tuning, tune
+from lyceum_warp.tuning.trial import DIVERGENCE_STEPS, NUDGE
+
+Cell: TypeAlias = Callable[[dict[str, Any]], str]
+"""Formats a cell of a row."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tune:
+    """Measure what each physics option of a task buys and what it changes, and print the fastest with equal returns.
+
+    Each setting is compared with the task as it is: steps per second, memory, faults, the divergence of trajectories,
+    and the returns of the same episodes under random actions and, with --run, under a policy. Every result is appended
+    to a file of JSON lines; the same command continues a search that was stopped. docs/physics.md explains the table.
+
+    $ lyceum-warp tune hopper --short
+    $ lyceum-warp tune humanoid --run runs/humanoid-20260101-120000
+    $ lyceum-warp tune humanoid --planning
+    $ lyceum-warp tune go1_velocity --device cuda --nworld 8192 --tolerance loose
+    """
+
+    task: TaskWord
+    run_folder: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
+    """A run of this task, whose policy runs the same episodes. Its task parameters are the defaults."""
+    which: str = "last"
+    """Which policy of --run: last, best, or the number of a saved iteration."""
+    tolerance: Annotated[str, tyro.conf.arg(metavar="strict|loose|any")] = "strict"
+    """Largest difference of returns, relative to the mean absolute return: the 95 % interval must lie within 2 %
+    (strict) or 5 % (loose); any accepts all settings without additional faults."""
+    short: bool = False
+    """Compare the first 100 steps of episodes, for a few seconds for each setting, instead of whole episodes."""
+    episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Number of episodes of each setting; by default as many as the interval needs, within a minute (5 s with
+    --short)."""
+    planning: bool = False
+    """Find physics for the task's planner: compare the time of a plan, and the ranks that the coarser physics and the
+    task as it is give to the same samples. --nworld is then the number of samples, and --episodes the number of states
+    of each kind."""
+    nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Number of worlds; by default 256, or 4096 on a GPU. With --planning the planner's samples, by default 64."""
+    seed: int = 0
+    """Seed of initial states and actions."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """File of the results, by default tune/TASK.jsonl or tune/TASK-planning.jsonl. Results that it has are not measured
+    again."""
+    param: ParamWords = ()
+    env: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
+
+    def run(self) -> int:
+        """Run the command, and return the exit code."""
+        torch.set_num_threads(1)
+        words: dict[str, Any] = vars(self.env) | parameters(self.param, self)
+        if self.nworld is not None:
+            words["nworld"] = self.nworld
+        tuning = tune(
+            self.task, run=self.run_folder, which=self.which, tolerance=self.tolerance, short=self.short,
+            episodes=self.episodes, planning=self.planning, out=self.out, seed=self.seed, progress=_progress, **words,
+        )  # fmt: skip
+        _report(tuning, self)
+        return 0
+
+
+def _progress(row: dict[str, Any]) -> None:
+    if row["verdict"] == "refused":
+        note(f"{row['name']}: refused")
+    else:
+        note(f"{row['name'] or 'the task as it is'}: {row['speedup']:.2f} x, {row['verdict']}")
+
+
+def _report(tuning: Tuning, options: Tune) -> None:
+    """Print the table of all settings, the best setting, and what was not tried."""
+    console, reference = make_console(), tuning.reference
+
+    def line(text: str) -> None:
+        console.print(text, soft_wrap=True, markup=False)
+
+    who = reference["identity"]
+    line(f"{who['task']}: {who['nworld']} worlds, {who['engine']} engine on {who['device']}")
+    columns = _planning_columns(reference) if options.planning else _columns(reference)
+    table = Table(box=rich.box.SIMPLE, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("setting")
+    for heading in columns:
+        table.add_column(heading, no_wrap=True, justify="right")
+    table.add_column("verdict", no_wrap=True)
+    for row in [*(row for row in tuning.rows if not row["refused"]), reference]:
+        cells = (cell(row) for cell in columns.values())
+        table.add_row(row["name"] or "the task as it is", *cells, row["verdict"])
+    console.print(table)
+    if not options.planning:
+        nudged = ", ".join(f"{value:.1e}" for value in reference["nudged_divergence"])
+        line(f"{reference['in_contact']:.0%} of the states are in contact. diverg. is the divergence after 1, 10 and "
+             f"50 steps, divided by the divergence of the exact physics from states moved by {NUDGE:g}: "
+             f"{nudged}.")  # fmt: skip
+    for row in tuning.rows:
+        if row["verdict"] == "refused":
+            line(f"refused: {row['name']}: {row['refused']}")
+        elif row["verdict"] == "ranks badly":
+            kind = min(row["ranks"], key=lambda kind: row["ranks"][kind]["mean"])
+            line(f"not suggested: {row['name']}: the rank correlation of samples is {row['ranks'][kind]['mean']:.2f} "
+                 f"in {kind} states")  # fmt: skip
+    for reason in tuning.not_tried:
+        line(f"not tried: {reason}")
+    if tuning.best is None:
+        unknown = sum(row["verdict"] == "not shown" for row in tuning.rows)
+        hint = f" ({unknown} not shown: more --episodes may decide)" if unknown else ""
+        line(f"best within {options.tolerance}: the task as it is{hint}")
+    else:
+        line(f"best within {options.tolerance}: {tuning.best['name']}, {tuning.best['speedup']:.2f} times as fast")
+        line(f"flags: {tuning.flags}")
+        line(f"task:  {tuning.task_line}")
+    line(f"results: {tuning.path}")
+
+
+def _columns(reference: dict[str, Any]) -> dict[str, Cell]:
+    """The columns of the table, by heading."""
+
+    def divergence(i: int) -> Cell:
+        return lambda row: _short(row["divergence"][i] / max(reference["nudged_divergence"][i], 1e-300))
+
+    def returns(source: str) -> Cell:
+        return lambda row: str(Difference(**row["returns"][source])) if source in row["returns"] else ""
+
+    return {
+        "steps/s": lambda row: f"{row['steps_per_second']:,.0f}",
+        "speed": lambda row: f"{row['speedup']:.2f}",
+        "kB/\nworld": lambda row: f"{row['bytes_per_world'] / 1e3:.1f}",
+        "faults/\nmillion": lambda row: f"{row['faults_per_million']:.3g}" if row["returns"] else "",
+        **{f"diverg.\n{steps}": divergence(i) for i, steps in enumerate(DIVERGENCE_STEPS)},
+        **{f"return, %,\n{source}": returns(source) for source in reference["returns"]},
+    }
+
+
+def _planning_columns(reference: dict[str, Any]) -> dict[str, Cell]:
+    """The columns of the table with --planning, by heading."""
+
+    def ranks(kind: str) -> Cell:
+        return lambda row: "{mean:.2f} [{low:.2f}, {high:.2f}]".format(**row["ranks"][kind])
+
+    return {
+        "plan, ms": lambda row: f"{row['plan_ms']:.1f}",
+        "speed": lambda row: f"{row['speedup']:.2f}",
+        **{f"ranks,\n{kind}": ranks(kind) for kind in reference["ranks"]},
+    }
+
+
+def _short(ratio: float) -> str:
+    """A ratio of any size in few characters."""
+    return f"{ratio:.0e}" if ratio >= 1e4 else f"{ratio:.2g}" if ratio < 10 else f"{ratio:,.0f}"

@@ -1,0 +1,72 @@
+"""Declare the mirror image of a task, in which left and right change places, by the names of its parts."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+Reflection = tuple[Sequence[int], Sequence[float]]
+"""An order of columns and their signs: the mirror image of a row is ``signs * row[order]``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Mirror:
+    """The mirror image of a task in the plane between left and right, for ``lw.Task.mirror``.
+
+    A reflection belongs to the name of a part, wherever it occurs: in observations, actions and states. It is the signs
+    of the part's columns, such as ``"command": (1, -1, -1)`` for velocities forwards and to the left and a yaw rate; or
+    an order of the columns and the signs after it, such as ``"foot_force": ([1, 0], [1, 1])`` for a left and a right
+    foot. In the base's axes, a vector has the signs (1, -1, 1), and an angular velocity (-1, 1, -1). The reflection
+    "action" is of a whole action whose parts are actuators.
+
+    Args:
+        parts: Reflections by the names of parts.
+
+    Raises:
+        ValueError: A reflection is not its own inverse.
+    """
+
+    parts: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        """Complete the reflections that are only signs, and check all."""
+        parts = {name: _complete(part) for name, part in self.parts.items()}
+        for name, (order, signs) in parts.items():
+            places, factors = np.asarray(order), np.asarray(signs)
+            fits = sorted(order) == list(range(len(signs))) and set(np.abs(factors)) <= {1.0}
+            if not fits or (places[places] != range(len(order))).any() or (factors * factors[places] != 1.0).any():
+                raise ValueError(
+                    f"the reflection {name!r} of lw.Mirror must be its own inverse, as ([1, 0], [-1, -1]) is, not "
+                    f"{self.parts[name]!r}"
+                )
+        object.__setattr__(self, "parts", parts)
+
+    def columns(self, parts: Mapping[str, slice], *, task: str, whole: str | None = None) -> Reflection:
+        """The reflection of a row of parts.
+
+        Args:
+            parts: The columns of each part, as ``Space.parts``.
+            task: Name of the task, for messages.
+            whole: Name of a reflection of the whole row, if there is one.
+
+        Raises:
+            ValueError: A part has no reflection, or one of another size.
+        """
+        if whole is not None and whole in self.parts:
+            parts = {whole: slice(0, max(part.stop for part in parts.values()))}
+        order, signs = list[int](), list[float]()
+        for name, part in parts.items():
+            size = part.stop - part.start
+            found = self.parts.get(name)
+            if found is None or len(found[1]) != size:
+                has = "no reflection" if found is None else f"a reflection of {len(found[1])} columns"
+                raise ValueError(f"the mirror of the task {task!r} has {has} for {name!r}, which has {size} columns")
+            order += [part.start + int(place) for place in found[0]]
+            signs += map(float, found[1])
+        return order, signs
+
+
+def _complete(part: Any) -> Reflection:
+    order, signs = (range(len(part)), part) if np.ndim(part[0]) == 0 else part
+    return [*map(int, order)], [*map(float, signs)]

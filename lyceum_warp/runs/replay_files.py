@@ -1,0 +1,85 @@
+"""Keep a replay buffer beside a run's checkpoint, in files that are written once.
+
+Each file holds the steps of one of the equal parts of the stream of all steps, about 1/64 of the buffer. A save writes
+the parts that have grown, so it takes time in proportion to the new steps. A part that has grown gets a new name. The
+old files are deleted after the checkpoint has been replaced, so the checkpoint always finds its steps.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from lyceum_warp.algos.distributed import Team
+from lyceum_warp.algos.replay import Replay
+from lyceum_warp.runs.checkpoints import FORMAT, read_checkpoint, write_content
+
+_PARTS = 64
+
+
+def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, check: Callable[[], object]) -> None:
+    """Write the parts that have grown; all ranks must call this.
+
+    Args:
+        folder: The folder; None on ranks that do not write.
+        replay: The replay buffer.
+        team: The processes.
+        since: Number of stored steps at the last save.
+        check: Called before each file is written.
+    """
+    oldest = replay.stored - replay.count
+    for start, end in _parts(replay, max(since, oldest), replay.stored):
+        first = max(start, oldest)
+        rows = {  # worlds come first while they are gathered
+            name: team.gather(part.transpose(0, 1).contiguous()).transpose(0, 1).cpu().contiguous()
+            for name, part in replay.rows(first, end).items()
+        }
+        with team.together():
+            if folder is not None:
+                check()
+                folder.mkdir(exist_ok=True)
+                content = {"lyceum_warp": FORMAT, "first": first, "rows": rows}
+                write_content(folder / _name(start, end), content, durable=True)
+
+
+def clean_replay(folder: Path, replay: Replay) -> None:
+    """Delete the files that the newest checkpoint does not need."""
+    needed = {_name(*part) for part in _parts(replay, replay.stored - replay.count, replay.stored)}
+    for path in folder.glob("*-*.pt"):
+        if path.name not in needed:
+            path.unlink(missing_ok=True)
+
+
+def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
+    """Restore the buffer of a checkpoint.
+
+    Args:
+        folder: The folder.
+        replay: The replay buffer.
+        stored: Number of stored steps.
+        own: This process's worlds.
+
+    Raises:
+        ValueError: A file is missing or damaged.
+    """
+    oldest = max(0, stored - replay.steps)
+    for start, end in _parts(replay, oldest, stored):
+        # a longer part, from a save whose checkpoint is lost, begins with the same steps
+        longer = sorted(path for path in folder.glob(f"{start:012d}-*.pt") if path.name >= _name(start, end))
+        if not longer:
+            raise ValueError(f"{folder} lacks steps {start} to {end} of the replay buffer")
+        content = read_checkpoint(longer[0], parts=("first", "rows"))
+        if content["first"] > max(start, oldest):
+            raise ValueError(f"{longer[0]} lacks steps before {content['first']}")
+        steps = end - content["first"]
+        replay.set_rows(content["first"], {name: part[:steps, own] for name, part in content["rows"].items()})
+    replay.restore(stored)
+
+
+def _parts(replay: Replay, first: int, stored: int) -> Iterator[tuple[int, int]]:
+    """Start and end of the parts with steps from ``first`` to ``stored``."""
+    each = -(-replay.steps // _PARTS)
+    for start in range(first // each * each, stored, each):
+        yield start, min(start + each, stored)
+
+
+def _name(start: int, end: int) -> str:
+    return f"{start:012d}-{end:012d}.pt"

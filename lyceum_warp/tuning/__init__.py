@@ -1,0 +1,1 @@
+"""Find physics options that are faster at equal returns: `lw.tune`."""

@@ -1,0 +1,130 @@
+"""List the physics settings to try for a task, and write a setting as flags and as Python."""
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from lyceum_warp.env import Env
+from lyceum_warp.options import CONES, INTEGRATORS, JACOBIANS
+
+_ITERATIONS = (4, 2, 1)
+_LS_ITERATIONS = (10, 5)
+"""Limits to try, if they are below the model's."""
+
+_AUTO_SPARSE = {"mujoco": 60, "warp": 33}
+"""Degrees of freedom from which each engine chooses a sparse Jacobian."""
+_DENSE_LIMIT = 60
+"""MuJoCo Warp takes a dense Jacobian up to this number of degrees of freedom."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """Physics options to try together."""
+
+    name: str
+    """Short description; empty for the task as it is."""
+    group: str
+    """What it changes. A combination takes at most one setting of each group."""
+    physics: Mapping[str, Any]
+    """Options that differ from the task's, by their names in ``lw.PhysicsOptions``."""
+    parts: tuple["Setting", ...] = ()
+    """The settings of a combination, in their order."""
+
+
+def candidates(env: Env) -> list[Setting]:
+    """The settings to try one by one, in order.
+
+    Args:
+        env: The task as it is.
+    """
+    option, limits = env.task.model.opt, env.options.physics.solver or {}
+    cone, integrator = _name(CONES, option.cone), _name(INTEGRATORS, option.integrator)
+    found = [
+        Setting(f"{name}={limit}", name, {"solver": {**limits, name: limit}})
+        for name, tried in (("iterations", _ITERATIONS), ("ls_iterations", _LS_ITERATIONS))
+        for limit in tried
+        if limit < getattr(option, name)
+    ]
+    if option.noslip_iterations:
+        found.append(Setting("noslip_iterations=0", "noslip", {"solver": {**limits, "noslip_iterations": 0}}))
+    found += [Setting(f"cone {name}", "cone", {"cone": name}) for name in CONES if name != cone]
+    others = [name for name in ("euler", "implicitfast") if name != integrator]
+    found += [Setting(name, "integrator", {"integrator": name}) for name in others]
+    for substeps in _fewer(env.task.frame_skip):
+        timestep = float(f"{env.timestep / substeps:.10g}")
+        words = {"frame_skip": substeps, "timestep": timestep}
+        name = f"{substeps} x {1e3 * timestep:.4g} ms"
+        found.append(Setting(name, "substeps", words))
+        if integrator != "implicitfast":  # stable with longer time steps
+            found.append(Setting(f"{name}, implicitfast", "substeps", {**words, "integrator": "implicitfast"}))
+    found += [Setting(f"jacobian {name}", "jacobian", {"jacobian": name}) for name in _other_jacobian(env)]
+    if cone == "elliptic" and option.impratio != 1.0:
+        found.append(Setting("impratio=1", "impratio", {"impratio": 1.0}))
+    if (room := getattr(env.engine, "nconmax", None)) is not None:
+        halves = {"nconmax": max(1, room // 2), "njmax": max(1, env.engine.njmax // 2)}  # type: ignore[attr-defined]
+        found.append(Setting("half the contacts and constraints", "room", halves))
+    return found
+
+
+def not_tried(env: Env) -> list[str]:
+    """What is not tried on this engine, each with the reason."""
+    found = ["the PGS solver: MuJoCo Warp lacks it, so the package uses Newton on both engines"]
+    if env.engine.name == "warp":
+        if env.task.model.nv > _DENSE_LIMIT:
+            found.append(f"a dense Jacobian: MuJoCo Warp takes it up to {_DENSE_LIMIT} degrees of freedom")
+    else:
+        found.append("nconmax and njmax: the C engine allocates contacts and constraints as they appear")
+    return found
+
+
+def combined(settings: Iterable[Setting]) -> Setting | None:
+    """A combination of settings, in which earlier ones override later ones; None if it is one of the settings.
+
+    A setting is left out if an earlier one is of the same group, or sets one of its options.
+    """
+    parts: list[Setting] = []
+    physics: dict[str, Any] = {}
+    for setting in settings:
+        limits = {**setting.physics.get("solver", {}), **physics.get("solver", {})}
+        rest = {name: value for name, value in setting.physics.items() if name != "solver"}
+        if not rest.keys() & physics.keys() and setting.group not in [part.group for part in parts]:
+            parts.append(setting)
+            physics |= rest | ({"solver": limits} if limits else {})
+    name = "; ".join(part.name for part in parts)
+    return Setting(name, "combination", physics, tuple(parts)) if len(parts) > 1 else None
+
+
+def flags(physics: Mapping[str, Any]) -> str:
+    """The flags that choose a setting in lyceum-warp train and plan."""
+    words = [f"--solver {name}={limit}" for name, limit in physics.get("solver", {}).items()]
+    words += [f"--{name.replace('_', '-')} {value}" for name, value in physics.items() if name != "solver"]
+    return " ".join(words)
+
+
+def task_line(physics: Mapping[str, Any]) -> str:
+    """The line of a task that offers a setting as its fast physics."""
+    words = ", ".join(f"{name}={value!r}" for name, value in physics.items()).replace("'", '"')
+    return f'physics = {{"fast": lw.PhysicsOptions({words})}}'
+
+
+def _name(names: Mapping[str, Any], value: int) -> str | None:
+    return next((name for name, known in names.items() if int(known) == int(value)), None)
+
+
+def _fewer(substeps: int) -> list[int]:
+    """Numbers of substeps below the given one, halved each time."""
+    found = []
+    while substeps > 1:
+        substeps = (substeps + 1) // 2
+        found.append(substeps)
+    return found
+
+
+def _other_jacobian(env: Env) -> list[str]:
+    """The form of the Jacobian that the engine does not use yet, if it takes it."""
+    nv, engine = env.task.model.nv, env.engine.name
+    now = _name(JACOBIANS, env.task.model.opt.jacobian)
+    if now == "auto":
+        now = "sparse" if nv >= _AUTO_SPARSE.get(engine, 60) else "dense"
+    other = "dense" if now == "sparse" else "sparse"
+    return [] if engine == "warp" and other == "dense" and nv > _DENSE_LIMIT else [other]

@@ -1,0 +1,112 @@
+"""Judge a setting: intervals of the difference of returns, and the verdict within a tolerance."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from lyceum_warp.support.intervals import mean_interval
+
+TOLERANCES = {"strict": 0.02, "loose": 0.05, "any": math.inf}
+"""Largest difference of returns, relative to the mean absolute return of the task as it is."""
+
+RANK_CORRELATIONS = {"strict": 0.9, "loose": 0.8, "any": -1.0}
+"""Smallest rank correlation of a planner's physics with the plant's, by the same names."""
+
+LEAST_GAIN = 1.03
+"""A setting that is not at least this many times faster, and takes no less memory, is not judged further."""
+_LEAST_SAVING = 0.95
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """The difference of returns between a setting and the task as it is, relative to the mean absolute return."""
+
+    mean: float
+    low: float
+    high: float
+    """The bounds of the 95 % interval."""
+    episodes: int
+
+    def within(self, tolerance: float) -> bool:
+        """Whether the interval lies within the tolerance."""
+        return -tolerance <= self.low and self.high <= tolerance
+
+    def beyond(self, tolerance: float) -> bool:
+        """Whether the interval lies outside the tolerance."""
+        return self.low > tolerance or self.high < -tolerance
+
+    def __str__(self) -> str:
+        """The interval in percent."""
+        return f"[{100 * self.low:+.1f}, {100 * self.high:+.1f}]"
+
+
+def difference(reference: np.ndarray, returns: np.ndarray) -> Difference:
+    """Compare the returns of the same episodes, (episodes,) each.
+
+    If all returns of the task as it is are 0, there is no scale, and every difference is infinite.
+    """
+    change, scale = returns - reference, float(np.abs(reference).mean())
+    if not change.any():
+        return Difference(0.0, 0.0, 0.0, len(change))
+    if not scale:
+        return Difference(math.inf, -math.inf, math.inf, len(change))
+    mean, half = mean_interval(change / scale)
+    return Difference(mean, mean - half, mean + half, len(change))
+
+
+@dataclasses.dataclass(frozen=True)
+class Correlation:
+    """The mean rank correlation over some states, with the bounds of its 95 % interval."""
+
+    mean: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: np.ndarray) -> "Correlation":
+        """The mean of the states' correlations, (states,)."""
+        mean, half = mean_interval(values)
+        return cls(mean, mean - half, mean + half)
+
+
+def episodes_needed(found: Difference, half_width: float) -> int:
+    """The number of episodes for an interval of the given half width, estimated from some episodes.
+
+    Only their spread counts, not their mean: the number does not depend on the result (Stein's two stages).
+    """
+    now = (found.high - found.low) / 2
+    return found.episodes if now <= half_width else math.ceil(min(found.episodes * (now / half_width) ** 2, 1e9))
+
+
+def buys(speedup: float, memory: float) -> bool:
+    """Whether a setting is faster or smaller, given the lower bound of its speed-up and the ratio of memory."""
+    return speedup >= LEAST_GAIN or memory <= _LEAST_SAVING
+
+
+def verdict(row: Mapping[str, Any], tolerance: str) -> str:
+    """What a row of results shows; see ``Tuning.rows``."""
+    if row["refused"]:
+        return "refused"
+    if "ranks" in row:
+        return _verdict_on_ranks(row, RANK_CORRELATIONS[tolerance])
+    if not buys(row["speedup_low"], row["memory"]):
+        return "no gain"
+    if row["faults_per_million"] > 2 * row["reference_faults_per_million"]:
+        return "faults"
+    limit = TOLERANCES[tolerance]
+    found = [Difference(**part) for part in row["returns"].values()]
+    if all(part.within(limit) for part in found):
+        return "same"
+    return "different" if any(part.beyond(limit) for part in found) else "not shown"
+
+
+def _verdict_on_ranks(row: Mapping[str, Any], least: float) -> str:
+    found = [Correlation(**part) for part in row["ranks"].values()]
+    if any(part.high < least for part in found):
+        return "ranks badly"
+    if row["speedup"] < LEAST_GAIN:
+        return "no gain"
+    return "same" if found and all(part.low >= least for part in found) else "not shown"

@@ -1,0 +1,144 @@
+"""Compare a planner's physics with the plant's: time of a plan, and whether both rank the same samples alike."""
+
+import dataclasses
+import statistics
+import time
+from typing import Any
+
+import numpy as np
+import torch
+
+from lyceum_warp.algos.planner import MPPI
+from lyceum_warp.options import PhysicsOptions
+from lyceum_warp.task import Task
+from lyceum_warp.tuning.candidates import Setting
+from lyceum_warp.tuning.judgement import Correlation
+from lyceum_warp.tuning.trial import random_actions
+
+_SAMPLES = 64
+_MOVING_STEPS, _FALLING_STEPS, _LYING_STEPS = 30, 200, 10
+_REPLAN_EVERY = 6
+_IMPROVEMENTS = 2
+"""Improvements of the plan around which the compared samples are drawn."""
+
+
+class Rankings:
+    """Measures a planner's physics against the plant's.
+
+    From each state, planners with both physics draw the same samples around the same plan. A planner only uses the
+    order and the differences of returns, so the rank correlation of the returns shows whether it can plan with coarser
+    physics. There are states of three kinds:
+
+    - standing: random initial states;
+    - moving: states of the plant after 30 steps under the planner with the plant's physics, with a plan every 6 steps;
+    - fallen: states after random actions until the end of the episode, at most 200 steps, and 10 steps more.
+
+    Args:
+        task: The task.
+        states: Number of states of each kind.
+        repeats: Number of timed plans.
+        samples: Number of samples.
+        seed: Seed of states and noise.
+        words: Options and parameters as for ``lw.MPPI``.
+    """
+
+    def __init__(
+        self, task: type[Task], *, states: int, repeats: int, samples: int = _SAMPLES, seed: int = 0, **words: Any
+    ) -> None:
+        self.task, self.states, self.repeats, self.seed = task, states, repeats, seed
+        # several improvements would adapt the samples to each planner's own physics
+        self.words = {"iterations": 1, "seed": seed, "samples": samples, **words}
+        self.exact, self.one = self._planner({}, states), self._planner({}, 1)
+        self.reference = self.exact.env
+        self.starts = self._find_states()
+        self._exact = {kind: self._prepared(start) for kind, start in self.starts.items()}
+
+    def _planner(self, physics: Any, plants: int) -> MPPI:
+        return MPPI(self.task, physics=PhysicsOptions(**physics), plants=plants, **self.words)
+
+    def _find_states(self) -> dict[str, torch.Tensor]:
+        """States of each kind, (states, state_space.size)."""
+        plant = self.reference.replicate(nworld=self.states, autoreset=False)
+        plant.rand_reset(self.seed)
+        found = {"standing": plant.get_state()}
+        self.exact.reset(self.seed)
+        every = min(_REPLAN_EVERY, self.exact.horizon)
+        for step in range(_MOVING_STEPS):
+            if step % every == 0:
+                self.exact(plant.get_state(), shift=every if step else 0)
+            plant.step(self.exact.actions[step % every].reshape(plant.action.shape))
+        found["moving"] = plant.get_state()
+        plant.rand_reset(self.seed + 1)
+        draw, fallen = random_actions(plant, self.seed), torch.zeros_like(plant.done)
+        for _ in range(_FALLING_STEPS):
+            plant.step(next(draw))
+            fallen |= plant.done
+            if fallen.all():
+                break
+        for _ in range(_LYING_STEPS):
+            plant.step(next(draw))
+        found["fallen"] = plant.get_state()
+        return found
+
+    def _prepared(self, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The plans from some states, and the returns of samples around them in the plant, (states, samples)."""
+        self.exact.reset(self.seed)
+        for _ in range(_IMPROVEMENTS):
+            self.exact(start, shift=0)
+        plan = self.exact.knot_actions.clone()
+        return plan, self._returns(self.exact, start, plan)
+
+    def _returns(self, planner: MPPI, start: torch.Tensor, plan: torch.Tensor) -> torch.Tensor:
+        """Returns of the samples that a planner draws around a plan, (states, samples)."""
+        planner.reset(self.seed + 1)
+        planner.knot_actions.copy_(plan)
+        planner(start, shift=0)
+        return planner.returns.reshape(self.states, -1).clone()
+
+    def measure(self, setting: Setting) -> dict[str, Any]:
+        """Measure a setting, and return the row of its results."""
+        row: dict[str, Any] = {"name": setting.name, "physics": dict(setting.physics), "refused": ""}
+        try:
+            planner, one = self._planner(setting.physics, self.states), self._planner(setting.physics, 1)
+        except ValueError as error:
+            return row | {"refused": str(error)}
+        times, ratios = [], []
+        start = self.starts["moving"][0]
+        for repeat in range(self.repeats + 1):
+            exact, own = self._seconds(self.one, start), self._seconds(one, start)
+            if repeat:  # the first plans warm up
+                times.append(own)
+                ratios.append(exact / own)
+        row |= {"plan_ms": 1e3 * statistics.median(times), "speedup": statistics.median(ratios), "ranks": {}}
+        for kind, (plan, returns) in self._exact.items():
+            found = rank_correlations(returns, self._returns(planner, self.starts[kind], plan))
+            if len(found):
+                row["ranks"][kind] = dataclasses.asdict(Correlation.of(found))
+        return row
+
+    def _seconds(self, planner: MPPI, start: torch.Tensor) -> float:
+        """Seconds of a plan from a state."""
+        begin = time.perf_counter()
+        planner(start)
+        if planner.actions.is_cuda:
+            torch.cuda.synchronize(planner.actions.device)
+        return time.perf_counter() - begin
+
+
+def rank_correlations(first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
+    """Spearman's rank correlation of each row, (rows, n) each; rows without any difference are left out.
+
+    Equal numbers have their mean rank.
+    """
+    a, b = (_ranks(values.double()) for values in (first, second))
+    a, b = a - a.mean(1, keepdim=True), b - b.mean(1, keepdim=True)
+    spread = a.square().sum(1) * b.square().sum(1)
+    known = a.square().sum(1) > 0
+    found = torch.where(spread > 0, (a * b).sum(1) / spread.clamp_min(1e-300).sqrt(), 0.0)
+    return found[known].cpu().numpy()
+
+
+def _ranks(values: torch.Tensor) -> torch.Tensor:
+    less = values[:, :, None] > values[:, None, :]
+    equal = values[:, :, None] == values[:, None, :]
+    return less.sum(2) + equal.sum(2) / 2

@@ -1,0 +1,79 @@
+"""Keep the results of settings in a file of JSON lines, from which a stopped search resumes."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lyceum_warp.env import Env
+from lyceum_warp.runs.task_copy import json_value, task_copy
+from lyceum_warp.support.versions import versions
+
+_BEGIN = b'{"name": '
+_VERSIONS = ("lyceum_warp", "mujoco", "mujoco_warp")
+
+
+def identity(env: Env, **more: Any) -> dict[str, Any]:
+    """What the results of a setting depend on besides the setting: task, machine, worlds and versions.
+
+    Args:
+        env: The task as it is.
+        more: Additional entries, JSON values.
+    """
+    kept, _ = task_copy(env)
+    params = {name: json_value(name, value) for name, value in env.given_params.items()}
+    task = {"task": kept, "params": params, "physics": env.options.physics.given(), "horizon": env.horizon}
+    known = versions(env.device.alias)
+    return {
+        "task": env.task.name, "digest": hashlib.sha256(json.dumps(task, sort_keys=True).encode()).hexdigest()[:16],
+        "engine": env.engine.name, "device": known.get("gpu") or f"{known['cpu']}, {known['cores']} cores",
+        "nthread": env.options.nthread, "nworld": env.nworld, **{name: known[name] for name in _VERSIONS}, **more,
+    }  # fmt: skip
+
+
+class RowFile:
+    """Rows of results in a file, by setting.
+
+    Args:
+        path: The file; it need not exist.
+        identity: Only rows with this identity count; see ``identity``.
+
+    Raises:
+        ValueError: The file holds something else.
+    """
+
+    def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
+        self.path, self.identity = path, json.loads(json.dumps(identity))  # with lists for tuples
+        self._rows: dict[str, dict[str, Any]] = {}
+        self._whole = 0
+        lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
+        for number, line in enumerate(lines, 1):
+            try:
+                row = json.loads(line)
+                found, key = row["identity"], _key(row["physics"])
+            except (ValueError, TypeError, KeyError):
+                if number == len(lines) and line.startswith(_BEGIN):  # its process was killed; the next row replaces it
+                    break
+                raise ValueError(f"line {number} of {path} is not a result of tune: give another file") from None
+            self._whole += len(line)
+            if found == self.identity:
+                self._rows[key] = row
+
+    def get(self, physics: Mapping[str, Any]) -> dict[str, Any] | None:
+        """The row of a setting, if the file has it."""
+        return self._rows.get(_key(physics))
+
+    def add(self, row: Mapping[str, Any]) -> dict[str, Any]:
+        """Append a row to the file, and return it as the file has it."""
+        line = json.dumps({**row, "identity": self.identity})
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self.path.open("ab") as file:
+            file.truncate(self._whole)
+            self._whole += file.write(f"{line}\n".encode())
+        self._rows[_key(row["physics"])] = kept = json.loads(line)
+        return kept
+
+
+def _key(physics: Mapping[str, Any]) -> str:
+    return json.dumps(physics, sort_keys=True)

@@ -1,0 +1,197 @@
+"""Search for the fastest physics of a task that keeps its returns: `lw.tune`."""
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from lyceum_warp.algos.policy import acting
+from lyceum_warp.binding.registry import find_task, task_name
+from lyceum_warp.env import Env
+from lyceum_warp.options import EnvOptions
+from lyceum_warp.runs.checkpoints import check_sizes
+from lyceum_warp.runs.configuration import Configuration
+from lyceum_warp.runs.folder import Run, load
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import check_flag, check_function, check_word, whole_number
+from lyceum_warp.task import Task
+from lyceum_warp.tuning.candidates import Setting, candidates, combined, flags, not_tried, task_line
+from lyceum_warp.tuning.judgement import TOLERANCES, verdict
+from lyceum_warp.tuning.ranking import Rankings
+from lyceum_warp.tuning.row_file import RowFile, identity
+from lyceum_warp.tuning.trial import FULL, SHORT, Effort, Trials
+
+NWORLD, GPU_NWORLD = 256, 4096
+"""Number of worlds by default."""
+
+Row = dict[str, Any]
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True)
+class Tuning:
+    """The results of ``tune``."""
+
+    rows: list[Row]
+    """The results of each setting, the fastest first; docs/physics.md describes the entries. ``verdict`` is "same",
+    "different" or "not shown" (the interval of the returns lies within, outside or across the tolerance), "faults"
+    (more than twice as many as in the task as it is), "no gain" (less than 3 % faster and no smaller: returns are not
+    compared), "refused" (by MuJoCo or the engine, whose reason is in ``refused``), or for a planner "ranks badly"."""
+    reference: Row
+    """The results of the task as it is, measured against itself."""
+    not_tried: list[str]
+    """What was not tried, with reasons."""
+    path: Path
+    """The file of the results."""
+
+    @property
+    def best(self) -> Row | None:
+        """The fastest setting with the same returns; None if there is none."""
+        return next((row for row in self.rows if row["verdict"] == "same"), None)
+
+    @property
+    def flags(self) -> str:
+        """The flags of the best setting for lyceum-warp train and plan; empty if there is none."""
+        return flags(self.best["physics"]) if self.best else ""
+
+    @property
+    def task_line(self) -> str:
+        """The line of the task that offers the best setting as ``physics="fast"``; empty if there is none."""
+        return task_line(self.best["physics"]) if self.best else ""
+
+
+def tune(
+    task: str | type[Task],
+    *,
+    run: str | Path | None = None,
+    which: str = "last",
+    tolerance: str = "strict",
+    short: bool = False,
+    episodes: int | None = None,
+    planning: bool = False,
+    out: str | Path | None = None,
+    seed: int = 0,
+    progress: Callable[[Row], object] | None = None,
+    **words: Any,
+) -> Tuning:
+    """Measure what each physics option of a task buys and what it changes, and find the fastest with equal returns.
+
+    Every setting is compared with the task as it is, in the same process: steps per second in alternation, memory,
+    faults, divergence, and the returns of the same episodes under random actions and under a policy. Settings are
+    tried alone first; then the best of each kind are combined, without those that buy least if the returns differ.
+
+    Args:
+        task: Name of a task, a file with one, or its class.
+        run: Folder of a run of this task, whose policy runs the same episodes; its parameters are the defaults.
+        which: Which policy of the run: "last", "best", or the number of a saved iteration.
+        tolerance: "strict": the 95 % interval of the difference of returns lies within 2 % of the mean absolute
+            return; "loose": within 5 %; "any": only faults count.
+        short: Whether to compare the first 100 steps of episodes, for a few seconds, instead of whole episodes.
+        episodes: Number of episodes of each setting, rounded up to a multiple of the number of worlds. By default as
+            many as the interval needs, within the time limit: a minute, or 5 s if ``short``.
+        planning: Whether to find physics for the task's planner instead of its worlds: compares the time of a plan,
+            and the ranks that both physics give to the same samples, from standing, moving and fallen states. A setting
+            is suggested if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8 ("loose").
+            ``nworld`` is then the number of samples, by default 64, and ``episodes`` the number of states of each kind.
+        out: File of the results, to which rows are appended; rows that it has are not measured again. By default
+            tune/TASK.jsonl, or tune/TASK-planning.jsonl.
+        seed: Seed of initial states and actions.
+        progress: Called with each row.
+        words: Options and parameters as for ``lw.make``; by default 256 worlds on the CPU, 4096 on a GPU.
+
+    Raises:
+        ValueError: An argument is unknown or does not fit, or the run is one of another task.
+        FileNotFoundError: A model, a task or a run is missing.
+    """
+    check_word("tolerance", tolerance, list(TOLERANCES))
+    for name, flag in (("short", short), ("planning", planning)):
+        check_flag(name, flag)
+    check_function("progress", progress)
+    if episodes is not None:
+        whole_number("episodes", episodes, low=1)
+    kind = find_task(task)
+    measured: dict[str, Any] = {"short": short, "episodes": episodes, "seed": seed}
+    trials: Rankings | Trials
+    if planning:
+        if run is not None:
+            raise ValueError("planning compares samples of the task's planner, without a run: omit one of them")
+        states, repeats = (4, 3) if short else (16, 15)
+        if "nworld" in words:
+            words["samples"] = words.pop("nworld")
+        trials = Rankings(kind, states=episodes or states, repeats=repeats, seed=seed, **words)
+        measured["planner"] = trials.exact.settings
+    else:
+        trials = _trials(kind, run, which, words, effort=SHORT if short else FULL, seed=seed, episodes=episodes)
+        measured["policy"] = None if run is None else _digest(run, which)
+    name = f"{task_name(kind)}{'-planning' * planning}.jsonl"
+    rows = RowFile(Path("tune", name) if out is None else Path(out), identity(trials.reference, **measured))
+    return _Search(trials, rows, tolerance, progress).run()
+
+
+def _trials(
+    task: type[Task], run: str | Path | None, which: str, words: Mapping[str, Any], *, effort: Effort, seed: int,
+    episodes: int | None,
+) -> Trials:  # fmt: skip
+    """The task as it is, and the policy of a run."""
+    options, params = EnvOptions.split(words)
+    if "nworld" not in words:
+        options = options.changed({"nworld": GPU_NWORLD if str(options.device).startswith("cuda") else NWORLD})
+    known = {} if run is None else _params_of(run, task)
+    env, policy = Env(task, options.changed({"autoreset": False}), **{**known, **params}), None
+    if run is not None:
+        own = load(run, which=which, device=env.obs.device)
+        check_sizes(own, env, Run.open(run).policy_file(which))
+        policy = acting(own)
+    return Trials(env, policy, effort=effort, seed=seed, episodes=episodes)
+
+
+def _digest(run: str | Path, which: str) -> str:
+    return hashlib.sha256(Run.open(run).policy_file(which).read_bytes()).hexdigest()[:16]
+
+
+def _params_of(run: str | Path, task: type[Task]) -> Mapping[str, Any]:
+    """The task parameters of a run.
+
+    Raises:
+        ValueError: The run is one of another task.
+    """
+    opened = Run.open(run)
+    if opened.task_name != task_name(task):
+        raise ValueError(f"{run} is a run of the task {opened.task_name!r}, not of {task_name(task)!r}")
+    return Configuration.of(opened).params
+
+
+class _Search:
+    """The search over settings."""
+
+    def __init__(
+        self, trials: Trials | Rankings, file: RowFile, tolerance: str, progress: Callable[[Row], object] | None
+    ) -> None:
+        self.trials, self.file, self.tolerance, self.progress = trials, file, tolerance, progress
+
+    def run(self) -> Tuning:
+        """Try all settings."""
+        env = self.trials.reference
+        reference = self._row(Setting("", "", {}))
+        tried = [(setting, self._row(setting)) for setting in candidates(env)]
+        rows = [row for _, row in tried]
+        good = [(setting, row) for setting, row in tried if row["verdict"] == "same"]
+        good.sort(key=lambda one: -one[1]["speedup"])
+        settings = [setting for setting, _ in good]
+        while (both := combined(settings)) is not None:
+            row = self._row(both)
+            if row["name"] == both.name:  # otherwise it was tried alone
+                rows.append(row)
+            if row["verdict"] == "same":
+                break
+            settings = settings[: settings.index(both.parts[-1])]  # without the part that buys least
+        rows.sort(key=lambda row: -row.get("speedup", 0.0))
+        return Tuning(rows, reference, not_tried(env), self.file.path)
+
+    def _row(self, setting: Setting) -> Row:
+        row = self.file.get(setting.physics) or self.file.add(self.trials.measure(setting))
+        row = {**row, "verdict": verdict(row, self.tolerance) if setting.physics else "reference"}
+        if self.progress is not None:
+            self.progress(row)
+        return row

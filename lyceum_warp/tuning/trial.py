@@ -1,0 +1,266 @@
+"""Measure a physics setting against the task as it is: speed, memory, faults, divergence, returns."""
+
+import dataclasses
+import gc
+import math
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+import warp as wp
+
+from lyceum_warp.algos.evaluation import ENDLESS_STEPS
+from lyceum_warp.done import FAULTS
+from lyceum_warp.env import Env
+from lyceum_warp.support.machine import free_memory
+from lyceum_warp.tuning.candidates import Setting
+from lyceum_warp.tuning.judgement import TOLERANCES, Difference, buys, difference, episodes_needed
+
+DIVERGENCE_STEPS = (1, 10, 50)
+NUDGE = 1e-6
+"""Standard deviation of the change of positions and velocities, to see how chaotic the task is."""
+_HALF_WIDTH = TOLERANCES["strict"] / 2
+"""Half width of the interval of the difference of returns that the number of episodes aims at."""
+_CONTACT_STATES = 64
+
+Policy = Callable[[torch.Tensor], torch.Tensor]
+
+
+@dataclasses.dataclass(frozen=True)
+class Effort:
+    """How long to measure."""
+
+    repeats: int
+    """Blocks of steps for the speed, each in the task as it is and in the setting."""
+    block_seconds: float
+    """Duration of a block in the task as it is."""
+    judging_seconds: float
+    """Time limit for all episodes of the task as it is, for random actions and for the policy each."""
+    steps: int
+    """Longest episode; 0 for the task's own horizon."""
+    recorded_at: tuple[int, ...]
+    """Steps of a run after which states are recorded, from which speed and divergence are measured."""
+
+
+FULL = Effort(repeats=15, block_seconds=0.3, judging_seconds=60.0, steps=0, recorded_at=(5, 20, 50, 100))
+SHORT = Effort(repeats=7, block_seconds=0.1, judging_seconds=5.0, steps=100, recorded_at=(30,))
+
+
+class Trials:
+    """Measures settings against the task as it is, in alternation within this process.
+
+    Args:
+        reference: The task as it is, with ``autoreset=False``.
+        policy: The policy, or None.
+        effort: How long to measure.
+        seed: Seed of initial states and actions.
+        episodes: Number of episodes of each setting, instead of as many as the interval needs within the time limit.
+    """
+
+    def __init__(
+        self, reference: Env, policy: Policy | None, *, effort: Effort, seed: int = 0, episodes: int | None = None
+    ) -> None:
+        self.reference, self.policy, self.effort, self.seed = reference, policy, effort, seed
+        self.batches = None if episodes is None else math.ceil(episodes / reference.nworld)
+        self.sources = {"random": None} | ({} if policy is None else {"policy": policy})
+        self.steps = effort.steps or reference.horizon or ENDLESS_STEPS
+        if reference.horizon:
+            self.steps = min(self.steps, reference.horizon)
+        self._returns: dict[tuple[str, int], tuple[np.ndarray, int, int]] = {}
+        self._batch_seconds: dict[str, float] = {}
+        self._record()
+
+    # states in the middle of a run, and actions that follow them
+
+    def _record(self) -> None:
+        """Record states under random actions and, in half of the worlds, the policy, and 50 actions after each."""
+        env, draw = self.reference, random_actions(self.reference, self.seed)
+        policy_worlds = torch.arange(env.nworld, device=env.obs.device)[:, None] % 2 == 1
+        self._parts = [env.state_space.parts[name] for name in ("qpos", "qvel")]
+        self._starts: list[torch.Tensor] = []
+        self._actions: list[torch.Tensor] = []
+        env.rand_reset(self.seed)
+        for step in range(max(self.effort.recorded_at) + 1):
+            if step in self.effort.recorded_at:
+                self._starts.append(env.get_state())
+            env.rand_reset(mask=env.done)
+            env.step(self._mixed(next(draw), policy_worlds))
+        for start in self._starts:
+            env.set_state(start)
+            actions = []
+            for _ in range(max(DIVERGENCE_STEPS)):
+                actions.append(self._mixed(next(draw), policy_worlds))
+                env.step(actions[-1])
+            self._actions.append(torch.stack(actions))
+        self._exact = [self._velocities(env, k) for k in range(len(self._starts))]
+        noise = torch.Generator("cpu").manual_seed(self.seed)
+        nudged = []
+        for k, start in enumerate(self._starts):
+            start = start.clone()
+            for part in self._parts:
+                moved = torch.randn(start[:, part].shape, generator=noise, dtype=torch.float64)
+                start[:, part] += NUDGE * moved.to(start.device)
+            nudged.append(self._velocities(env, k, start))
+        self.nudged = self._distance(nudged)
+        self.in_contact = self._share_in_contact()
+        self._block = 1
+        self._block = max(1, round(self.effort.block_seconds / self._seconds(env, 0)))
+
+    def _mixed(self, random: torch.Tensor, policy_worlds: torch.Tensor) -> torch.Tensor:
+        if self.policy is None:
+            return random
+        return torch.where(policy_worlds, self.policy(self.reference.obs), random)
+
+    def _share_in_contact(self) -> float:
+        """The fraction of recorded states with contacts, from a sample of them on the CPU."""
+        model, size = self.reference.task.model, self.reference.engine.integration_size
+        data, kind = mujoco.MjData(model), mujoco.mjtState.mjSTATE_INTEGRATION.value
+        states = torch.cat(self._starts)[:, :size].cpu().numpy()
+        found = 0
+        for state in (chosen := states[:: max(1, len(states) // _CONTACT_STATES)]):
+            mujoco.mj_setState(model, data, state, kind)
+            mujoco.mj_fwdPosition(model, data)
+            found += data.ncon > 0
+        return found / len(chosen)
+
+    # one setting
+
+    def measure(self, setting: Setting) -> dict[str, Any]:
+        """Measure a setting, and return the row of its results; returns are compared only if it buys anything."""
+        row: dict[str, Any] = {"name": setting.name, "physics": dict(setting.physics), "refused": ""}
+        before = self._free()
+        try:
+            env = self.reference.replicate(autoreset=False, **setting.physics)
+        except ValueError as error:
+            return row | {"refused": str(error)}
+        taken = before - self._free()
+        speed, speedup, low = self._speed(env)
+        row |= {"steps_per_second": speed, "speedup": speedup, "speedup_low": low}
+        row |= {"in_contact": self.in_contact, "bytes_per_world": env.bytes_per_world}
+        row["memory"] = env.bytes_per_world / self.reference.bytes_per_world
+        if env.device.is_cuda:
+            row["device_bytes"] = taken
+        row["divergence"] = self._distance([self._velocities(env, k) for k in range(len(self._starts))])
+        row["nudged_divergence"] = self.nudged
+        row["returns"], faults, steps = {}, np.zeros(2), np.zeros(2)
+        if not setting.physics or buys(low, row["memory"]):
+            for source in self.sources:
+                found, *counts = self._compare(env, source)
+                row["returns"][source] = dataclasses.asdict(found)
+                faults, steps = faults + counts[0], steps + counts[1]
+        rates = 1e6 * faults / np.maximum(steps, 1)
+        row |= {"faults_per_million": rates[0], "reference_faults_per_million": rates[1]}
+        return row
+
+    def _free(self) -> int:
+        """Free memory of the device; 0 on the CPU."""
+        if not self.reference.device.is_cuda:
+            return 0
+        gc.collect()
+        torch.cuda.empty_cache()
+        wp.synchronize_device(self.reference.device)
+        return free_memory(self.reference.device) or 0
+
+    def _speed(self, env: Env) -> tuple[float, float, float]:
+        """Steps per second of all worlds; how many times faster than the task as it is, in the median and at least.
+
+        The last is the smaller of the lower quartile and the ratio of the fastest blocks, because other processes slow
+        some blocks down.
+        """
+        count = self._block * env.nworld
+        starts = [repeat % len(self._starts) for repeat in range(self.effort.repeats)]
+        times = np.array([(self._seconds(self.reference, k), self._seconds(env, k)) for k in starts])
+        exact, own = times.T
+        low = min(np.quantile(exact / own, 0.25), exact.min() / own.min())
+        return count / float(np.median(own)), float(np.median(exact / own)), float(low)
+
+    def _seconds(self, env: Env, k: int) -> float:
+        """Seconds of a block of steps from the k-th recorded states, after one step that is not timed."""
+        actions = self._actions[k]
+        env.set_state(self._starts[k])
+        env.step(actions[0])
+        wp.synchronize_device(env.device)
+        start = time.perf_counter()
+        for step in range(self._block):
+            env.step(actions[step % len(actions)])
+        wp.synchronize_device(env.device)
+        return time.perf_counter() - start
+
+    def _velocities(self, env: Env, k: int, start: torch.Tensor | None = None) -> torch.Tensor:
+        """Velocities after some steps from the k-th states, (times, nworld, nv) float64; NaN after a fault."""
+        env.set_state(self._starts[k] if start is None else start)
+        found, bad = [], torch.zeros(env.nworld, dtype=torch.bool, device=env.obs.device)
+        for step, action in enumerate(self._actions[k], 1):
+            env.step(action)
+            bad |= env.done_reason & int(FAULTS) != 0
+            if step in DIVERGENCE_STEPS:
+                found.append(env.get_state()[:, self._parts[1]].masked_fill(bad[:, None], torch.nan))
+        return torch.stack(found)
+
+    def _distance(self, velocities: list[torch.Tensor]) -> list[float]:
+        """Median distance to the exact velocities after 1, 10 and 50 steps, in root mean squares of each velocity."""
+        exact, found = torch.cat(self._exact, 1), torch.cat(velocities, 1)
+        scale = exact.square().nanmean(1, keepdim=True).sqrt().clamp_min(1e-9)
+        return ((found - exact) / scale).square().mean(2).sqrt().nanmedian(1).values.tolist()
+
+    def _compare(self, env: Env, source: str) -> tuple[Difference, np.ndarray, np.ndarray]:
+        """The difference of returns, and the numbers of faults and of steps in the setting and in the task as it is.
+
+        The spread in the first batch of episodes determines the number of batches, within the time limit.
+        """
+        pairs: list[np.ndarray] = []
+        faults, steps = np.zeros(2), np.zeros(2)
+        wanted = self.batches or 1
+        while len(pairs) < wanted:
+            batch = len(pairs)
+            if (source, batch) not in self._returns:
+                start = time.perf_counter()
+                self._returns[source, batch] = self._episodes(self.reference, source, batch)
+                self._batch_seconds[source] = time.perf_counter() - start
+            own, exact = self._episodes(env, source, batch), self._returns[source, batch]
+            pairs.append(np.stack([exact[0], own[0]]))
+            faults += (own[1], exact[1])
+            steps += (own[2], exact[2])
+            if batch == 0 and self.batches is None:
+                first = difference(*pairs[0])
+                if not first.beyond(TOLERANCES["loose"]):
+                    most = max(1, int(self.effort.judging_seconds / self._batch_seconds[source]))
+                    wanted = min(most, math.ceil(episodes_needed(first, _HALF_WIDTH) / env.nworld))
+        return difference(*np.concatenate(pairs, axis=1)), faults, steps
+
+    def _episodes(self, env: Env, source: str, batch: int) -> tuple[np.ndarray, int, int]:
+        """Returns of one episode per world, (nworld,), and the numbers of faults and of steps.
+
+        Episodes of the same batch have the same initial states, random streams and, under random actions, actions.
+        """
+        seed = self.seed + 1 + batch
+        self.reference.rand_reset(seed)
+        if env is not self.reference:
+            env.set_state(self.reference.get_state())
+        draw, policy = random_actions(env, seed), self.sources[source]
+        total = torch.zeros(env.nworld, dtype=torch.float64, device=env.obs.device)
+        alive = torch.ones(env.nworld, dtype=torch.bool, device=env.obs.device)
+        faults, steps = (torch.zeros((), dtype=torch.int64, device=env.obs.device) for _ in range(2))
+        for step in range(self.steps):
+            env.step(next(draw) if policy is None else policy(env.obs))
+            total += torch.where(alive, env.reward, 0.0)
+            steps += alive.sum()
+            faults += (alive & (env.done_reason & int(FAULTS) != 0)).sum()
+            alive &= ~env.done
+            if step % 10 == 9 and not alive.any():
+                break
+        return total.cpu().numpy(), int(faults), int(steps)
+
+
+def random_actions(env: Env, seed: int) -> Iterator[torch.Tensor]:
+    """Draw uniformly random actions, (nworld, nact), one batch after another; actions without bounds from -1 to 1."""
+    device, low, high = env.obs.device, env.action_space.low, env.action_space.high
+    assert low is not None and high is not None
+    generator = torch.Generator(device).manual_seed(seed)
+    start = torch.as_tensor(np.where(np.isfinite(low), low, -1.0), device=device).float()
+    size = torch.as_tensor(np.where(np.isfinite(high), high, 1.0), device=device).float() - start
+    while True:
+        yield start + size * torch.rand(env.action.shape, generator=generator, device=device)

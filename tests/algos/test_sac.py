@@ -1,0 +1,281 @@
+"""SAC as a whole: an update equals plain torch, it learns, and it resumes exactly."""
+
+import copy
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import SharedEnv
+from metered_task import Metered
+
+import lyceum_warp as lw
+from lyceum_warp.algos.networks import Normalizer
+from lyceum_warp.algos.sac import SACIteration
+
+SMALL = lw.SACConfig(
+    hidden=(8,), value_hidden=(8, 8), num_steps=12, warmup=60, batch=16, replay=80, mean_every=2, mean_episodes=2
+)
+
+
+@pytest.fixture
+def env(shared_env: SharedEnv) -> lw.Env:
+    return shared_env(Metered, nworld=4, horizon=10, far=0.3)
+
+
+def made(env: lw.Env, *, seed: int = 0, **changes: Any) -> lw.SAC:
+    return lw.SAC(env, config=dataclasses.replace(SMALL, **changes), seed=seed)
+
+
+def numbers(it: SACIteration) -> dict[str, Any]:
+    """Return an iteration's numbers without measured times."""
+    return {name: value for name, value in it.row().items() if "time" not in name and name != "samples_per_second"}
+
+
+def test_it_learns_for_a_fixed_seed(shared_env: SharedEnv) -> None:
+    """With random actions the pole falls after about 5 steps; after these updates, with other seeds, after 45 to 75."""
+    config = lw.SACConfig(
+        hidden=(32, 32), value_hidden=(32, 32), num_steps=50, warmup=300, updates=4, batch=128, n_step=3,
+        learning_rate=1e-3, temperature=0.1, tau=0.02, gamma=0.97, mean_every=4, mean_episodes=4,
+    )  # fmt: skip
+    sac = lw.SAC(shared_env("inverted_pendulum", nworld=8, horizon=200), config=config)
+    rows = [next(sac) for _ in range(4)]
+    assert rows[0].return_mean is not None and rows[0].return_mean < 10.0
+    assert rows[-1].return_mean is not None and rows[-1].return_mean > 30.0
+    assert rows[-1].mean_return is not None and rows[-1].mean_return > 25.0
+    assert rows[-1].samples == 4 * 50 * 8 and rows[-1].temperature < 0.1
+
+
+class Plain(torch.nn.Module):
+    """One critic of a twin in float64, written out."""
+
+    def __init__(self, twin: lw.TwinCritic, k: int) -> None:
+        super().__init__()
+        weights = [p.detach()[k].double().clone().requires_grad_(True) for p in twin.network.parameters()]
+        self.w = torch.nn.ParameterList(weights)
+        self.shift, self.scale = twin.normalizer.shift.double(), twin.normalizer.scale.double()
+
+    def forward(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        x = torch.cat([((obs - self.shift) * self.scale).clamp(-10.0, 10.0), action], dim=-1)
+        for i in range(0, 8, 4):
+            weight, bias, gain, shift = self.w[i : i + 4]
+            x = x @ weight + bias
+            x = (x - x.mean(-1, keepdim=True)) / (x.var(-1, correction=0, keepdim=True) + 1e-5).sqrt()
+            x = torch.relu(x * gain + shift)
+        return (x @ self.w[8] + self.w[9]).squeeze(-1)
+
+
+@pytest.mark.parametrize("changes", [{"updates": 1}, {"updates": 1, "n_step": 3, "critic_bound": "mean"}])
+def test_an_update_equals_plain_torch_in_float64(changes: dict[str, Any], env: lw.Env) -> None:
+    sac = made(env, target_entropy=-0.7, temperature=0.3, **changes)
+    for _ in range(2):
+        next(sac)
+    with torch.no_grad():  # otherwise the target would equal the critics
+        for p in sac.target.parameters():
+            p += 0.05
+    sac.draw()
+    nact, config = 1, sac.config
+    batch = sac.replay.at(sac._index[0], n_step=config.n_step, gamma=config.gamma)
+    assert (batch.discount == 0.0).any()
+    next_noise, noise = sac._noise[0].double().split(nact, dim=-1)
+    critics, targets = ([Plain(twin, k) for k in range(2)] for twin in (sac.value, sac.target))
+    actor = copy.deepcopy(sac.policy).double()
+    alpha = sac.log_temperature.detach().double().exp()
+
+    def drawn(obs: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        mean, log_std = actor(obs.double())
+        u = torch.distributions.Normal(mean, log_std.exp())
+        value = mean + log_std.exp() * noise
+        log_prob = u.log_prob(value) - torch.log(1.0 - torch.tanh(value) ** 2)
+        return torch.tanh(value), log_prob.sum(-1)
+
+    def bound(pair: list[Plain], obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        one, two = (critic(obs.double(), action) for critic in pair)
+        return torch.minimum(one, two) if config.critic_bound == "min" else (one + two) / 2
+
+    with torch.no_grad():
+        action, log_prob = drawn(batch.next_obs["policy"], next_noise)
+        value = bound(targets, batch.next_obs["critic"], action) - alpha * log_prob
+        target = batch.reward.double() + batch.discount.double() * value
+    unit = 2.0 * (batch.action.double() + 1.0) / 2.0 - 1.0  # actions of this task are between -1 and 1
+    loss = sum((critic(batch.obs["critic"].double(), unit) - target).square().mean() for critic in critics)
+    step = torch.optim.Adam([p for critic in critics for p in critic.parameters()], lr=config.learning_rate)
+    # Adam's moments so far
+    for k, critic in enumerate(critics):
+        for own, p in zip(critic.parameters(), sac.value.network.parameters(), strict=True):
+            saved = sac.critic_step.optimizer.state[p]
+            step.state[own] = {"step": saved["step"].clone()} | {
+                name: saved[name][k].double().clone() for name in ("exp_avg", "exp_avg_sq")
+            }
+    loss.backward()
+    step.step()
+    action, log_prob = drawn(batch.obs["policy"], noise)
+    actor_loss = (alpha * log_prob - bound(critics, batch.obs["critic"], action)).mean()
+    gradients = torch.autograd.grad(actor_loss, list(actor.parameters()))
+    before = [p.detach().clone() for p in sac.target.parameters()]
+
+    sac._sums.zero_()
+    sac.learn()
+    assert sac._sums[0].item() == pytest.approx(loss.item(), rel=1e-4)
+    assert sac._sums[2].item() == pytest.approx(actor_loss.item(), rel=1e-4, abs=1e-5)
+    assert sac._sums[3].item() == pytest.approx(-log_prob.mean().item(), rel=1e-4)
+    for k, critic in enumerate(critics):
+        for own, p in zip(critic.parameters(), sac.value.network.parameters(), strict=True):
+            torch.testing.assert_close(p.detach()[k].double(), own.detach(), rtol=1e-4, atol=2e-6)
+    for p, gradient in zip(sac.policy.parameters(), gradients, strict=True):
+        torch.testing.assert_close(p.grad.double(), gradient, rtol=1e-3, atol=1e-6)
+    assert sac.log_temperature.grad.item() == pytest.approx(-log_prob.mean().item() + 0.7, rel=1e-4)
+    for old, new, p in zip(before, sac.target.parameters(), sac.value.parameters(), strict=True):
+        torch.testing.assert_close(new, old + 0.005 * (p - old))
+
+
+def test_the_density_of_actions_integrates_to_one() -> None:
+    policy = lw.SquashedPolicy(1, 1, (4,), low=[-2.0], high=[3.0], generator=torch.Generator().manual_seed(0))
+    obs = torch.ones(20_001, 1)
+    mean, log_std = policy(obs[:1])
+    u = torch.linspace(-8.0, 8.0, 20_001).unsqueeze(-1)
+    unit, log_prob = policy.sample(obs, (u - mean) / log_std.exp())
+    total = torch.trapezoid(log_prob.detach().exp(), unit.detach().squeeze(-1))
+    assert total.item() == pytest.approx(1.0, abs=1e-3)
+    action = policy.scaled(unit)
+    assert action.min() >= -2.0 and action.max() <= 3.0
+    torch.testing.assert_close(policy.unit(action), unit, atol=1e-5, rtol=0.0)
+
+
+@pytest.mark.parametrize("changes", [{}, {"n_step": 3, "actor_every": 2, "normalize": False, "layer_norm": False}])
+def test_a_run_is_reproducible_and_resumes_to_the_bit(changes: dict[str, Any], env: lw.Env) -> None:
+    def fresh(seed: int) -> lw.SAC:
+        env.rand_reset(7)
+        return made(env, seed=seed, **changes)
+
+    sac = fresh(1)
+    first = [numbers(next(sac)) for _ in range(3)]
+    saved = sac.state_dict(), sac.replay.state_dict()
+    rest = [numbers(next(sac)) for _ in range(3)]
+    torch.manual_seed(2)  # torch's global generators stay unchanged
+    again = fresh(1)
+    np.testing.assert_equal([numbers(next(again)) for _ in range(6)], first + rest)
+    resumed = fresh(2)
+    next(resumed)
+    resumed.load_state_dict(saved[0])
+    resumed.replay.load_state_dict(saved[1])
+    np.testing.assert_equal([numbers(next(resumed)) for _ in range(3)], rest)
+    for own, other in ((sac.policy, resumed.policy), (sac.value, resumed.value), (sac.target, resumed.target)):
+        for name, part in own.state_dict().items():
+            assert torch.equal(part, other.state_dict()[name]), name
+    assert math.isnan(first[0]["critic_loss"]) and math.isfinite(first[1]["critic_loss"])
+
+
+def test_a_run_continues_with_the_replay_buffer_of_its_folder(tmp_path: Path) -> None:
+    """The buffer holds 20 steps of 4 worlds; an iteration has 12."""
+    runs = []
+    for name, parts in (("whole", (6,)), ("parts", (1, 2, 3, 5, 6))):
+        for i, iterations in enumerate(parts):
+            sac = made(lw.make(Metered, nworld=4, horizon=10))
+            runs.append(lw.train(sac, tmp_path / name, iterations=iterations, resume=i > 0, save_every=1))
+        kept = [tuple(map(int, path.stem.split("-"))) for path in sorted((tmp_path / name / "replay").iterdir())]
+        assert kept == [(k, k + 1) for k in range(52, 72)]
+    clocks = ("time_sample", "time_update", "time_mean", "samples_per_second")
+    whole, parts = ([{k: v for k, v in row.items() if k not in clocks} for row in run.rows()]
+                    for run in (runs[0], runs[-1]))  # fmt: skip
+    np.testing.assert_equal(parts, whole)
+    run = runs[-1]
+    assert run.config["algorithm"] == "sac" and run.config["sac"]["replay"] == 80
+    policy, value = lw.load(run, which="best"), lw.load_value(run)
+    assert isinstance(policy, lw.SquashedPolicy) and value.group == "critic"
+    assert policy.act(torch.full((5, 1), 1e3)).abs().max() <= 1.0
+    exported = torch.export.load(lw.export_policy(policy, tmp_path / "policy.pt2")).module()
+    obs = torch.linspace(-1.0, 1.0, 5).unsqueeze(-1)
+    torch.testing.assert_close(exported(obs), policy.act(obs))
+    (tmp_path / "parts" / "replay" / "000000000060-000000000061.pt").unlink()
+    with pytest.raises(ValueError, match="lacks steps 60 to 61 of the replay buffer"):
+        lw.train(made(sac.env), tmp_path / "parts", iterations=7, resume=True)
+
+
+def test_it_goes_on_with_given_networks(env: lw.Env) -> None:
+    sac = made(env)
+    for _ in range(2):
+        next(sac)
+    policy, value = copy.deepcopy(sac.policy), copy.deepcopy(sac.value)
+    for module in (policy, value):
+        module.requires_grad_(False)
+    other = lw.SAC(env, policy, value, dataclasses.replace(SMALL, hidden=(4,)))
+    assert other.config.hidden == (8,)
+    assert not math.isnan([next(other) for _ in range(2)][-1].critic_loss)
+    assert not torch.equal(policy.network[0].weight, sac.policy.network[0].weight)
+    assert (other.replay.action[:4].abs() < 1.0).all()  # the given policy also acts during the warm-up
+    npg = lw.NPG(env, config=lw.NPGConfig(samples=80, hidden=(8,), value_hidden=(8,), mean_every=0))
+    with pytest.raises(ValueError, match="policy of SAC must be of type SquashedPolicy.* not a GaussianPolicy"):
+        lw.SAC(env, npg.policy)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="value of PPO must be of type ValueFunction.* not a TwinCritic"):
+        lw.PPO(env, value=value)  # type: ignore[arg-type]
+    wide = lw.SquashedPolicy(1, 1, (8,), low=[-2.0], high=[2.0])
+    with pytest.raises(ValueError, match=r"actions are from \[-2.0\] to \[2.0\], and those of the task 'metered' from"):
+        lw.SAC(env, wide)
+    with pytest.raises(ValueError, match="the TwinCritic takes 1 observations and 1 actions, .* has 2 and 1"):
+        lw.SAC(env, value=lw.TwinCritic(1, 1, group="critic"))
+
+
+def test_actions_without_bounds_get_the_limit(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=2)
+    sac = lw.SAC(env, config=dataclasses.replace(SMALL, action_limit=1.5, num_steps=3))
+    next(sac)
+    assert sac.policy.shape["low"] == 12 * [-1.5] and 1.0 < sac.replay.action.abs().max() < 1.5
+    assert sac.value.group == "critic" and sac.value.shape["nobs"] == env.obs_spaces["critic"].size
+
+
+def test_every_step_updates_the_statistics_of_observations(env: lw.Env) -> None:
+    sac = made(env)
+    next(sac)
+    for module, group in ((sac.policy, "policy"), (sac.value, "critic")):
+        normalizer = module.normalizer
+        assert isinstance(normalizer, Normalizer) and normalizer.count == 48
+        obs = torch.cat([sac.replay.obs[group][1:12].flatten(0, 1), env.obs_groups[group]]).double()
+        torch.testing.assert_close(normalizer.mean, obs.mean(0))
+    assert sac.target.normalizer is sac.value.normalizer
+
+
+def test_a_reward_that_is_not_finite_is_a_fault_and_learning_goes_on(env: lw.Env) -> None:
+    sac = made(env)
+    next(sac)
+    step = env.step
+
+    def faulty() -> None:
+        env.action[1] = 1e30  # its square is infinite
+        step()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(env, "step", faulty)
+        it = next(sac)
+    assert it.faults == 12 and math.isfinite(it.critic_loss)
+    assert sac.replay.truncated[4:16, 1].sum() >= 4 and sac.replay.reward.isfinite().all()
+
+
+def test_an_update_that_is_not_finite_ends_learning(env: lw.Env) -> None:
+    sac = made(env, learning_rate=1e30)
+    next(sac)
+    with pytest.raises(FloatingPointError, match="the updates of iteration 2 are not finite: make learning_rate, or"):
+        next(sac)
+
+
+def test_defaults_depend_on_the_number_of_worlds() -> None:
+    few, many = lw.SACConfig().resolved(8), lw.SACConfig().resolved(4096)
+    assert (few.updates, few.batch, few.num_steps, few.warmup, few.gamma) == (8, 256, 125, 5_000, 0.99)
+    assert (many.updates, many.batch, many.num_steps, many.warmup, many.gamma) == (8, 8192, 50, 40_960, 0.97)
+    assert lw.SACConfig().resolved(1).updates == 1 and lw.SACConfig(gamma=0.9).resolved(4096).gamma == 0.9
+
+
+@pytest.mark.parametrize("words, message", [
+    ({"batch": 0}, "batch must be a whole number from 1 "),
+    ({"critic_bound": "max"}, "critic_bound must be 'min' or 'mean', not 'max'"),
+    ({"hidden": (0,)}, "hidden"),
+    ({"tau": 1.5}, "tau must be a finite number from 0 to 1, not 1.5"),
+])  # fmt: skip
+def test_hyperparameters_that_are_not_valid_are_refused(words: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        lw.SACConfig(**words)
+    with pytest.raises(ValueError, match="updates must be a multiple of actor_every, as 4, not 6"):
+        lw.SACConfig(updates=6).resolved(4096)

@@ -1,0 +1,115 @@
+"""Policies that are symmetric exactly, or learn to be."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import SharedEnv
+
+import lyceum_warp as lw
+from lyceum_warp.algos.symmetry import PolicyMirror, reflections
+
+CONFIG = lw.PPOConfig(hidden=(16,), value_hidden=(16,), num_steps=16, mean_every=2, mean_episodes=2)
+
+
+@pytest.fixture
+def env(shared_env: SharedEnv) -> lw.Env:
+    return shared_env("point_mass", nworld=8)
+
+
+def learner(env: lw.Env, symmetry: str, **changes: Any) -> lw.PPO:
+    env.rand_reset(1)
+    return lw.PPO(env, config=dataclasses.replace(CONFIG, symmetry=symmetry, **changes), seed=1)
+
+
+def asymmetry(policy: lw.GaussianPolicy, env: lw.Env) -> float:
+    """Return the mean difference between actions and mirrored actions of mirrored observations."""
+    mirror = PolicyMirror(reflections(env))
+    obs = torch.randn(500, policy.nobs, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        return (policy(mirror.obs(obs)) - mirror.action(policy(obs))).abs().mean().item()
+
+
+def test_an_exact_policy_is_equivariant_to_the_bit_also_from_a_file(env: lw.Env, tmp_path: Path) -> None:
+    """The normaliser's statistics need not be symmetric."""
+    ppo = learner(env, "exact")
+    run = lw.train(ppo, tmp_path / "run", iterations=2)
+    policy = lw.load(run)
+    assert policy.normalizer.shift[1].abs() > 1e-3
+    assert asymmetry(ppo.policy, env) == asymmetry(policy, env) == 0.0
+    assert policy(torch.ones(1, 6)).abs().min() > 0.0 and policy.log_std[0] != policy.log_std[1]
+    runtime = pytest.importorskip("onnxruntime")
+    file = lw.export_policy(policy, tmp_path / "policy.onnx")
+    obs = torch.randn(9, 6)
+    (action,) = runtime.InferenceSession(str(file)).run(["action"], {"obs": obs.numpy()})
+    np.testing.assert_allclose(action, policy(obs), rtol=1e-5, atol=1e-6)
+    # NPG and a run that continues from it keep the symmetry
+    npg = lw.NPG(env, lw.load(run), config=lw.NPGConfig(samples=512, value_hidden=(8,), mean_every=0))
+    next(npg)
+    assert asymmetry(npg.policy, env) == 0.0
+    continued = lw.PPO(env, lw.load(run), config=CONFIG)
+    assert continued.settings()["symmetry"] == "exact"
+    next(continued)
+    assert asymmetry(continued.policy, env) == 0.0
+
+
+def test_standard_deviations_of_a_walking_robot_are_symmetric(shared_env: SharedEnv) -> None:
+    robot = shared_env("go1_velocity", nworld=4)
+    ppo = lw.PPO(robot, config=dataclasses.replace(CONFIG, symmetry="exact", mean_every=0))
+    next(ppo)
+    right, left = ppo.policy.log_std.view(2, 2, 3).unbind(1)
+    assert torch.equal(right, left) and right.unique().numel() == 6
+    assert asymmetry(ppo.policy, robot) == 0.0
+    augmented = lw.PPO(robot, config=dataclasses.replace(CONFIG, symmetry="augment", mean_every=0))
+    assert next(augmented).kl > 0.0 and augmented.value.group == "critic"
+
+
+@pytest.mark.parametrize("symmetry", ["loss", "augment"])
+def test_losses_and_mirrored_samples_make_a_policy_more_symmetric(symmetry: str, env: lw.Env) -> None:
+    found = {}
+    for name in ("none", symmetry):
+        ppo = learner(env, name, schedule="fixed", learning_rate=3e-3)
+        before = asymmetry(ppo.policy, env)
+        for _ in range(15):
+            next(ppo)
+        found[name] = asymmetry(ppo.policy, env) / before
+    assert found[symmetry] < 0.6 * found["none"]
+
+
+@pytest.mark.parametrize("symmetry", ["exact", "loss", "augment"])
+def test_a_symmetric_run_resumes_to_the_bit(symmetry: str, tmp_path: Path) -> None:
+    def made() -> lw.PPO:
+        return lw.PPO(lw.make("point_mass", nworld=8), config=dataclasses.replace(CONFIG, symmetry=symmetry))
+
+    whole = lw.train(made(), tmp_path / "whole", iterations=4)
+    lw.train(made(), tmp_path / "halves", iterations=2)
+    halves = lw.train(made(), tmp_path / "halves", iterations=4, resume=True)
+    one, other = (lw.load(run).state_dict() for run in (whole, halves))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    with pytest.raises(ValueError, match=f"has symmetry {symmetry}, not none, and a run keeps its settings"):
+        lw.train(lw.PPO(lw.make("point_mass", nworld=8), config=CONFIG), halves.folder, iterations=9, resume=True)
+
+
+def test_mirrored_samples_have_the_gradient_of_the_mirrored_task(env: lw.Env) -> None:
+    """For a policy and a value function that are symmetric, mirrored samples add the mirror image of the gradient."""
+    ppo = learner(env, "augment", hidden=(), value_hidden=(), normalize=False)
+    with torch.no_grad():
+        for network in (ppo.policy.network, ppo.value.network):
+            for parameter in network.parameters():
+                parameter.zero_()
+    ppo.sample()
+    samples = {name: part.flatten(0, 1) for name, part in ppo.evaluated_samples().items()}
+    ppo.learn(samples, torch.full((len(samples["obs"]),), 1.0 / len(samples["obs"])))
+    weight = ppo.policy.network[0].weight.grad
+    signs = torch.tensor([1.0, -1.0])
+    rows, columns = signs, signs.repeat(3)
+    assert weight.abs().min() < 1e-6 * weight.abs().max()  # entries that mix x and y are odd
+    torch.testing.assert_close(weight, weight * rows[:, None] * columns, rtol=0.0, atol=1e-6)
+
+
+def test_a_task_without_a_mirror_image_is_refused(shared_env: SharedEnv) -> None:
+    with pytest.raises(ValueError, match="the task 'hopper' declares no mirror image: give it mirror = lw.Mirror"):
+        lw.PPO(shared_env("hopper"), config=dataclasses.replace(CONFIG, symmetry="exact"))

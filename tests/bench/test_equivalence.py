@@ -1,0 +1,39 @@
+from pathlib import Path
+
+import equivalence
+import experiment
+import numpy as np
+import pytest
+
+
+def test_a_short_experiment_continues_and_ends_with_a_verdict(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--short", "--out", str(tmp_path / "equivalence.jsonl"), "--threads", "1"]
+    assert experiment.main(equivalence.EXPERIMENT, [*out, "--seeds", "0"]) == 0
+    assert "| inverted_double_pendulum" not in capsys.readouterr().out  # one seed has no standard deviation
+    assert experiment.main(equivalence.EXPERIMENT, out) == 0
+    shown = capsys.readouterr().out
+    assert "equivalence: 2 of 4 cases are stored" in shown
+    (line,) = [line for line in shown.splitlines() if line.startswith("| inverted_double_pendulum")]
+    assert line.split(" | ")[1:4] == ["2,000", "cpu", "2, 2"]
+    rows = experiment.read(tmp_path / "equivalence.jsonl")
+    areas = {(row.case["engine"], row.case["seed"]): row.result["area"] for row in rows}
+    assert len(areas) == 4 and all(30.0 < area < 200.0 for area in areas.values())
+    assert [row.result["curve"][-1][0] for row in rows] == [2000] * 4
+
+
+def test_equivalence_needs_a_small_difference_and_enough_seeds() -> None:
+    random = np.random.default_rng(0)
+    for difference, seeds, verdict in ((0.0, 20, "equivalent"), (0.0, 4, "not shown"), (1.0, 20, "not shown"),
+                                       (2.0, 20, "different")):  # fmt: skip
+        a, b = random.normal(size=(2, 500, seeds))
+        found = [equivalence.equivalence(one, other + difference)["verdict"] for one, other in zip(a, b, strict=True)]
+        assert found.count(verdict) > 350
+
+
+def test_different_engines_are_seldom_called_equivalent() -> None:
+    random = np.random.default_rng(1)
+    a, b = random.normal(size=(2, 2000, 20))
+    wrong = sum(equivalence.equivalence(x, y + 1.0)["verdict"] == "equivalent" for x, y in zip(a, b, strict=True))
+    assert wrong <= 120  # 5 %, and the margin is estimated

@@ -1,0 +1,39 @@
+"""lyceum-warp tune: its table, the flags that it prints, and errors."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from lyceum_warp import cli
+from lyceum_warp.tuning import search
+from lyceum_warp.tuning.trial import SHORT
+
+QUICK = ["--short", "--episodes", "8", "--nworld", "8", "--nthread", "1", "--tolerance", "any"]
+
+
+def test_tune_prints_the_table_and_flags_that_another_command_takes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(search, "SHORT", dataclasses.replace(SHORT, repeats=2, block_seconds=0.005, steps=40))
+    assert cli.main(["tune", "half_cheetah", *QUICK, "--out", str(tmp_path / "rows.jsonl")]) == 0
+    out, err = capsys.readouterr()
+    assert "half_cheetah: 8 worlds, mujoco engine on" in out and "the task as it is" in out
+    assert "not tried: the PGS solver" in out and "1 x 50 ms" in out and "1 x 50 ms: " in err
+    flags = next(line for line in out.splitlines() if line.startswith("flags: ")).removeprefix("flags: ").split()
+    assert cli.main(["check", "half_cheetah", "--rule", "spaces", *flags]) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["hoper"], "there is no task 'hoper'"),
+        (["hopper", "--tolerance", "tight"], "tolerance must be"),
+        (["hopper", "--param", "nworld=3"], "nworld is an option, not a parameter of the task: use --nworld"),
+        (["hopper", "--run", "none"], "there is no run in none"),
+    ],
+)
+def test_wrong_words_are_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["tune", *words]) == 2
+    err = capsys.readouterr().err
+    assert message in err and err.count("\n") == 1

@@ -1,0 +1,129 @@
+"""A policy's ONNX file alone runs a robot in plain MuJoCo as the environment does."""
+
+import copy
+import json
+import re
+import runpy
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+import lyceum_warp as lw
+from lyceum_warp.cli import main
+
+PAGE = Path(__file__).parents[2] / "docs" / "deployment.md"
+
+CALM = {
+    "linear_velocity_noise": 0.0, "angular_velocity_noise": 0.0, "gravity_noise": 0.0, "joint_position_noise": 0.0,
+    "joint_velocity_noise": 0.0, "encoder_bias": 0.0, "push_seconds": (1e6, 1e6), "command_seconds": (1e6, 1e6),
+    "heading_share": 0.0, "standing_share": 0.0,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Run the page's program, and return its names."""
+    pytest.importorskip("onnxruntime")
+    (program,) = re.findall(r"^```python title=robot_loop.py\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    assert "lyceum_warp" not in program
+    path = tmp_path_factory.mktemp("page") / "robot_loop.py"
+    path.write_text(program)
+    return runpy.run_path(str(path))
+
+
+def walking_policy(env: lw.Env) -> lw.GaussianPolicy:
+    """Make a policy with moving actions and statistics of its observations."""
+    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, normalize=True)
+    policy.observe(env.obs + 0.3 * torch.randn(200, 1, env.obs_space.size))
+    with torch.no_grad():
+        policy.network[-1].weight *= 40.0
+    return policy.requires_grad_(False)
+
+
+@pytest.mark.parametrize(
+    ("task", "steps"),
+    [("go1_velocity", 25), ("spot_velocity", 25), pytest.param("g1_velocity", 10, marks=pytest.mark.long)],
+)
+def test_the_pages_loop_does_what_the_environment_does(
+    page: dict[str, Any], task: str, steps: int, tmp_path: Path
+) -> None:
+    torch.manual_seed(0)
+    try:
+        env = lw.make(task, **CALM)
+    except (FileNotFoundError, ImportError) as error:
+        pytest.skip(str(error))
+    env.rand_reset(4)
+    policy = walking_policy(env)
+    file = lw.export_policy(policy, tmp_path / "policy.onnx", env=env)
+    model = copy.copy(env.model)
+    model.geom_friction[:], model.body_ipos[:] = env.field("geom_friction")[0], env.field("body_ipos")[0]
+    data = mujoco.MjData(model)
+    mujoco.mj_setConst(model, data)
+    parts = env.state_space.split(env.get_state()[0])
+    data.qpos[:], data.qvel[:], data.ctrl[:] = parts["qpos"], parts["qvel"], parts["ctrl"]
+    robot, command = page["Policy"](str(file), model), parts["drawn_velocity"].numpy()
+    moved = 0.0
+    for _ in range(steps):
+        robot.act(data, command)
+        np.testing.assert_allclose(robot.observation(data, command)[-3:], env.obs[0, -3:], atol=1e-6)
+        env.step(policy(env.obs))
+        mujoco.mj_step(model, data, robot.substeps)
+        np.testing.assert_allclose(robot.action, env.action[0], atol=1e-5)
+        np.testing.assert_allclose(robot.observation(data, command), env.obs[0], atol=1e-5, rtol=1e-5)
+        moved = max(moved, np.abs(robot.action).max())
+    assert moved > 0.3 and not env.done.any()
+
+
+def test_the_loop_of_the_page_walks_for_the_given_time(page: dict[str, Any], tmp_path: Path) -> None:
+    env = lw.make("go1_velocity")
+    file = lw.export_policy(walking_policy(env), tmp_path / "policy.onnx", env=env)
+    model = copy.copy(env.model)
+    robot, data = page["Policy"](str(file), model), mujoco.MjData(model)
+    page["walk"](robot, model, data, np.zeros(3), 0.5)
+    assert data.time == pytest.approx(0.5)
+
+
+def test_metadata_name_the_robots_parts(page: dict[str, Any], tmp_path: Path) -> None:
+    env = lw.make("go1_velocity")
+    policy = walking_policy(env)
+    meta = page["Policy"](str(lw.export_policy(policy, tmp_path / "policy.onnx", env=env)), env.model).meta
+    joints = [f"{leg}_{joint}" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")]
+    assert meta["task"] == "go1_velocity" and meta["joints"] == meta["actuators"] == joints
+    assert (meta["timestep"], meta["substep"], meta["base"]) == (0.02, 0.005, "trunk")
+    assert [(part["name"], part["size"]) for part in meta["observations"]] == [
+        ("linear_velocity", 3), ("angular_velocity", 3), ("gravity", 3), ("joint_position", 12),
+        ("joint_velocity", 12), ("last_action", 12), ("command", 3),
+    ]  # fmt: skip
+    offsets, scales = (
+        [number for part in meta["observations"] for number in part[name]] for name in ("offset", "scale")
+    )
+    obs = torch.randn(5, 48)
+    normalized = (obs - torch.tensor(offsets)) * torch.tensor(scales)
+    torch.testing.assert_close(normalized.clamp(-10.0, 10.0), policy.normalizer(obs))
+    assert meta["stiffness"][:3] == pytest.approx([15.895, 15.895, 35.764], abs=1e-3)
+    assert meta["damping"][:3] == pytest.approx([1.0119, 1.0119, 2.2768], abs=1e-4)
+    assert meta["commands"]["forward_velocity"] == [-2.0, 3.0] and meta["force_limit"][2] == pytest.approx(35.55)
+
+
+def test_the_command_writes_metadata_of_the_runs_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runtime = pytest.importorskip("onnxruntime")
+    config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
+    run = lw.train(lw.NPG(lw.make("point_mass", nworld=2, frame_skip=3), config=config), tmp_path / "run", iterations=1)
+
+    def metadata() -> dict[str, str]:
+        assert main(["export", str(run.folder)]) == 0
+        return runtime.InferenceSession(str(run.folder / "policy.onnx")).get_modelmeta().custom_metadata_map
+
+    found = metadata()
+    env = lw.make("point_mass", frame_skip=3)
+    assert json.loads(found["timestep"]) == pytest.approx(env.timestep)
+    assert [part["name"] for part in json.loads(found["observations"])] == list(env.obs_space.parts)
+    assert json.loads(found["actions"]) == [{"name": name, "size": 1} for name in env.action_space.parts]
+    capsys.readouterr()
+    run.amend(task="nowhere.py")  # a policy remains useful without its task
+    assert metadata() == {}
+    assert "the file has no metadata on the robot: " in capsys.readouterr().err

@@ -1,0 +1,71 @@
+"""Settings to try: only what differs from the task and what the engine takes; as flags and as Python."""
+
+import mujoco
+import pytest
+import tyro
+from conftest import SharedEnv
+
+import lyceum_warp as lw
+from lyceum_warp.cli.arguments import Physics
+from lyceum_warp.tuning.candidates import Setting, candidates, combined, flags, not_tried, task_line
+
+
+def test_settings_of_hopper_are_below_its_limits_and_keep_its_control_interval(shared_env: SharedEnv) -> None:
+    env = shared_env("hopper", solver={"iterations": 3})  # RK4, 4 substeps of 2 ms
+    settings = candidates(env)
+    names = [setting.name for setting in settings]
+    assert [name for name in names if name.startswith("iterations")] == ["iterations=2", "iterations=1"]
+    assert {"cone elliptic", "euler", "implicitfast", "jacobian sparse"} <= set(names)
+    assert [name for name in names if " x " in name] == [
+        "2 x 4 ms", "2 x 4 ms, implicitfast", "1 x 8 ms", "1 x 8 ms, implicitfast",
+    ]  # fmt: skip
+    assert all(
+        setting.physics["frame_skip"] * setting.physics["timestep"] == pytest.approx(env.timestep, rel=1e-9)
+        for setting in settings
+        if setting.group == "substeps"
+    )
+    limited = next(setting for setting in settings if setting.name == "ls_iterations=10")
+    assert limited.physics == {"solver": {"iterations": 3, "ls_iterations": 10}}  # the given limit stays
+    assert not {"noslip", "impratio", "room"} & {setting.group for setting in settings}
+
+
+def test_an_elliptic_cone_and_noslip_have_settings_of_their_own(shared_env: SharedEnv) -> None:
+    spec = lw.gymnasium_model("hopper.xml").spec()
+    spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10
+    spec.option.noslip_iterations = 5
+    found = {setting.name: setting.physics for setting in candidates(shared_env("hopper", model=spec))}
+    assert found["impratio=1"] == {"impratio": 1.0} and "cone pyramidal" in found
+    assert found["noslip_iterations=0"] == {"solver": {"noslip_iterations": 0}}
+
+
+def test_what_an_engine_does_not_take_is_named(shared_env: SharedEnv) -> None:
+    own = shared_env("point_mass")
+    assert "nconmax" in " ".join(not_tried(own)) and "PGS" in " ".join(not_tried(own))
+    env = shared_env("point_mass", engine="warp", nconmax=10, njmax=30)
+    rooms = [setting.physics for setting in candidates(env) if setting.group == "room"]
+    assert rooms == [{"nconmax": 5, "njmax": 15}] and "nconmax" not in " ".join(not_tried(env))
+
+
+LIMITED = Setting("iterations=2", "iterations", {"solver": {"iterations": 2}})
+SEARCH = Setting("ls_iterations=5", "ls_iterations", {"solver": {"ls_iterations": 5}})
+EULER = Setting("euler", "integrator", {"integrator": "euler"})
+COARSE = Setting("1 x 8 ms, implicitfast", "substeps",
+                 {"frame_skip": 1, "timestep": 0.008, "integrator": "implicitfast"})  # fmt: skip
+
+
+def test_a_combination_takes_one_setting_of_each_group_without_conflicts() -> None:
+    finer = Setting("2 x 4 ms", "substeps", {"frame_skip": 2, "timestep": 0.004})
+    both = combined([COARSE, EULER, LIMITED, finer, SEARCH])
+    assert both is not None and both.parts == (COARSE, LIMITED, SEARCH)
+    assert both.physics == {**COARSE.physics, "solver": {"iterations": 2, "ls_iterations": 5}}
+    assert combined([COARSE, EULER, finer]) is None and combined([]) is None
+
+
+def test_flags_and_the_line_of_the_task_select_the_setting() -> None:
+    both = combined([COARSE, LIMITED, SEARCH])
+    assert both is not None
+    wanted = lw.PhysicsOptions(**both.physics)
+    assert tyro.cli(tyro.conf.OmitArgPrefixes[Physics], args=flags(both.physics).split()).options() == wanted
+    scope = {"lw": lw}
+    exec(task_line(both.physics), scope)
+    assert scope["physics"]["fast"] == wanted  # type: ignore[index]

@@ -1,0 +1,60 @@
+"""Intervals of differences of returns, and verdicts."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lyceum_warp.tuning.judgement import Difference, difference, episodes_needed, verdict
+
+
+def test_an_interval_covers_the_difference_and_shrinks_with_more_episodes() -> None:
+    rng = np.random.default_rng(1)
+    reference = rng.normal(-100.0, 10.0, 2000)
+    returns = reference + rng.normal(3.0, 20.0, 2000)
+    few, many = difference(reference[:200], returns[:200]), difference(reference, returns)
+    assert few.low < 0.03 < few.high and many.low < 0.03 < many.high  # 3 of 100
+    assert many.high - many.low == pytest.approx((few.high - few.low) / math.sqrt(10), rel=0.3)
+    assert many.mean == pytest.approx((returns - reference).mean() / np.abs(reference).mean())
+    assert episodes_needed(few, (many.high - many.low) / 2) == pytest.approx(2000, rel=0.5)
+
+
+def test_equal_returns_differ_by_zero_even_if_all_are_zero() -> None:
+    for returns in (np.zeros(5), np.arange(5.0)):
+        assert difference(returns, returns) == Difference(0.0, 0.0, 0.0, 5)
+
+
+def test_returns_that_were_all_zero_show_nothing() -> None:
+    found = difference(np.zeros(5), np.arange(5.0))
+    assert not found.within(0.05) and not found.beyond(0.05)
+
+
+def row(*bounds: tuple[float, float], **entries: Any) -> dict[str, Any]:
+    returns = {str(i): {"mean": 0.0, "low": low, "high": high, "episodes": 9} for i, (low, high) in enumerate(bounds)}
+    known = {"refused": "", "speedup": 2.0, "speedup_low": 1.9, "memory": 1.0, "faults_per_million": 0.0}
+    return {**known, "reference_faults_per_million": 0.0, "returns": returns, **entries}
+
+
+@pytest.mark.parametrize(
+    ("found", "wanted"),
+    [
+        (row((-0.01, 0.02), (0.0, 0.0)), "same"),
+        (row((-0.01, 0.03), (0.0, 0.0)), "not shown"),
+        (row((-0.01, 0.02), (0.03, 0.04)), "different"),
+        (row((-0.05, -0.03)), "different"),
+        (row((0.0, 0.0), speedup_low=1.01), "no gain"),
+        (row((0.0, 0.0), speedup_low=1.01, memory=0.6), "same"),
+        (row((0.0, 0.0), faults_per_million=3.0, reference_faults_per_million=1.0), "faults"),
+        (row((0.0, 0.0), faults_per_million=3.0, reference_faults_per_million=2.0), "same"),
+        ({"refused": "MuJoCo refuses it"}, "refused"),
+    ],
+)
+def test_verdicts_depend_on_where_the_intervals_lie(found: dict[str, Any], wanted: str) -> None:
+    assert verdict(found, "strict") == wanted
+
+
+def test_a_looser_tolerance_accepts_more() -> None:
+    found = row((-0.04, 0.01))
+    assert verdict(found, "strict") == "not shown"
+    assert verdict(found, "loose") == verdict(row((1.0, 2.0)), "any") == "same"

@@ -1,0 +1,50 @@
+"""Rank correlations of samples between a planner's physics and the plant's."""
+
+import pytest
+import torch
+
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.tuning.candidates import Setting
+from lyceum_warp.tuning.judgement import verdict
+from lyceum_warp.tuning.ranking import Rankings, rank_correlations
+
+FAILED = float("-inf")
+
+
+def test_rank_correlations_are_spearmans_with_mean_ranks_of_equal_numbers() -> None:
+    order = [1.0, 2.0, 3.0, 4.0]
+    first = torch.tensor([order, [1.0, 2.0, 2.0, 3.0], [0.0, 1.0, 5.0, FAILED], [7.0] * 4, order])
+    second = torch.tensor([[1.0, 3.0, 2.0, 4.0], order, [9.0, 4.0, 1.0, 90.0], order, [2.0] * 4])
+    found = rank_correlations(first, second)
+    assert found.tolist() == pytest.approx([0.8, 0.9487, -1.0, 0.0], abs=1e-4)  # a row without differences is left out
+
+
+@pytest.fixture(scope="module")
+def rankings() -> Rankings:
+    return Rankings(find_task("half_cheetah"), states=3, repeats=1, samples=24, horizon=16, nthread=1)
+
+
+def test_the_plants_own_physics_ranks_its_samples_perfectly(rankings: Rankings) -> None:
+    row = rankings.measure(Setting("", "", {}))
+    assert list(row["ranks"]) == ["standing", "moving", "fallen"]
+    assert [found["mean"] for found in row["ranks"].values()] == pytest.approx([1.0, 1.0, 1.0], abs=1e-12)
+    assert row["plan_ms"] > 0.0
+
+
+def test_the_form_of_the_jacobian_keeps_ranks_and_a_crude_model_loses_them(rankings: Rankings) -> None:
+    sparse = rankings.measure(Setting("", "", {"jacobian": "sparse"}))
+    assert all(found["low"] > 0.999 for found in sparse["ranks"].values())
+    crude = rankings.measure(Setting("", "", {"frame_skip": 1, "timestep": 0.05, "solver": {"iterations": 1}}))
+    assert min(found["mean"] for found in crude["ranks"].values()) < 0.9
+    assert verdict(crude, "strict") in ("ranks badly", "not shown") and verdict(crude, "any") in ("same", "no gain")
+
+
+def test_states_of_the_three_kinds_differ(rankings: Rankings) -> None:
+    columns = rankings.reference.state_space.parts["step"]
+    steps = {kind: start[:, columns] for kind, start in rankings.starts.items()}
+    assert (steps["standing"] == 0).all() and (steps["moving"] == 30).all() and (steps["fallen"] > 100).all()
+
+
+def test_a_setting_that_mujoco_refuses_has_its_reason() -> None:
+    own = Rankings(find_task("soft_ball"), states=1, repeats=1, samples=2, horizon=2, nthread=1)
+    assert "flex elasticity" in own.measure(Setting("", "", {"integrator": "implicitfast"}))["refused"]

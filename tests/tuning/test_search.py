@@ -1,0 +1,123 @@
+"""lw.tune: its results, resuming from their file, and wrong arguments."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from training_runs import CONFIG
+
+import lyceum_warp as lw
+from lyceum_warp.tuning import search
+from lyceum_warp.tuning.trial import SHORT, Trials
+
+QUICK = {"short": True, "episodes": 8, "nworld": 8, "nthread": 1}
+
+
+@pytest.fixture
+def no_measuring(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make every further measurement an error."""
+
+    def measure(own: Trials, setting: Any) -> Any:
+        raise AssertionError(f"{setting.name} was measured")
+
+    monkeypatch.setattr(Trials, "measure", measure)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def brief() -> Iterator[None]:
+    """Measure speeds for milliseconds."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(search, "SHORT", dataclasses.replace(SHORT, repeats=2, block_seconds=0.005, steps=40))
+        yield
+
+
+@pytest.fixture(scope="module")
+def tuned(brief: None, tmp_path_factory: pytest.TempPathFactory) -> lw.Tuning:
+    return lw.tune("half_cheetah", out=tmp_path_factory.mktemp("tune") / "rows.jsonl", tolerance="loose", **QUICK)
+
+
+def test_rows_are_sorted_by_speed_and_the_best_is_the_fastest_with_equal_returns(tuned: lw.Tuning) -> None:
+    speeds = [row["speedup"] for row in tuned.rows]
+    assert speeds == sorted(speeds, reverse=True)
+    assert tuned.reference["divergence"] == [0.0, 0.0, 0.0]
+    same = [row for row in tuned.rows if row["verdict"] == "same"]
+    assert tuned.best == (same[0] if same else None)
+    if tuned.best is not None:
+        assert lw.PhysicsOptions(**tuned.best["physics"]).given() and tuned.flags and "fast" in tuned.task_line
+
+
+def test_a_stopped_search_resumes_from_its_file(tuned: lw.Tuning, no_measuring: None) -> None:
+    with tuned.path.open("a") as file:
+        file.write('{"name": "cut off by a ki')
+    again = lw.tune("half_cheetah", out=tuned.path, tolerance="loose", **QUICK)
+    assert again == tuned
+    rows = lw.tune("half_cheetah", out=tuned.path, tolerance="strict", **QUICK).rows  # only judged again
+    assert len(rows) <= len(tuned.rows)
+
+
+@pytest.mark.parametrize("change", [{"nworld": 4}, {"seed": 1}, {"ctrl_cost_weight": 0.2}, {"integrator": "rk4"}])
+def test_results_of_another_task_or_number_of_worlds_do_not_count(
+    change: dict[str, Any], tuned: lw.Tuning, no_measuring: None
+) -> None:
+    with pytest.raises(AssertionError, match="was measured"):
+        lw.tune("half_cheetah", out=tuned.path, **{**QUICK, **change})
+
+
+def test_a_new_row_follows_a_line_that_was_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "rows.jsonl"
+    out.write_text('{"name": "cut off by a ki')
+    rows: list[dict[str, Any]] = []
+
+    def stop(row: dict[str, Any]) -> None:
+        rows.append(row)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        lw.tune("point_mass", out=out, progress=stop, **QUICK)
+    monkeypatch.setattr(Trials, "measure", lambda own, setting: {**rows[0], "physics": dict(setting.physics)})
+    lw.tune("point_mass", out=out, **QUICK)
+    assert len(out.read_text().splitlines()) > 1
+    monkeypatch.undo()
+    lw.tune("point_mass", out=out, **QUICK)  # reads every line
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "point_mass"
+    env = lw.make("point_mass", nworld=2, nthread=1, success_distance=0.05)
+    lw.train(lw.NPG(env, config=CONFIG), folder, iterations=1)
+    return folder
+
+
+def test_a_runs_policy_is_compared_with_the_runs_parameters(run: Path, tmp_path: Path) -> None:
+    rows: list[dict[str, Any]] = []
+
+    def stop(row: dict[str, Any]) -> None:
+        rows.append(row)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        lw.tune("point_mass", run=run, out=tmp_path / "rows.jsonl", progress=stop, **QUICK)
+    assert set(rows[0]["returns"]) == {"random", "policy"}
+
+
+def test_wrong_arguments_are_one_error_each(run: Path, tmp_path: Path) -> None:
+    other = tmp_path / "notes.txt"
+    other.write_text("bread\nmilk\n")
+    wrong: list[tuple[str, dict[str, Any], str]] = [
+        ("hoper", {}, "there is no task 'hoper': did you mean hopper"),
+        ("hopper", {"tolerance": "tight"}, "tolerance must be 'strict', 'loose' or 'any', not 'tight'"),
+        ("hopper", {"run": run}, "is a run of the task 'point_mass', not of 'hopper'"),
+        ("hopper", {"run": tmp_path / "none"}, "there is no run in"),
+        ("point_mass", {"run": run, "which": "worst"}, "which must be 'last', 'best' or the number"),
+        ("hopper", {"episodes": 0}, "episodes must be a whole number from 1 .*, not 0"),
+        ("hopper", {"short": "yes"}, "short must be True or False, not 'yes'"),
+        ("hopper", {"out": other, "nworld": 2}, "line 1 of .*notes.txt is not a result of tune: give another file"),
+        ("hopper", {"gravity": 3}, "gravity"),
+    ]
+    for task, words, message in wrong:
+        with pytest.raises((ValueError, FileNotFoundError), match=message):
+            lw.tune(task, **words)
+    assert other.read_text() == "bread\nmilk\n"

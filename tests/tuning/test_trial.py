@@ -1,0 +1,72 @@
+"""Measurements of settings on real tasks."""
+
+import pytest
+import torch
+
+import lyceum_warp as lw
+from lyceum_warp.tuning.candidates import Setting
+from lyceum_warp.tuning.judgement import verdict
+from lyceum_warp.tuning.trial import Effort, Trials
+
+BRIEF = Effort(repeats=2, block_seconds=0.001, judging_seconds=1.0, steps=60, recorded_at=(5, 30))
+SAME = Setting("", "", {})
+CRUDE = Setting("crude", "", {"frame_skip": 1, "timestep": 0.05, "solver": {"iterations": 1}})
+
+
+def lean(obs: torch.Tensor) -> torch.Tensor:
+    """A policy of half_cheetah."""
+    return torch.sin(3.0 * obs[:, :6])
+
+
+def trials(task: str = "half_cheetah", *, policy: bool = False, episodes: int | None = 16, **options: object) -> Trials:
+    env = lw.make(task, autoreset=False, **{"nworld": 16, **options})
+    return Trials(env, lean if policy else None, effort=BRIEF, episodes=episodes)
+
+
+def test_the_task_as_it_is_differs_from_itself_by_exactly_zero() -> None:
+    row = trials(policy=True).measure(SAME)
+    assert row["divergence"] == [0.0, 0.0, 0.0] and row["memory"] == 1.0
+    assert set(row["returns"]) == {"random", "policy"}
+    for found in row["returns"].values():
+        assert found == {"mean": 0.0, "low": 0.0, "high": 0.0, "episodes": 16}
+    assert row["faults_per_million"] == row["reference_faults_per_million"] == 0.0
+
+
+def test_a_crude_setting_is_different_and_diverges_beyond_chaos() -> None:
+    own = trials(policy=True)
+    row = own.measure(CRUDE)
+    assert verdict(row, "loose") in ("different", "faults")
+    assert all(1e-8 < small < 1e-3 < found for small, found in zip(own.nudged, row["divergence"], strict=True))
+
+
+def test_a_form_of_the_jacobian_changes_results_only_by_rounding() -> None:
+    own = trials("hopper", nworld=8)
+    row = own.measure(Setting("", "", {"jacobian": "sparse"}))
+    assert row["divergence"][0] < 1e-9 < own.nudged[0]
+    assert 0.0 < own.in_contact < 1.0  # some are in the air
+
+
+def test_the_spread_determines_the_number_of_episodes_within_the_time_limit() -> None:
+    own = trials("hopper", episodes=None, nworld=8)
+    coarse = Setting("", "", {"integrator": "implicitfast", "frame_skip": 2, "timestep": 0.004})
+    assert own.measure(coarse)["returns"]["random"]["episodes"] > 8
+    assert own.measure(SAME)["returns"]["random"]["episodes"] == 8  # without spread, one batch
+
+
+def test_a_setting_that_mujoco_refuses_has_its_reason() -> None:
+    refused = trials("soft_ball", nworld=2).measure(Setting("", "", {"integrator": "implicitfast"}))
+    assert "flex elasticity" in refused["refused"] and verdict(refused, "strict") == "refused"
+
+
+def test_too_little_room_on_the_warp_engine_shows_as_faults() -> None:
+    own = trials("hopper", engine="warp", nworld=8, nconmax=16, njmax=64)
+    assert own.measure(SAME)["divergence"] == [0.0, 0.0, 0.0]
+    row = own.measure(Setting("", "", {"nconmax": 1, "njmax": 2}))
+    assert row["memory"] < 0.95 and row["faults_per_million"] > row["reference_faults_per_million"]
+    assert verdict(row, "strict") == "faults"
+
+
+@pytest.mark.gpu
+def test_a_gpu_reports_the_memory_of_the_device() -> None:
+    row = trials("hopper", nworld=1024, device="cuda").measure(SAME)
+    assert row["device_bytes"] > 0
