@@ -105,34 +105,38 @@ def share(good: int, count: int) -> str:
     return f"{good} of {count} ({low:.0%} to {high:.0%})"
 
 
+def success(task: str, one: dict[str, Any]) -> bool:
+    if task == "humanoid_get_up":
+        return bool(one["up_at_the_end"])
+    return not one["fell"] and (task != "humanoid_walk" or one["speed"] >= WALKS)
+
+
 def tables(rows: Sequence[Row]) -> list[Table]:
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in rows:
+        kind = tuple(row.case[name] for name in ("task", "contestant", "threads", "settings"))
+        groups.setdefault(kind, []).append(row.result)
     lines = []
-    for task in TASKS:
-        for name, label in CONTESTANTS.items():
-            found = [row.result for row in rows if (row.case["task"], row.case["contestant"]) == (task, name)]
-            if not found:
-                continue
-            if task == "humanoid_get_up":
-                good = [one["up_at_the_end"] for one in found]
-            elif task == "humanoid_walk":
-                good = [not one["fell"] and one["speed"] >= WALKS for one in found]
-            else:
-                good = [not one["fell"] for one in found]
-            plans, misses = (sum(one[key] for one in found) for key in ("plans", "misses"))
-            lines.append([
-                task, label, share(sum(good), len(found)), median_and_range([one["seconds"] for one in found], ".1f"),
-                median_and_range([one["speed"] for one in found]), f"{1 - misses / max(plans, 1):.2%}",
-                median_and_range([one["plan_ms"] for one in found if one["plan_ms"]], ".1f"),
-                f"{max(one['plan_max_ms'] or 0.0 for one in found):.1f}",
-                str(max(one["oldest_action_steps"] for one in found)),
-            ])  # fmt: skip
+    for (task, name, threads, settings_of_plans), found in groups.items():
+        plans, misses = (sum(one[key] for one in found) for key in ("plans", "misses"))
+        lines.append([
+            task, CONTESTANTS[name], str(threads), settings_of_plans,
+            share(sum(success(task, one) for one in found), len(found)),
+            median_and_range([one["seconds"] for one in found], ".1f"),
+            median_and_range([one["speed"] for one in found]), f"{1 - misses / max(plans, 1):.2%}",
+            median_and_range([one["plan_ms"] for one in found if one["plan_ms"]], ".1f"),
+            f"{max(one['plan_max_ms'] or 0.0 for one in found):.1f}",
+            str(max(one["oldest_action_steps"] for one in found)),
+        ])  # fmt: skip
     title = (
         f"Episodes of {SECONDS:g} s. Success: stands through; walks at {WALKS} m/s or more, without a fall; has got up "
         f"(torso above {UP} m in the last second). Deadlines: plans within 15 ms. Age: steps from the state of a plan "
         "to its last action that was applied."
     )
-    header = ["task", "planner", "success (95 % interval)", "seconds before a fall", "speed, m/s", "deadlines met",
-              "plan, ms", "longest, ms", "age"]  # fmt: skip
+    header = [
+        "task", "planner", "threads", "settings", "success (95 % interval)", "seconds before a fall", "speed, m/s",
+        "deadlines met", "plan, ms", "longest, ms", "age",
+    ]  # fmt: skip
     return [Table(title, header, lines)]
 
 

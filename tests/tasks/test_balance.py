@@ -6,7 +6,7 @@ import torch
 from conftest import SharedEnv
 
 import lyceum_warp as lw
-from lyceum_warp.tasks.balance.humanoid import JOINTS
+from lyceum_warp.tasks.balance.humanoid_balance import JOINTS
 
 
 def test_motors_are_servos_within_the_torques_of_the_model(shared_env: SharedEnv) -> None:

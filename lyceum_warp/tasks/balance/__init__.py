@@ -1,4 +1,8 @@
 """Stand, walk and get up under pushes: a family of tasks for planners in real time."""
 
-TASKS = {"humanoid_stand": "humanoid", "humanoid_walk": "humanoid", "humanoid_get_up": "humanoid"}
+TASKS = {
+    "humanoid_stand": "humanoid_balance",
+    "humanoid_walk": "humanoid_balance",
+    "humanoid_get_up": "humanoid_balance",
+}
 """The modules of the tasks, by the tasks' names; the registry reads them without running this file."""
