@@ -202,9 +202,10 @@ class SAC(Learner):
                     updates += config.updates
                 timer.mark()
         self.env.update_shared(team.sum)
+        parameters = [self.log_temperature, *self.policy.parameters(), *self.value.parameters()]
+        team.copy_leader([*parameters, *self.target.parameters()])
 
         # One copy transfers the statistics of all processes to the host.
-        parameters = [self.log_temperature, *self.policy.parameters(), *self.value.parameters()]
         finite = torch.stack([numbers.isfinite().all() for numbers in (self._sums, *parameters)]).all()
         numbers = [
             *finished(rollout), *metric_sums(rollout), rollout.reward.double().mean(), rollout.faults.sum(), finite,
