@@ -162,7 +162,7 @@ class SAC(Learner):
         self.count = given.num_steps * nworld
         # a separate seed, so that weights and noise are independent
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
-        self._act_noise = torch.empty(nworld, nact, device=device)
+        self._all_worlds, self._act_noise = nworld, torch.empty(nworld, nact, device=device)
 
         # updates
         share = room(given.batch, team)
@@ -196,15 +196,16 @@ class SAC(Learner):
                 timer.mark()
 
                 # 2. Update critics, actor and temperature on samples of the buffer.
-                if self.replay.stored * self._act_noise.shape[0] >= config.warmup:
+                if self.replay.stored * self._all_worlds >= config.warmup:
                     self.draw()
                     self._learn()
                     updates += config.updates
                 timer.mark()
         self.env.update_shared(team.sum)
+        parameters = [self.log_temperature, *self.policy.parameters(), *self.value.parameters()]
+        team.copy_leader([*parameters, *self.target.parameters()])
 
         # One copy transfers the statistics of all processes to the host.
-        parameters = [self.log_temperature, *self.policy.parameters(), *self.value.parameters()]
         finite = torch.stack([numbers.isfinite().all() for numbers in (self._sums, *parameters)]).all()
         numbers = [
             *finished(rollout), *metric_sums(rollout), rollout.reward.double().mean(), rollout.faults.sum(), finite,
@@ -255,7 +256,7 @@ class SAC(Learner):
     def sample(self) -> None:
         """Step every world with an action of the policy, or with a random action during the warm-up."""
         env, noise = self.env, self._act_noise
-        if self._warms_up and self.replay.stored * len(noise) < self.config.warmup:
+        if self._warms_up and self.replay.stored * self._all_worlds < self.config.warmup:
             noise.uniform_(-1.0, 1.0, generator=self.generator)
             unit = noise[self.own_worlds]
         else:

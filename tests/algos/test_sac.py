@@ -208,9 +208,9 @@ def test_it_goes_on_with_given_networks(env: lw.Env) -> None:
     assert not torch.equal(policy.network[0].weight, sac.policy.network[0].weight)
     assert (other.replay.action[:4].abs() < 1.0).all()  # the given policy also acts during the warm-up
     npg = lw.NPG(env, config=lw.NPGConfig(samples=80, hidden=(8,), value_hidden=(8,), mean_every=0))
-    with pytest.raises(ValueError, match="policy of SAC must be of type SquashedPolicy.* not a GaussianPolicy"):
+    with pytest.raises(ValueError, match="policy of SAC must be of type SquashedPolicy.* not GaussianPolicy"):
         lw.SAC(env, npg.policy)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="value of PPO must be of type ValueFunction.* not a TwinCritic"):
+    with pytest.raises(ValueError, match="value of PPO must be of type ValueFunction.* not TwinCritic"):
         lw.PPO(env, value=value)  # type: ignore[arg-type]
     wide = lw.SquashedPolicy(1, 1, (8,), low=[-2.0], high=[2.0])
     with pytest.raises(ValueError, match=r"actions are from \[-2.0\] to \[2.0\], and those of the task 'metered' from"):

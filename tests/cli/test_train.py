@@ -115,7 +115,7 @@ def test_resume_refuses_other_settings(trained: Path, tmp_path: Path, capsys: py
         (["--iterations", "9", "--gamma", "0.9"], ["has gamma 0.995, not 0.9", "start a new run in another folder"]),
         (["--iterations", "9", "--nworld", "4"], ["has nworld 2, not 4"]),
         (["--iterations", "9", "--param", "success_distance=1"], ["has success_distance None, not 1"]),
-        (["--iterations", "9", "--num-steps", "4"], ["--num-steps is a setting of ppo, not of npg"]),
+        (["--iterations", "9", "--num-steps", "4"], ["--num-steps is a setting of ppo or sac, not of npg"]),
         (["--iterations", "9", "--seed", "0"], ["--seed has no effect with --resume", "omit it"]),
         (["--iterations", "9", "--algorithm", "npg"], ["--algorithm has no effect with --resume"]),
         (["--iterations", "9", "--out", str(tmp_path)], ["--out has no effect with --resume"]),
