@@ -2,7 +2,7 @@
 
 Actions are offsets of the joints' targets from a default pose with bent knees; the motors act as servos with these
 targets, within Gymnasium's torques, at the rate of control. The feet are spheres: only steps and swings of the body
-keep the balance. Its measure is the distance of the capture point, at which a foot would have to stand to stop the
+keep the balance. Its measure is the distance of the capture point, at which a foot must stand to stop the
 robot, from the line between the feet (Pratt et al. 2006, "Capture point: a step toward humanoid push recovery").
 
 At each of ``push_times`` the robot gets an impulse in a random horizontal direction: the velocities of all bodies
