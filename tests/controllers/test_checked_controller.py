@@ -80,7 +80,7 @@ def test_action_holds_or_interpolates_a_plan_with_longer_steps_and_skips_in_a_fi
     assert applied(env.timestep / 2, 3) == [0, 2, 2]
 
 
-def test_a_time_step_that_is_no_multiple_of_the_plants_is_refused(env: lw.Env) -> None:
+def test_a_time_step_that_is_not_a_multiple_of_the_plants_is_refused(env: lw.Env) -> None:
     planner = StepPlanner(env)
     planner.timestep = 1.5 * env.timestep
     with pytest.raises(ValueError, match=r"step of 0.03 s must be a whole multiple of the plant's, 0.02 s, or a whole"):
