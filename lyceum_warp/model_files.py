@@ -87,7 +87,7 @@ class PackageFile(ModelFile):
     """The first version of Python without that package, as "3.13"; None if there is none."""
 
     def place(self) -> tuple[Path, str]:
-        """The package's folder of models, and the file; FileNotFoundError if the package is not installed."""
+        """The folder of models in the package, and the path of the file; FileNotFoundError if it is not installed."""
         folder = _package_folder(self.package)
         if folder is None:
             what = f"the model {self.file} comes with the package {self.source}, which"

@@ -364,7 +364,7 @@ def prepare_walker(
     timestep: float | None = None,
     iterations: tuple[int, int] | None = None,
 ) -> None:
-    """Prepare a model for a velocity task: forces on its feet are sensed, and their friction decides.
+    """Prepare a model for a velocity task: add sensors of the forces on the feet; the feet set the friction.
 
     The model's own sensors are removed, because each costs time and the task reads none of them. Geoms of the feet get
     priority in contacts, so that friction that is drawn for them holds. Pairs of a foot's geom with the ground become

@@ -20,7 +20,7 @@ def towards(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
 
 
 class StepPlanner:
-    """A planner whose actions hold the step of the plan's state and the action's index within the plan.
+    """A planner whose actions encode two numbers: the step at which the plan was made, and the action's index.
 
     Both are divided by 100; ``hundredths`` converts them back.
     """

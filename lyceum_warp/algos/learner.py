@@ -162,7 +162,7 @@ class Learner(abc.ABC):
 
     @property
     def title(self) -> str:
-        """Name of the algorithm in messages, with what a user should know of it."""
+        """The algorithm's name for messages, with details such as the size of the replay buffer."""
         return self.algorithm
 
     def settings(self) -> dict[str, Any]:

@@ -69,7 +69,7 @@ class SAC(Learner):
     """Learns a policy by SAC; an infinite iterator of ``SACIteration``.
 
     An iteration makes ``num_steps`` steps of every world, each followed by ``updates`` updates. On a GPU all updates
-    after a step are one CUDA graph, including the choice of their samples.
+    after a step run as one CUDA graph, which also gathers their samples.
 
     Example:
         >>> for it in SAC(env):

@@ -40,7 +40,7 @@ class Parameters:
         nworld: Number of worlds.
         timestep: Seconds in a step, the value of ``dt``.
         given: Values that replace defaults.
-        weights: The weights of the task's terms, by name, which are set and given as parameters are.
+        weights: The weights of the task's terms, by name, set and given as parameters are.
 
     Raises:
         ValueError: A field has the name of an option, a name is unknown, or a value is missing or does not fit.

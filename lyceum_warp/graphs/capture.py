@@ -102,7 +102,7 @@ class Graphs:
 SECONDS_A_THREAD = 5e-4
 """Minimum seconds of work per thread; waking a thread takes about 20 microseconds."""
 TIMED = 8
-"""Number of timed calls. The shortest counts, because other programs may interrupt some."""
+"""Number of timed calls. Only the fastest call is used, because other programs may slow some calls down."""
 _CAPTURING = threading.RLock()
 """Allows one capture at a time: controllers and viewers use environments in separate threads."""
 separate_captures()

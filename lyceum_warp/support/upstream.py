@@ -22,8 +22,8 @@ def builtin_functions() -> Mapping[str, Any]:
 def extend_structs() -> None:
     """Let Python classes extend a ``wp.struct``: ``class World(go1.World)`` under ``@wp.struct`` has its fields, too.
 
-    Warp refuses such a class, because a struct is not a type. A class that extends the struct's own class would have
-    only its own fields.
+    Warp refuses such a class, because a struct is not a type. A class derived from the struct's Python class
+    would lose the inherited fields, because Warp reads only the annotations of the class itself.
     """
     codegen: Any = wp._src.codegen
 

@@ -146,7 +146,7 @@ def soft_landing(
     substep_dt: float,
     active: float,
 ) -> float:
-    """The sum of |force| over the feet that ``landed`` a substep ago, times ``active``, N.
+    """The sum of |force| in N over the feet with ``landed`` true one substep ago, times ``active``.
 
     The forces are from the beginning of the last substep, when a contact was one substep younger. mjlab 1.6.0,
     ``soft_landing``.

@@ -57,7 +57,7 @@ def gait_pose(
     least_command: float,
     running_command: float,
 ) -> float:
-    """``pose`` with further standard deviations for running, a ``command_size`` from ``running_command`` on.
+    """``pose`` with separate standard deviations for running: a ``command_size`` of ``running_command`` or more.
 
     mjlab 1.6.0, ``variable_posture``.
     """

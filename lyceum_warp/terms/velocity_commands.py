@@ -26,7 +26,7 @@ def draw_timer(timer: Row[float], seconds: wp.vec2, rng: Row[wp.uint32]):
 
 @wp.func
 def run_timer(timer: Row[float], dt: float):
-    """Let dt seconds of a timer pass; for ``advance``."""
+    """Count a timer down by dt seconds; call this in ``advance``."""
     timer[0] = timer[0] - dt
 
 

@@ -159,7 +159,7 @@ def check_dynamics(ctx: Context) -> None:
     for name in once:
         ctx.equal(rows(a, name), first[:, parts[name]].float(), f"{name}, drawn once, after {3 * SHORT} resets")
     a.rand_reset(ctx.seed)
-    ctx.equal(a.get_state()[:, : a.engine.state_size], first[:, : a.engine.state_size], "the first draw again")
+    ctx.equal(a.get_state()[:, : a.engine.state_size], first[:, : a.engine.state_size], "the same seed again")
     a.reset()
     for name in varied:
         if name in once:

@@ -129,7 +129,7 @@ class Trials:
     # one setting
 
     def measure(self, setting: Setting) -> dict[str, Any]:
-        """Measure a setting, and return the row of its results; returns are compared only if it buys anything."""
+        """Measure a setting; the row of its results has returns only if the setting saves time or memory."""
         row: dict[str, Any] = {"name": setting.name, "physics": dict(setting.physics), "refused": ""}
         before = self._free()
         try:

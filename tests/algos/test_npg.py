@@ -394,9 +394,7 @@ def test_gpu_a_resumed_run_continues() -> None:
 
 
 @pytest.mark.parametrize("kl_limit", [1.0, 1.5])  # with 1.0 many steps are shortened
-def test_hand_written_and_parallel_iterations_equal_plain_ones(
-    kl_limit: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_optimized_iterations_equal_those_with_autograd(kl_limit: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The plain version uses autograd, all rounds of the line search, and a value fit after the policy's step."""
     threads, learned = torch.get_num_threads(), []
     torch.set_num_threads(2)

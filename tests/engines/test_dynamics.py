@@ -188,7 +188,7 @@ def test_a_change_in_one_world_alters_no_other(engine: type[Engine]) -> None:
     assert (got[1] != expected[1]).any()
 
 
-def test_worlds_of_the_nominal_model_equal_an_engine_without_dynamics() -> None:
+def test_per_world_fields_at_nominal_values_step_as_one_shared_model() -> None:
     np.testing.assert_array_equal(run(make(MujocoEngine, *DRAWN)), run(make(MujocoEngine)))
 
 
@@ -368,7 +368,7 @@ SLIDERS = """<mujoco><worldbody>
 </worldbody></mujoco>"""
 
 
-def test_inverse_weights_of_bodies_that_only_slide_or_turn_equal_a_compiled_models() -> None:
+def test_inverse_weights_of_sliding_or_turning_bodies_match_a_compiled_model() -> None:
     """MuJoCo gives weight 0 to directions in which a body cannot move, unlike MuJoCo Warp's ``set_const``."""
     model = mujoco.MjModel.from_xml_string(SLIDERS)
     engine = make(WarpEngine, "body_mass", nworld=2, model=model)

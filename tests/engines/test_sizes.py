@@ -103,7 +103,7 @@ OBJECTS = {
 
 
 @pytest.mark.parametrize("kind", OBJECTS)
-def test_an_inactive_constraint_of_any_type_adds_its_rows(kind: str) -> None:
+def test_room_includes_the_rows_of_inactive_constraints_of_every_type(kind: str) -> None:
     model = mujoco.MjModel.from_xml_string(JOINED.format(10 * OBJECTS[kind].format("false")))
     without = mujoco.MjModel.from_xml_string(JOINED.format(""))
     assert probe_sizes(model)[1] - probe_sizes(without)[1] == -(-10 * EQUALITIES[kind] // 8) * 8

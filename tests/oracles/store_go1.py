@@ -95,7 +95,7 @@ def trajectories(model: mujoco.MjModel) -> dict[str, Any]:
 
 
 def judged_states(env: ManagerBasedRlEnv) -> dict[str, Any]:
-    """Return states along random steps with the results of mjlab's functions; poses and contacts are current."""
+    """Return states under random actions, and the values of mjlab's functions there, with up-to-date contacts."""
     torch.manual_seed(0)
     robot, command = env.scene["robot"], env.command_manager.get_term("twist")
     feet = env.scene["feet_ground_contact"]

@@ -31,7 +31,7 @@ def test_model_has_mjlabs_bodies_and_geoms(shared_env: SharedEnv) -> None:
 
 
 @pytest.mark.parametrize("name", MODEL)
-def test_model_has_mjlabs_numbers(shared_env: SharedEnv, name: str) -> None:
+def test_model_fields_equal_mjlabs(shared_env: SharedEnv, name: str) -> None:
     np.testing.assert_allclose(getattr(shared_env("go1_velocity").model, name), STORED[f"model/{name}"], rtol=1e-12)
 
 

@@ -220,7 +220,7 @@ def test_fields_equal_mj_forward_of_the_state(module: ModuleType, engine: str) -
     """The fields are current after a step, an automatic reset, set_state and rand_reset, even if the task reads none of
     them.
 
-    The accelerometer belongs to the last substep; only after a reset it belongs to the state.
+    The accelerometer's reading is from the start of the last substep; only after a reset does it match the state.
     """
     env = lw.make("follow_target", engine=engine, nworld=3, horizon=5, fields=["xipos"])
     centers = env.field("xipos")

@@ -61,7 +61,7 @@ def test_a_combination_takes_one_setting_of_each_group_without_conflicts() -> No
     assert combined([COARSE, EULER, finer]) is None and combined([]) is None
 
 
-def test_flags_and_the_line_of_the_task_select_the_setting() -> None:
+def test_printed_flags_and_the_printed_task_line_select_the_setting() -> None:
     both = combined([COARSE, LIMITED, SEARCH])
     assert both is not None
     wanted = lw.PhysicsOptions(**both.physics)
