@@ -34,8 +34,6 @@ class GaussianPolicy(Normalized):
         log_std: Initial logarithm of the standard deviations.
         normalize: Whether to normalise observations by their running mean and variance.
         limit: Normalised observations are clipped to [-limit, limit]; inf for no limit.
-        mirror: Reflections of observations and actions (``algos.symmetry.reflections``). Mean actions are then averages
-            with those of the mirror image.
         generator: Draws the initial weights.
 
     Raises:
@@ -57,7 +55,6 @@ class GaussianPolicy(Normalized):
         log_std: float = -0.5,
         normalize: bool = False,
         limit: float = LIMIT,
-        mirror: Mapping[str, Reflection] | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
         nobs, nact = whole_number("nobs", nobs, low=1), whole_number("nact", nact, low=1)
@@ -83,8 +80,6 @@ class GaussianPolicy(Normalized):
             torch.full((nact,), finite_number("log_std", log_std, low=-_LARGEST, high=_LARGEST))
         )
         self.mirror: PolicyMirror | None = None
-        if mirror is not None:
-            self.use_mirror(mirror)
 
     def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:
         """Average mean actions with those of the mirror image from now on.
@@ -108,7 +103,10 @@ class GaussianPolicy(Normalized):
                 f"the policy has a custom class, {own}: pass one of this class, as in lw.load(run, "
                 f"policy=lw.GaussianPolicy({shape['nobs']}, {shape['nact']}, network=...{normalize}))"
             )
-        return GaussianPolicy(**shape)
+        policy = GaussianPolicy(**{name: value for name, value in shape.items() if name != "mirror"})
+        if "mirror" in shape:
+            policy.use_mirror(shape["mirror"])
+        return policy
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Compute mean actions, (..., nact)."""

@@ -110,7 +110,8 @@ PPO = ["--algorithm", "ppo", "--nworld", "12", "--num-steps", "20", "--minibatch
     ("settings", "tolerance"),
     [
         pytest.param(OPTIONS, 2e-4, id="npg"),
-        pytest.param(PPO, 2e-3, id="ppo"),  # Adam turns rounding errors of small gradients into steps
+        # Adam turns rounding errors of small gradients into steps
+        pytest.param(PPO, 2e-3, id="ppo", marks=pytest.mark.long),
         pytest.param(
             [*PPO, "--whiten-minibatches", "--std-type", "log"], 2e-3, id="whitened ppo", marks=pytest.mark.long
         ),

@@ -27,6 +27,7 @@ def test_python_environments_give_our_rewards(task: str) -> None:
         assert theirs.step(env.action[0].numpy().astype(float))[1] == pytest.approx(env.reward.item(), abs=2e-4)
 
 
+@pytest.mark.long
 def test_the_short_mode_runs_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "mppi.jsonl"
     assert main(out, "--contestants", "mppi", "python") == 0

@@ -65,7 +65,8 @@ def test_printed_flags_and_the_printed_task_line_select_the_setting() -> None:
     both = combined([COARSE, LIMITED, SEARCH])
     assert both is not None
     wanted = lw.PhysicsOptions(**both.physics)
-    assert tyro.cli(tyro.conf.OmitArgPrefixes[Physics], args=flags(both.physics).split()).options() == wanted
+    given = tyro.cli(tyro.conf.OmitArgPrefixes[Physics], args=flags(both.physics).split()).given()
+    assert lw.PhysicsOptions(**given) == wanted
     scope = {"lw": lw}
     exec(task_line(both.physics), scope)
     assert scope["physics"]["fast"] == wanted  # type: ignore[index]
