@@ -22,7 +22,7 @@ SAME_FUNCTIONS = (
 )  # fmt: skip
 """Tasks that share their functions with ``go1_velocity``, ``g1_velocity``, ``go1_rough_velocity`` or
 ``humanoid_stand``."""
-SAME_MODELS = ("adroit_door", "adroit_relocate", "humanoid_standup")
+SAME_MODELS = ("adroit_door", "adroit_hammer", "adroit_relocate", "humanoid_get_up", "humanoid_standup")
 """Tasks with the hand or the humanoid of other tasks, which need no quick tests of the Warp engine."""
 
 

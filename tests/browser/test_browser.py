@@ -379,6 +379,7 @@ def test_pages_of_other_sites_cannot_reach_the_viewer(viewer: Viewer, context: B
         server.shutdown()
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_the_command_and_closes_its_port(context: BrowserContext, tmp_path: Path) -> None:
     # a shell makes its background jobs ignore Ctrl-C
     obey = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"

@@ -48,7 +48,7 @@ def test_tasks_are_listed_with_their_sizes_and_models(capsys: pytest.CaptureFixt
         "    walk forward on two legs without falling over (Gymnasium's Humanoid-v5) (physics: fast)"
         in out.splitlines()
     )
-    assert "    hop forward on one leg (Gymnasium's Hopper-v5)" in out.splitlines()
+    assert "    hop forward on one leg (Gymnasium's Hopper-v5) (physics: fast)" in out.splitlines()
 
 
 def test_listed_sizes_equal_an_environments(capsys: pytest.CaptureFixture[str]) -> None:

@@ -152,7 +152,10 @@ class WholeWarpEngine(WarpEngine):
     partial_refresh = False
 
 
-@pytest.fixture(params=[MujocoEngine, WarpEngine, WholeWarpEngine], ids=["mujoco", "warp", "whole_warp"])
+@pytest.fixture(
+    params=[MujocoEngine, WarpEngine, pytest.param(WholeWarpEngine, marks=pytest.mark.long)],
+    ids=["mujoco", "warp", "whole_warp"],
+)
 def kind(request: pytest.FixtureRequest) -> type[Engine]:
     engine: type[Engine] = request.param
     return engine
