@@ -101,7 +101,13 @@ ON_WARP = ("reach", "stop", "value", "covariance", "model", "cem_smoothed", "lin
 """Cases that run each kernel once on the Warp engine."""
 
 
-@pytest.mark.parametrize("case, engine", [*((c, "mujoco") for c in CASES), *((c, "warp") for c in ON_WARP)])
+@pytest.mark.parametrize(
+    "case, engine",
+    [
+        *((case, "mujoco") for case in CASES),
+        *(pytest.param(case, "warp", marks=pytest.mark.long if case in ("reach", "model") else ()) for case in ON_WARP),
+    ],
+)
 def test_plans_equal_the_plain_versions(case: str, engine: str) -> None:
     check_against(Plain, engine, **CASES[case])
 

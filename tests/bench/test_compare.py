@@ -74,6 +74,7 @@ def test_a_failure_of_one_checkout_is_reported(task: str, text: str, report: dic
     assert (failure["kind"], failure["text"]) == ("failure", f"new failed: {text}")
 
 
+@pytest.mark.long
 def test_a_working_tree_equals_itself(capsys: pytest.CaptureFixture[str]) -> None:
     options = compare.Options(str(ROOT), tasks=("point_mass",), **(QUICK | {"parts": ("env", "plans")}))
     assert compare.run(options) == 0

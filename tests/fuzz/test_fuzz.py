@@ -14,17 +14,17 @@ from minimal_cases import COMMANDS, FILES, KEYWORDS
 
 FEW = {
     "file_attacks.py": {
-        "config.json": 3, "kept config.json": 2, "versions.json": 2, "metrics.csv": 2, "policy.pt": 3, "best.pt": 2,
-        "checkpoint.pt": 2, "previous.pt": 1, "episode.npz": 3, "kept model": 1, "kept table": 1, "model.xml": 4,
-        "table.npy": 3,
+        "config.json": 2, "kept config.json": 1, "versions.json": 2, "metrics.csv": 2, "policy.pt": 2, "best.pt": 1,
+        "checkpoint.pt": 2, "previous.pt": 1, "episode.npz": 3, "kept model": 1, "kept table": 1, "model.xml": 2,
+        "table.npy": 2,
     },
     "keyword_attacks.py": {
-        "EnvOptions": 30, "PhysicsOptions": 30, "MPPIConfig": 30, "NPGConfig": 30, "make": 8, "MPPI": 8, "CEM": 2,
+        "EnvOptions": 15, "PhysicsOptions": 15, "MPPIConfig": 15, "NPGConfig": 15, "make": 4, "MPPI": 4, "CEM": 2,
         "NPG": 3, "evaluate": 3, "train": 3, "control": 3, "control_async": 2, "Rollout": 3, "OpenLoop": 3, "load": 6,
         "load_value": 6, "GaussianPolicy": 20, "ValueFunction": 20,
     },
     "command_attacks.py": {
-        "tasks": 1, "new": 2, "check": 2, "train": 4, "train --resume good": 2, "train --from good": 2, "eval": 2,
+        "tasks": 1, "new": 2, "check": 2, "train": 2, "train --resume good": 1, "train --from good": 1, "eval": 2,
         "export": 2, "plan": 2, "view": 2, "bench": 1,
     },
 }  # fmt: skip

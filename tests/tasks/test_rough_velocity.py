@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from conftest import SharedEnv
+from conftest import SharedEnv, long_if_alike
 
 import lyceum_warp as lw
 from lyceum_warp.tasks.velocity.rough import TERRAIN
@@ -109,7 +109,7 @@ def test_an_episode_ends_outside_the_field(task: str, env: lw.Env) -> None:
     assert env.metrics["left_field"].tolist() == [1.0] + (NWORLD - 1) * [0.0]
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", long_if_alike(TASKS))
 def test_a_robot_that_falls_on_rough_ground_is_not_thrown_away_by_mujoco_warp(task: str, shared_env: SharedEnv) -> None:
     """The G1's own soles are boxes, with which MuJoCo Warp finds contacts whose normals point down."""
     env = shared_env(task, engine="warp", nworld=24)
