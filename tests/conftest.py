@@ -22,8 +22,11 @@ SAME_FUNCTIONS = (
 )  # fmt: skip
 """Tasks that share their functions with ``go1_velocity``, ``g1_velocity``, ``go1_rough_velocity`` or
 ``humanoid_stand``."""
-SAME_MODELS = ("adroit_door", "adroit_hammer", "adroit_relocate", "humanoid_get_up", "humanoid_standup")
-"""Tasks with the hand or the humanoid of other tasks, which need no quick tests of the Warp engine."""
+SAME_MODELS = (
+    "adroit_door", "adroit_hammer", "adroit_relocate", "aloha_lift", "arm_hand_pickup", "herb_reach", "humanoid_get_up",
+    "humanoid_standup", "inverted_double_pendulum", "pusher", "reacher", "swimmer", "walker2d",
+)  # fmt: skip
+"""Tasks whose models have nothing that others lack, so that they need no quick tests of the Warp engine."""
 
 
 def long_if_alike(tasks: Iterable[str], *more: str) -> list[Any]:

@@ -62,6 +62,7 @@ def test_a_task_is_shown(opened: Opened) -> None:
     assert opened.options == {"host": "127.0.0.1", "port": 8123}
 
 
+@pytest.mark.long
 def test_a_task_is_shown_under_a_planner(opened: Opened) -> None:
     opened.number = 12
     assert cli.main(["view", "point_mass", "--mppi", "--samples", "4", "--horizon", "5", "--paused"]) == 0
