@@ -166,7 +166,7 @@ def run_worlds(
     with run.settings():
         env = run_env(run, known, own | params, note=note, task=task, trust=trust)
     if task is None:
-        note_changes(run, env, note=note)
+        note_changes(run, env, note=note, model=env.options.physics == saved.options.physics)
     return env
 
 

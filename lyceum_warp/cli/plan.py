@@ -3,7 +3,9 @@
 import dataclasses
 import datetime
 import functools
+import math
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -38,7 +40,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.folder import Run, load_value
 from lyceum_warp.support.interrupts import Interrupted
-from lyceum_warp.support.validate import whole_number
+from lyceum_warp.support.validate import positive_number, whole_number
 from lyceum_warp.task import Task
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 from lyceum_warp.viz.control_plot import control_plot
@@ -104,6 +106,8 @@ class Plan:
     task: TaskWord
     episodes: int = 1
     """Number of episodes."""
+    minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    """Time limit: no episode begins after it."""
     steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of steps in an episode; by default the task's horizon."""
     replan_every: int = 1
@@ -134,6 +138,8 @@ class Plan:
     def run(self) -> int:
         """Run the command, and return the exit code."""
         whole_number("episodes", self.episodes, low=1)
+        if self.minutes is not None:
+            positive_number("minutes", self.minutes, "minutes")
         whole_number("seed", self.seed, low=0)
         whole_number("seed of the last episode", self.seed + self.episodes - 1, low=0)
         every = whole_number("replan_every", self.replan_every, low=1)
@@ -297,8 +303,12 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
     aborted: list[Trajectory] = []
     method: Any = control_async if options.real_time else functools.partial(control, replan_every=options.replan_every)
     shown: dict[str, Any] = dict(steps=plant.horizon, timestep=plant.timestep, real_time=options.real_time)
+    end = math.inf if options.minutes is None else time.monotonic() + 60 * options.minutes
     try:
         for episode in range(options.episodes):
+            if done and time.monotonic() >= end:
+                console.print(f"{options.minutes:g} minutes are over after {len(done)} of {options.episodes} episodes")
+                break
             with PlanDisplay(console, episode, options.episodes, **shown) as display:
                 seed = options.seed + episode
                 trajectory = method(plant, planner, seed=seed, on_step=display, on_abort=aborted.append)

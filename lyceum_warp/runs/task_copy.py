@@ -192,20 +192,21 @@ def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, b
     return changes
 
 
-def note_changes(run: Run, env: Env, *, note: Note = log.warning) -> None:
+def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = True) -> None:
     """Report differences between an environment's task or model and the run's; the environment's are used.
 
     Args:
         run: The run.
         env: The environment.
         note: Called with each message.
+        model: Whether to compare the compiled model, which other physics change, too.
     """
     kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
     file = next(iter(loaded), None)
     hashed = None if kept.get("program") else kept.get("source_hash")  # a training script may change for other reasons
     for change in _source_changes(file, {**kept, "source_hash": hashed}, loaded) if file is not None else ():
         note(f"{change}: it is used as it is now" if "changed" in change else change)
-    if _model_changed(run, env):
+    if model and _model_changed(run, env):
         note(f"the model of the task {env.task.name!r} has changed since the run began: it is used as it is now")
 
 

@@ -69,7 +69,7 @@ class Correlation:
     def of(cls, values: np.ndarray) -> "Correlation":
         """The mean of the states' correlations, (states,)."""
         mean, half = mean_interval(values)
-        return cls(mean, mean - half, mean + half)
+        return cls(mean, max(mean - half, -1.0), min(mean + half, 1.0))
 
 
 def episodes_needed(found: Difference, half_width: float) -> int:

@@ -73,9 +73,9 @@ class SetGhosts:
     """Choose which ghosts are drawn."""
 
     worlds: int = 0
-    """Number of other worlds, at most ``MOST_GHOSTS``: those after the shown one."""
+    """Number of worlds to draw as ghosts, at most ``MOST_GHOSTS``, beginning after the shown world."""
     episodes: int = 0
-    """Number of other episodes, at the same step, at most ``MOST_GHOSTS``: those after the shown one."""
+    """Number of episodes to draw as ghosts, at the same step, beginning after the shown episode."""
     burst: int = 0
     """Number of states along the trajectory, past red and future blue, at most ``MOST_BURST``."""
     plan: bool = True

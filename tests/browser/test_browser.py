@@ -35,7 +35,7 @@ pytestmark = pytest.mark.browser
 SECONDS = 120.0
 """Time limit for a page, in seconds; without a GPU a browser draws only a few frames per second."""
 INPUT_SECONDS = 6.0
-"""Time limit for a key or a click to reach the session, in seconds; a busy browser may lose it."""
+"""Seconds to wait for the effect of a key or a click, which a busy browser may lose."""
 VIEW = {"width": 1000, "height": 640}
 FLAGS = (
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",

@@ -52,6 +52,11 @@ def test_eval_prints_statistics_of_the_seeds_episodes(trained: Path, capsys: pyt
     assert "success:" in lines
 
 
+def test_other_physics_do_not_count_as_a_changed_model(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["eval", str(trained), "--episodes", "2", "--integrator", "implicitfast"]) == 0
+    assert "has changed" not in "".join(capsys.readouterr())
+
+
 def test_eval_refuses_zero_episodes_and_folders_without_a_run(
     trained: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -32,6 +32,13 @@ def plan(out: Path, *options: str, task: str = "point_mass") -> int:
     return cli.main(["plan", task, "--out", str(out), *SMALL, *options])
 
 
+def test_no_episode_begins_after_the_time_limit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    assert plan(out, *QUIET, "--steps", "3", "--episodes", "3", "--minutes", "1e-9") == 0
+    assert "1e-09 minutes are over after 1 of 3 episodes" in capsys.readouterr().out
+    assert [file.name for file in out.glob("*.npz")] == ["episode-000.npz"]
+
+
 def test_a_folder_name_may_look_like_rich_markup(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "[" / "bold]x"
     assert plan(out, "--steps", "2", "--no-video", "--no-plot") == 0

@@ -181,7 +181,7 @@ def touching(model: mujoco.MjModel) -> np.ndarray:
 
 
 def drawn_fields() -> list[Any]:
-    """Return all fields; those without derived constants are long tests, because MuJoCo Warp reads their rows."""
+    """Return all model fields; fields without derived constants are marked long."""
     return [name if constants else pytest.param(name, marks=pytest.mark.long) for name, constants in _FIELDS.items()]
 
 

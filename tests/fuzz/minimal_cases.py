@@ -1,4 +1,4 @@
-"""List minimal cases of fixed failures: files, arguments and command lines."""
+"""List minimal inputs that once failed: files, arguments and command lines."""
 
 import io
 import json

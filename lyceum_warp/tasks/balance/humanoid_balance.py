@@ -2,8 +2,8 @@
 
 Actions are offsets of the joints' targets from a default pose with bent knees; the motors act as servos with these
 targets, within Gymnasium's torques, at the rate of control. The feet are spheres: only steps and swings of the body
-keep the balance. Its measure is the distance of the capture point, at which a foot must stand to stop the
-robot, from the line between the feet (Pratt et al. 2006, "Capture point: a step toward humanoid push recovery").
+keep the balance. Its measure is the distance from the line between the feet to the capture point, at which a foot must
+stand to stop the robot (Pratt et al. 2006, "Capture point: a step toward humanoid push recovery").
 
 At each of ``push_times`` the robot gets an impulse in a random horizontal direction: the velocities of all bodies
 change by impulse / mass. Planners do not foresee pushes.
