@@ -33,7 +33,8 @@ import tyro
 
 FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
-NAMES = ("throughput", "npg", "learning", "mppi", "latency", "humanoid", "fidelity", "equivalence", "soak")
+NAMES = ("throughput", "npg", "learning", "records", "gate", "mppi", "latency", "humanoid", "fidelity", "equivalence",
+         "soak")  # fmt: skip
 """Names of the experiments."""
 
 SOFTWARE = ("python", "mujoco", "mujoco_warp", "warp_lang", "torch", "numpy", "gymnasium")

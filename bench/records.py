@@ -1,0 +1,199 @@
+"""Measure the seconds and samples from the start of ``lyceum-warp train`` until a policy reaches a threshold.
+
+    lyceum-warp bench records --device cuda --tasks go1_velocity g1_velocity --seeds 42 43 44
+    lyceum-warp bench records --tasks hopper --cache cold
+
+The clock starts before the command does, so the seconds include imports, compilation and graph captures; it stops when
+the run's config.json says that the target is reached. With a cold cache all kernels are compiled; before a measurement
+with a warm cache, the same command trains for one iteration, off the clock. A run that lasts longer than --seconds is
+stopped: the same command of this program continues it, and the seconds add up, with every further start.
+"""
+
+import contextlib
+import dataclasses
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import experiment
+from experiment import Experiment, Row, Skipped, Table, choose, median_and_range
+
+from lyceum_warp.runs.folder import Run
+
+WALKING = ("--algorithm", "ppo", "--mean-every", "0")
+"""The target is then the mean return of an iteration's episodes, with exploration noise."""
+NPG = ("--algorithm", "npg", "--mean-every", "5")
+"""The target is then the return of the mean policy in 16 episodes, whose evaluations count."""
+LARGE = ("--samples", "65536")
+
+RECORDS: dict[str, tuple[float, dict[str, tuple[str, ...]]]] = {
+    "go1_velocity": (80.0, {"cuda": WALKING}),
+    "spot_velocity": (95.0, {"cuda": WALKING}),
+    "h1_velocity": (100.0, {"cuda": (*WALKING, "--log-std", "-0.7")}),
+    "g1_velocity": (85.0, {"cuda": (*WALKING, "--log-std", "-0.7")}),
+    "t1_velocity": (60.0, {"cuda": (*WALKING, "--log-std", "-0.7")}),
+    "swimmer": (150.0, {"cpu": NPG}),
+    "hopper": (1500.0, {"cpu": NPG, "cuda": (*NPG, *LARGE)}),
+    "walker2d": (3000.0, {"cpu": NPG, "cuda": (*NPG, *LARGE)}),
+    "half_cheetah": (4000.0, {"cpu": NPG, "cuda": (*NPG, *LARGE)}),
+    "humanoid": (4500.0, {"cuda": (*NPG, "--nworld", "8192", "--samples", "131072")}),
+}
+"""The threshold of each task, and flags of the command by kind of device."""
+
+COMMON = ("--iterations", "1000000", "--no-video", "--no-plot", "--no-transfer")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(experiment.Options):
+    """Seconds and samples from process start until a policy reaches a threshold."""
+
+    cache: tuple[Literal["warm", "cold"], ...] = ("warm",)
+    """State of the cache of compiled kernels."""
+    seconds: float = 540.0
+    """Seconds after which a run is stopped; the same command continues it."""
+    runs: Path = Path("runs/records")
+    """Folder for the folders of the runs."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    task: str
+    target: float
+    seed: int
+    cache: str
+    device: str
+    flags: str
+    """Flags of the command, without those that all runs have."""
+
+
+def cases(options: Options) -> list[Case]:
+    """List the runs of the tasks that have a recipe for the device."""
+    kind = options.device.partition(":")[0]
+    tasks = choose(options.tasks, RECORDS, ("hopper",) if options.short else (), what="task")
+    for task in options.tasks:
+        if kind not in RECORDS[task][1]:
+            raise ValueError(f"{task} has no record on {kind}: give --device {next(iter(RECORDS[task][1]))}")
+    seeds = options.seeds or range(1 if options.short else 3)
+    return [
+        Case(task, 20.0 if options.short else RECORDS[task][0], seed, cache, kind, " ".join(RECORDS[task][1][kind]))
+        for task in tasks if kind in RECORDS[task][1] for seed in seeds for cache in options.cache
+    ]  # fmt: skip
+
+
+def command(case: Case, folder: Path, device: str) -> list[str]:
+    """The command that starts a run, or that continues it if the folder has a checkpoint."""
+    train = [sys.executable, "-m", "lyceum_warp.cli", "train"]
+    if (folder / "checkpoint.pt").exists():
+        return [*train, "--resume", str(folder), *COMMON]
+    return [
+        *train, case.task, *case.flags.split(), "--device", device, "--seed", str(case.seed),
+        "--target-return", str(case.target), "--out", str(folder), *COMMON,
+    ]  # fmt: skip
+
+
+def measure(case: Case, options: Options) -> dict[str, Any]:
+    """Train until the target is reached, or raise Skipped once the seconds of this call are over."""
+    name = f"{case.task}-{case.device}-{case.cache}-{case.seed}"
+    folder, notes = options.runs / name, options.runs / f"{name}.json"
+    earlier = json.loads(notes.read_text()) if notes.exists() and (folder / "checkpoint.pt").exists() else [0.0, 0]
+    if not earlier[1]:
+        shutil.rmtree(folder, ignore_errors=True)  # of a call that was killed
+    options.runs.mkdir(parents=True, exist_ok=True)
+    with cache(case, options, folder) as environment:
+        reached, seconds = timed(command(case, folder, options.device), folder, environment, options.seconds)
+    total, starts = earlier[0] + seconds, earlier[1] + 1
+    if reached is None:
+        notes.write_text(json.dumps([total, starts]))
+        raise Skipped(f"{name} has not reached {case.target:g} after {total:.0f} s: the same command continues it")
+    notes.unlink(missing_ok=True)
+    rows = [row for row in Run.open(folder).rows() if row["iteration"] <= reached["iteration"]]
+    learning = sum(row[part] or 0.0 for row in rows for part in row if part.startswith("time_"))
+    return {
+        "seconds": total, "samples": rows[-1]["samples"], "return": reached["return"], "learning_seconds": learning,
+        "starts": starts,
+    }  # fmt: skip
+
+
+@contextlib.contextmanager
+def cache(case: Case, options: Options, folder: Path) -> Iterator[dict[str, str]]:
+    """The environment variables of the command, with an empty cache of kernels or with a filled one."""
+    if case.cache == "warm":
+        if not folder.exists():
+            with tempfile.TemporaryDirectory() as spare:
+                once = command(case, Path(spare) / "run", options.device)
+                once[once.index("--iterations") + 1] = "1"
+                run(once, dict(os.environ)).wait()
+        yield dict(os.environ)
+        return
+    with tempfile.TemporaryDirectory() as empty:
+        yield os.environ | {"WARP_CACHE_PATH": f"{empty}/warp", "CUDA_CACHE_PATH": f"{empty}/cuda"}
+
+
+def run(words: Sequence[str], environment: dict[str, str]) -> "subprocess.Popen[bytes]":
+    return subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL)
+
+
+def timed(
+    words: Sequence[str], folder: Path, environment: dict[str, str], limit: float
+) -> tuple[dict[str, Any] | None, float]:
+    """Run the command until its run reaches the target, or for ``limit`` seconds; return the entry and the seconds.
+
+    Raises:
+        RuntimeError: The command failed.
+    """
+    began, reached = time.perf_counter(), None
+    process = run(words, environment)
+    config = folder / "config.json"
+    while True:
+        code = process.poll()
+        with contextlib.suppress(FileNotFoundError):
+            reached = json.loads(config.read_text()).get("reached")
+        seconds = time.perf_counter() - began
+        if reached is not None:
+            process.wait()  # it saves the policy and evaluates it
+            return reached, seconds
+        if code is not None:
+            raise RuntimeError(f"{' '.join(words)} ended with code {code} before its target")
+        if seconds > limit:
+            process.send_signal(signal.SIGTERM)  # the run is saved after the iteration
+            process.wait()
+            return None, time.perf_counter() - began
+        time.sleep(0.05)
+
+
+def tables(rows: Sequence[Row]) -> list[Table]:
+    """One line for each task, cache and flags, over the seeds."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        kind = tuple(row.case[name] for name in ("task", "target", "device", "cache", "flags"))
+        groups.setdefault(kind, []).append(row)
+    lines = []
+    for (task, target, device, cached, flags), same in groups.items():
+        results = [row.result for row in same]
+        lines.append([
+            task, f"{target:,g}", device, cached, " ".join(str(row.case["seed"]) for row in same),
+            median_and_range([one["seconds"] for one in results], ".1f"),
+            median_and_range([one["learning_seconds"] for one in results], ".1f"),
+            median_and_range([one["samples"] / 1e6 for one in results], ".3g"), f"`{flags}`",
+        ])  # fmt: skip
+    header = ["task", "target", "device", "kernels", "seeds", "seconds from process start", "of these learning",
+              "million samples", "flags of `lyceum-warp train`"]  # fmt: skip
+    title = "Until the mean return reaches a threshold: median over the seeds, with the smallest and the largest."
+    return [Table(title, header, lines)]
+
+
+EXPERIMENT = Experiment(
+    name="records", summary="Seconds and samples from process start until a policy reaches a threshold.",
+    cases=cases, estimate=lambda case: 120.0, measure=measure, tables=tables, options=Options,
+)  # fmt: skip
+
+if __name__ == "__main__":
+    sys.exit(experiment.main(EXPERIMENT))

@@ -1,0 +1,46 @@
+import math
+from pathlib import Path
+from types import SimpleNamespace
+
+import experiment
+import gate
+import pytest
+import torch
+
+import lyceum_warp as lw
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on go1_velocity whose policy has not learned."""
+    config = lw.PPOConfig(hidden=(4,), value_hidden=(4,), num_steps=4, mean_every=0)
+    made = lw.train(
+        lw.PPO(lw.make("go1_velocity", nworld=2), config=config), tmp_path_factory.mktemp("gate") / "run", iterations=1
+    )
+    return made.folder
+
+
+def test_a_policy_is_judged_once(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--short", "--policy", str(run), "--out", str(tmp_path / "gate.jsonl")]
+    assert experiment.main(gate.EXPERIMENT, words) == 0
+    out = capsys.readouterr().out
+    assert "| mean velocity error, m/s | " in out and "does not pass" in out and "| falls with pushes |" in out
+    assert experiment.main(gate.EXPERIMENT, words) == 0
+    assert "1 of 1 cases are stored" in capsys.readouterr().out
+
+
+def test_a_standing_robot_has_the_error_of_its_command(run: Path) -> None:
+    env = gate.worlds(run, 2, gate.Options(), **gate.calm(gate.worlds(run, 1, gate.Options())))
+    stand = SimpleNamespace(act=lambda obs: torch.zeros(2, 12))
+    played = gate.play(env, stand, [(0.8, 0.6, 0.0), (0.0, 0.0, 0.5)], 50, gate.home(env))
+    torch.testing.assert_close(played.velocity_error[30:].mean(0), torch.tensor([1.0, 0.0]), atol=0.05, rtol=0.0)
+    torch.testing.assert_close(played.yaw_rate_error[30:].mean(0), torch.tensor([0.0, 0.5]), atol=0.05, rtol=0.0)
+    assert not played.fell.any()
+
+
+def test_every_limit_is_necessary() -> None:
+    good = {"falls": 1, "perf": 0.9, "action_change": 0.21, "roll_pitch_rate": 0.2, "yaw_rate": 0.1,
+            "joint_velocity": 1.0}  # fmt: skip
+    assert gate.passes("nanoG1", good)
+    for name, (kind, _, _) in gate.LIMITS["nanoG1"].items():
+        assert not gate.passes("nanoG1", good | {name: math.inf if kind == "at most" else 0.0})
