@@ -10,6 +10,7 @@ from typing import Any
 
 import tyro
 
+from lyceum_warp.cli.parsing import parse
 from lyceum_warp.support.interrupts import Interrupted, signals
 from lyceum_warp.viz import NoVideoError
 
@@ -41,7 +42,7 @@ $ lyceum-warp tune humanoid --short
 $ lyceum-warp view reach --mppi
 $ lyceum-warp bench throughput --short
 
-lyceum-warp COMMAND --help describes a command and its options.
+lyceum-warp COMMAND --help describes a command and its usual options, --help-all all its options.
 """
 
 
@@ -95,4 +96,4 @@ def _run(argv: list[str]) -> int:
     command = getattr(importlib.import_module(f"lyceum_warp.cli.{module}"), kind)
     # arguments after the name of a bench/ program belong to that program
     words, rest = (words[:1], words[1:]) if name == "bench" else (words, [])
-    return int(tyro.cli(command, prog=f"lyceum-warp {name}", args=words).run(*rest))
+    return int(parse(command, f"lyceum-warp {name}", words).run(*rest))

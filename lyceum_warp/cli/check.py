@@ -24,6 +24,8 @@ class Check:
     $ lyceum-warp check path/to/my_task.py --engine warp --steps 50
     """
 
+    USUAL = ("nworld", "steps", "seed", "rule", "param", "engine", "device", "physics")
+
     task: TaskWord
     nworld: int = 4
     """Number of worlds, at least 2."""
@@ -34,7 +36,9 @@ class Check:
     rule: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
     """A rule to check, by its name in the report; may be repeated. By default all rules."""
     param: ParamWords = ()
-    env: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
+    env: Annotated[Placement, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
+        default_factory=Placement
+    )
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
     def run(self) -> int:

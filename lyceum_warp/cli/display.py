@@ -3,7 +3,7 @@
 import contextlib
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import rich.box
 import torch
 from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -91,7 +92,7 @@ class Display(training.Display):
         rate = f"{row['samples_per_second'] / 1000:.3g}k samples/s" if "samples_per_second" in row else ""
         if self.console.is_terminal:
             most = [result, mean, success, *bad, rate.replace(" samples", "")]
-            for parts in (most, most[:-1], [result, success, *bad], [result, *bad]):
+            for parts in (most, most[:-1], [result, success, *bad], [result, *bad], [result]):
                 text = " ".join(filter(None, parts))
                 if len(text) <= self.console.width - _BAR_WIDTH:
                     break
@@ -127,26 +128,51 @@ def counted(number: int, what: str) -> str:
 
 _COLUMNS = [
     ("iter", "iteration", "d"), ("samples", "samples", ",d"), ("reward\na step", "reward_mean", ".3g"),
-    ("return", "return_mean", ".1f"), ("± std", "return_std", ".1f"), ("mean\npolicy", "mean_return", ".1f"),
+    ("return", "return_mean", ".1f"), ("std", "return_std", ".1f"), ("mean\npolicy", "mean_return", ".1f"),
     ("length", "length_mean", ".0f"), ("eval", "eval_mean", ".3g"), ("success", "success", ".0%"),
     ("KL", "kl", ".3f"), ("samples/s", "samples_per_second", ",.0f"),
 ]  # fmt: skip
 """Columns of the table of iterations: heading, column in metrics.csv, format."""
 
 
-def curve_table(rows: list[dict[str, float | None]]) -> Table:
-    """A table of at most 15 of a run's iterations, without empty columns.
+def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omit: Sequence[str] = ()) -> Table:
+    """A table that fits the console's width: words in the first column are wrapped, and then columns are omitted.
+
+    Args:
+        console: The output.
+        columns: The cells of each column, by its heading. The first may hold words, the others hold numbers.
+        omit: Headings of the columns that may be omitted, in this order.
+    """
+    table = Table()
+    for count in range(len(omit) + 1):
+        table = Table(box=rich.box.SIMPLE, padding=0, pad_edge=False)
+        for i, (heading, cells) in enumerate(columns.items()):
+            if heading in omit[:count]:
+                continue
+            width = max(map(len, cells))
+            lines = heading if len(heading) <= width else heading.replace(" ", "\n")
+            width = max(width, *map(len, lines.split("\n")))
+            words: dict[str, Any] = {"min_width": width, "no_wrap": True} if i else {"overflow": "fold"}
+            table.add_column(escape(lines), justify="right" if i or cells[0].isdecimal() else "left", **words)
+        for row in zip(*(cells for heading, cells in columns.items() if heading not in omit[:count]), strict=True):
+            table.add_row(*map(escape, row))
+        if Measurement.get(console, console.options.update_width(10_000), table).minimum <= console.width:
+            break
+    return table
+
+
+def curve_table(rows: list[dict[str, float | None]], console: Console) -> Table:
+    """A table of at most 15 of a run's iterations, without empty columns and those for which the console is too narrow.
 
     If the mean policy was evaluated in at least 4 iterations between the first and the last, other iterations are
     omitted.
     """
-    table = Table(box=rich.box.SIMPLE, padding=0, pad_edge=False)  # fits into 80 columns
     known = [_known(row) for row in rows]
     between = [row for row in known[1:-1] if "mean_return" in row]
     shown = [known[0], *between, known[-1]] if len(between) >= 4 else known
     if len(shown) > _TABLE_ROWS:
         shown = [shown[round(i * (len(shown) - 1) / (_TABLE_ROWS - 1))] for i in range(_TABLE_ROWS)]
-    columns = []
+    columns = {}
     for heading, name, form in _COLUMNS:
         cells = []
         for row in shown:
@@ -155,10 +181,8 @@ def curve_table(rows: list[dict[str, float | None]]) -> Table:
         if name == "reward_mean" and all("return_mean" in row for row in known):
             continue  # shown only until an episode has ended
         if any(cells):
-            table.add_column(heading, justify="right", no_wrap=True)
-            columns.append(cells)
-    for line in zip(*columns, strict=True):
-        table.add_row(*line)
+            columns[heading] = cells
+    table = fitting_table(console, columns, omit=("samples", "std", "KL", "samples/s", "length", "eval", "success"))
     bad = []
     for what in ("fault", "outlier"):
         if number := round(sum(row.get(what + "s") or 0.0 for row in rows)):

@@ -1,20 +1,19 @@
 """Evaluate a run's policy: lyceum-warp eval."""
 
 import dataclasses
+import signal
 from pathlib import Path
 from typing import Annotated, Any
 
-import rich.box
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.algos.transfer import Transfer, transfer
 from lyceum_warp.binding.registry import find_task, task_name
 from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, Trust, given, parameters
-from lyceum_warp.cli.display import make_console, note, policy_video, tried
+from lyceum_warp.cli.display import fitting_table, make_console, note, policy_video, tried
 from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.controllers.trajectory import source
 from lyceum_warp.engines.placement import options_for_few_worlds
@@ -24,6 +23,7 @@ from lyceum_warp.runs.checkpoints import check_sizes
 from lyceum_warp.runs.configuration import Configuration
 from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.runs.task_copy import note_changes, run_env
+from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 from lyceum_warp.viz.long_work import LongWork
 from lyceum_warp.viz.video import check_video
@@ -42,6 +42,10 @@ class Eval:
     $ lyceum-warp eval runs/humanoid-20260101-120000 --physics exact
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 8 --episodes-to runs/hopper-episodes
     """
+
+    USUAL = (
+        "which", "task", "episodes", "seed", "nworld", "video", "camera", "transfer", "episodes_to", "device",
+    )  # fmt: skip
 
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
@@ -66,7 +70,9 @@ class Eval:
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder for one file per episode, in the format of lyceum-warp plan: episode-000.npz and so on."""
     trust: Trust = False
-    env: tyro.conf.OmitArgPrefixes[EnvFlags] = dataclasses.field(default_factory=EnvFlags)
+    env: Annotated[EnvFlags, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
+        default_factory=EnvFlags
+    )
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
     def run(self) -> int:
@@ -93,21 +99,26 @@ class Eval:
             env = evaluation_worlds(env, nworld)
         policy = load(run, which=self.which, device=env.obs.device)
         check_sizes(policy, env, path)
-        with LongWork("evaluating the policy", "steps", make_console()) as work:
-            episodes = evaluate(env, policy, self.episodes, seed=self.seed, progress=work).first(self.episodes)
-        table = Table(box=rich.box.SIMPLE)
-        for heading in ("", "mean", "std", "min", "max"):
-            table.add_column(heading, justify="right" if heading else "left")
+        try:
+            with LongWork("evaluating the policy", "steps", make_console()) as work:
+                episodes = evaluate(env, policy, self.episodes, seed=self.seed, progress=work).first(self.episodes)
+        except Interrupted as signalled:
+            name = signal.Signals(signalled.number).name
+            note(f"interrupted by {name} before the episodes were complete: there are no statistics")
+            raise
+        columns: dict[str, list[str]] = {heading: [] for heading in ("", "mean", "std", "min", "max")}
         for name, values in (("return", episodes.returns), ("evaluation at the end", episodes.evals),
                              ("last reward", episodes.rewards), ("length", episodes.lengths),
                              *episodes.metrics.items()):  # fmt: skip
             numbers = (values.mean(), values.std(correction=0), values.min(), values.max())
-            table.add_row(name, *(f"{number.item():.6g}" for number in numbers))
+            cells = (name, *(f"{number.item():.6g}" for number in numbers))
+            for column, cell in zip(columns.values(), cells, strict=True):
+                column.append(cell)
         console = make_console()
         which = "the mean policy" if self.which == "last" else f"the mean policy {self.which!r}"
         text = f"{env.task.name}: {self.episodes} episodes of {which} in {self.folder}"
         console.print(text, soft_wrap=True, markup=False)
-        console.print(table)
+        console.print(fitting_table(console, columns, omit=("std",)))
         if env.task.functions["success"] is not None:
             console.print(f"success: {episodes.success.mean().item():.0%}")
         if self.transfer:
@@ -130,15 +141,18 @@ class Eval:
 def _print_transfer(verdict: Transfer, console: Console) -> None:
     """Print a table of the differences of each comparison, and its verdict."""
     for comparison in verdict.comparisons:
-        table = Table(box=rich.box.SIMPLE)
-        for heading in ("", comparison.first, comparison.second, "difference", "95 % interval", "margin", "verdict"):
-            table.add_column(heading, justify="right" if heading else "left")
-        for one in comparison.differences:
-            numbers = (f"{one.first:.6g}", f"{one.second:.6g}", f"{one.second - one.first:+.3g}")
-            interval = f"{one.low:+.3g} to {one.high:+.3g}"
-            table.add_row(one.quantity, *numbers, interval, f"{one.margin:.3g}", one.verdict)
+        found = comparison.differences
+        columns = {
+            "": [one.quantity for one in found],
+            comparison.first: [f"{one.first:.6g}" for one in found],
+            comparison.second: [f"{one.second:.6g}" for one in found],
+            "difference": [f"{one.second - one.first:+.3g}" for one in found],
+            "95 % interval": [f"{one.low:+.3g} to {one.high:+.3g}" for one in found],
+            "margin": [f"{one.margin:.3g}" for one in found],
+            "verdict": [one.verdict for one in found],
+        }
         console.print(f"{comparison.second} against {comparison.first}: {comparison.verdict}", soft_wrap=True)
-        console.print(table)
+        console.print(fitting_table(console, columns, omit=("difference", "margin", comparison.first)))
         if any(comparison.faults):
             console.print(f"faults: {comparison.faults[0]} and {comparison.faults[1]}")
 

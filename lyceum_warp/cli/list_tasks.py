@@ -56,18 +56,21 @@ class Tasks:
             raise ValueError(
                 f"no task has {self.word!r} in its name, description or model: lyceum-warp tasks lists all"
             )
-        table = [_HEADINGS, *map(_cells, entries)]
+        console, table = make_console(), [_HEADINGS, *map(_cells, entries)]
         widths = [max(len(row[i]) for row in table) for i in range(len(_HEADINGS))]
+        fits = sum(widths) + 2 * len(widths) - 2 <= console.width
+        shown = len(_HEADINGS) - (not fits)  # the model moves to the line below
         heading, *lines = (
-            "  ".join(f"{cell:{'>' if 1 <= i <= 5 else '<'}{widths[i]}}" for i, cell in enumerate(row)) for row in table
+            "  ".join(f"{cell:{'>' if 1 <= i <= 5 else '<'}{widths[i]}}" for i, cell in enumerate(row[:shown]))
+            for row in table
         )
-        console = make_console()
         indented: dict[str, Any] = {"width": min(console.width, _WIDTH)}
         indented |= dict.fromkeys(("initial_indent", "subsequent_indent"), "    ")
         console.print(heading.rstrip(), style="bold", soft_wrap=True)
         for line, entry in zip(lines, entries, strict=True):
             console.print(escape(line.rstrip()), soft_wrap=True)
-            console.print(escape(textwrap.fill(entry.about or _UNKNOWN, **indented)), style="dim", soft_wrap=True)
+            about = (entry.about or _UNKNOWN) + f"; model: {entry.source}" * (not fits)
+            console.print(escape(textwrap.fill(about, **indented)), style="dim", soft_wrap=True)
             if entry.note:
                 console.print(escape(textwrap.fill(entry.note, **indented)), style="yellow", soft_wrap=True)
         console.print(f"\n{_LEGEND}", style="dim", soft_wrap=True)

@@ -32,7 +32,7 @@ from lyceum_warp.runs.checkpoints import read_checkpoint
 from lyceum_warp.runs.configuration import ALGORITHMS, Configuration, saved_networks
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.task_copy import note_changes
-from lyceum_warp.support.interrupts import Interrupted
+from lyceum_warp.support.interrupts import Interrupted, obeyed
 from lyceum_warp.training import train
 from lyceum_warp.viewer.follow import RunViewer
 from lyceum_warp.viz.cameras import parsed_camera
@@ -76,6 +76,10 @@ class Train:
     resumed. Rank 0 writes files and messages. After Ctrl-C or SIGTERM to torchrun or to any process, all processes
     finish the iteration and end together; torchrun waits for them for 30 s, or for its --shutdown-timeout.
     """
+
+    USUAL = (
+        "algorithm", "iterations", "minutes", "seed", "out", "resume", "nworld", "param", "view", "device",
+    )  # fmt: skip
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
@@ -134,9 +138,13 @@ class Train:
     """Whether to plot the learning curve at the end."""
     require_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Exit with code 1 unless the return of the trained mean policy exceeds this number."""
-    env: tyro.conf.OmitArgPrefixes[EnvFlags] = dataclasses.field(default_factory=EnvFlags)
+    env: Annotated[EnvFlags, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
+        default_factory=EnvFlags
+    )
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
-    hyperparameters: tyro.conf.OmitArgPrefixes[Hyperparameters] = dataclasses.field(default_factory=Hyperparameters)
+    hyperparameters: Annotated[Hyperparameters, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="hyperparameter")] = (
+        dataclasses.field(default_factory=Hyperparameters)
+    )
 
     def run(self) -> int:
         """Run the command, and return the exit code."""
@@ -178,6 +186,9 @@ class Train:
                     if done < total:
                         text += f"; continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
                     console.print(text, soft_wrap=True, markup=False)
+                    if self.plot and (folder / "metrics.csv").exists():
+                        with obeyed():
+                            console.print(f"curve:      {tried(learning_curve, folder)}", soft_wrap=True, markup=False)
                 return 128 + signalled.number
             if not leads:
                 return 0
@@ -254,7 +265,7 @@ class Train:
     def _report(self, run: Run, learner: Learner, console: Console) -> int:
         """Print the table, evaluate the policy, make the plot and the video; return the exit code."""
         env, policy, seed = learner.env, learner.policy, learner.env.options.seed + 1
-        console.print(curve_table(run.rows()))
+        console.print(curve_table(run.rows(), console))
         few = evaluation_worlds(env, _FINAL_EPISODES)
         with LongWork("evaluating the mean policy", "steps", console) as work:
             returns = evaluate(few, moved(policy, few), _FINAL_EPISODES, seed=seed, progress=work).returns

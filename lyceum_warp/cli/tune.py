@@ -5,13 +5,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
-import rich.box
 import torch
 import tyro
-from rich.table import Table
 
 from lyceum_warp.cli.arguments import ParamWords, Placement, TaskWord, parameters
-from lyceum_warp.cli.display import make_console, note
+from lyceum_warp.cli.display import fitting_table, make_console, note
 from lyceum_warp.tuning.judgement import Difference
 from lyceum_warp.tuning.search import Tuning, tune
 from lyceum_warp.tuning.trial import DIVERGENCE_STEPS, NUDGE
@@ -59,7 +57,9 @@ class Tune:
     """File of the results, by default tune/TASK.jsonl or tune/TASK-planning.jsonl. Results that it has are not measured
     again."""
     param: ParamWords = ()
-    env: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
+    env: Annotated[Placement, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
+        default_factory=Placement
+    )
 
     def run(self) -> int:
         """Run the command, and return the exit code."""
@@ -92,15 +92,14 @@ def _report(tuning: Tuning, options: Tune) -> None:
     who = reference["identity"]
     line(f"{who['task']}: {who['nworld']} worlds, {who['engine']} engine on {who['device']}")
     columns = _planning_columns(reference) if options.planning else _columns(reference)
-    table = Table(box=rich.box.SIMPLE, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("setting")
-    for heading in columns:
-        table.add_column(heading, no_wrap=True, justify="right")
-    table.add_column("verdict", no_wrap=True)
-    for row in [*(row for row in tuning.rows if not row["refused"]), reference]:
-        cells = (cell(row) for cell in columns.values())
-        table.add_row(row["name"] or "the task as it is", *cells, row["verdict"])
-    console.print(table)
+    rows = [*(row for row in tuning.rows if not row["refused"]), reference]
+    cells = {
+        "setting": [row["name"] or "the task as it is" for row in rows],
+        **{heading: list(map(cell, rows)) for heading, cell in columns.items()},
+        "verdict": [row["verdict"] for row in rows],
+    }
+    rest = [heading for heading in columns if heading != "speed"]
+    console.print(fitting_table(console, cells, omit=[name for name in rest if not name.startswith("return")]))
     if not options.planning:
         nudged = ", ".join(f"{value:.1e}" for value in reference["nudged_divergence"])
         line(f"{reference['in_contact']:.0%} of the states are in contact. diverg. is the divergence after 1, 10 and "

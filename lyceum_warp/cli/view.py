@@ -65,6 +65,8 @@ class View:
     $ lyceum-warp view runs/plan-reach-20260101-120000/episode-*.npz
     """
 
+    USUAL = ("mppi", "follow", "which", "nworld", "seed", "paused", "host", "port", "param", "samples")
+
     what: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TASK|RUN|FILE...")]
     """A task's name or file, a run's folder, or episode files."""
     mppi: bool = False
@@ -87,7 +89,9 @@ class View:
     """Port of the page; by default the first free port from 8080 on."""
     param: ParamWords = ()
     trust: Trust = False
-    place: tyro.conf.OmitArgPrefixes[Place] = dataclasses.field(default_factory=Place)
+    place: Annotated[Place, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
+        default_factory=Place
+    )
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
     planner: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
 

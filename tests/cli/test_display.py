@@ -78,9 +78,9 @@ def test_the_bar_fits_into_80_columns(npg: lw.NPG, first: lw.Iteration, changes:
     assert all(not changes.get("faults") or "12,345 faults" in text for text in lines if "return" in text)
 
 
-def table(rows: list[dict[str, float | None]]) -> str:
-    console = Console(file=io.StringIO(), width=80)
-    console.print(display.curve_table(rows))
+def table(rows: list[dict[str, float | None]], width: int = 80) -> str:
+    console = Console(file=io.StringIO(), width=width)
+    console.print(display.curve_table(rows, console))
     return console.file.getvalue()
 
 
@@ -108,3 +108,27 @@ def test_the_table_counts_faults_and_outliers_of_all_iterations(first: lw.Iterat
     row = first.row() | {"faults": 1.0, "outliers": 3.0}
     assert "2 faults and 6 outliers in all 2 iterations" in " ".join(table([row, row]).split())
     assert "fault" not in table([first.row(), {"iteration": 2.0}])  # a row of an earlier release
+
+
+@pytest.mark.parametrize("width, absent", [(60, {"samples", "std"}), (80, set()), (40, {"samples", "std", "KL"})])
+def test_a_narrow_terminal_shows_fewer_columns(width: int, absent: set[str], first: lw.Iteration) -> None:
+    numbers = {
+        "samples": 12_345_678, "return_mean": -1234.56, "return_std": 1234.5, "mean_return": -1234.5,
+        "length_mean": 1000.0, "eval_mean": -0.0123, "success": 0.5, "kl": 0.01, "samples_per_second": 1e5,
+    }  # fmt: skip
+    shown = table([first.row() | numbers] * 3, width)
+    assert max(len(line.rstrip()) for line in shown.splitlines()) <= width
+    assert "…" not in shown and {"iter", "return", "policy"} <= set(shown.split())
+    assert not absent & set(shown.split()) and (width < 80 or "samples" in shown.split())
+
+
+@pytest.mark.parametrize("width", [60, 80])
+def test_tables_wrap_their_first_column_and_omit_others(width: int) -> None:
+    names = ["evaluation at the end", "track_linear_velocity_of_the_base", "return"]
+    columns = {"": names, **{name: ["-1.23457e-05"] * 3 for name in ("mean", "std", "min", "max")}}
+    console = Console(file=io.StringIO(), width=width)
+    console.print(display.fitting_table(console, columns, omit=("std",)))
+    shown = console.file.getvalue()
+    assert max(len(line.rstrip()) for line in shown.splitlines()) <= width
+    assert "…" not in shown and shown.count("-1.23457e-05") >= 9
+    assert len({len(line) for line in shown.splitlines() if line}) == 1  # borders are straight

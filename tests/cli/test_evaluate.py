@@ -1,12 +1,13 @@
 import json
 import shutil
+import signal
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import pytest
 import torch
-from training_runs import refused, train
+from training_runs import interrupted, refused, train
 
 import lyceum_warp as lw
 from lyceum_warp import cli
@@ -50,6 +51,14 @@ def test_eval_prints_statistics_of_the_seeds_episodes(trained: Path, capsys: pyt
     assert low <= mean <= high
     assert std > 0
     assert "success:" in lines
+
+
+def test_an_interrupted_evaluation_says_so(
+    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(lw.Env, "step", lambda env: signal.raise_signal(signal.SIGINT))
+    assert interrupted(["eval", str(trained), "--episodes", "2"]) == 130
+    assert "interrupted by SIGINT before the episodes were complete" in capsys.readouterr().err
 
 
 def test_other_physics_do_not_count_as_a_changed_model(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:

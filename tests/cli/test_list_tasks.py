@@ -5,11 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 from training_runs import refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.binding.registry import find_task, task_names
+from lyceum_warp.cli import list_tasks
 
 INSTALL = "pip install 'lyceum-warp[hand]'"
 
@@ -49,6 +51,16 @@ def test_tasks_are_listed_with_their_sizes_and_models(capsys: pytest.CaptureFixt
         in out.splitlines()
     )
     assert "    hop forward on one leg (Gymnasium's Hopper-v5) (physics: fast)" in out.splitlines()
+
+
+def test_on_a_narrow_terminal_models_are_listed_below_the_numbers(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(list_tasks, "make_console", lambda: Console(width=60, highlight=False))
+    assert cli.main(["tasks", "adroit"]) == 0
+    table = capsys.readouterr().out.partition("\n\n")[0]
+    assert max(map(len, table.splitlines())) <= 60
+    assert "model: gymnasium-robotics [hand]" in " ".join(table.split())
 
 
 def test_listed_sizes_equal_an_environments(capsys: pytest.CaptureFixture[str]) -> None:

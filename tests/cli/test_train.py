@@ -244,7 +244,7 @@ def test_a_flag_of_the_other_algorithm_is_refused(capsys: pytest.CaptureFixture[
 
 def test_hyperparameters_are_shown_by_help_with_their_algorithms(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        cli.main(["train", "--help"])
+        cli.main(["train", "--help-all"])
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     for words in ("--whiten, --no-whiten", "(npg 0.995, ppo 0.99, sac)", "sac 0.0003)", "(ppo 24, sac)"):
         assert words in shown
@@ -425,10 +425,12 @@ def test_a_second_interrupt_ends_a_run_at_once_and_it_continues_from_its_last_sa
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(lw.Env, "step", interrupting)
-    argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "9", "--save-every", "2"]
+    argv = ["train", "point_mass", "--out", str(out), *TINY, "--no-video", "--iterations", "9", "--save-every", "2"]
     assert interrupted(argv) == 130
     monkeypatch.undo()
-    assert steps == [0, 1] and "interrupted by SIGINT after 2 of 9 iterations" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert steps == [0, 1] and "interrupted by SIGINT after 2 of 9 iterations" in shown
+    assert f"curve:      {out / 'curve.png'}" in shown and (out / "curve.png").stat().st_size > 1000
     assert cli.main(["train", "--resume", str(out), "--iterations", "4", *QUIET]) == 0
     assert metrics(out) == metrics(trained)
 

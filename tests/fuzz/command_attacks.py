@@ -61,7 +61,7 @@ def flags(command: str) -> tuple[str, ...]:
     """Return the flags that a command's help text lists."""
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
-        cli.main([command.split()[0], "--help"])
+        cli.main([command.split()[0], "--help-all"])
     found = re.findall(r"^\W*(--[\w.-]+(?:, --[\w.-]+)*)", out.getvalue(), re.MULTILINE)
     return tuple(name for names in found for name in names.split(", ") if name not in _OMIT)
 

@@ -1,0 +1,104 @@
+"""Parse a command's options, print its help, and suggest options for misspelt ones."""
+
+import dataclasses
+import difflib
+import shutil
+import textwrap
+import typing
+from collections.abc import Sequence
+from typing import Any
+
+import tyro
+
+_CONFIG = (tyro.conf.DisallowNone,)  # an option that defaults to None takes no None
+
+
+def parse(command: type, prog: str, words: Sequence[str]) -> Any:
+    """Parse the options of a command.
+
+    Args:
+        command: The command's class. Its attribute ``USUAL`` names the options that --help describes, by their fields;
+            --help-all describes all. Without the attribute, both do.
+        prog: The command, for messages.
+        words: The arguments.
+
+    Returns:
+        The command with its options.
+
+    Raises:
+        ValueError: There is no such option; the message suggests one.
+        SystemExit: The help was printed, or an option has a wrong value.
+    """
+    if {"-h", "--help"} & set(words):
+        _print_help(command, prog)
+    if "--help-all" in words:
+        words = ["--help"]
+    options: Any = dict(prog=prog, config=_CONFIG, return_unknown_args=True)
+    found, unknown = tyro.cli(command, args=words, **options)
+    if unknown:
+        flags = [flag for group in _options(command).values() for flag in group]
+        raise ValueError(_unknown(unknown[0], flags, prog))
+    return found
+
+
+def _print_help(command: type, prog: str) -> None:
+    """Print the help of the usual options, and the names of the others."""
+    usual = getattr(command, "USUAL", None)
+    shown = command if usual is None else _with_only(command, usual)
+    try:
+        tyro.cli(shown, prog=prog, args=["--help"], config=_CONFIG)
+    finally:
+        if usual is not None:
+            print(f"{prog} --help-all also describes")
+            width = min(shutil.get_terminal_size().columns, 80)
+            for group, flags in _options(command).items():
+                if others := [flag for flag, name in flags.items() if name not in usual]:
+                    text = f"{group}: {' '.join(others)}"
+                    indent: dict[str, Any] = {"initial_indent": "  ", "subsequent_indent": "    "}
+                    print(textwrap.fill(text, width, break_on_hyphens=False, **indent))
+
+
+def _unknown(word: str, options: Sequence[str], prog: str) -> str:
+    """An error message for an argument that a command does not take."""
+    flag = word.partition("=")[0].replace("_", "-")
+    if not flag.startswith("-"):
+        return f"{prog} does not take the argument {word!r}: see {prog} --help"
+    close = difflib.get_close_matches(flag.strip("-"), [option[2:] for option in options], 1)
+    hint = f"did you mean --{close[0]}?" if close else f"{prog} --help-all lists the options"
+    return f"{prog} has no option {flag}: {hint}"
+
+
+def _nested(hint: Any) -> Any:
+    """The dataclass of a group of options; None for a single option."""
+    inner = next(iter(typing.get_args(hint)), None)
+    return inner if dataclasses.is_dataclass(inner) else None
+
+
+def _options(command: Any, group: str = "options") -> dict[str, dict[str, str]]:
+    """The flags of a command with the names of their fields, by group."""
+    found: dict[str, dict[str, str]] = {group: {}}
+    for name, hint in typing.get_type_hints(command, include_extras=True).items():
+        own = next(filter(None, (getattr(marker, "name", None) for marker in _markers(hint))), name)
+        if (inner := _nested(hint)) is not None:
+            found |= _options(inner, f"{own.replace('_', ' ')} options")
+        elif name in command.__dataclass_fields__ and tyro.conf.Positional not in _markers(hint):
+            found[group]["--" + own.replace("_", "-")] = name
+    return found
+
+
+def _markers(hint: Any) -> tuple[Any, ...]:
+    return getattr(hint, "__metadata__", ())
+
+
+def _with_only(command: Any, usual: Sequence[str]) -> type:
+    """A subclass of a command, or of a group of its options, that hides all but the usual options from the help."""
+    own = _options(command)["options"].values()
+    body: dict[str, Any] = {"__annotations__": {}, "__doc__": command.__doc__}
+    for name, hint in typing.get_type_hints(command, include_extras=True).items():
+        if (group := _nested(hint)) is not None:
+            group = _with_only(group, usual)
+            body["__annotations__"][name] = typing.Annotated[group, tyro.conf.OmitArgPrefixes]
+            body[name] = dataclasses.field(default_factory=group)
+        elif name in own and name not in usual:
+            body["__annotations__"][name] = typing.Annotated[hint, tyro.conf.Suppress]
+    return dataclasses.dataclass(frozen=True, kw_only=True)(type(command.__name__, (command,), body))
