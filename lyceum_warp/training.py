@@ -167,7 +167,7 @@ def train(
         )  # fmt: skip
         callbacks: list[Callback] = []
         if leads:
-            board = shown.enter_context(TensorBoard(run.folder)) if tensorboard else None
+            board = shown.enter_context(TensorBoard(run.folder, env)) if tensorboard else None
             seed = evaluation_seed(env.options.seed + 1)
             videos = Videos(
                 learner, run.folder / "videos", video_every, seed, camera=camera, note=display.note,

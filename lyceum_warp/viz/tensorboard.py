@@ -11,34 +11,44 @@ from pathlib import Path
 from typing import Any
 
 from lyceum_warp.algos.learner import Iteration
+from lyceum_warp.env import Env
 
 EXTRA = "pip install 'lyceum-warp[tensorboard]'"
 """Command that installs the package for TensorBoard."""
 
 _GROUPS = {
     "mean_": "mean_policy", "return_": "return", "value_": "value", "time_": "time", "metrics/": "metrics",
-    "step_metrics/": "step_metrics",
+    "step_metrics/": "Episode_Metrics",
 }  # fmt: skip
-"""Groups of curves, by the prefix of their columns in metrics.csv."""
+"""Groups of curves, by the prefix of their columns in metrics.csv. mjlab calls means of a metric per step
+Episode_Metrics."""
 
 _TAGS = {
+    # as in rsl_rl
+    "return_mean": "Train/mean_reward", "length_mean": "Train/mean_episode_length", "std_mean": "Policy/mean_std",
+    "value_loss": "Loss/value", "surrogate_loss": "Loss/surrogate", "entropy": "Loss/entropy",
+    "learning_rate": "Loss/learning_rate", "total_fps": "Perf/total_fps", "time_sample": "Perf/collection_time",
+    "time_update": "Perf/learning_time",
+    # others that cannot be derived from the columns
     "iteration": "time/iteration", "samples": "time/samples", "samples_per_second": "time/samples_per_second",
-    "length_mean": "episode/length", "terminal_reward": "episode/terminal_reward", "eval_mean": "episode/eval",
-    "success": "episode/success", "faults": "episode/faults", "outliers": "episode/outliers", "std_mean": "policy/std",
+    "terminal_reward": "episode/terminal_reward", "eval_mean": "episode/eval",
+    "success": "episode/success", "faults": "episode/faults", "outliers": "episode/outliers",
     "skipped_updates": "policy/skipped_updates", "reward_mean": "return/reward",
     "explained_variance": "value/explained_variance",
 }  # fmt: skip
-"""Names of curves that cannot be derived from the columns."""
+"""Names of curves, by their columns."""
 
 
 class TensorBoard:
-    """Writes a run's iterations where TensorBoard reads them; the horizontal axis counts samples.
+    """Writes a run's iterations where TensorBoard reads them; the horizontal axis counts iterations from 0.
 
-    Every number of an iteration is a curve, named by its group: return/, episode/, mean_policy/, policy/, value/, time/
-    metrics/ and step_metrics/.
+    Every number of an iteration is a curve. Curves that rsl_rl or mjlab writes, too, have their names, units and axis,
+    so that runs overlay: Train/, Loss/, Policy/, Perf/, Episode_Metrics/ and, with ``env``, Episode_Reward/ and
+    Episode_Termination/. The groups of the others are return/, episode/, mean_policy/, policy/, value/, time/ and
+    metrics/.
 
-    In a folder that already holds curves, the curves continue: what they hold from the samples of the first new
-    iteration on is replaced.
+    In a folder that already holds curves, the curves continue: what they hold from the first new iteration on is
+    replaced.
 
     Example:
         >>> with TensorBoard("runs/mine") as board:
@@ -47,13 +57,16 @@ class TensorBoard:
 
     Args:
         folder: The folder; it is made if it does not exist. ``tensorboard --logdir`` takes it, or one above it.
+        env: The environment of the run. Its rewards' terms become Episode_Reward/NAME, sums over an episode divided by
+            the time limit in seconds; its terminations Episode_Termination/NAME, terminations in a step of all worlds.
 
     Raises:
         ImportError: The package tensorboard is not installed.
     """
 
-    def __init__(self, folder: str | Path) -> None:
+    def __init__(self, folder: str | Path, env: Env | None = None) -> None:
         check_tensorboard()
+        self._terms: dict[str, tuple[str, float]] = {} if env is None else _terms(env)
         self._folder = Path(folder)
         self._folder.mkdir(parents=True, exist_ok=True)
         self._file: Any = None
@@ -69,10 +82,11 @@ class TensorBoard:
         from tensorboard.compat.proto.summary_pb2 import Summary
 
         values = []
-        for column, number in iteration.row().items():
+        for column, number in (_total_fps(iteration) | iteration.row()).items():
             if number is not None and math.isfinite(number):
-                values.append(Summary.Value(tag=tag(column), simple_value=number))
-        self._write(Summary(value=values), iteration.samples, replaced=iteration.samples)
+                name, scale = self._terms.get(column, (tag(column), 1.0))
+                values.append(Summary.Value(tag=name, simple_value=scale * number))
+        self._write(Summary(value=values), iteration.iteration - 1)
 
     def close(self) -> None:
         """Close the file. A later iteration opens a new one."""
@@ -80,15 +94,15 @@ class TensorBoard:
             file, self._file = self._file, None
             file.close()
 
-    def _write(self, summary: Any, samples: int, *, replaced: int) -> None:
+    def _write(self, summary: Any, step: int) -> None:
         from tensorboard.compat.proto.event_pb2 import Event
 
         if self._file is None:
-            self._open(replaced)
-        self._add(Event(step=samples, summary=summary))
+            self._open(step)
+        self._add(Event(step=step, summary=summary))
         self._file.flush()
 
-    def _open(self, replaced: int) -> None:
+    def _open(self, step: int) -> None:
         """Open a file. Writers of torch and TensorBoard use a thread, which would hide a full disk."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
         from torch.utils.tensorboard import RecordWriter
@@ -98,7 +112,7 @@ class TensorBoard:
         self._file = RecordWriter((self._folder / name).open("xb"))
         self._add(Event(file_version="brain.Event:2"))
         if number:  # TensorBoard discards points of earlier files from this step on
-            self._add(Event(step=replaced, session_log=SessionLog(status=SessionLog.START)))
+            self._add(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
 
     def _add(self, event: Any) -> None:
         event.wall_time = time.time()
@@ -113,6 +127,22 @@ def check_tensorboard() -> None:
     """
     if importlib.util.find_spec("tensorboard") is None:
         raise ImportError(f"curves for TensorBoard need the package tensorboard: {EXTRA}")
+
+
+def _terms(env: Env) -> dict[str, tuple[str, float]]:
+    """Curves with mjlab's names and units, with the factor of their values, by column."""
+    task, seconds = env.task.task, env.horizon * env.timestep
+    rewards = task.rewards if seconds else ()  # without a time limit there is no such unit
+    return {f"metrics/{name}": (f"Episode_Reward/{name}", 1 / seconds) for name in rewards} | {
+        f"step_metrics/{name}": (f"Episode_Termination/{name}", float(env.nworld)) for name in task.terminations
+    }
+
+
+def _total_fps(iteration: Iteration) -> dict[str, float]:
+    """Samples per second of an iteration, without the evaluation of the mean policy; empty if times are unknown."""
+    times = {name: time for name, time in iteration.row().items() if name.startswith("time_") and name != "time_mean"}
+    seconds = sum(filter(None, times.values()))
+    return {"total_fps": iteration.samples / iteration.iteration / seconds} if seconds else {}
 
 
 def tag(column: str) -> str:

@@ -1,6 +1,7 @@
 """Write curves for TensorBoard, and read them with TensorBoard's own reader."""
 
 import dataclasses
+import inspect
 import math
 import signal
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 from training_runs import QUIET, train
 
 import lyceum_warp as lw
+from lyceum_warp.algos.ppo import PPOIteration
 from lyceum_warp.cli import main
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.viz import tensorboard as module
@@ -43,25 +45,50 @@ def test_every_number_of_an_iteration_is_a_curve_in_its_group(first: lw.Iteratio
     with TensorBoard(tmp_path / "new" / "run") as board:
         board(iteration)
     scalars = read(tmp_path / "new" / "run").Tags()["scalars"]
-    assert set(scalars) == {tag(name) for name in iteration.row()}
-    assert len(scalars) == len(iteration.row())
-    for name, value in [("return/mean", iteration.return_mean), ("mean_policy/return", iteration.mean_return),
+    assert set(scalars) == {tag(name) for name in (*iteration.row(), "total_fps")}
+    assert len(scalars) == len(iteration.row()) + 1
+    seconds = iteration.time_sample + iteration.time_gradient + iteration.time_solve + iteration.time_value
+    for name, value in [("Train/mean_reward", iteration.return_mean), ("mean_policy/return", iteration.mean_return),
                         ("policy/kl", 0.01), ("value/explained_variance", iteration.explained_variance),
-                        ("episode/length", 12.0), ("metrics/forward", 2.5),
-                        ("step_metrics/forward", 0.5), ("policy/std", iteration.std_mean),
-                        ("time/sample", iteration.time_sample), ("episode/faults", 0.0)]:  # fmt: skip
-        assert curve(tmp_path / "new" / "run", name) == [(96, value)]
+                        ("Train/mean_episode_length", 12.0), ("metrics/forward", 2.5),
+                        ("Episode_Metrics/forward", 0.5), ("Policy/mean_std", iteration.std_mean),
+                        ("Perf/collection_time", iteration.time_sample), ("Perf/total_fps", 96 / seconds),
+                        ("episode/faults", 0.0)]:  # fmt: skip
+        assert curve(tmp_path / "new" / "run", name) == [(0, value)]
     assert {name.partition("/")[0] for name in scalars} == {
-        "return", "episode", "mean_policy", "policy", "value", "time", "metrics", "step_metrics",
+        "Train", "Policy", "Perf", "Episode_Metrics", "return", "episode", "mean_policy", "policy", "value", "time",
+        "metrics",
     }  # fmt: skip
+
+
+def test_curves_that_rsl_rl_writes_have_its_names() -> None:
+    logger = inspect.getsource(pytest.importorskip("rsl_rl.utils.logger"))
+    losses = inspect.getsource(pytest.importorskip("rsl_rl.algorithms.ppo").PPO.update)
+    for column in (*inspect.signature(PPOIteration).parameters, "total_fps"):
+        group, _, name = tag(column).partition("/")
+        if group in ("Train", "Policy", "Perf"):
+            assert f'"{group}/{name}"' in logger
+        elif group == "Loss":
+            assert f'"{name}": mean_' in losses or f'"Loss/{name}"' in logger
+
+
+def test_terms_of_a_walking_robot_have_mjlabs_names_and_units(first: lw.Iteration, tmp_path: Path) -> None:
+    env = lw.make("go1_velocity", nworld=3, horizon=100)
+    metrics = {"upright": 1.5, "fell_over": 0.25}
+    with TensorBoard(tmp_path, env) as board:
+        board(numbered(first, 1, metrics=metrics, step_metrics={"fell_over": 0.01, "velocity_error": 0.2}))
+    seconds = 100 * env.timestep
+    for name, value in [("Episode_Reward/upright", 1.5 / seconds), ("Episode_Termination/fell_over", 3 * 0.01),
+                        ("Episode_Metrics/velocity_error", 0.2), ("metrics/fell_over", 0.25)]:  # fmt: skip
+        assert curve(tmp_path, name) == [(0, value)]
 
 
 def test_numbers_that_are_absent_or_not_finite_are_left_out(first: lw.Iteration, tmp_path: Path) -> None:
     with TensorBoard(tmp_path) as board:
         board(numbered(first, 1, return_mean=math.nan, mean_return=None))
         board(numbered(first, 2, return_mean=-3.0))
-    assert curve(tmp_path, "return/mean") == [(192, -3.0)]
-    assert curve(tmp_path, "mean_policy/return") == [(192, first.mean_return)]
+    assert curve(tmp_path, "Train/mean_reward") == [(1, -3.0)]
+    assert curve(tmp_path, "mean_policy/return") == [(1, first.mean_return)]
 
 
 def test_a_resumed_run_replaces_later_points_and_repeats_none(first: lw.Iteration, tmp_path: Path) -> None:
@@ -71,14 +98,14 @@ def test_a_resumed_run_replaces_later_points_and_repeats_none(first: lw.Iteratio
     with TensorBoard(tmp_path) as board:  # the checkpoint was of iteration 2
         for i in (3, 4, 5):
             board(numbered(first, i, return_mean=100.0))
-    assert curve(tmp_path, "policy/kl") == [(96 * i, 0.01 * i) for i in (1, 2, 3, 4, 5)]
-    assert [value for _, value in curve(tmp_path, "return/mean")] == [first.return_mean] * 2 + [100.0] * 3
+    assert curve(tmp_path, "policy/kl") == [(i - 1, 0.01 * i) for i in (1, 2, 3, 4, 5)]
+    assert [value for _, value in curve(tmp_path, "Train/mean_reward")] == [first.return_mean] * 2 + [100.0] * 3
 
 
 def test_points_are_in_the_file_before_it_is_closed(first: lw.Iteration, tmp_path: Path) -> None:
     board = TensorBoard(tmp_path)
     board(numbered(first, 1))
-    assert curve(tmp_path, "policy/kl") == [(96, 0.01)]
+    assert curve(tmp_path, "policy/kl") == [(0, 0.01)]
     board.close()
 
 
@@ -95,7 +122,7 @@ def test_a_full_disk_is_an_error_of_the_call(first: lw.Iteration, tmp_path: Path
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, before)
     board.close()
-    assert [step for step, _ in curve(tmp_path, "policy/kl")] == [96 * i for i in range(1, i + 1)]
+    assert [step for step, _ in curve(tmp_path, "policy/kl")] == list(range(i))
 
 
 def test_a_missing_package_raises_one_line_with_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,5 +138,5 @@ def test_train_writes_the_numbers_of_metrics_csv_also_after_it_resumes(tmp_path:
     assert main(["train", "--resume", str(run), "--tensorboard", "--iterations", "3", *QUIET]) == 0
     rows = Run.open(run).rows()
     for column in ("kl", "return_mean", "explained_variance"):
-        assert curve(run, tag(column)) == [(row["samples"], pytest.approx(row[column])) for row in rows]
-    assert [step for step, _ in curve(run, "mean_policy/return")] == [1024]
+        assert curve(run, tag(column)) == [(i, pytest.approx(row[column])) for i, row in enumerate(rows)]
+    assert [step for step, _ in curve(run, "mean_policy/return")] == [1]
