@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from lyceum_warp.openloop import OpenLoop
     from lyceum_warp.options import EnvOptions, PhysicsOptions
     from lyceum_warp.runs.folder import load, load_value
+    from lyceum_warp.runs.pretrained_runs import pretrained_run
     from lyceum_warp.task import (
         Planning, Row, Task, act, actuator, actuators, bodies, body, camera, ctrl, dof, dofs, equality, from_model,
         geom, geoms, joint, joints, lasting_memory, memory, mocap, part, qpos, qposes, sensor, sensors, site, sites,
@@ -79,11 +80,12 @@ __all__ = [
     "follow_velocity", "follow_walk", "from_model", "geom", "geoms", "grasp_terms", "ground_distance", "ground_height",
     "ground_normal", "gymnasium_model", "gymnasium_robotics_model", "height_field", "height_scan", "inside", "joint",
     "joints", "lasting_memory", "load", "load_value", "local_velocity", "make", "memory", "menagerie_model", "mocap",
-    "next_level", "normal", "on_ground", "package_model", "part", "playground_model", "put", "put_upright", "qpos",
-    "qposes", "quat", "quat_angle", "quat_difference", "quat_from_axis_angle", "quat_from_euler", "quat_from_mat",
-    "quat_from_rotvec", "quat_inverse", "quat_mul", "quat_random", "quat_rotate", "quat_rotate_inverse",
-    "quat_to_euler", "quat_to_mat", "quat_to_rotvec", "register", "scan_grid", "sensor", "sensors", "site", "sites",
-    "start_on_terrain", "sum_squares", "task_names", "tendon", "tolerance", "train", "transfer", "tune", "uniform",
+    "next_level", "normal", "on_ground", "package_model", "part", "playground_model", "pretrained_run", "put",
+    "put_upright", "qpos", "qposes", "quat", "quat_angle", "quat_difference", "quat_from_axis_angle",
+    "quat_from_euler", "quat_from_mat", "quat_from_rotvec", "quat_inverse", "quat_mul", "quat_random",
+    "quat_rotate", "quat_rotate_inverse", "quat_to_euler", "quat_to_mat", "quat_to_rotvec", "register", "scan_grid",
+    "sensor", "sensors", "site", "sites", "start_on_terrain", "sum_squares", "task_names", "tendon", "tolerance",
+    "train", "transfer", "tune", "uniform",
     "vec10", "view"]
 
 _NAMES = {
@@ -133,6 +135,7 @@ _NAMES = {
     "openloop": "OpenLoop",
     "options": "EnvOptions PhysicsOptions",
     "runs.folder": "load load_value",
+    "runs.pretrained_runs": "pretrained_run",
     "task":
         "Planning Row Task act actuator actuators bodies body camera ctrl dof dofs equality from_model geom geoms "
         "joint joints lasting_memory memory mocap part qpos qposes sensor sensors site sites tendon",

@@ -22,6 +22,7 @@ from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import check_sizes
 from lyceum_warp.runs.configuration import Configuration
 from lyceum_warp.runs.folder import Run, load
+from lyceum_warp.runs.pretrained_runs import pretrained_run, pretrained_text
 from lyceum_warp.runs.task_copy import note_changes, run_env
 from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
@@ -40,15 +41,18 @@ class Eval:
     $ lyceum-warp eval runs/hopper-20260101-120000 --video --camera track=torso --camera azimuth=45
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --transfer
     $ lyceum-warp eval runs/humanoid-20260101-120000 --physics exact
+    $ lyceum-warp eval go1_velocity --pretrained
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 8 --episodes-to runs/hopper-episodes
     """
 
     USUAL = (
-        "which", "task", "episodes", "seed", "nworld", "video", "camera", "transfer", "episodes_to", "device",
+        "pretrained", "which", "episodes", "seed", "nworld", "video", "camera", "transfer", "episodes_to", "device",
     )  # fmt: skip
 
-    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """The run's folder."""
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|TASK")]
+    """The run's folder; with --pretrained the name of a task."""
+    pretrained: bool = False
+    """Whether to evaluate the pretrained policy of a task, which is part of the package."""
     which: str = "last"
     """Which policy: last, best, or the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
@@ -62,7 +66,7 @@ class Eval:
     nworld: int = 32
     """Maximum number of worlds; never more than episodes."""
     video: bool = False
-    """Whether to write a video of one episode, eval.mp4 in the run's folder."""
+    """Whether to write a video of one episode: eval.mp4 in the run's folder, or with --pretrained TASK.mp4."""
     camera: CameraWords = ()
     transfer: bool = False
     """Whether to play the episodes on both engines, and under each of the task's physics, and to print the differences
@@ -88,7 +92,7 @@ class Eval:
             raise ValueError("--camera has no effect without --video: give both, or omit --camera")
         if self.episodes_to is not None:
             Run.check_free(self.episodes_to)
-        run = Run.open(self.folder)
+        run = Run.open(pretrained_run(str(self.folder)) if self.pretrained else self.folder)
         nworld = min(self.nworld, self.episodes)
         path = run.policy_file(self.which)
         words, params = given(self.env) | self.physics.given(), parameters(self.param, self)
@@ -116,7 +120,8 @@ class Eval:
                 column.append(cell)
         console = make_console()
         which = "the mean policy" if self.which == "last" else f"the mean policy {self.which!r}"
-        text = f"{env.task.name}: {self.episodes} episodes of {which} in {self.folder}"
+        where = pretrained_text(run) if self.pretrained else f"in {self.folder}"
+        text = f"{env.task.name}: {self.episodes} episodes of {which} {where}"
         console.print(text, soft_wrap=True, markup=False)
         console.print(fitting_table(console, columns, omit=("std",)))
         if env.task.functions["success"] is not None:
@@ -128,12 +133,11 @@ class Eval:
                 )
             _print_transfer(verdict, console)
         if self.episodes_to is not None:
-            paths = _save_episodes(env, policy, self, origin)
+            paths = _save_episodes(env, policy, self, run, origin)
             console.print(f"episodes: {paths}", soft_wrap=True, markup=False)
         if self.video:
-            video = tried(
-                policy_video, env, policy, run.folder / "eval.mp4", evaluation_seed(self.seed), camera=camera
-            )  # fmt: skip
+            path = Path(f"{env.task.name}.mp4") if self.pretrained else run.folder / "eval.mp4"
+            video = tried(policy_video, env, policy, path, evaluation_seed(self.seed), camera=camera)
             console.print(f"video: {video}", soft_wrap=True, markup=False)
         return 0
 
@@ -184,10 +188,10 @@ def run_worlds(
     return env
 
 
-def _save_episodes(env: Env, policy: Policy, options: Eval, source: dict[str, Any]) -> str:
+def _save_episodes(env: Env, policy: Policy, options: Eval, run: Run, source: dict[str, Any]) -> str:
     """Run the same episodes again, write one file per episode, and return a pattern that matches the files."""
     assert options.episodes_to is not None
-    whose = {"name": type(policy).__name__, "run": str(options.folder.resolve()), "which": options.which}
+    whose = {"name": type(policy).__name__, "run": str(run.folder.resolve()), "which": options.which}
     with LongWork("running the episodes that are saved", "steps", make_console()) as work:
         episodes = policy_episodes(
             env.replicate(autoreset=False), acting(policy), options.episodes, seed=evaluation_seed(options.seed),

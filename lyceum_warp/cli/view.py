@@ -25,6 +25,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import check_sizes
 from lyceum_warp.runs.folder import Run, load
+from lyceum_warp.runs.pretrained_runs import pretrained_run, pretrained_text
 from lyceum_warp.support.interrupts import Interrupted, signals
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.viewer.follow import Follower, wait_for_run
@@ -59,16 +60,19 @@ class View:
     forwards the port.
 
     $ lyceum-warp view hopper
+    $ lyceum-warp view go1_velocity --pretrained
     $ lyceum-warp view runs/hopper-20260101-120000 --which best
     $ lyceum-warp view runs/hopper-20260101-120000 --follow --nworld 64
     $ lyceum-warp view reach --mppi --samples 64
     $ lyceum-warp view runs/plan-reach-20260101-120000/episode-*.npz
     """
 
-    USUAL = ("mppi", "follow", "which", "nworld", "seed", "paused", "host", "port", "param", "samples")
+    USUAL = ("pretrained", "mppi", "follow", "which", "nworld", "paused", "host", "port", "param", "samples")
 
     what: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TASK|RUN|FILE...")]
     """A task's name or file, a run's folder, or episode files."""
+    pretrained: bool = False
+    """Show the pretrained policy of a task, which is part of the package."""
     mppi: bool = False
     """Control the shown world with a planner: MPPI, or with --update a different one."""
     follow: bool = False
@@ -106,6 +110,10 @@ class View:
             seconds: Maximum time that --follow waits for the run.
         """
         _check(self)
+        if self.pretrained:
+            folder = pretrained_run(" ".join(self.what))
+            note(pretrained_text(Run.open(folder)))
+            return dataclasses.replace(self, what=(str(folder),), pretrained=False).show(seconds)
         torch.set_num_threads(1)
         kind = _kind(self.what)
         for flag, fits in (("follow", ("run",)), ("mppi", ("task", "run")), ("trust", ("run",))):

@@ -1,0 +1,46 @@
+"""Find the pretrained policies of the package: run folders without training state, whose weights are float16."""
+
+import difflib
+from pathlib import Path
+
+from lyceum_warp.runs.folder import Run
+
+_FOLDER = Path(__file__).resolve().parents[1] / "pretrained"
+
+
+def pretrained_tasks() -> list[str]:
+    """Names of the tasks that have a pretrained policy."""
+    return sorted(path.parent.name for path in _FOLDER.glob("*/config.json"))
+
+
+def pretrained_run(task: str) -> Path:
+    """The folder of a task's pretrained policy, which ``lw.load`` and others take as they take a run.
+
+    Its config.json holds the settings of the training, and under ``evaluated`` the return that the policy reached.
+
+    Example:
+        >>> policy = lw.load(lw.pretrained_run("hopper"))
+
+    Args:
+        task: The task's name.
+
+    Raises:
+        ValueError: The task has no pretrained policy; the message names those that have one.
+    """
+    tasks = pretrained_tasks()
+    if task not in tasks:
+        close = difflib.get_close_matches(task, tasks, 1)
+        hint = f"did you mean {close[0]}? " if close else ""
+        raise ValueError(f"there is no pretrained policy of {task!r}: {hint}there are {', '.join(tasks)}")
+    return _FOLDER / task
+
+
+def pretrained_text(run: Run) -> str:
+    """A line on the training of a pretrained policy, and on the settings that differ from the task's defaults."""
+    config, found = run.config, run.config["evaluated"]
+    settings = {**config["params"], **config["physics"], **config["options"]}
+    given = ", ".join(f"{name} {value}" for name, value in settings.items()) or "its defaults"
+    return (
+        f"pretrained by {config['algorithm']} on {config['task']} with {given}: return {found['return']:.4g} ± "
+        f"{found['std']:.2g} in {found['episodes']} episodes of lyceum_warp {found['lyceum_warp']}"
+    )

@@ -1,0 +1,70 @@
+"""Every pretrained policy loads, fits its task and reaches its return; nothing else is in its folder."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import long_if_alike
+from training_runs import refused
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.binding.registry import task_names
+from lyceum_warp.cli.evaluate import run_worlds
+from lyceum_warp.runs.checkpoints import check_sizes
+from lyceum_warp.runs.folder import Run, load
+from lyceum_warp.runs.pretrained_runs import pretrained_run, pretrained_tasks, pretrained_text
+
+TASKS = pretrained_tasks()
+
+
+@pytest.mark.parametrize("task", long_if_alike(TASKS))
+def test_a_pretrained_policy_fits_its_task_and_reaches_its_return(task: str) -> None:
+    run = Run.open(pretrained_run(task))
+    first = run.config["evaluated"]["first_steps"]
+    env = run_worlds(run, {}, {}, nworld=first["worlds"], task=None, trust=False)
+    policy = load(run)
+    check_sizes(policy, env, run.policy)
+    env.rand_reset(run.config["evaluated"]["seed"])
+    total = torch.zeros(env.nworld)
+    for _ in range(first["steps"]):
+        env.action.copy_(policy.act(env.obs))
+        env.step()
+        total += env.reward
+    assert total.mean().item() == pytest.approx(first["return"], rel=0.1)
+
+
+def test_pretrained_policies_are_small_and_run_no_code() -> None:
+    size = 0
+    for task in TASKS:
+        folder = pretrained_run(task)
+        assert {path.name for path in folder.iterdir()} == {"config.json", "policy.pt", "versions.json"}
+        size += sum(path.stat().st_size for path in folder.iterdir())
+        config = json.loads((folder / "config.json").read_text())
+        assert config["task"] == config["kept"]["name"] == task and task in task_names()
+        assert "file" not in config["kept"]
+        assert all(type(value) in (int, float, list) for value in config["params"].values())
+        content = torch.load(folder / "policy.pt", weights_only=True)
+        assert content.keys() == {"lyceum_warp", "iteration", "policy"}
+        assert lw.load(folder).training is False
+    assert size < 5e6
+
+
+def test_the_text_names_the_settings_of_the_training(tmp_path: Path) -> None:
+    evaluated = {"return": 123.45, "std": 6.78, "episodes": 32, "lyceum_warp": "0.2.0"}
+    config = {"algorithm": "ppo", "task": "hopper", "params": {"ctrl_cost_weight": 0.5}, "physics": {}, "options": {}}
+    assert pretrained_text(Run(tmp_path, config | {"evaluated": evaluated})) == (
+        "pretrained by ppo on hopper with ctrl_cost_weight 0.5: return 123.5 ± 6.8 in 32 episodes of lyceum_warp 0.2.0"
+    )
+
+
+def test_eval_runs_a_pretrained_policy(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["eval", "hopper", "--pretrained", "--episodes", "2", "--horizon", "20"]) == 0
+    assert "2 episodes of the mean policy pretrained by" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["eval", "view"])
+def test_a_task_without_a_pretrained_policy_is_refused(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([command, "reacher", "--pretrained"]) == 2
+    refused(capsys, "there is no pretrained policy of 'reacher': there are ", ", hopper")
