@@ -149,7 +149,7 @@ _NAMES = {
 # isort: on
 # fmt: on
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 

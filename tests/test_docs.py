@@ -213,6 +213,7 @@ def test_the_workflow_runs_the_checks_on_every_supported_python() -> None:
     job = workflow["jobs"]["check"]
     commands = [step.get("run") for step in job["steps"]]
     assert "bash .ci/run" in commands and "make test-all" in commands
+    assert "bash .ci/wheel" in [step.get("run") for step in workflow["jobs"]["wheel"]["steps"]]
     classifiers = re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text())
     assert job["strategy"]["matrix"]["python"] == classifiers
 

@@ -1,0 +1,17 @@
+"""The wheel holds everything that the package reads."""
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_wheel_has_every_module_model_and_pretrained_policy() -> None:
+    wheel = pytest.importorskip("hatchling.builders.wheel")
+    builder = wheel.WheelBuilder(str(ROOT))
+    packed = {file.distribution_path for file in builder.recurse_included_files()}
+    files = [path for path in (ROOT / "lyceum_warp").rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    assert {path.relative_to(ROOT).as_posix() for path in files} == packed
+    assert {"lyceum_warp/py.typed", "lyceum_warp/pretrained/hopper/policy.pt"} <= packed
+    assert sum(name.endswith(".xml") for name in packed) >= 11
