@@ -315,7 +315,7 @@ class SAC(Learner):
         Args:
             batch: Transitions.
             weight: Weights of the transitions, (batch,), which sum to 1 over all processes.
-            noise: Standard normal numbers, (batch, nact).
+            noise: Standard normal numbers for the actions of the next observations, (batch, nact).
         """
         group = self.value.group
         with torch.no_grad():
@@ -332,9 +332,9 @@ class SAC(Learner):
         """Compute the actor's loss, and its entropy.
 
         Args:
-            batch: Transitions.
-            weight: Weights of the transitions, (batch,), which sum to 1 over all processes.
-            noise: Standard normal numbers, (batch, nact).
+            batch: Transitions, of which only the observations are used.
+            weight: As in ``critic_loss``.
+            noise: Standard normal numbers for the actions of these observations, (batch, nact).
         """
         action, log_prob = self.policy.sample(batch.obs["policy"], noise)
         value = self._bound(self.value(batch.obs[self.value.group], action))
