@@ -14,8 +14,8 @@ from lyceum_warp.viz.pictures import WorldPictures
 _SEEDS = 2**31
 """Upper bound (exclusive) of an environment's seeds."""
 
-_OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode, where there is one,"}
-"""Options that an adapter sets itself, with the argument to use instead."""
+_OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode (in adapters that have it)"}
+"""Options that an adapter sets itself, each with the argument that replaces it."""
 
 
 def environment_of(

@@ -24,7 +24,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     """An environment for rsl_rl's runners: ``OnPolicyRunner(RslRlVecEnv("hopper", 4096, device="cuda"), config)``.
 
     ``step`` never waits for the device. It returns copies of the observations, because rsl_rl stores observations only
-    after the next step. All other results are buffers that the next step overwrites; rsl_rl copies them before.
+    after the next step. All other results are buffers that the next step overwrites; rsl_rl copies them before that.
 
     Args:
         task: A task, as in ``lw.make``, or an environment with automatic resets.
@@ -85,7 +85,8 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             )
         if env.horizon == 0:
             raise ValueError(
-                f"episodes of {env.task.name!r} have no time limit to begin at a random step of: call learn with "
+                f"episodes of {env.task.name!r} have no time limit, so they cannot begin at a random step: call "
+                f"learn with "
                 "init_at_random_ep_len=False, or give make() a horizon"
             )
         if ((steps < 0) | (steps >= env.horizon)).any():

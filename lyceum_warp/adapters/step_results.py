@@ -17,7 +17,7 @@ class Observations:
 
     Args:
         env: The environment.
-        dict_obs: Whether to return all groups; by default if there are several.
+        dict_obs: Whether to return all groups. The default is True if there are several.
     """
 
     def __init__(self, env: Env, *, dict_obs: bool | None) -> None:
@@ -27,7 +27,10 @@ class Observations:
 
     @property
     def current(self) -> list[torch.Tensor]:
-        """The current observations by group, (nworld, size); without automatic resets, ended worlds keep their last."""
+        """The current observations by group, (nworld, size).
+
+        Without automatic resets, ended worlds keep their last observation.
+        """
         env = self._env
         if env.autoreset:
             return [env.obs_groups[group] for group in self._groups]

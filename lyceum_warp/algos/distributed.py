@@ -148,8 +148,8 @@ class Team:
 class Captured:
     """Calls a function that consists of torch operations and communication; on a GPU as a CUDA graph.
 
-    The first call runs directly, which allocates what the function keeps. The second call is captured and then
-    replayed. A graph stores addresses, so the function must update tensors in place.
+    The first call runs the function directly, so that it allocates its buffers. The second call captures a graph, which
+    it and all later calls replay. A graph stores addresses, so the function must update tensors in place.
 
     Args:
         function: The function.

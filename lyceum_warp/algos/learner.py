@@ -118,7 +118,7 @@ class Learner(abc.ABC):
     """The replay buffer, if the algorithm has one. ``state_dict`` does not contain it, because it may be large: a run
     keeps it in files of its own, which are updated step by step."""
     own_worlds: slice
-    """This process's worlds among those of all processes."""
+    """Range of this process's worlds among the worlds of all processes."""
     iteration: int
     """Number of complete iterations."""
     samples: int

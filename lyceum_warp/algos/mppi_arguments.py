@@ -147,7 +147,7 @@ _OWN_OPTIONS = {
     "autoreset": "its worlds never reset",
     "horizon": "episodes of its worlds have no limit, and the horizon of a plan is a setting",
     "seed": "every sample starts from the state to plan from",
-    "first_world": "its worlds are all the samples that there are",
+    "first_world": "no other process has samples",
 }
 """Options that the planner sets itself, each with the reason."""
 

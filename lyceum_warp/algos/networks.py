@@ -122,7 +122,7 @@ class Normalizer(nn.Module):
 
         Args:
             obs: Observations, (..., size).
-            team: The processes; each brings the same number of observations.
+            team: The processes; each contributes the same number of observations.
             eps: Added to the standard deviations.
         """
         team = team or Team()
@@ -172,7 +172,7 @@ class Normalized(nn.Module):
 
         Args:
             obs: Observations, (..., nobs).
-            team: The processes; each brings the same number of observations.
+            team: The processes; each contributes the same number of observations.
             eps: Added to the standard deviations.
         """
         if isinstance(self.normalizer, Normalizer):

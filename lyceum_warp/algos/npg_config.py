@@ -94,7 +94,7 @@ class NPGConfig:
         """Check every value."""
         check_fields(self, _BOUNDS)
         if self.fisher_fraction == 0.0:
-            raise ValueError("fisher_fraction must be greater than 0, as in 0.1 for every tenth sample")
+            raise ValueError("fisher_fraction must be greater than 0, such as 0.1 for every tenth sample")
         if self.log_std < self.min_log_std:
             raise ValueError(f"log_std must not be below min_log_std, which is {self.min_log_std}, not {self.log_std}")
 

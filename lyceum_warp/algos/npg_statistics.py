@@ -141,7 +141,7 @@ def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence
 
 
 def value_statistics(sums: Sequence[ValueSums], samples: int) -> dict[str, float]:
-    """Compute ``value_error`` and ``explained_variance`` from the sums of all processes of ``samples`` samples each."""
+    """Compute ``value_error`` and ``explained_variance`` from the sums of all processes (``samples`` samples each)."""
     n, mean, square = pooled([Moments(samples, part.return_mean, part.return_square) for part in sums])
     _, error_mean, error_square = pooled([Moments(samples, part.error_mean, part.error_square) for part in sums])
     error, size = error_square + n * error_mean**2, square + n * mean**2

@@ -31,7 +31,7 @@ class PlanSamples:
     actions: torch.Tensor
     """The samples, (rows, plants, samples, nact)."""
     nominal: torch.Tensor
-    """The plans to which the noise of the samples was added, (rows, plants, nact)."""
+    """The plans around which the samples were drawn, (rows, plants, nact)."""
     plan: torch.Tensor
     """The new plans, (rows, plants, nact): before ``fit``, the weighted means of the samples."""
     nominal_deviation: torch.Tensor | None

@@ -135,7 +135,7 @@ class Planner:
     weights: torch.Tensor
     """The samples' weights, (samples,)."""
 
-    _only_update: str | None = None  # in a subclass: its only update
+    _only_update: str | None = None  # the only update of a subclass
 
     def __init__(
         self,
@@ -217,7 +217,8 @@ class Planner:
             self._value_in_torch = True
             try:
                 self._torch_values()
-            except (RuntimeError, TypeError) as error:  # other weights, another size, or critics of actions
+            # such as missing weights, another input size, or critics, which also take actions
+            except (RuntimeError, TypeError) as error:
                 observations = described(self._value_obs)
                 raise ValueError(f"value cannot take observations {observations}: {error}") from error
 
@@ -293,7 +294,7 @@ class Planner:
         self._terminal_view, self._shift_view = torch_view(self._terminal), torch_view(self._shift)
 
     def _by_plant(self, rows: torch.Tensor, axis: int) -> torch.Tensor:
-        """Remove a buffer's axis for the plants if there is only one."""
+        """Remove a buffer's axis for the plants if there is only one plant."""
         return rows.squeeze(axis) if self.plants == 1 else rows
 
     @torch.no_grad()
@@ -539,8 +540,8 @@ class MPPI(Planner):  # noqa: D101
 class CEM(MPPI):
     """The cross-entropy method: ``lw.CEM(task, ...)`` is ``lw.MPPI(task, update="cem", ...)``.
 
-    The new plan is the mean of the best samples, and the new standard deviation of the noise is theirs. It persists
-    between calls; ``reset`` restores the initial one. Names in other packages:
+    The mean of the best samples is the new plan. Their standard deviation becomes the standard deviation of the noise
+    and persists between calls; ``reset`` restores the initial one. Names in other packages:
 
     ============= =============== ========================
     here          hydrax          judo

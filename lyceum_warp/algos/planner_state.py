@@ -46,14 +46,15 @@ def checked_state(env: Env, state: torch.Tensor, like: torch.Tensor) -> torch.Te
     if not isinstance(state, torch.Tensor) or state.shape != like.shape or state.dtype != like.dtype:
         parts = "plan.state_of(qpos=..., qvel=...)"
         if like.ndim == 1:
-            which, hint = "a state", f"make it by its parts with {parts}"
+            which, hint = "a state", f"make it from its parts with {parts}"
         else:
             which, hint = "the states", f"stack one {parts} for each plant"
         raise ValueError(
             f"{which} to plan from must be {described(like)}, not {described(state)}: call env.get_state() of the same "
             f"task, or {hint}. (fields=[...] may make the states of an environment longer.)"
         )
-    if state.device.type != "cpu":  # the check would wait; all samples will fail, and the plan stays
+    # on a GPU a check would wait for the device; without it, all samples fail and the plan does not change
+    if state.device.type != "cpu":
         return state
     values = state.numpy().ravel()
     # a single call, because a plan may take only a millisecond; the slow check runs only if the dot product is not

@@ -154,7 +154,7 @@ class PPO(OnPolicyLearner):
     def _make_mirror(self) -> None:
         """Set the mirror images of observations and actions, if the policy is to be symmetric."""
         config, env = self.config, self.env
-        if self.policy.mirror is not None:  # of another run
+        if self.policy.mirror is not None:  # the policy of another run is already mirrored
             config = self.config = dataclasses.replace(config, symmetry="exact")
         self._mirror: PolicyMirror | None = None
         if config.symmetry == "none":
@@ -336,7 +336,7 @@ class PPO(OnPolicyLearner):
     def _with_images(self, samples: Samples) -> dict[str, torch.Tensor]:
         """Append the mirror images of samples.
 
-        The mirror image of the sampling policy would have drawn an image with the density of its sample.
+        The mirror image of the sampling policy would draw a mirrored sample with the same density as the original.
         """
         assert self._mirror is not None
         images = dict(samples)

@@ -18,7 +18,7 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PPOConfig:
-    """Hyperparameters of PPO. The defaults are mjlab's for legged robots, except ``desired_kl``.
+    """Hyperparameters of PPO. Except for ``desired_kl``, the defaults are mjlab's settings for legged robots.
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.
@@ -79,7 +79,7 @@ class PPOConfig:
     image; "loss" adds symmetry_coef times the squared difference between both; "augment" learns from the mirror images
     of all samples, too."""
     symmetry_coef: float = 1.0
-    """Coefficient of the loss of symmetry "loss"."""
+    """Coefficient of the symmetry loss, if symmetry is "loss"."""
     normalize: bool = True
     """Whether to normalise observations by their running mean and variance, updated in every step."""
     stagger: bool = True

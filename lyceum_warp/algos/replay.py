@@ -99,7 +99,7 @@ class Replay:
         self._sizes = sizes
         self.obs, self.next_obs = self._groups(self._before), self._groups(self._after)
         self.action = self._before[..., sum(sizes) :]
-        # the number of steps and the row of the oldest, on the device for captured samples
+        # the number of steps and the row of the oldest step, on the device so that sampling can be captured
         self._count, self._oldest = torch.zeros(2, dtype=torch.long, device=device)
         self.stored = 0
 
@@ -159,10 +159,11 @@ class Replay:
         """Get transitions by number; can be captured in a CUDA graph.
 
         A return ends at the end of the episode, and at the newest step. It then has fewer than ``n_step`` rewards, and
-        bootstraps from the observation there: after a time limit or a fault, too, but not after a termination.
+        bootstraps from the last observation, also after a time limit or a fault, but not after a termination.
 
         Args:
-            index: Numbers of the transitions, (batch,) int64: world w in the k-th oldest step has k * nworld + w.
+            index: Numbers of the transitions, (batch,) int64; the transition of world w in the k-th oldest step has
+                number k * nworld + w.
             n_step: Maximum number of steps in a return.
             gamma: Discount factor.
         """
@@ -213,7 +214,7 @@ class Replay:
         """Restore a state of ``state_dict``; the same numbers then sample the same transitions.
 
         Raises:
-            ValueError: The state is from a buffer of another size.
+            ValueError: The state belongs to a buffer of another size.
         """
         rows, stored = state["rows"], state["stored"]
         sizes = {name: tuple(part.shape[1:]) for name, part in rows.items()}

@@ -210,7 +210,8 @@ class Rollout:
     def explain_not_finite(self) -> str:
         """Describe in one sentence the first number that is not finite or too large for float32, and how to fix it.
 
-        Waits for the device. Rewards and observations from a task are always finite, because others are faults.
+        Waits for the device. Rewards and observations from a task are always finite, because non-finite values are
+        faults.
         """
         kinds: list[tuple[str, torch.Tensor, float, Mapping[str, slice]]] = [("reward", self.reward, torch.inf, {})]
         for groups in (self.obs_groups, self.final_obs_groups):

@@ -44,7 +44,9 @@ _EPS = 1e-2
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SACIteration(SampledIteration):
-    """Statistics of one iteration of SAC; losses, values and entropy are means over its updates, NaN without any.
+    """Statistics of one iteration of SAC.
+
+    Losses, values and entropy are means over its updates, or NaN if it made no update.
 
     Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended. The worlds'
     first episodes start at a random step and are not counted.
@@ -77,7 +79,7 @@ class SAC(Learner):
 
     Args:
         env: The environment; do not step it between iterations.
-        policy: The policy; a new one by default. A given one also acts during the warm-up.
+        policy: The policy; a new one by default. A given policy also acts during the warm-up.
         value: The critics; new ones by default.
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
@@ -277,7 +279,7 @@ class SAC(Learner):
         random: dict[str, Any] = dict(generator=self.generator, device=self._index.device)
         index = torch.randint(self.replay.count * nworld * team.size, shape, **random)
         noise = torch.randn((*shape, self._noise.shape[-1]), **random)
-        if team.size > 1:  # as in Minibatches: move own samples to the front, and drop the few that exceed the room
+        if team.size > 1:  # as in Minibatches: move own samples to the front, and drop the few that exceed the capacity
             index, own = team.locate(index, nworld)
             first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self._index.shape[1]]
             index, noise = index.gather(1, first), noise.gather(1, first[..., None].expand(-1, -1, noise.shape[-1]))
@@ -399,7 +401,7 @@ class GradientStep:
 
 
 def action_bounds(env: Env, limit: float) -> tuple[list[float], list[float]]:
-    """Lower and upper bounds of actions, each (nact,); where the task has none, -limit and limit."""
+    """Lower and upper bounds of actions, each (nact,); -limit and limit for actions that the task does not bound."""
     space = env.action_space
     assert space.low is not None and space.high is not None
     return tuple(  # type: ignore[return-value]

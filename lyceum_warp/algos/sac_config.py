@@ -14,19 +14,19 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 MANY_WORLDS = 256
-"""From this number of worlds on, the defaults are those for many worlds."""
+"""Smallest number of worlds for which the defaults for many worlds apply."""
 
 _FEW: dict[str, Any] = {
     "batch": 256, "actor_every": 1, "gamma": 0.99, "tau": 0.005, "temperature": 1.0, "target_entropy": -1.0,
     "critic_bound": "min", "hidden": (256, 256), "value_hidden": (256, 256),
 }  # fmt: skip
-"""Defaults for few worlds, of Haarnoja et al. (2018)."""
+"""Defaults for few worlds, from Haarnoja et al. (2018)."""
 
 _MANY: dict[str, Any] = {
     "batch": 8192, "actor_every": 4, "gamma": 0.97, "tau": 0.125, "temperature": 1e-3, "target_entropy": 0.0,
     "critic_bound": "mean", "hidden": (512, 256, 128), "value_hidden": (512, 512, 512),
 }  # fmt: skip
-"""Defaults for many worlds, close to those of Seo et al. (2025) for humanoids."""
+"""Defaults for many worlds, close to Seo et al. (2025) for humanoids."""
 
 
 @document_attributes
@@ -35,8 +35,8 @@ class SACConfig:
     """Hyperparameters of SAC.
 
     A value of None is chosen by the number of worlds (``resolved``): below 256 worlds as in Haarnoja et al. (2018,
-    "Soft Actor-Critic Algorithms and Applications"), and from there on close to Seo et al. (2025, "Learning Sim-to-Real
-    Humanoid Locomotion in 15 Minutes").
+    "Soft Actor-Critic Algorithms and Applications"), and with more worlds close to Seo et al. (2025, "Learning
+    Sim-to-Real Humanoid Locomotion in 15 Minutes").
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.
@@ -62,8 +62,8 @@ class SACConfig:
     gamma: float | None = None
     """Discount factor. The default is 0.99, or 0.97 with many worlds."""
     tau: float | None = None
-    """Part of the way from the target critics to the critics that each update moves the targets (Polyak averaging). The
-    default is 0.005, or 0.125 with many worlds."""
+    """Step size of the target critics: each update moves them by this fraction towards the critics (Polyak averaging).
+    The default is 0.005, or 0.125 with many worlds."""
     critic_bound: Literal["min", "mean"] | None = None
     """Whether the value of an action is the minimum or the mean of the two critics. The default is "min", or "mean"
     with many worlds."""
@@ -72,10 +72,10 @@ class SACConfig:
     temperature: float | None = None
     """Initial weight of the entropy, which is then learned. The default is 1, or 0.001 with many worlds."""
     target_entropy: float | None = None
-    """Entropy of the policy that the temperature is adapted to, per unit action, which lies between -1 and 1. The
+    """Target entropy of the policy per unit action, which lies between -1 and 1; the temperature is adapted to it. The
     default is -1, or 0 with many worlds."""
     action_limit: float = 1.0
-    """Bound of the actions to which the task gives none."""
+    """Bound of actions that the task does not bound."""
     hidden: tuple[int, ...] | None = None
     """Widths of the policy's hidden layers. The default is 256 256, or 512 256 128 with many worlds."""
     activation: Activation = "relu"
@@ -121,6 +121,6 @@ class SACConfig:
         assert config.updates is not None and config.actor_every is not None
         if config.updates % config.actor_every:
             raise ValueError(
-                f"updates must be a multiple of actor_every, as {config.actor_every}, not {config.updates}"
+                f"updates must be a multiple of actor_every, which is {config.actor_every}, not {config.updates}"
             )
         return config

@@ -1,4 +1,4 @@
-"""Define policies with bounded actions: the hyperbolic tangent of a Gaussian, as SAC learns them."""
+"""Define SAC's policies, which draw bounded actions: the hyperbolic tangent of a Gaussian sample."""
 
 import math
 from collections.abc import Sequence

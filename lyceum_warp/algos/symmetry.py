@@ -28,7 +28,7 @@ class Reflected(nn.Module):
         return self.swapped(rows) * self.signs
 
     def swapped(self, rows: torch.Tensor) -> torch.Tensor:
-        """Compute the mirror image of sizes, such as standard deviations, which have no sign."""
+        """Compute the mirror image of unsigned values, such as standard deviations."""
         return rows.index_select(-1, self.order)
 
 
@@ -47,16 +47,16 @@ class PolicyMirror(nn.Module):
     def average(self, function: Callable[[torch.Tensor], torch.Tensor], obs: torch.Tensor) -> torch.Tensor:
         """Average the actions of a function of observations with the mirror image's.
 
-        The mirror images of a batch of observations give the mirror images of the actions, to the bit.
+        Mirrored observations then give exactly the mirrored actions, bit for bit.
         """
         return 0.5 * (function(obs) + self.action(function(self.obs(obs))))
 
 
 def reflections(env: Env, *, group: str = "policy") -> dict[str, Reflection]:
-    """The reflections of a group of observations, ``obs``, and of actions, ``action``, of an environment's task.
+    """The reflections of an observation group (``obs``) and of the actions (``action``) of an environment's task.
 
     Raises:
-        ValueError: The task declares no mirror, or none of a part.
+        ValueError: The task declares no mirror, or a part has no mirror image.
     """
     task: Any = env.task.task
     declared = task.mirror

@@ -1,4 +1,4 @@
-"""Compare a policy between engines and between physics, in pairs of episodes with equal starts."""
+"""Compare a policy between engines and between physics, in pairs of episodes with equal initial states."""
 
 import dataclasses
 import functools
@@ -29,7 +29,8 @@ class Difference:
     """The difference of a mean over episodes between two simulations, with its 95 % confidence interval."""
 
     quantity: str
-    """Its name: return, length (steps) or terminated (share of episodes that the task ended; walking robots' falls)."""
+    """Name of the quantity: return, length (steps) or terminated (share of episodes that the task ended, such as by a
+    fall)."""
     first: float
     """The mean in the first simulation."""
     second: float
@@ -39,7 +40,7 @@ class Difference:
     high: float
     """Upper end of the interval."""
     margin: float
-    """Differences up to this one are irrelevant."""
+    """Largest irrelevant difference."""
 
     @property
     def verdict(self) -> str:
@@ -50,7 +51,7 @@ class Difference:
 
     @property
     def text(self) -> str:
-        """The interval, as "return +1.2 ± 0.5"."""
+        """Format the interval, for example "return +1.2 ± 0.5"."""
         return f"{self.quantity} {0.5 * (self.low + self.high):+.3g} ± {0.5 * (self.high - self.low):.2g}"
 
 
@@ -64,7 +65,7 @@ class Comparison:
     second: str
     """The second simulation: "Warp engine on cuda:0", or other physics on the C engine."""
     faults: tuple[int, int]
-    """Number of faults in each."""
+    """Number of faults in each simulation."""
     differences: tuple[Difference, ...]
     """Differences of returns, lengths and, if the task ends episodes, shares of terminated episodes."""
 
@@ -87,7 +88,7 @@ class Transfer:
     seed: int
     """Seed of the initial states."""
     comparisons: tuple[Comparison, ...]
-    """One for each engine and physics that is compared."""
+    """One comparison for each engine and each physics."""
 
     @property
     def line(self) -> str:
@@ -123,22 +124,23 @@ def transfer(
 ) -> Transfer:
     """Play the same episodes on both engines, and under each physics of the task, and compare them in pairs.
 
-    The Warp engine is compared with the C engine under the environment's physics; each physics of the task, and the
-    environment's own, with the task's exact physics, on the C engine. The episodes of a pair have equal random numbers:
-    initial states, model fields, pushes and commands. Intervals of returns and lengths are Student's t over the pairs;
-    the interval of the terminated share is Agresti and Min's.
+    The Warp engine is compared with the C engine under the environment's physics. On the C engine, each physics of the
+    task and the environment's own physics are compared with the task's exact physics. The episodes of a pair have equal
+    random numbers: initial states, model fields, pushes and commands. Intervals of returns and lengths are Student's t
+    over the pairs; the interval of the terminated share is Agresti and Min's.
 
     Args:
         env: An environment of the task; its worlds stay unchanged.
         policy: A module with a method ``act``, or a function; maps observations to actions, without noise.
         episodes: Number of pairs, each in a world of its own.
         seed: Seed of the initial states.
-        margin: Irrelevant difference, as a share of the mean absolute return and of the mean length in the first
-            simulation, and as a difference of the terminated share.
+        margin: Largest irrelevant difference: for returns and lengths, a fraction of the mean absolute return or mean
+            length in the first simulation; for the terminated share, an absolute difference.
         device: Device of the Warp engine; by default the environment's GPU, or else one of this machine, or else the
             CPU, where its kernels may take minutes to compile.
         warp: Whether to play on the Warp engine.
-        physics: Whether to play under each of the task's physics; otherwise only under the environment's and the exact.
+        physics: Whether to play under each of the task's physics; otherwise only under the environment's physics and
+            the exact physics.
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:
@@ -178,9 +180,9 @@ def _show(progress: Callable[[int, int], object] | None, play: int, plays: int, 
 
 
 def task_physics(env: Env) -> tuple[dict[str, PhysicsOptions], str]:
-    """The physics of an environment's task by name, the environment's own included, and the name of its own.
+    """The physics of a task by name, including the environment's own physics, and the name of the latter.
 
-    Options that only the Warp engine has are left out.
+    Options of the Warp engine alone are omitted.
     """
     named = {EXACT: PhysicsOptions(), **env.task.task.physics}
     given = dataclasses.replace(env.options.physics, nconmax=None, njmax=None, deterministic=False)

@@ -15,7 +15,7 @@ from lyceum_warp.support.validate import layer_sizes, whole_number
 
 @document_attributes
 class TwinCritic(Normalized):
-    """Two independent networks of one shape, whose layers are computed together.
+    """Two independent networks of the same shape, computed together layer by layer.
 
     Args:
         nobs: Length of an observation.

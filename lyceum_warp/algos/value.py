@@ -35,7 +35,7 @@ class ValueFunction(Normalized):
     """
 
     LATER = ("shift", "scale")
-    """Buffers missing in files of earlier releases; the initial values are used instead."""
+    """Buffers that files of earlier releases lack; their initial values are used instead."""
 
     group: str
     """The group of observations that is the input."""
@@ -116,7 +116,7 @@ class ValueFunction(Normalized):
         Args:
             returns: Returns, of any shape.
             first: Whether the value function has never been fitted, so that its scale is arbitrary.
-            team: The processes; each brings the same number of returns.
+            team: The processes; each contributes the same number of returns.
         """
         team = team or Team()
         returns = returns.flatten().double()

@@ -248,7 +248,7 @@ class CapturedStep:
         self.at.zero_()
 
     def _capture(self, times: int) -> None:
-        """Run ``times`` steps directly, which allocates Adam's moments, and then capture the graph."""
+        """Run ``times`` steps directly, so that Adam allocates its moments, and then capture the graph."""
         with side_stream():
             for _ in range(times):
                 self.learn()

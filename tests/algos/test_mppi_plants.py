@@ -163,7 +163,7 @@ def test_bad_input_gets_one_line() -> None:
     assert plan.seeds == [0, 1]
     with pytest.raises(AttributeError, match="make another MPPI with plants=3"):
         plan.plants = 3
-    with pytest.raises(ValueError, match="plans for 2 plants, and this loop controls one: make it with plants=1"):
+    with pytest.raises(ValueError, match="plans for 2 plants, but this loop controls one: make it with plants=1"):
         lw.control(lw.make("point_mass", autoreset=False), plan, steps=2)
 
 

@@ -277,5 +277,5 @@ def test_defaults_depend_on_the_number_of_worlds() -> None:
 def test_hyperparameters_that_are_not_valid_are_refused(words: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         lw.SACConfig(**words)
-    with pytest.raises(ValueError, match="updates must be a multiple of actor_every, as 4, not 6"):
+    with pytest.raises(ValueError, match="updates must be a multiple of actor_every, which is 4, not 6"):
         lw.SACConfig(updates=6).resolved(4096)
