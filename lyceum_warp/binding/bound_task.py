@@ -37,12 +37,12 @@ _PARTS = 'the parts of its observation, as obs = {"position": 5}'
 
 
 def task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSpec:
-    """The MjSpec of a task's own model or of another one, after the task's ``edit_model``."""
+    """Load a task's own model, or another one, as an MjSpec, and apply the task's ``edit_model``."""
     return _edited(task, _read_spec(task, model))
 
 
 def _read_spec(task: type[Task], model: ModelSource | None) -> mujoco.MjSpec:
-    """The model before the task's ``edit_model``."""
+    """Load the model that the task's ``edit_model`` will change."""
     if model is not None:
         return models.load_spec(model)
     if not hasattr(task, "model"):
@@ -52,7 +52,7 @@ def _read_spec(task: type[Task], model: ModelSource | None) -> mujoco.MjSpec:
 
 
 def _edited(task: type[Task], spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """A copy of a model after the task's ``edit_model``."""
+    """Copy a model, and apply the task's ``edit_model`` to the copy."""
     copy = spec.copy()
     try:
         changed: Any = task.edit_model(copy)
@@ -73,7 +73,7 @@ def check_field_name(name: str) -> None:
     """Refuse a name that neither MjData nor MjModel has.
 
     Raises:
-        ValueError: There is no such field; the message names those that resemble it.
+        ValueError: There is no such field; the message suggests similar names.
     """
     if is_data_field(name) or is_model_field(name):
         return
@@ -86,7 +86,8 @@ def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict
     """The parts of each group of a task's observations and their sizes, for given values of its parameters.
 
     Raises:
-        ValueError: ``obs`` of the task is not a dict of sizes, or a dict of groups of them; or a struct has no parts.
+        ValueError: The task's ``obs`` is neither a dict of sizes nor a dict of groups of sizes, or a struct has no
+            parts.
     """
     task, name = source.task, source.name
     if not hasattr(task, "obs"):
@@ -99,8 +100,8 @@ def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict
         given = {"policy": given}
     elif not all(grouped) or "policy" not in given:
         raise ValueError(
-            f"obs of the task {name!r} must be a dict of parts and sizes, or of groups of them, one of them 'policy', "
-            f"not {given!r}"
+            f"obs of the task {name!r} must be a dict of parts and sizes, or a dict of such dicts for groups, "
+            f"including 'policy', not {given!r}"
         )
     for group in given:
         if not (isinstance(group, str) and group.isidentifier()) or keyword.iskeyword(group):
@@ -112,10 +113,10 @@ def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict
 
 
 def obs_slices(source: TaskSource, params: Mapping[str, Any]) -> dict[str, parts.Layout]:
-    """The layouts of the groups of observations that a task writes into structs; without groups if it has ``obs``.
+    """The layouts of the observation groups that a task writes into structs; empty if the task has ``obs``.
 
     Raises:
-        ValueError: ``observe`` takes no struct, or a struct has no parts or fields that are no parts.
+        ValueError: ``observe`` takes no struct, or a struct has no parts, or has fields that are not parts.
     """
     if hasattr(source.task, "obs"):
         return {}
@@ -184,14 +185,14 @@ class BoundTask:
         for name in named:
             check_field_name(name)
         self.types = {name: v.type for name, v in self.source.world.vars.items() if name not in own_names}
-        """The types of a world's fields and of its rows of memory, as a batch of worlds has them."""
+        """The types, in a batch of worlds, of the fields and of the rows of memory."""
         self.types |= {name: Row[float] for name in MEMORIES if any(part.kind == name for part in memory.values())}
         self.writes = self._checked_writes()
-        """The fields of World and the rows of memory that each function writes, by the functions' names."""
+        """For each function by name, the fields of World and the rows of memory that it writes."""
         own = [name for name in named if is_data_field(name)]
         of_model = [name for name in named if name not in own]
         self.spec = _read_spec(task, model)
-        """The model before ``edit_model``. Replicas are made from it, because its source may have changed."""
+        """The model before ``edit_model``. Replicas are made from it, because the file may have changed."""
         self.model = models.compile_model(_edited(task, self.spec), own, physics, varied={*of_model, *dynamics})
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.frame_skip = whole_number(f"frame_skip of the task {self.name!r}", skip, low=1)
@@ -210,17 +211,17 @@ class BoundTask:
             given=params or {}, weights=self.source.terms.weights,
         )  # fmt: skip
         self.actions = self._checked_actions()
-        """The sizes of the parts of an action, by name; None if actions are controls."""
+        """Sizes of an action's parts, by name; None if actions are controls."""
         self.memory = self._memory_layouts()
-        """The layouts of the rows ``memory`` and ``lasting_memory``."""
+        """Layouts of the rows ``memory`` and ``lasting_memory``."""
         self.obs_layouts = obs_layouts(self.source, self.params)
         """The parts of each group of observations and their sizes."""
         self.observers = self.source.group_functions(self.obs_layouts)
-        """The functions that write the groups of observations, by the groups' names."""
+        """The functions that write observation groups, by group name."""
         observers = {observer_name(group): function for group, function in self.observers.items()}
         check_writes(self.name, observers, dict.fromkeys(observers, self._rights(FUNCTIONS["observe"])))
         self.shared = self._shared_layouts()
-        """The layouts of Shared and Sums; empty for a task without memory that worlds share."""
+        """Layouts of Shared and Sums; empty if worlds share no memory."""
         structs = obs_slices(self.source, self.params) | self.shared
         self.kernels = kernels_of(self.source, self.observers, self.memory, structs)
 
@@ -236,7 +237,7 @@ class BoundTask:
 
     @property
     def noisy_groups(self) -> list[str]:
-        """The groups of observations whose functions draw random numbers."""
+        """The observation groups whose functions draw random numbers."""
         return [group for group, function in self.observers.items() if draws_noise(function)]
 
     def _checked_writes(self) -> dict[str, frozenset[str]]:
@@ -264,7 +265,7 @@ class BoundTask:
         }
 
     def _rights(self, function: TaskFunction) -> Rights:
-        """The fields that a function may write, by the names of its arguments."""
+        """The fields that a function may write, by argument name."""
         model = [name for name in self.types if is_model_field(name)]
         memory = tuple(self.source.memory)
         lasting = (*(name for name, part in self.source.memory.items() if part.kind == "lasting_memory"), *model)
@@ -290,7 +291,7 @@ class BoundTask:
         self.dynamics = [describe_model_field(self.model, name) for name in varied]
         """The model fields that differ between worlds."""
         self.constants = [describe_model_field(self.model, name, varies=False) for name in named if name not in varied]
-        """The model fields that functions read and that are the same in all worlds."""
+        """The model fields that functions read and that do not differ between worlds."""
         drawn_constants = [field.name for field in self.dynamics if field.constants]
         if drawn_constants and (stale := [field.name for field in self.constants if field.follows]):
             raise ValueError(
@@ -302,12 +303,12 @@ class BoundTask:
         """Change parameters.
 
         Raises:
-            ValueError: There is no such parameter, or the observation would change its size.
+            ValueError: There is no such parameter, or the observation's size would change.
         """
         previous, self.parameters = self.parameters, self.parameters.changed(params)
         try:
             changed = "the observation's" if obs_layouts(self.source, self.params) != self.obs_layouts else ""
-        except ValueError:  # one value per world for a parameter that sets a size
+        except ValueError:  # a parameter that sets a size has one value per world
             changed = "the observation's"
         layouts = (self._memory_layouts(), self._shared_layouts())
         changed = changed or ("the memory's" if layouts != (self.memory, self.shared) else "")
@@ -356,8 +357,8 @@ class BoundTask:
             raise ValueError(f"{name} is {steps}, but the task has no {FUNCTIONS['success'].signature}: add it")
         if steps > task.horizon > 0:
             raise ValueError(
-                f"{name} is {steps}, but its episodes have {task.horizon} steps, so that none can succeed: lower it, "
-                "or raise horizon"
+                f"{name} is {steps}, but its episodes have {task.horizon} steps, so no episode can succeed: lower "
+                f"it, or raise horizon"
             )
 
     def _check_metrics(self) -> None:
@@ -402,7 +403,7 @@ class BoundTask:
         """Compare the type of a field in World with its array, (nworld, ...).
 
         Raises:
-            ValueError: They differ in the type of an element or in the number of axes.
+            ValueError: The element types or the numbers of axes differ.
         """
         kind = self.types[name]
         dtype, ndim = (kind.dtype, kind.ndim) if hasattr(kind, "ndim") else (kind, 0)

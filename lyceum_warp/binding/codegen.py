@@ -1,7 +1,7 @@
 """Generate the source that turns a task's functions of one world into kernels over a batch of worlds.
 
-The generated source has a struct of the fields with one more axis, a view of world w in it, and default functions. It
-is text, because Warp compiles source.
+The generated source defines a struct of the fields with an additional axis for the worlds, a function that returns a
+view of world w, and default functions. It is text, because Warp compiles source.
 """
 
 import dataclasses
@@ -91,7 +91,7 @@ _MEMORY_CHECKS = {
         "    if not restored_row(before.lasting_memory[w], after.lasting_memory[w], lane, lanes):\n"
         "        finite = False",
 }  # fmt: skip
-"""Lines that find memory that is not finite, and restore lasting memory to its value before the step."""
+"""Lines that detect non-finite memory, and restore lasting memory to its value before the step."""
 
 _kernels: dict[Any, steps.Kernels] = {}
 _MAKING = threading.RLock()
@@ -107,9 +107,9 @@ def kernels_of(
 
     Args:
         source: The task.
-        groups: The functions that write its groups of observations.
+        groups: The functions that write its observation groups.
         memory: The layouts of its rows of memory.
-        structs: The layouts of rows that functions see as structs: groups of observations, Shared and Sums.
+        structs: The layouts of rows that functions access as structs: observation groups, Shared and Sums.
     """
     layouts = tuple((name, *layout.items()) for name, layout in (*memory.items(), *structs.items()))
     called = tuple(source.terms.functions.items())
@@ -138,7 +138,7 @@ def _generated(
     memory: Mapping[str, Layout],
     structs: Mapping[str, Layout],
 ) -> dict[str, Any]:
-    """The names that the generated source defines: structs, functions that call the task's, and defaults."""
+    """The names that the generated source defines: structs, wrappers of the task's functions, and default functions."""
     scope: dict[str, Any] = {"wp": wp, "Row": Row, "World": source.world, "Params": source.params}
     scope |= {"Shared": source.shared, "Sums": source.sums}
     batch, rows, state, views = [], [], [], []
@@ -174,7 +174,7 @@ def _generated(
         scope[f"observe_{number}"] = function
         noisy = draws_noise(function)
         observe.append(f"if group == {number}:")
-        if noisy:  # a stream for each group, so that no group's draws depend on another's
+        if noisy:  # a stream for each group, so that no group's draws depend on another group
             observe.append(f"    rng[0] = substream(base, {number})")
         row = f"out.{group}[w]"
         if group in structs:
@@ -218,7 +218,7 @@ def _copy(name: str, ndim: int) -> list[str]:
 
 
 def _model_checks(source: TaskSource) -> list[str]:
-    """Lines that find negative numbers and NaN in model fields that the task writes and that must not be negative."""
+    """Lines that detect NaN and invalid negative numbers in the model fields that the task writes."""
     written = frozenset[str]().union(*(written_fields(function) for function in source.functions.values() if function))
     lines = []
     for name, variable in source.world.vars.items():

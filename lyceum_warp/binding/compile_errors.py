@@ -6,11 +6,11 @@ from lyceum_warp.task import FUNCTIONS
 
 
 def explained(error: Exception, task: str) -> Exception:
-    """A one-line error if Warp could not compile the functions of a task; any other error unchanged."""
+    """Return a one-line error if Warp could not compile the functions of a task; return any other error unchanged."""
     text = str(error)
     if "while parsing function" not in text and not type(error).__module__.startswith("warp"):
         return error
-    # the message names the kernel that Warp compiled first, which differs from run to run
+    # the message names the kernel that Warp happened to compile first
     flat = " ".join(text.split())
     # the last function in the message contains the error: if it is a kernel that calls a function of the task, the
     # type of the result is wrong

@@ -24,8 +24,8 @@ class TaskSource:
         name: The task's name, for messages.
 
     Raises:
-        ValueError: A struct or ``observe`` is missing, a function has another signature than in the table, or a name
-            resembles one of the table.
+        ValueError: A struct or ``observe`` is missing, a function's signature differs from the table, or a name
+            resembles a name in the table.
     """
 
     def __init__(self, task: type[Task], name: str) -> None:
@@ -42,18 +42,19 @@ class TaskSource:
         self.memory: dict[str, Part] = self._memory()
         """The fields of World that are the task's memory, by name."""
         self.shared, self.sums = self._shared_structs()
-        """The structs of the memory that worlds share and of the sums over worlds; None for a task without them."""
+        """The structs of the memory that worlds share, and of the sums over worlds; None if the task has no shared
+        memory."""
         self.functions: dict[str, wp.Function | None] = {
             name: self._function(wanted) for name, wanted in FUNCTIONS.items()
         }
-        """The task's functions by their names in the table; None for a function that the task lacks."""
+        """The task's functions by their names in the table; None for missing functions."""
         self.terms = Terms(task, name, self._term, self.functions, self.world, self.params)
         if self.functions["observe"] is None:
             raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), which every task needs")
         self._check_names()
 
     def group_functions(self, groups: Collection[str]) -> dict[str, wp.Function]:
-        """The functions that write groups of observations, by the groups' names.
+        """The functions that write observation groups, by group name.
 
         Raises:
             ValueError: No function writes a group, or a function writes a group that is not listed.
@@ -74,14 +75,14 @@ class TaskSource:
         return found
 
     def group_structs(self) -> dict[str, Any]:
-        """The structs of the groups of observations that functions write, by the groups' names."""
+        """The structs of the observation groups that functions write, by group name."""
         names = [name for owner in reversed(self._owners) for name in self._observers(owner)]
         groups = dict.fromkeys(["policy", *(name.removeprefix(GROUP_PREFIX) for name in names)])
         functions = self.group_functions(groups)
         return {group: list(function.input_types.values())[2] for group, function in functions.items()}
 
     def _observers(self, owner: type[Task]) -> list[str]:
-        """Names of functions for groups: those in a class, and those in its module that nothing there uses."""
+        """Names of functions for groups: in a class, or in its module if no other code of the module uses them."""
         module = vars(sys.modules[owner.__module__])
         functions = {name: self._seen(value) for name, value in module.items() if isinstance(value, wp.Function)}
         tasks = [kind for kind in (owner, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
@@ -93,13 +94,13 @@ class TaskSource:
             name
             for name, function in functions.items()
             if name not in called and id(function) not in used
-            and tuple(map(self._kind, function.input_types.values())) in forms  # not another task's
+            and tuple(map(self._kind, function.input_types.values())) in forms  # not of another task
             and (self._has_structs or not any(_may_list(task, name.removeprefix(GROUP_PREFIX)) for task in tasks))
         ]  # fmt: skip
         return [name for name in (*own, *unused) if name.startswith(GROUP_PREFIX)]
 
     def _written(self, name: str) -> Any:
-        """The value of a name in the class, in its module, or in a base class or its module."""
+        """Look up a name in the class, in its module, and in the base classes and their modules."""
         for owner in self._owners:
             found = vars(owner).get(name, owner.scope.get(name, vars(sys.modules[owner.__module__]).get(name)))
             if found is not None:
@@ -107,12 +108,12 @@ class TaskSource:
         return None
 
     def _seen(self, value: Any) -> Any:
-        """A value of the task's family over the task's own structs; see ``variants``."""
+        """A value of the task's family, converted to the task's own structs; see ``variants``."""
         return value if self._variant is None else self._variant.seen(value)
 
     @property
     def _has_structs(self) -> bool:
-        """Whether structs, not the task's ``obs``, lay out the observations."""
+        """Whether structs define the layout of the observations, instead of the task's ``obs``."""
         return not hasattr(self.task, "obs")
 
     def _term(self, name: str) -> wp.Function | None:
@@ -135,9 +136,9 @@ class TaskSource:
         return struct
 
     def _with_functions(self, own: Any) -> Any:
-        """The struct of the parameters that functions take: a base task's, if the task's own only has other defaults.
+        """The parameter struct that functions take: a base task's struct if the task's own differs only in defaults.
 
-        Tasks that differ in defaults then share functions and kernels.
+        Tasks that differ only in defaults then share functions and kernels.
         """
         fields = {name: wp.types.type_repr(field.type) for name, field in own.vars.items()}
         for owner in reversed(self._owners):
@@ -148,7 +149,7 @@ class TaskSource:
         return own
 
     def _memory(self) -> dict[str, Part]:
-        """The parts of memory in World; a task that gives only their number is refused."""
+        """The parts of memory in World. A task that only gives their number is refused."""
         counted = [name for name in MEMORIES if hasattr(self.task, name)]
         parts = parts_of(self.world, "World")
         if old := [*counted, *(name for name in MEMORIES if name in self.world.vars and name not in parts)]:
@@ -161,10 +162,10 @@ class TaskSource:
         return parts
 
     def _shared_structs(self) -> tuple[Any, Any]:
-        """The structs of the memory that worlds share and of their sums.
+        """The structs of the memory that worlds share, and of the sums over worlds.
 
         Raises:
-            ValueError: One of ``World.shared``, ``tally`` and ``share`` is missing, or is of another form.
+            ValueError: ``World.shared``, ``tally`` or ``share`` is missing or malformed.
         """
         field, tally, share = self.world.vars.get("shared"), self._written("tally"), self._written("share")
         if field is None and tally is None and share is None:
@@ -203,7 +204,7 @@ class TaskSource:
             raise ValueError(f"{name} of the task {self.name!r} has no return: write it as {wanted.signature}")
         if wanted.result is not None and any(isinstance(value, ast.Tuple) for value in values):
             raise ValueError(
-                f"{name} of the task {self.name!r} returns a tuple, and must return a single {wanted.result.__name__}"
+                f"{name} of the task {self.name!r} returns a tuple, but must return a single {wanted.result.__name__}"
             )
         self._check_structs(name, structs)
         kinds = tuple(map(self._kind, types))
@@ -215,14 +216,14 @@ class TaskSource:
         return function
 
     def _check_structs(self, name: str, structs: list[Any]) -> None:
-        """Refuse a function that takes the World or the Params of another file."""
+        """Refuse a function that takes the World or Params of another file."""
         for kind in structs:
             for own_name, own in (("World", self.world), ("Params", self.params)):
                 if kind is not own and kind.key.rpartition(".")[2] == own_name:
                     raise ValueError(
                         f"{name} of the task {self.name!r} takes the {own_name} of {_origin(kind)}, but the task has "
                         f"the {own_name} of {_origin(own)}: import both structs from one module, extend the first by "
-                        f"@wp.struct class {own_name}(module.{own_name}), or write {name} for the task's own"
+                        f"@wp.struct class {own_name}(module.{own_name}), or rewrite {name} for the task's own structs"
                     )
 
     def _kind(self, argument: Any) -> str:
@@ -240,7 +241,7 @@ class TaskSource:
         return "bool" if argument in (bool, wp.bool) else kinds.get(element, "?")
 
     def _check_names(self) -> None:
-        """Refuse names that resemble one of the table: nothing would ever call such a function."""
+        """Refuse names that resemble a name in the table, because such a function would never be called."""
         attributes = [name for name in vars(Task) if not name.startswith("_")]
         for name in vars(self.task):
             if name.startswith(("_", GROUP_PREFIX)) or name in (*attributes, "World", "Params", *FUNCTIONS):
@@ -257,12 +258,12 @@ class TaskSource:
 
 
 def draws_noise(observer: wp.Function) -> bool:
-    """Whether the function of a group of observations takes a random stream."""
+    """Whether an observation group's function takes a random stream."""
     return len(observer.input_types) > len(FUNCTIONS["observe"].kinds)
 
 
 def _may_list(task: type[Task], group: str) -> bool:
-    """Whether a class lists a group of observations, or may do so, because its ``obs`` is a method."""
+    """Whether a class lists an observation group, or may do so because its ``obs`` is a method."""
     obs = getattr(task, "obs", None)
     return callable(obs) or (isinstance(obs, Mapping) and isinstance(obs.get(group), Mapping))
 

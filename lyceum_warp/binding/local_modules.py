@@ -1,4 +1,4 @@
-"""Find and import the modules beside a task's file, as Python does for a program."""
+"""Find and import the modules beside a task's file, as Python does for a script."""
 
 import ast
 import contextlib
@@ -13,11 +13,11 @@ Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
 """Modification times and sizes of files; None for a file that does not exist."""
 
 _taken: dict[str, Stamps] = {}
-"""The modules in ``sys.modules`` that a task's file imported from its folder, with their stamps."""
+"""The modules in ``sys.modules`` that task files imported from their folders, with their stamps."""
 
 
 def local_modules(file: Path) -> dict[str, Path]:
-    """The modules beside a Python file that it imports, directly or through each other. None of them is run.
+    """The modules beside a Python file that it imports, directly or indirectly. They are not run.
 
     Returns:
         The modules' files by name; for a package without ``__init__.py``, its folder.
@@ -34,7 +34,7 @@ def local_modules(file: Path) -> dict[str, Path]:
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
         for wanted in _imported_names(tree, package):
             if _module_file(folder, wanted) is None:
-                wanted = wanted.rpartition(".")[0]  # a name within a module
+                wanted = wanted.rpartition(".")[0]  # the name may be an attribute of a module
             for part in _prefixes(wanted):
                 if part not in found and (module := _module_file(folder, part)) not in (None, file.resolve()):
                     found[part] = module
@@ -44,12 +44,12 @@ def local_modules(file: Path) -> dict[str, Path]:
 
 
 def _imported_names(tree: ast.AST, package: str) -> Iterator[str]:
-    """Full names of the modules, and of the names in modules, that a module of this package imports."""
+    """Full names of everything that a module of this package imports: modules, and names in modules."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            with contextlib.suppress(ImportError):  # too many dots
+            with contextlib.suppress(ImportError):  # the relative import has too many dots
                 owner = importlib.util.resolve_name("." * node.level + (node.module or ""), package or None)
                 yield from (owner, *(f"{owner}.{alias.name}" for alias in node.names))
 
@@ -60,7 +60,7 @@ def _prefixes(name: str) -> list[str]:
 
 
 def _module_file(folder: Path, name: str) -> Path | None:
-    """The file of a module below a folder, or the folder of a package without ``__init__.py``."""
+    """The file of a module in a folder; for a package without ``__init__.py``, its folder."""
     if not name:
         return None
     base = folder.joinpath(*name.split("."))
@@ -71,7 +71,7 @@ def _module_file(folder: Path, name: str) -> Path | None:
 
 
 def stamps(files: Iterable[Path]) -> Stamps:
-    """The current stamps of files, to find those that changed."""
+    """The current stamps of files, to detect changed files."""
     found: Stamps = dict.fromkeys(files)
     for file in found:
         with contextlib.suppress(OSError):
@@ -81,10 +81,10 @@ def stamps(files: Iterable[Path]) -> Stamps:
 
 @contextlib.contextmanager
 def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
-    """Context in which a task's file can import the modules beside it, which ``local_modules`` returned.
+    """Context in which a task's file can import the modules beside it, as returned by ``local_modules``.
 
-    It replaces modules of the same names that have changed, or that a task's file in another folder imported. If the
-    block raises an error, ``sys.modules`` has the previous modules again.
+    It replaces loaded modules of the same names if they have changed or come from another folder. If the block raises
+    an error, ``sys.modules`` is restored.
     """
     before = {name: sys.modules.get(name) for name in modules}
     if any(name in _taken and _taken[name] != stamps([path]) for name, path in modules.items()):
@@ -94,7 +94,7 @@ def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
     folder, bytecode = str(file.resolve().parent), sys.dont_write_bytecode
     sys.path.insert(0, folder)
     importlib.invalidate_caches()
-    sys.dont_write_bytecode = True  # the folder may belong to a run, and its time stamps are in whole seconds
+    sys.dont_write_bytecode = True  # the folder may belong to a run, whose time stamps are in whole seconds
     try:
         yield
     except BaseException:

@@ -21,12 +21,12 @@ log = logging.getLogger(__name__)
 
 
 def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
-    """Load a model as an MjSpec, which can be edited and then compiled from any current folder.
+    """Load a model as an editable MjSpec that compiles from any current folder.
 
     Args:
-        source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec, which is copied. A path
-            is relative to the file in which ``owner`` or a base class gives it, or else to the current folder.
-        owner: The task class whose own model it is.
+        source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec, which is copied. A path is
+            relative to the file of ``owner``, or of the base class that gives it, or else to the current folder.
+        owner: The task class that declares the model.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -36,7 +36,7 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         raise ValueError("a task's model must be a file or an MjSpec, not a compiled MjModel: give its MjSpec")
     if isinstance(source, mujoco.MjSpec):
         spec = source.copy()
-        spec.modelfiledir = str(Path(spec.modelfiledir).absolute())  # its meshes are relative to it
+        spec.modelfiledir = str(Path(spec.modelfiledir).absolute())  # its mesh paths are relative to it
         return spec
     if isinstance(source, ModelFile):
         return source.spec()
@@ -45,7 +45,7 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
 
 
 def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFile:
-    """The file for a model's path, or gymnasium's model of a name; see ``load_spec``.
+    """Find a model's file from its path, or from the name of a gymnasium model; see ``load_spec``.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -53,7 +53,7 @@ def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFil
     """
     if isinstance(source, str) and source.lstrip().startswith("<"):
         start = textwrap.shorten(source, 24, placeholder=" ...")
-        raise ValueError(f"the model {start!r} is XML, not a file: give mujoco.MjSpec.from_string(...) of it")
+        raise ValueError(f"the model {start!r} is XML, not a file: pass mujoco.MjSpec.from_string(...)")
     folder = Path()
     if owner is not None:  # a subclass in another folder inherits the path
         owner = next((kind for kind in owner.__mro__ if "model" in vars(kind)), owner)
@@ -153,7 +153,7 @@ def compile_model(
             model = spec.compile()
     except ValueError as error:
         raise ValueError(f"MuJoCo refuses the model {spec.modelname!r}: {error}") from error
-    for warning in caught:  # only logged: most are about Gymnasium's XML, which users cannot change
+    for warning in caught:  # warnings are only logged: most concern Gymnasium's XML, which users cannot change
         log.info("%s: %s", spec.modelname, warning.message)
     return model
 

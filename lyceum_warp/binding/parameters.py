@@ -15,13 +15,13 @@ from lyceum_warp.options import OPTIONS, suggestion
 from lyceum_warp.task import Element, FromModel
 
 _FILLED_IN = ("dt", "substep_dt")
-"""Fields of ``Params`` that are filled in: seconds in a step and in a substep."""
+"""Fields of ``Params`` that are filled in: the durations of a step and of a substep, s."""
 
 
 def defaults(struct: Any, owner: type) -> dict[str, Any]:
     """The defaults of a task's parameters, by name, without fields that are filled in.
 
-    ``struct`` is the struct that the functions take, ``owner`` the class with the defaults.
+    The functions take ``struct``; the class ``owner`` has the defaults.
     """
     names = [name for name in struct.vars if name not in _FILLED_IN and hasattr(owner, name)]
     return {name: getattr(owner, name) for name in names}
@@ -40,7 +40,7 @@ class Parameters:
         nworld: Number of worlds.
         timestep: Seconds in a step, the value of ``dt``.
         given: Values that replace defaults.
-        weights: The weights of the task's terms, by name, set and given as parameters are.
+        weights: The weights of the task's terms, by name; they are set like parameters.
 
     Raises:
         ValueError: A field has the name of an option, a name is unknown, or a value is missing or does not fit.
@@ -72,7 +72,7 @@ class Parameters:
             )
         found = defaults(struct, owner) | self._weights | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
         self._computed = {name for name, value in found.items() if isinstance(value, FromModel)}
-        """Names of the values that are computed from the model."""
+        """Names of values that are computed from the model."""
         self.values: dict[str, Any] = {name: found[name] for name in (*struct.vars, *self._weights) if name in found}
         self.values = self.changed(given).values
         self._computed -= set(given)
@@ -83,10 +83,10 @@ class Parameters:
         return {name: v for name, v in self.values.items() if isinstance(v, np.ndarray) and name not in self.tables}
 
     def changed(self, given: Mapping[str, Any]) -> "Parameters":
-        """A copy with some values replaced, each converted to the type of its field. Both use the same arrays.
+        """Copy with some values replaced, each converted to the type of its field. The copy shares the arrays.
 
         Raises:
-            ValueError: A name is unknown, a value is missing or does not fit its field.
+            ValueError: A name is unknown, or a value is missing or does not fit its field.
         """
         known = (*self._struct.vars, *self._weights)
         for name in given:
@@ -95,7 +95,7 @@ class Parameters:
                 if name in OPTIONS:
                     raise ValueError(
                         f"{name!r} is an option, not a parameter of the task {self._task_name!r}: make another "
-                        f"environment, as env.replicate({name}=...)"
+                        f"environment with env.replicate({name}=...)"
                     )
                 hint = suggestion(name, names) or f"it has {', '.join(names) or 'none'}"
                 raise ValueError(f"the task {self._task_name!r} has no parameter {name!r}: {hint}")
@@ -114,10 +114,10 @@ class Parameters:
         return other
 
     def _compute(self, name: str, values: Mapping[str, Any]) -> Any:
-        """The value of a default that is computed from the model; the previous table if it has not changed."""
+        """Compute a default from the model; return the previous table if its contents are the same."""
         try:
             found = getattr(self._owner, name).function(self._model, SimpleNamespace(**values))
-        except Exception as error:  # a function of the task may raise any
+        except Exception as error:  # a function of the task may raise any error
             message = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
             raise ValueError(
                 f"the parameter {name} of {self._task_name!r} can't be computed from the model: {message}"
@@ -163,7 +163,7 @@ class Parameters:
                 )
 
     def _converted(self, name: str, value: Any) -> Any:
-        """A value in the type of its field: a scalar, a vector, a table, or an array with one value per world."""
+        """Convert a value to its field's type: a scalar, a vector, a table, or an array with one value per world."""
         kind = self._struct.vars[name].type if name in self._struct.vars else wp.float32
         if name in self.tables:
             return self._table(name, value)
@@ -181,7 +181,7 @@ class Parameters:
             return elements(self._model, default.field, value).start
         shape = tuple(getattr(kind, "_shape_", ()))
         try:
-            array = np.asarray(value, dtype=np.float64)  # Warp's own vectors, lists and tensors alike
+            array = np.asarray(value, dtype=np.float64)  # also converts Warp's vectors, lists and tensors
         except (TypeError, ValueError) as error:
             raise ValueError(f"{given} is not a number: {error}") from error
         if np.isnan(array).any():
@@ -202,7 +202,7 @@ class Parameters:
         )
 
     def _table(self, name: str, value: Any) -> np.ndarray:
-        """A table as a read-only array of float32 or int32, with the axes of its elements last."""
+        """Convert a table to a read-only array of float32 or int32, with the axes of its elements last."""
         if value is self.values.get(name) and isinstance(value, np.ndarray) and not value.flags.writeable:
             return value
         kind, what = self.tables[name], f"the parameter {name} of {self._task_name!r}"
@@ -235,7 +235,7 @@ class Parameters:
         return table
 
     def _indices(self, what: str, value: Any, field: str | None) -> Any:
-        """A table in which the model's elements and, with a field, names are replaced by indices."""
+        """Replace the model's elements in a table by indices and, if ``field`` is given, names too."""
         if isinstance(value, list | tuple):
             return [self._indices(what, entry, field) for entry in value]
         if isinstance(value, Element):
@@ -250,8 +250,8 @@ class Parameters:
         count = self._sizes[field]
         if ((array < 0) | (array >= count)).any():
             raise ValueError(
-                f"{given} is an index of {field!r}, of which the model has {count}: give one from 0 to {count - 1}, "
-                "or a name"
+                f"{given} is an index of {field!r}, of which the model has {count}: give an index from 0 to "
+                f"{count - 1}, or a name"
             )
 
     def _instance(self, world: int) -> Any:
@@ -267,21 +267,24 @@ class Parameters:
 
 
 def _element_field(default: Any) -> str | None:
-    """The field of the elements in the default of a table, such as "site_xpos"; None if it has other numbers."""
+    """The field, such as "site_xpos", of the model elements in a table's default.
+
+    It is None if the default has plain numbers.
+    """
     while isinstance(default, list | tuple) and default:
         default = default[0]
     return default.field if isinstance(default, Element) else None
 
 
 def _loaded(what: str, path: str | Path) -> np.ndarray:
-    """The array in a file that ``numpy.save`` wrote."""
+    """Load the array in a file written by ``numpy.save``."""
     try:
         # memory-mapped, because a broken header may ask for any amount of memory
         loaded: np.ndarray = np.load(path, allow_pickle=False, mmap_mode="r")
     except FileNotFoundError:
         raise FileNotFoundError(f"{what}: there is no such file") from None
-    except Exception as error:  # NumPy raises many types
+    except Exception as error:  # NumPy raises many types of errors
         raise ValueError(f"{what} cannot be read: {error}") from error
     if not isinstance(loaded, np.ndarray):
-        raise ValueError(f"{what} must be a single array, a .npy file of numpy.save")
+        raise ValueError(f"{what} must be a single array, in a .npy file written by numpy.save")
     return np.array(loaded)

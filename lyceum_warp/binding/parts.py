@@ -1,4 +1,4 @@
-"""Lay out the named parts of memory and observations: rows of a struct that are slices of one row of floats."""
+"""Lay out the named parts of memory and observations: each field of a struct is a slice of one row of floats."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from lyceum_warp.task import Part
 
 @dataclasses.dataclass(frozen=True)
 class Slice:
-    """The place of a part in its row of floats."""
+    """The position of a part in its row of floats."""
 
     start: int
     """Index of the first float."""
@@ -34,10 +34,10 @@ Layout = dict[str, Slice]
 
 
 def parts_of(struct: Any, owner: str) -> dict[str, Part]:
-    """The fields of a struct whose defaults are parts, by name; ``owner`` names the struct in messages.
+    """The fields of a struct whose defaults are parts, by name; ``owner`` is the struct's name in error messages.
 
     Raises:
-        ValueError: The type of such a field is not a row of numbers.
+        ValueError: A part's type is not a row of numbers.
     """
     found = {name: getattr(struct.cls, name, None) for name in struct.vars}
     parts = {name: part for name, part in found.items() if isinstance(part, Part)}
@@ -45,14 +45,14 @@ def parts_of(struct: Any, owner: str) -> dict[str, Part]:
         kind = struct.vars[name].type
         if not is_row(kind) or kind.ndim != 1 or getattr(kind.dtype, "_wp_scalar_type_", kind.dtype) is not wp.float32:
             raise ValueError(
-                f"{owner}.{name} has a size, so it must be a row of floats or of vectors of them: declare it as "
+                f"{owner}.{name} has a size, so it must be a row of floats or of float vectors: declare it as "
                 f"{name}: Row[float]"
             )
     return parts
 
 
 def layout(struct: Any, kind: str, params: Mapping[str, Any], owner: str) -> Layout:
-    """Lay out the parts of a kind in a struct; ``params`` has the tables that give sizes.
+    """Lay out a struct's parts of one kind; ``params`` has the tables that determine sizes.
 
     Raises:
         ValueError: A size is not a positive number, or names no table of Params.
@@ -76,7 +76,7 @@ def view_lines(layout: Layout, struct: str, row: str, scope: dict[str, Any]) -> 
     lines = []
     for name, part in layout.items():
         scope[f"dtype_{struct}_{name}"] = part.dtype
-        # by pointer: compilers handle a constant size better than a slice
+        # a pointer with a constant size compiles to faster code than a slice
         pointer = f"{row}.ptr + wp.uint64({4 * part.start})"
         lines.append(f"{struct}.{name} = wp.array(ptr={pointer}, shape=({part.count},), dtype=dtype_{struct}_{name})")
     return lines
@@ -87,10 +87,12 @@ def _floats(dtype: Any) -> int:
 
 
 def length(what: str, size: int | str, params: Mapping[str, Any]) -> int:
-    """A size, which may be given as the name of a table in ``params`` with as many rows; ``what`` is for messages.
+    """Resolve a size: a number, or the name of a table in ``params``, whose rows are counted.
+
+    ``what`` is its name in error messages.
 
     Raises:
-        ValueError: The size is not a positive number, or names no table.
+        ValueError: The size is not a positive number or the name of a table.
     """
     if not isinstance(size, str):
         return whole_number(what, size, low=1)

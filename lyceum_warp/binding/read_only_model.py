@@ -1,4 +1,4 @@
-"""Copy a compiled model for its user, and refuse edits, which the engine's own copy would not see."""
+"""Copy a compiled model for the user, and refuse edits, because they would not reach the engine's copy."""
 
 from typing import Any
 

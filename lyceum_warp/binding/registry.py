@@ -25,10 +25,10 @@ from lyceum_warp.task import Task
 _tasks: dict[str, type[Task]] = {}
 
 _loaded: dict[str, Stamps] = {}
-"""Stamps of the files of tasks and of the modules beside them when they were last run, by the tasks' modules."""
+"""For each task module, the stamps of its file and of the modules beside it when they were last run."""
 
 _LOADING = threading.RLock()
-"""Held while a file is loaded, because imports and linecache belong to the process."""
+"""Held while a file is loaded, because imports and linecache are global to the process."""
 
 _PACKAGE = "lyceum_warp.tasks."
 _FILE = "lyceum_task_"
@@ -72,9 +72,10 @@ def package_task_names() -> list[str]:
 
 @functools.cache
 def _package_modules() -> dict[str, str]:
-    """The modules of the package's tasks, by the tasks' names; none of them is imported.
+    """The modules of the package's tasks, by task name. They are not imported.
 
-    A module has the task of its name. A folder, a family of tasks, declares which of its modules has which task.
+    A module contains the task of the same name. A folder contains a family of tasks and declares their modules in
+    ``TASKS``.
     """
     found: dict[str, str] = {}
     for folder in map(Path, importlib.import_module("lyceum_warp.tasks").__path__):
@@ -88,7 +89,7 @@ def _package_modules() -> dict[str, str]:
 
 
 def _declared(file: Path) -> dict[str, str]:
-    """The dict ``TASKS`` in a file, which is not run: modules by the names of their tasks."""
+    """Read the dict ``TASKS`` from a file without running it: modules by task name."""
     for node in ast.parse(file.read_bytes()).body:
         if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["TASKS"]:
             declared: dict[str, str] = ast.literal_eval(node.value)
@@ -102,7 +103,10 @@ def _file(task: type[Task]) -> str | None:
 
 
 def spelled_task(task: type[Task]) -> str | None:
-    """The name or ``file:Class`` by which ``find_task`` finds a task in another process; None if it has no file."""
+    """The name or ``file:Class`` that finds a task in another process (``find_task``).
+
+    It is None for a task without a file.
+    """
     if task.__module__.startswith("lyceum_warp."):
         return task_name(task)
     file = _file(task)
@@ -115,17 +119,17 @@ def task_name(task: type[Task]) -> str:
 
 
 def snake_case(name: str) -> str:
-    """The name of a task for the name of its class: half_cheetah for HalfCheetah."""
+    """Convert the name of a class to a task name: HalfCheetah to half_cheetah."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
 
 
 def task_names() -> list[str]:
-    """Names of all tasks, of the package and registered by the user."""
+    """Names of all tasks, from the package and from the user."""
     return sorted({*_tasks, *package_task_names()})
 
 
 def find_task(task: str | Path | type[Task]) -> type[Task]:
-    """The class of a task, given by name, by file (``path/to/file.py`` or ``path/to/file.py:Class``) or as a class.
+    """Find a task's class by name, by file (``path/to/file.py`` or ``path/to/file.py:Class``), or return a given class.
 
     A file may import modules beside it. If one of these files has changed, the task's file is run again; existing
     environments keep their task.
@@ -155,10 +159,10 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
 
 
 def source_files(task: type[Task]) -> Mapping[Path, bytes]:
-    """The contents of a task's file, then of the modules beside it that it imports, at the time it was loaded.
+    """The contents of a task's file and of the modules beside it that it imports, when the task was loaded.
 
-    A class that the program imports or defines counts as loaded when ``find_task`` first returns it. A class without
-    a file, as in a notebook, has none.
+    A class that the program imports or defines counts as loaded when ``find_task`` first returns it. A class without a
+    file, as in a notebook, has no sources.
     """
     if task not in _sources:
         file = Path(_file(task) or "")
@@ -178,8 +182,8 @@ def _run(path: Path, name: str, source: bytes) -> None:
     before = sys.modules.get(name)
     sys.modules[name] = module
     try:
-        code = compile(source, file, "exec")  # importers would use bytecode written in the same second
-        # Warp reads the source of functions from the line cache, even if the file changes meanwhile
+        code = compile(source, file, "exec")  # otherwise imports would use bytecode written in the same second
+        # Warp reads the source of functions from the line cache, so later changes of the file do not matter
         text = importlib.util.decode_source(source)
         linecache.cache[file] = (len(text), None, list(io.StringIO(text)), file)
         exec(code, vars(module))
@@ -226,7 +230,7 @@ def _task_of_file(path: Path, attribute: str) -> type[Task]:
             raise ValueError(f"{path} has no task {attribute!r}; it has {', '.join(found) or 'none'}")
         return found[attribute]
     if len(found) != 1:
-        raise ValueError(f"{path} has {len(found)} tasks ({', '.join(found)}): name one, as in {path}:Name")
+        raise ValueError(f"{path} has {len(found)} tasks ({', '.join(found)}): name one of them, as {path}:Name")
     return next(iter(found.values()))
 
 

@@ -14,7 +14,7 @@ from lyceum_warp.support.upstream import builtin_functions
 
 
 class FunctionSource:
-    """The source of a ``wp.func`` when it was defined, even if its file has changed since.
+    """The source of a ``wp.func`` as it was defined, even if its file has changed since then.
 
     Raises:
         ValueError: The source is not a single function definition.
@@ -31,11 +31,11 @@ class FunctionSource:
         self.file = Path(adj.filename).name
         self._first_line: int = adj.fun_lineno
         self.scope = _scope(function.func)
-        """The values of global names and of names from enclosing functions."""
+        """The values of names from the module and from enclosing functions."""
         self.locals = {argument.arg for argument in self.tree.args.args} | {
             node.id for node in ast.walk(self.tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
         }
-        """Its arguments, and the names that it assigns."""
+        """The function's arguments, and the names that it assigns."""
 
     def place(self, node: ast.AST) -> str:
         """The file and the line of a node, for messages."""
@@ -56,7 +56,7 @@ class FunctionSource:
             assert isinstance(node, ast.Call)
             try:
                 return eval(ast.unparse(node.args[0]), dict(self.scope))
-            except Exception:  # it may use other names, such as the counter of a loop that Warp unrolls
+            except Exception:  # the argument may use other names, such as the counter of a loop that Warp unrolls
                 return None
         return None
 
@@ -70,10 +70,10 @@ class FunctionSource:
         )
 
     def call(self, node: ast.Call) -> tuple[Literal["static", "helper", "native", "builtin", "other"], Any]:
-        """The kind of a call, and what it calls.
+        """Classify a call, and return its kind and its callee.
 
-        A helper is a function with a source, a native function a ``wp.func_native``, a builtin one of Warp's own.
-        Others are types and Python's functions, or None if the name stands for no known value.
+        The kinds are helpers (functions with Python source), native functions (``wp.func_native``), Warp's builtins,
+        and others: types, Python's functions, or None if the callee is unknown.
         """
         callee = self.value(node.func)
         if self.is_static(node):
@@ -85,7 +85,10 @@ class FunctionSource:
         return "helper" if has_source(callee) else "native", callee
 
     def condition(self, node: ast.expr) -> bool | None:
-        """The value of a ``wp.static(...)`` condition, of which Warp compiles one branch; None for any other."""
+        """The value of a ``wp.static(...)`` condition, for which Warp compiles only one branch.
+
+        It is None for other conditions.
+        """
         found = self.value(node) if self.is_static(node) else None
         return None if found is None else bool(found)
 
@@ -111,12 +114,15 @@ def name_of(function: wp.Function) -> str:
 
 
 def builtin(name: str) -> Any:
-    """Warp's builtin of a name, which need not be an attribute of the module, or Python's; None if there is none."""
+    """Find a builtin by name, among Warp's and then Python's.
+
+    Returns None if there is none. Warp's builtins need not be attributes of its module.
+    """
     return builtin_functions().get(name) or getattr(wp, name, None) or getattr(builtins, name, None)
 
 
 def overloads(function: wp.Function) -> list[wp.Function]:
-    """The overloads of a function with Python source: functions of its name with arguments of other types."""
+    """The overloads of a function with Python source: functions of the same name with other argument types."""
     found = [*function.user_overloads.values(), *function.user_templates.values()]
     # without instances that Warp made from a generic function
     return [overload for overload in found if overload.generic_parent is None] or [function]
@@ -128,7 +134,7 @@ def _scope(function: Any) -> dict[str, Any]:
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         try:
             scope[name] = cell.cell_contents
-        except ValueError:  # not assigned yet
+        except ValueError:  # the enclosing function has not assigned it yet
             scope.pop(name, None)
     return scope
 
@@ -137,7 +143,7 @@ _module_names: set[str] = set()
 
 
 def free_module_name(name: str) -> str:
-    """A name for a Warp module, the same in every process, so that Warp's cache has it; numbered if it is taken."""
+    """A name for a Warp module, the same in every process so that Warp finds it in its cache; numbered if taken."""
     free = name = re.sub(r"[^\w.]", "_", name)
     number = 0
     while free in _module_names:

@@ -16,10 +16,10 @@ from lyceum_warp.binding.sources import FunctionSource, is_struct, overloads, ru
 from lyceum_warp.task import Row, Task
 
 _STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
-"""The names that stand for the transition in a term of the reward or in a metric, with their names in the text."""
+"""The names that refer to the transition in reward terms and metrics, with their names in the generated text."""
 
 _STATE = {"s": "s", "s1": "s", "p": "p"}
-"""The same in a termination, which sees one state."""
+"""The same for terminations, which depend on one state."""
 
 _OWN = ("weights", "metrics", "total")
 """Other names that the generated source uses."""
@@ -33,8 +33,9 @@ class Terms:
     Args:
         task: The task's class.
         name: Its name, for messages.
-        lookup: Finds a function by its name in the task's class, its module, and those of its base classes.
-        written: The task's functions by their names in the table; None for those that it lacks.
+        lookup: Finds a function by its name in the task's class and its module, and in the base classes and their
+            modules.
+        written: The task's functions by their names in the table; None for missing functions.
         world: The task's World.
         params: The task's Params.
 
@@ -70,9 +71,10 @@ class Terms:
             self.text = self._written_text(functions, len(task.metrics) - len(functions))
 
     def generated(self, file: str) -> dict[str, wp.Function]:
-        """The generated functions: ``reward``, ``score`` and ``terminated``, without those that the task writes.
+        """Generate ``reward``, ``score`` and ``terminated``, except the functions that the task defines.
 
-        ``reward`` is that of a transition under weights; ``score`` also writes the metrics. ``file`` names the text.
+        ``reward`` computes a transition's reward under weights; ``score`` also writes the metrics. ``file`` is the name
+        of the generated text in error messages.
         """
         if not self.text:
             return {}
@@ -103,7 +105,7 @@ class Terms:
         return {term: float(weight) for term, weight in rewards.items()}
 
     def _names(self, attribute: str, names: Any, *, written: bool = False) -> tuple[str, ...]:
-        """The functions that an attribute of the task names; none if the task has written the function for them."""
+        """The functions that an attribute of the task names; empty if the task defines the combined function."""
         if not isinstance(names, tuple | list) or not all(isinstance(name, str) and name for name in names):
             raise ValueError(
                 f"{attribute} of the task {self._name!r} must be names, such as ('forward', 'cost'), not {names!r}"
@@ -120,7 +122,7 @@ class Terms:
     # text
 
     def _written_text(self, metrics: tuple[str, ...], first: int) -> str:
-        """The text; ``first`` is the number of metrics that ``measure`` writes."""
+        """The generated text; ``first`` is the number of metrics that ``measure`` writes."""
         parts = []
         if self.weights:
             body = _Body(self, _STEP)
@@ -154,12 +156,12 @@ class Terms:
     # names
 
     def choose(self, name: str, given: Mapping[str, str], within: tuple[str, ...] = ()) -> tuple[wp.Function, Any]:
-        """The overload of a function whose arguments can be found, and the type of its result.
+        """Select the overload of a function whose arguments can all be found; return it and its result type.
 
         Args:
             name: The function's name.
-            given: The names that stand for states, the action and parameters.
-            within: The names of the functions that ask for it.
+            given: The names that refer to states, the action and parameters.
+            within: The names of the functions that need this one.
         """
         if name in within:
             raise ValueError(f"terms of the task {self._name!r} need each other: {' needs '.join((*within, name))}")
@@ -180,7 +182,7 @@ class Terms:
     def source_of(
         self, function: wp.Function, name: str, given: Mapping[str, str], within: tuple[str, ...]
     ) -> tuple[Literal["expression", "function", "default"], str]:
-        """The source of an argument: an expression, the result of a function by its name, or the argument's default."""
+        """Find the source of an argument: an expression, the result of a function of that name, or the default."""
         source: Literal["expression", "function"] = "expression"
         if name in given:
             text = given[name]
@@ -204,7 +206,7 @@ class Terms:
     def _unknown(self, function: wp.Function, name: str, given: Mapping[str, str]) -> str:
         place = self._place(function)
         if name in _STEP:
-            return f"{place} takes {name}, but a termination sees the state only: it may take s and p"
+            return f"{place} takes {name}, but a termination depends only on the state: it may take s and p"
         if name in _OWN:
             return f"{place} takes {name}, which is a name of the generated text: rename it"
         known = [*given, *self._params.vars, *self._world.vars, *FunctionSource(function).scope]
@@ -223,7 +225,7 @@ class Terms:
         return f"{source.name} of the task {self._name!r} ({source.place(source.tree)})"
 
     def check_result(self, function: wp.Function, kind: Any, wanted: tuple[type, ...]) -> None:
-        """Refuse a result of another type."""
+        """Refuse a function whose result has the wrong type."""
         if not any(_fits(one, kind) for one in wanted):
             raise ValueError(
                 f"{self._place(function)} returns {_spelled(kind)}, but must return "
@@ -240,7 +242,7 @@ class _Body:
         self._values: dict[str, tuple[wp.Function, Any]] = {}
 
     def value(self, name: str, *wanted: type) -> str:
-        """The variable with the result of a function of the task, which must be one of the wanted types, if any."""
+        """The variable that holds the result of a task's function; check the result's type if types are given."""
         if name not in self._values:
             function, kind = self._terms.choose(name, self._given)
             arguments, named = [], False
@@ -248,7 +250,7 @@ class _Body:
                 source, text = self._terms.source_of(function, argument, self._given, (name,))
                 text = self.value(text) if source == "function" else text
                 if source == "default":
-                    named = True  # so that the arguments behind it are passed by name
+                    named = True  # the arguments after a default are passed by name
                 else:
                     arguments.append(f"{argument}={text}" if named else text)
             self._lines.append(f"{name}_ = {name}({', '.join(arguments)})")
@@ -261,12 +263,12 @@ class _Body:
         return f"{name}_"
 
     def number(self, name: str) -> str:
-        """The same as a float; a bool counts as 0 or 1."""
+        """The value as a float; a bool counts as 0 or 1."""
         value = self.value(name, float, bool)
         return f"wp.where({value}, 1.0, 0.0)" if _fits(bool, self._values[name][1]) else value
 
     def function(self, signature: str, lines: list[str]) -> str:
-        """The text of the function, whose last lines are given."""
+        """The text of the function; ``lines`` are its last lines."""
         return f"@wp.func\ndef {signature}:\n" + "\n".join(f"    {line}" for line in (*self._lines, *lines)) + "\n"
 
 

@@ -1,8 +1,8 @@
-"""Copy the functions of a task's family, so that a variant runs them over structs and with functions of its own.
+"""Copy the functions of a task's family, so that a variant can run them with its own structs and functions.
 
-Warp compiles a function for the structs that it names. If a variant extends the World of its parent, the parent's
-functions are copied with the variant's World in its place, and calls of a function that the variant replaces go to the
-variant's. A copy has the source of its original: messages name the original's file and line.
+Warp compiles a function for the structs that it names. If a variant extends its parent's World, the parent's functions
+are copied: the copies take the variant's World, and call the variant's functions in place of those that it replaces. A
+copy keeps its original's source, so messages name the original's file and line.
 """
 
 import sys
@@ -17,13 +17,13 @@ from lyceum_warp.task import Task
 
 
 class Variant:
-    """The functions and structs of a family as one task sees them.
+    """The functions and structs of a family, as one task uses them.
 
     Args:
-        modules: The modules of the family, that of the task first.
-        functions: Their functions with sources.
-        structs: By a struct, the one that takes its place.
-        replaced: By a function, the one that is called in its place.
+        modules: The modules of the family; the task's module comes first.
+        functions: The functions with Python source in these modules.
+        structs: Maps each replaced struct to its replacement.
+        replaced: Maps each replaced function to its replacement.
     """
 
     def __init__(
@@ -45,10 +45,10 @@ class Variant:
             scope |= {key: self.seen(value, name) for key, value in scope.items()}
 
     def seen(self, value: Any, viewer: str = "") -> Any:
-        """The value that takes the place of a function, a struct or a module of the family.
+        """The replacement of a function, a struct or a module of the family.
 
-        ``viewer`` is the name of the module that uses the value. The module with a replacement still sees the function
-        that it replaces, so that the new one may call the old one.
+        ``viewer`` is the name of the module that uses the value. The module that defines a replacement still gets the
+        original function, so that the replacement can call it.
         """
         if isinstance(value, wp.Function):
             while (other := self._replaced.get(value)) is not None and _home(other) != viewer:
@@ -86,19 +86,19 @@ _made: dict[Any, Variant] = {}
 
 
 def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any, own: Any) -> Variant | None:
-    """The variant that a task is of its family; None if it has its parents' structs and replaces no function.
+    """Make a task's variant of its family; None if the task uses its parents' structs and replaces no function.
 
     Tasks with the same structs and replacements share it, and with it their compiled kernels.
 
     Args:
         task: The task's name, for messages.
-        owners: Its class and its base classes, without ``Task``.
-        world: Its World.
-        params: Its Params, which its functions take.
-        own: The struct with the defaults of its Params, which may be another one with the same fields.
+        owners: The task's class and its base classes, without ``Task``.
+        world: The task's World.
+        params: The task's Params, which its functions take.
+        own: The struct with the defaults of Params: ``params``, or another struct with the same fields.
 
     Raises:
-        ValueError: A function replaces one that takes other arguments.
+        ValueError: A function takes other arguments than the function that it replaces.
     """
     modules = list(dict.fromkeys(sys.modules[owner.__module__] for owner in owners))
     values = [list(_values(module, owners)) for module in modules]
@@ -117,7 +117,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
         if isinstance(value, wp.Function) and hasattr(value, "replaces")
     }
     named = {*structs, *structs.values(), world, params}
-    for module in modules:  # the list grows
+    for module in modules:  # the loop body extends the list
         for value in _values(module, owners):
             home = sys.modules.get(_home(value)) if isinstance(value, wp.Function) else value
             if isinstance(home, types.ModuleType) and home not in modules and _names(home, named):
@@ -127,7 +127,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
     taken = {kind for f in functions for overload in overloads(f) for kind in overload.input_types.values()
              if is_struct(kind)}  # fmt: skip
     structs = {struct: new for struct, new in structs.items() if struct in taken}
-    if not structs and not replaced:  # such as a robot that gives other defaults only
+    if not structs and not replaced:  # such as a robot that only changes defaults
         return None
     key = (tuple(modules), tuple(functions), tuple(structs.items()), tuple(replaced.items()))
     if key not in _made:
@@ -143,7 +143,7 @@ def _home(function: wp.Function) -> str:
 
 
 def _values(module: types.ModuleType, owners: Sequence[type[Task]]) -> Iterator[Any]:
-    """The values of a module, also as they were when its tasks were defined, and of these tasks' classes."""
+    """The values of a module, now and when its tasks were defined, and of these tasks' classes."""
     for owner in owners:
         if owner.__module__ == module.__name__:
             own = (value.__func__ if isinstance(value, staticmethod) else value for value in vars(owner).values())
@@ -162,7 +162,7 @@ def _names(module: types.ModuleType, structs: set[Any]) -> bool:
 
 
 def _check_replacement(task: str, made: Variant, old: wp.Function, new: wp.Function) -> None:
-    """Refuse a replacement that takes other arguments than the function in whose place it is called."""
+    """Refuse a replacement that takes other arguments than the function that it replaces."""
     wanted, given = (list(made.seen(f, _home(new)).input_types.values()) for f in (old, new))
     same = len(wanted) == len(given) and all(
         a is b if is_struct(a) or is_struct(b) else wp.types.types_equal(a, b)

@@ -15,7 +15,7 @@ from lyceum_warp.support.arrays import launch_parts, launch_worlds
 from lyceum_warp.task import observer_name
 
 _ROOM = 2**18
-"""Bytes of guard memory before and after every row. Writes out of range land there and do no damage."""
+"""Bytes of guard memory before and after every row. Out-of-range writes land there harmlessly."""
 
 _ALIGNED = 64
 
@@ -24,7 +24,7 @@ _UNWRITTEN = 0x7FA5C3E1
 
 
 class GuardedRows:
-    """Rows, (n, ...), with guard memory around each. Elements are sentinels, or the first n of ``values``."""
+    """Rows, (n, ...), with guard memory around each row. Elements are sentinels, or the first n of ``values``."""
 
     def __init__(self, shape: Sequence[int], dtype: Any, device: wp.Device, values: wp.array | None = None) -> None:
         self.size = math.prod(shape[1:])
@@ -41,7 +41,7 @@ class GuardedRows:
             wp.copy(self.array, values[: shape[0]])
 
     def outside(self) -> np.ndarray:
-        """Indices of elements outside of a row that were written, ascending; negative before its start."""
+        """Ascending indices of written elements outside a row; elements before its start have negative indices."""
         words: np.ndarray = self._memory.numpy()
         changed = 4 * np.flatnonzero(words != _UNWRITTEN)[:, None] + np.arange(4)
         unwritten = np.array(_UNWRITTEN, dtype=np.uint32).reshape(1).view(np.uint8)
@@ -51,7 +51,7 @@ class GuardedRows:
         return np.unique(index[(index < 0) | (index >= self.size)])
 
     def written(self) -> np.ndarray:
-        """A mask of the elements that were written, for a single row of 32-bit numbers."""
+        """Mask of the written elements of a single row of 32-bit numbers."""
         start = _ROOM // 4
         written: np.ndarray = self._memory.numpy()[start : start + self.size] != _UNWRITTEN
         return written
@@ -146,7 +146,7 @@ class Probe:
                 )
 
     def _named(self, group: str, chosen: np.ndarray) -> str:
-        """The names of chosen numbers of an observation."""
+        """The names of the chosen elements of an observation."""
         columns = Space.of(self._layouts[group]).columns
         return ", ".join(columns[i] for i in np.flatnonzero(chosen))
 
@@ -166,14 +166,14 @@ class Probe:
         """Raise a ValueError if a function wrote beyond a field or beyond its random stream."""
         for name in sorted(self._writes.get(function, ())):
             rows, parts = self._fields[name], self._memory.get(name)
-            if parts:  # a write within the row may be one into a neighbour, which only check_task finds
+            if parts:  # a write within the row may still be a wrong element, which only check_task finds
                 self._check_memory(function, rows, parts)
             else:
                 self._check(function, rows, name, f"the model has {rows.size}")
         self._check(function, self._streams, "rng", "a stream has 1")
 
     def _check_memory(self, function: str, rows: GuardedRows, layout: Layout) -> None:
-        """Raise a ValueError if a function wrote before the first part of a row of memory, or behind the last."""
+        """Raise a ValueError if a function wrote outside the parts of a row of memory."""
         name = next(iter(layout) if (rows.outside() < 0).all() else reversed(layout))
         start, size = layout[name].start, layout[name].size
         self._check(function, rows, name, f"World declares {size}", start, size)

@@ -1,8 +1,8 @@
-"""Find the writes of a Warp function, and of the functions that it calls, into its arguments.
+"""Find the writes of a Warp function, and of its callees, into its arguments.
 
 The analysis follows elements, components, calls, local names of a row, and rows in the fields of a local struct. A row
-that is used in any other way (returned, put into a tuple, chosen by ``wp.where``, given to a native function) counts as
-written.
+that is used in any other way (returned, put into a tuple, selected by ``wp.where``, passed to a native function) counts
+as written.
 """
 
 import ast
@@ -44,7 +44,7 @@ class Write:
 
 @functools.cache
 def find_writes(function: wp.Function) -> tuple[Write, ...]:
-    """The writes of a function, and of the functions that it calls, into its arguments, in the order of its source."""
+    """The writes of a function and of its callees into its arguments, in source order."""
     kinds = enumerate(map(_kind, function.input_types.values()))
     places = tuple(None if kind is None else _Place(i, None, kind) for i, kind in kinds)
     arguments, writes = list(function.input_types), dict[Write, None]()
@@ -61,11 +61,11 @@ def written_fields(function: wp.Function) -> frozenset[str]:
 
 
 Rights = Mapping[str, Collection[str] | None]
-"""By the name of each argument, in order, the fields that a function may write; None for a row that is a result."""
+"""For each argument by name, in order, the fields that a function may write; None for a result row."""
 
 
 def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mapping[str, Rights]) -> None:
-    """Raise a ValueError if a function of a task writes a field or a row without having the right."""
+    """Raise a ValueError if a function of a task writes a field or a row that it must not write."""
     for name, function in functions.items():
         allowed = list(rights[name].values())
         for write in find_writes(function):
@@ -84,7 +84,7 @@ def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mappin
 
 
 def _advice(write: Write, name: str, rights: Mapping[str, Rights]) -> str:
-    """The fields that the function may write, and the functions that may write this field."""
+    """List the fields that the function may write, and the functions that may write this field."""
     may = [field for fields in rights[name].values() for field in fields or ()]
     results = [argument for argument, fields in rights[name].items() if fields is None and argument != "rng"]
     own = f"{name} may write {', '.join(dict.fromkeys([*results, *may])) or 'nothing'}"
@@ -135,11 +135,11 @@ def _kind(written: Any) -> Any:
 
 
 class _Reader:
-    """Reads the source of one function, and of the functions that it calls.
+    """Reads the source of one function and of its callees.
 
     Args:
         function: The function.
-        places: For each of its arguments, the memory of the analysed function's arguments that it gets, or None.
+        places: For each argument, the memory of the analysed function's arguments that it refers to, or None.
         arguments: Names of the arguments of the analysed function.
         writes: Collects the writes.
         seen: The functions that were read, with their places.
@@ -157,12 +157,13 @@ class _Reader:
         self.source = FunctionSource(function)
         # by name, and "name.field" for a row in a local struct
         self.places: dict[str, _Place | None] = dict(zip(function.input_types, places, strict=True))
-        for _ in range(2):  # the first round of a loop may use a local struct before the line that puts a row into it
+        # a loop may use a local struct in its first iteration, before a later line puts a row into it
+        for _ in range(2):
             for statement in self.source.tree.body:
                 self._read(statement)
 
     def _note(self, place: _Place, node: ast.AST, *, replaced: bool = False, follows: bool = True) -> None:
-        """Note a write; with ``follows=False`` a use that the analysis cannot follow."""
+        """Note a write; with ``follows=False``, note a use that the analysis cannot follow."""
         use = None if follows else ast.unparse(node).splitlines()[0]
         target = ".".join(filter(None, (self.arguments[place.position], place.field)))
         where = self.source.place(node)
@@ -194,7 +195,7 @@ class _Reader:
         return None
 
     def _read_all(self, parent: ast.AST, nodes: Any, *, elements: bool = False) -> None:
-        """Read parts of an expression or a statement in which a row as a whole cannot be followed."""
+        """Read parts of an expression or a statement in which the analysis cannot follow a whole row."""
         for node in nodes:
             place = self._read(node)
             if place is not None and (elements or place.kind is not None):
@@ -215,7 +216,7 @@ class _Reader:
                     self._note(lost, node, follows=False)
 
     def _is_local(self, target: ast.expr) -> bool:
-        """Whether a name is assigned, or a field of a local struct."""
+        """Whether an assignment is to a local name, or to a field of a local struct."""
         owner = target.value if isinstance(target, ast.Attribute) else None
         return isinstance(target, ast.Name) or (isinstance(owner, ast.Name) and owner.id not in self.places)
 

@@ -80,7 +80,7 @@ def test_named_elements_become_their_indices_in_the_model(model: mujoco.MjModel)
         ({"offset": 1.0}, r"offset of 'arm' has shape \(\); it takes \(3,\), or one per world, \(2, 3\)"),
         ({"count": 2.5}, "count=2.5 of 'arm' must be a whole number"),
         ({"lively": 0.5}, "lively=0.5 of 'arm' must be a whole number"),
-        ({"tip": 1}, "tip=1 of 'arm' is an index of 'site_xpos', of which the model has 1: give one from 0 to 0"),
+        ({"tip": 1}, "tip=1 of 'arm' is an index of 'site_xpos', of which the model has 1: give an index from 0 to 0"),
         ({"tip": -1}, "tip=-1 of 'arm' is an index of 'site_xpos', of which the model has 1"),
         ({"tip": [0, 1]}, r"tip=\[0, 1\] of 'arm' is an index of 'site_xpos', of which the model has 1"),
         ({"tip": "top"}, "no site 'top'; it has: tip"),
@@ -178,7 +178,7 @@ def test_a_table_that_does_not_fit_is_refused(given: dict[str, Any], message: st
 def test_a_file_without_a_table_is_refused(model: mujoco.MjModel, tmp_path: Path) -> None:
     (tmp_path / "text.npy").write_text("1 2 3")
     np.savez(tmp_path / "several.npz", a=1)
-    for name, message in (("text.npy", "cannot be read"), ("several.npz", "a .npy file of numpy.save")):
+    for name, message in (("text.npy", "cannot be read"), ("several.npz", "a .npy file written by numpy.save")):
         with pytest.raises(ValueError, match=f"motion of 'arm' from '.*{name}' .*{message}"):
             parameters(model, Tables, motion=tmp_path / name)
 
@@ -207,7 +207,10 @@ def test_a_table_of_named_elements_has_their_indices(model: mujoco.MjModel) -> N
     ("joints", "message"),
     [
         (["knee"], "the model has no joint 'knee'; it has: elbow, shoulder"),
-        ([0, 2], "joints of 'arm' is an index of 'qvel', of which the model has 2: give one from 0 to 1, or a name"),
+        (
+            [0, 2],
+            "joints of 'arm' is an index of 'qvel', of which the model has 2: give an index from 0 to 1, or a name",
+        ),
         (lw.sites("tip"), "joints of 'arm' can't have an element of 'site_xpos': it has elements of 'qvel'"),
     ],
 )

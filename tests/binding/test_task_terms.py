@@ -143,7 +143,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     ),
     "a termination that asks for the action": (
         term("def fell(action: Row[float]) -> bool:\n    return action[0] > 1.0", 'terminations = ("fell",)'),
-        r"fell of the task 'tiny' \(.*\) takes action, but a termination sees the state only: it may take s and p",
+        r"fell of the task 'tiny' \(.*\) takes action, but a termination depends only on the state",
     ),
     "terms that need each other": (
         term("def a(b: float) -> float:\n    return b", 'rewards = {"a": 1.0}',
@@ -214,10 +214,10 @@ def test_unused_fields_and_terms_are_named(tmp_path: Path) -> None:
     )
     report = check_task(tiny_task.write(tmp_path, source), engine="mujoco", steps=1, checks=[])
     assert report.unused == [
-        "nothing calls level: name it in rewards, terminations or metrics, call it, or remove it",
-        "nothing reads World.count: remove it",
+        "level is never called: list it in rewards, terminations or metrics, call it, or remove it",
+        "World.count is never read: remove it",
     ]
-    assert str(report).endswith("unused: nothing reads World.count: remove it")
+    assert str(report).endswith("unused: World.count is never read: remove it")
 
 
 def test_an_index_out_of_range_in_a_term_is_found(tmp_path: Path) -> None:

@@ -447,7 +447,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     ),
     "groups without a policy": (
         [('obs = {"x": 1}', 'obs = {"actor": {"x": 1}, "critic": {"x": 1}}')],
-        "must be a dict of parts and sizes, or of groups of them, one of them 'policy'",
+        "must be a dict of parts and sizes, or a dict of such dicts for groups, including 'policy'",
     ),
     "metrics as a number": ([line("metrics = 5")], r"metrics of the task 'tiny' must be names, .*, not 5"),
     "a comma in a metric's name": (

@@ -155,7 +155,7 @@ class WarpEngine(Engine):
     # fields
 
     def _alias_model(self, field: ModelField) -> wp.array:
-        """A model field's memory as an array of the type in ``model_fields``."""
+        """A view of a model field's memory with the type in ``model_fields``."""
         source = getattr(owner(self.m, field.name), field.name)
         if not field.size:
             return wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
@@ -170,7 +170,7 @@ class WarpEngine(Engine):
         return ModelConstants(self.model, self.m, fields, self._static, self.nworld, self.device, loop=loop)
 
     def _alias(self, field: Field) -> wp.array:
-        """A field's memory as an array of the type in ``fields``; MuJoCo Warp's types differ only in name."""
+        """A view of a field's memory with the type in ``fields``; MuJoCo Warp's types differ only in name."""
         return alias(getattr(self.d, field.name), field.dtype, (self.nworld, *field.shape))
 
     def _copy_snapshots(self, mask: wp.array, fields: Iterable[Field]) -> None:
@@ -209,7 +209,7 @@ class WarpEngine(Engine):
                 if stage == Stage.VELOCITY:
                     mjw.fwd_velocity(m, d)
                     mjw.sensor_vel(m, d)
-                if "energy" in self.fields:  # the model's sensors do not compute it
+                if "energy" in self.fields:  # the model's sensors do not compute this field
                     mjw.energy_pos(m, d)
                     mjw.energy_vel(m, d)
 
@@ -366,7 +366,7 @@ def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied
 def _check_sdf_plugins(model: mujoco.MjModel) -> None:
     """Refuse SDF plugins unless a distance function was registered with MuJoCo Warp, which has none of its own."""
     if (model.geom_plugin >= 0).any() and not has_sdf_functions():
-        raise NotImplementedError("it has no functions of SDF plugins")
+        raise NotImplementedError("it cannot evaluate SDF plugins")
 
 
 def _contacts_of_one_world(model: mjw.Model) -> int:
