@@ -106,7 +106,7 @@ class Env:
     episode_metric_sums: torch.Tensor
     """``episode_metrics`` as one tensor, (nworld, number of metrics), in the order of ``metrics``."""
     shared: dict[str, torch.Tensor]
-    """The memory that all worlds share, by name; only the task's ``share`` changes it, in ``update_shared``."""
+    """The memory that all worlds share, by name; only ``update_shared`` changes it, with the task's ``share``."""
     success: torch.Tensor
     """Whether the task's goal has been met for ``success_steps`` steps in a row, (nworld,), bool."""
     done: torch.Tensor
@@ -190,9 +190,9 @@ class Env:
                 self.engine.prepare_capture()
             self.engine.reset(worlds.everyone)
             probe = Probe(self.task, worlds.after, worlds.params, self.device)
-            probe.check_bounds()  # before any function of the task writes into an array
+            probe.check_bounds()  # check writes before any function of the task writes into an array
             self.rand_reset(options.seed)
-            if self.task.dynamics and not _replica:  # a later bad draw is a fault of its world
+            if self.task.dynamics and not _replica:  # a bad draw in a later reset is a fault of its world
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
             probe.check_observations()
             if not _replica:
@@ -443,7 +443,7 @@ class Env:
         return view[:, where.start] if one_object else view[:, where]
 
     def set_dynamics(self, mask: torch.Tensor | None = None, **fields: Any) -> None:
-        """Set model fields that the task randomizes or ``dynamics=`` names, and update the constants derived from them.
+        """Set model fields that the task randomizes or ``dynamics=`` lists, and update the constants derived from them.
 
         Each reset first restores the nominal values of fields that the task's ``initialize``, ``randomize`` or
         ``event`` writes. Other fields keep the new values until ``rand_reset(seed=...)``.
@@ -474,9 +474,10 @@ class Env:
     # memory that all worlds share
 
     def update_shared(self, total: Callable[[torch.Tensor], object] | None = None) -> None:
-        """Update ``shared`` from the sums over the transitions since the last update, by the task's ``share``.
+        """Update ``shared`` with the task's ``share``, from the sums over the transitions since the last update.
 
-        Observations that depend on it follow. Learners call it after each rollout. Nothing waits for the device.
+        Observations that depend on ``shared`` are updated, too. Learners call this method after each rollout. Nothing
+        waits for the device.
 
         Args:
             total: Adds the sums of several processes, int64, in place, such as ``Team.sum``. All processes must call
@@ -533,7 +534,7 @@ class Env:
             self._scratch.follow(self)
 
     def follow(self, other: "Env") -> None:
-        """Copy the parameters, and the memory that worlds share, of another environment of the same task.
+        """Copy the parameters and the shared memory of another environment of the same task.
 
         Raises:
             ValueError: ``other`` is not an environment, or belongs to a task with other parameters.

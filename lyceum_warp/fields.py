@@ -127,8 +127,8 @@ _RANGES = (
     | {"sensordata": _SENSORS, "flexvert_xpos": _VERTICES}
     | dict.fromkeys(("flexedge_length", "flexedge_velocity"), _EDGES)
 )  # fmt: skip
-"""For fields in which an object may have several rows, by name or prefix: the kind of object, the MjModel array of its
-first row, and the array of its row counts or the total number of rows."""
+"""For fields in which an object may have several rows, by name or prefix: the kind of object, the MjModel array with
+the index of its first row, and the array of row counts or the total number of rows."""
 
 _COUNTS = {
     _Kind.mjOBJ_ACTUATOR: "nactuator",
@@ -206,8 +206,8 @@ def describe(
         written: Whether the task writes the field before a step. Controls are always written.
 
     Raises:
-        ValueError: There is no such field; or no enabled sensor makes MuJoCo compute it; or it is written, but not one
-            of ``INPUTS``; or it is cleared, but belongs to the current state.
+        ValueError: There is no such field, no enabled sensor makes MuJoCo compute it, ``written`` is set for a field
+            not in ``INPUTS``, or ``cleared`` for a field of the current state.
     """
     if written and name not in INPUTS:
         raise ValueError(f"the field {name!r} cannot be written before a step: the inputs are {', '.join(INPUTS)}")
@@ -268,7 +268,7 @@ def _sensed(model: mujoco.MjModel, name: str) -> bool:
     if name == "sensordata":
         return True
     kind = mujoco.mjtSensor
-    if ON_DEMAND[name] == kind.mjSENS_FRAMELINACC:  # one pass computes them all
+    if ON_DEMAND[name] == kind.mjSENS_FRAMELINACC:  # one pass computes all of them
         kinds = [kind.mjSENS_ACCELEROMETER, kind.mjSENS_FORCE, kind.mjSENS_TORQUE, kind.mjSENS_FRAMELINACC,
                  kind.mjSENS_FRAMEANGACC]  # fmt: skip
     else:

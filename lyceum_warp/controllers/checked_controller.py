@@ -14,7 +14,7 @@ from lyceum_warp.support.validate import described, positive_number
 
 
 class CheckedController:
-    """Calls a controller, checks its actions, and selects the action of a plan that applies in a step of the plant.
+    """Calls a controller, checks its actions, and selects a plan's action for each step of the plant.
 
     Args:
         controller: The controller.
@@ -34,7 +34,7 @@ class CheckedController:
             )
         if (plants := getattr(controller, "plants", 1)) != 1:
             raise ValueError(
-                f"the controller plans for {plants} plants, and this loop controls one: make it with plants=1, or "
+                f"the controller plans for {plants} plants, but this loop controls one: make it with plants=1, or "
                 "control the worlds of an environment with env.step(plan(env.get_state()))"
             )
         self._controller: Any = controller
@@ -115,7 +115,7 @@ class CheckedController:
         if (needed := self.steps(steps - 1) + 1) > horizon:
             plan = f"a plan of {horizon} actions" if hasattr(self._controller, "actions") else "no plan, but one action"
             raise ValueError(
-                f"replan_every={steps} needs a plan of {needed} actions, and the controller has {plan}: plan more "
+                f"replan_every={steps} needs a plan of {needed} actions, but the controller has {plan}: plan more "
                 "often, or give it a longer horizon"
             )
 
@@ -146,7 +146,7 @@ class CheckedController:
 
 
 def _steps(plant: float, plan: float) -> tuple[int, int]:
-    """The numbers of steps of a plan and of steps of the plant in the longer of their two time steps.
+    """The numbers of plan steps and of plant steps in the longer of the two time steps.
 
     Raises:
         ValueError: Neither time step is a multiple of the other.
@@ -170,7 +170,7 @@ def _check_call(controller: Any) -> None:
     signature = _signature(controller.forward if isinstance(controller, torch.nn.Module) else controller)
     if signature is not None and _fits(signature, 1) and not _fits(signature, 2):
         raise ValueError(
-            f"a controller is called with (state, obs), and {type(controller).__name__} takes one argument: give "
+            f"a controller is called with (state, obs), but {type(controller).__name__} takes one argument: give "
             "lambda state, obs: policy(obs)"
         )
 

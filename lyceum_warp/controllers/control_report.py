@@ -163,7 +163,8 @@ def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: flo
         rate: Required plans per second, which determine the deadline; by default one plan per period of the plant.
 
     Raises:
-        ValueError: There is no trajectory, the trajectories differ in one of these, or the rate is not positive.
+        ValueError: There is no trajectory, the trajectories differ in task, engine, mode or controller, or the rate is
+            not positive.
     """
     episodes = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
     if not episodes:

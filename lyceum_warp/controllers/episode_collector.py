@@ -45,8 +45,8 @@ class TimedPlan:
     """A finished plan and its planning time."""
 
     index: int
-    step: int  # of the state that it starts from
-    begun: float  # time by the run's clock
+    step: int  # index of the state that the plan starts from
+    begun: float  # seconds on the run's clock
     seconds: float
     actions: torch.Tensor  # (horizon, nact)
 

@@ -47,15 +47,15 @@ def control_async(
     on_abort: OnAbort | None = None,
     clock: "Clock | None" = None,
 ) -> Trajectory:
-    """Control one world, the plant, in real time: it steps by the wall clock and does not wait for plans.
+    """Control one world, the plant, in real time: the plant steps by the wall clock and does not wait for plans.
 
     The plant steps in the calling thread. Step k is due at ``k * period``; a late step does not delay later steps. The
     controller plans in a second thread, each time from the newest state, and never twice from the same state.
 
     Each step applies the newest finished plan, at the time that has passed since the plan's state: the action of the
     plan's step at that time, or the last action if the plan is shorter. This compensates for the planning delay up to
-    the length of the plan. The plant waits for the first plan, so the first action has age 0. All
-    other actions are at least one step old, and exactly one step old if every plan takes less than a period.
+    the length of the plan. The plant waits for the first plan, so the first action has age 0. Later actions are at
+    least one step old, and exactly one step old if every plan takes less than a period.
 
     Before the clock starts, the controller is called three times with the first state, and the plant takes three steps
     and is restored to its state. This warm-up loads kernels and captures graphs, because Warp cannot capture a graph
@@ -63,8 +63,8 @@ def control_async(
     states, such as ``env.get_reward(before, action, after)``.
 
     During the run Python switches between threads more often than usual (``sys.setswitchinterval``). To keep the plant
-    on time, leave a CPU core free by setting ``nthread`` of the planner's environment, and put the plant on the CPU: on
-    the planner's GPU both would share a stream, and each step would wait for the previous plan.
+    on time, leave a CPU core free by setting ``nthread`` of the planner's environment, and put the plant on the CPU. On
+    the planner's GPU, both would share a stream, and each step would wait for the previous plan.
 
     When the episode ends, the unfinished plan is completed and counted. When an exception, including Ctrl-C, ends the
     run, the loop waits at most 0.2 seconds for the unfinished plan. Do not use the controller again until the thread,

@@ -14,7 +14,7 @@ from lyceum_warp.env import Env
 SHARE = 0.8
 """Largest share of the deadline that the 99 % planning time may take."""
 
-_SECONDS = 0.4  # of a measurement, but at least this number of steps
+_SECONDS = 0.4  # duration of a measurement, and its least number of steps
 _STEPS = 12
 
 
@@ -81,7 +81,7 @@ def choose_setting(
         deadline: Longest time of a plan, seconds.
 
     Returns:
-        The choice. If no setting meets the deadline, it is the fastest one measured.
+        The choice. If no setting meets the deadline, the choice is the fastest measured setting.
     """
     budget, missed = SHARE * deadline, []
     for name in physics:

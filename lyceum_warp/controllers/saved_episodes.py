@@ -123,7 +123,10 @@ def _check_same(first: Path, one: Trajectory, path: Path, other: Trajectory) -> 
 
 
 def _difference(wanted: Mapping[str, Sequence[int]], found: Mapping[str, Sequence[int]]) -> str:
-    """The first difference between two state layouts, such as "qpos of 7 numbers, not 9"; empty if they are equal."""
+    """Describe the first difference between two state layouts, such as "qpos of 7 numbers, not 9".
+
+    Empty if they are equal.
+    """
     for name in {**wanted, **found}:
         one, other = (parts[name][1] - parts[name][0] if name in parts else None for parts in (wanted, found))
         if one != other:
@@ -157,7 +160,10 @@ def _task(path: Path, episode: Trajectory, given: str | Path | type[Task] | None
 
 
 def _foreign(file: Path) -> str:
-    """Why a file may hold another user's code, such as "it can be written by other users"; empty if it cannot."""
+    """Explain why a file may hold another user's code, such as "it can be written by other users".
+
+    Empty if it cannot.
+    """
     if not hasattr(os, "getuid"):
         return "this system does not say who can write it"
     for place, name in ((file, "it"), (file.parent, f"its folder {file.parent}")):

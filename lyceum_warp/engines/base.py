@@ -38,8 +38,8 @@ class Engine(abc.ABC):
         initial: The state that ``reset`` puts worlds into, (integration_size,); None for the model's own.
 
     Raises:
-        ValueError: A field is listed twice, once lagged and once current, the initial state has the wrong shape, or a
-            model field cannot differ between worlds of this model.
+        ValueError: A field is listed both lagged and current, the initial state has the wrong shape, or a model field
+            cannot differ between worlds of this model.
     """
 
     name: str
@@ -111,7 +111,7 @@ class Engine(abc.ABC):
         self._everyone = wp.full(nworld, True, dtype=bool, device=device)
 
     def _nominal_rows(self, field: ModelField, rows: int) -> wp.array:
-        """An array of a model field with the model's own value in every row."""
+        """Make an array of a model field, with the model's own value in every row."""
         value = np.tile(field.value(self.model).astype(np.float32).reshape(-1), (rows, 1))
         array: wp.array = wp.zeros((rows, *field.shape), dtype=field.dtype, device=self.device)
         if value.size:
@@ -146,7 +146,7 @@ class Engine(abc.ABC):
         """
 
     def step_phases(self, nstep: int) -> list[Phase]:
-        """``step`` as phases, so that an engine that is not ``capturable`` can still capture its copies of fields."""
+        """The phases of ``step``. An engine that is not ``capturable`` can thus still capture its copies of fields."""
         return [Phase("physics", partial(self.step, nstep), engine=True)]
 
     @abc.abstractmethod
@@ -157,10 +157,7 @@ class Engine(abc.ABC):
         """
 
     def check_room(self) -> None:  # noqa: B027
-        """Log a warning if the worlds need more contacts or constraints than fit; called once, after the first reset.
-
-        Does not consist of launches.
-        """
+        """Log a warning if worlds need more contacts or constraints than fit; called once, after the first reset."""
 
     @abc.abstractmethod
     def reset(self, mask: wp.array) -> None:
@@ -296,8 +293,7 @@ class Engine(abc.ABC):
 EngineFactory = Callable[..., Engine]
 """Called with (model, nworld, device, fields, dynamics, initial, **options).
 
-An engine class is such a factory. If the factory has ``bytes_per_world``, as engine classes do, memory is checked
-first.
+Engine classes are factories. If a factory has ``bytes_per_world``, as engine classes do, memory is checked first.
 """
 
 

@@ -37,7 +37,7 @@ _NOSLIP = 6
 
 
 def find_device(device: str | None) -> wp.Device:
-    """The Warp device of a name.
+    """Find a Warp device by name.
 
     Raises:
         ValueError: This machine has no such device.
@@ -145,7 +145,7 @@ def place_samples(
     Args:
         engine: The requested engine.
         device: The requested device.
-        nthread: Threads that the C engine would have; None for all cores.
+        nthread: Threads of the C engine; None for all cores.
         samples: Number of samples, each in a world.
         spec: Returns the planner's model; called only if the choice depends on its noslip solver.
         solver: The option ``solver`` of the planner's physics.

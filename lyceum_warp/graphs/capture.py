@@ -36,14 +36,14 @@ class Phase:
     """
 
     name: str
-    """Name, by which the rules of an environment find it."""
+    """Name of the phase, by which the rules of an environment find it."""
     run: Callable[[], object]
     """The function to run, without arguments."""
     engine: bool = False
-    """True for an engine call, which consists of Warp launches only on some engines."""
+    """Whether the phase calls the engine; such a call consists of Warp launches only on some engines."""
     by_world: bool = False
-    """Whether it only launches kernels through functions like ``arrays.launch_worlds`` and no world depends on another,
-    so that threads can share the worlds."""
+    """Whether the phase only launches kernels through functions like ``arrays.launch_worlds`` and no world depends on
+    another world, so that threads can share the worlds."""
 
 
 class Graphs:
@@ -126,10 +126,11 @@ def capturing() -> Iterator[None]:
 
 
 class _Graph:
-    """Functions that consist of launches, as one graph, or as one graph per thread if they take long.
+    """Captures functions that consist of launches: as a single graph or, if they take long, as one graph per thread.
 
-    The first call runs them directly, which loads their modules; the second captures and replays; later calls only
-    replay. With workers, the first replays are timed, and the shortest time determines how many threads share the work.
+    The first call runs the functions directly, which loads their modules. The second call captures and replays them;
+    later calls only replay. With workers, the first replays are timed, and the shortest time determines how many
+    threads share the work.
     """
 
     def __init__(

@@ -22,7 +22,7 @@ class Workers:
             calls: The functions, at most ``nthread``; the caller's thread runs the first one.
 
         Raises:
-            BaseException: A function raised it; the other functions have ended.
+            BaseException: Any exception that a function raised; the other functions have ended.
         """
         others: list[Future[object]] = []
         try:

@@ -113,7 +113,7 @@ class MujocoEngine(Engine):
         self._before_stage = [field for field in late if field.name not in STATE_FIELDS]
         """Fields to copy before that call, because it may run in an MjData that another world used."""
         self._after_stage = [field for field in self._before_stage if field in computed]
-        """Fields that the call computes in part: sensors up to its stage."""
+        """Fields that the separate call computes in part: sensors up to its stage."""
         self._last = [field for field in shown if field not in self._before_stage]
         """Fields to copy at the end of a step, by kernel launches."""
         # positions do not depend on contacts, and collision detection takes most of the position stage
@@ -310,7 +310,7 @@ class MujocoEngine(Engine):
         launch_several_rows(widen_four, mask, numbers)
 
     def refresh(self, mask: wp.array) -> None:
-        computed = [field for field in self._derived if field.reset > Stage.NONE]  # the others are cleared
+        computed = [field for field in self._derived if field.reset > Stage.NONE]  # the other bits are cleared
         self._forward(mask, self.reset_stage, computed)
 
     def refresh_current(self, mask: wp.array) -> None:

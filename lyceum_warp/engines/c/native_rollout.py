@@ -16,9 +16,9 @@ from lyceum_warp.model_fields import ModelField
 def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
     """Whether ``Batch.rollout`` returns the same values as one call of ``Batch.step`` per step.
 
-    A row holds values as ``mj_step`` leaves them. Its state is the new one, but quantities of the position and velocity
-    stages belong to the state before the last substep; those of the new state are in the next row. With RK4 they belong
-    to an intermediate stage instead. Sensor data mix the stages, so they are not exact either.
+    A row holds values as ``mj_step`` leaves them. Its state is the new state, but quantities of the position and
+    velocity stages belong to the state before the last substep, and the next row holds their new values. With RK4 they
+    belong to an intermediate stage instead. Sensor data mix the stages, so they are not exact either.
     """
     current = [field for field in fields if field.refresh > Stage.NONE]
     if any(field.snapshot for field in current):

@@ -13,8 +13,8 @@ from lyceum_warp.model_fields import ModelField
 class WorldModels:
     """Writes values of model fields into a batch, and recomputes the constants derived from them.
 
-    Only the float32 values matter: a value equal to the model's rounded value becomes the model's float64 value, and
-    all others are written unchanged.
+    Only the float32 values matter: a value equal to the model's rounded value becomes the model's float64 value; all
+    other values are written unchanged.
 
     Args:
         batch: The worlds.

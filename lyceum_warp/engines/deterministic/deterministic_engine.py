@@ -27,7 +27,7 @@ _FEW = 256
 
 
 class DeterministicEngine(WarpEngine):
-    """A Warp engine whose steps are reproducible bit for bit on a CUDA device, as every engine's are on the CPU.
+    """A Warp engine whose steps are reproducible bit for bit on a CUDA device, as on the CPU.
 
     It sorts contacts and constraint rows, makes MuJoCo Warp sum in a fixed order, and shares the scratch memory for
     this between all launches. It takes the arguments of ``WarpEngine``.

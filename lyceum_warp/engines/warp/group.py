@@ -108,7 +108,7 @@ class Turns:
 class Arena(Reserve):
     """An allocator for loops and branches of CUDA graphs, where Warp cannot allocate.
 
-    A run outside a graph allocates from the device, counts the bytes, and reserves as many. Graphs then use the
+    A run outside a graph allocates from the device, counts the bytes, and reserves the same number. Graphs then use the
     reserve. They never run at the same time, so they can all share it.
 
     Args:

@@ -112,7 +112,7 @@ def warn_of_little_room(
 
 
 def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> mujoco.MjModel:
-    """The model with every friction loss turned on that a world may turn on."""
+    """Copy a model, and turn on every friction loss that a world may turn on."""
     if names := _FRICTION.intersection(varied):
         model = copy.copy(model)
         for name in names:
@@ -135,7 +135,7 @@ def _equalities(model: mujoco.MjModel) -> int:
 
 
 def _limits(model: mujoco.MjModel, varied: Collection[str]) -> int:
-    """The total number of limits if randomized fields determine which are reached, else 0."""
+    """The total number of limits if randomized fields determine which limits are reached, else 0."""
     drawn = not _LIMITS.isdisjoint(varied)
     return int(model.jnt_limited.sum() + model.tendon_limited.sum()) if drawn else 0
 
@@ -163,7 +163,7 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
     for _ in range(_HOLDS):
         batch.ctrl[:] = rng.uniform(low, high, size=(_WORLDS, model.nu))
         for _ in range(_SUBSTEPS):
-            # an error from too little memory leaves the counts intact
+            # the counts are valid even if the memory is too small
             with contextlib.suppress(SimulationError):
                 batch.step()
             contacts, constraints = max(contacts, int(ncon.max())), max(constraints, int(nefc.max()))
@@ -179,8 +179,8 @@ graphs and for the group of a partial forward pass. CPU graphs keep all temporar
 times as much."""
 
 _TEMPORARIES_CONVEX = 3.5
-"""The same with convex collisions or the noslip solver: on adroit_pen the temporary arrays take 1.5 to 2.4 times the
-memory of the Data."""
+"""The same factor with convex collisions or the noslip solver: on adroit_pen the temporary arrays take 1.5 to 2.4 times
+the memory of the Data."""
 
 _CONVEX = {mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_MESH,
            mujoco.mjtGeom.mjGEOM_HFIELD}  # fmt: skip
@@ -221,7 +221,7 @@ _BITS = mjw.OverflowType
 CONTACT_BITS = int(_BITS.BROADPHASE | _BITS.NARROWPHASE)
 CONSTRAINT_BITS = int(_BITS.NEFC | _BITS.NJMAX_NNZ | _BITS.NVMAX)
 IGNORED_BITS = int(_BITS.ITERATIONS | _BITS.LS_ITERATIONS)
-"""A solver that reaches its iteration limit still returns a solution."""
+"""Bits that are not faults: a solver that reaches its iteration limit still returns a solution."""
 
 
 def report_pool_overflow(data: mjw.Data, mask: wp.array) -> None:

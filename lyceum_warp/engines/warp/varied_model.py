@@ -63,7 +63,7 @@ def constants_of(fields: Iterable[ModelField]) -> Constants:
 
 
 def outputs_of(fields: Collection[ModelField]) -> list[str]:
-    """The names of the constants that differ between worlds if these fields do."""
+    """The names of the constants that differ between worlds if these fields differ."""
     groups = constants_of(fields)
     names = [name for group, outputs in OUTPUTS.items() if group & groups for name in outputs]
     sized = any(field.name == "geom_size" for field in fields)
@@ -114,7 +114,8 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
 class ModelRows:
     """A model for a group of worlds, with its own rows of fields that differ; all other fields are shared.
 
-    With the whole model, MuJoCo Warp would read row ``world % rows`` of a field, which belongs to another world.
+    With the model of all worlds, MuJoCo Warp would read row ``world % rows`` of a field, which belongs to another
+    world.
 
     Args:
         whole: The model of all worlds.
