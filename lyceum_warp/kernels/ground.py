@@ -1,8 +1,8 @@
-"""Look up the height of the ground in a table, in Warp functions for tasks, and choose levels of difficulty.
+"""Provide Warp functions for rough ground: look up its height in a table, and choose levels of difficulty.
 
 A table of heights is ``lw.height_field(name)``: heights z with their coordinates, x in the first row, y in the first
-column, at constant distances. Points between have the heights of MuJoCo's triangles: the diagonal of a cell leads from
-its point with the least x and y to its point with the greatest.
+column, at constant distances. Heights in between are interpolated on MuJoCo's triangles: the diagonal of each cell goes
+from its point with the smallest x and y to its point with the largest x and y.
 """
 
 import warp as wp
@@ -33,7 +33,7 @@ def _triangle(ground: wp.array2d[float], x: float, y: float) -> wp.vec3:
 def ground_height(ground: wp.array2d[float], x: float, y: float) -> float:
     """The height of the ground at a point, m, on the triangles with which MuJoCo collides.
 
-    Outside the field it is the height of the nearest point of the edge, although MuJoCo has no ground there.
+    Outside the field, the height of the nearest edge point is returned, although MuJoCo has no ground there.
 
     Args:
         ground: The table of ``lw.height_field``.
@@ -54,7 +54,7 @@ def ground_normal(ground: wp.array2d[float], x: float, y: float) -> wp.vec3:
 def ground_distance(ground: wp.array2d[float], point: wp.vec3) -> float:
     """The distance of a point from the plane of the triangle below it, m; negative below the ground.
 
-    A sphere touches this triangle if the distance of its middle is at most its radius. Other triangles may be nearer.
+    A sphere touches this triangle if the distance of its centre is at most its radius. Other triangles may be nearer.
     """
     t = _triangle(ground, point[0], point[1])
     return (point[2] - t[0]) / wp.length(wp.vec3(t[1], t[2], 1.0))
@@ -100,10 +100,11 @@ def _draw(count: int, rng: wp.array[wp.uint32]) -> int:
 
 @wp.func
 def next_level(level: int, walked: float, commanded: float, patch: float, levels: int, rng: wp.array[wp.uint32]) -> int:
-    """The level of the next episode on a terrain: one more, the same or one less; as in Rudin et al., 2021.
+    """Choose the terrain level of the next episode: one higher, the same or one lower, as in Rudin et al. (2021).
 
-    One more if the robot walked more than half a patch; otherwise one less if it walked less than half the commanded
-    distance, but at least 0. After the last level follows a random one. (arXiv 2109.11978, section 3.2.)
+    The level rises if the robot walked more than half a patch. Otherwise it falls if the robot walked less than half
+    the commanded distance, but not below 0. The last level is followed by a random level. (arXiv 2109.11978, section
+    3.2.)
 
     Args:
         level: The level of the episode that ended, from 0.
@@ -132,9 +133,10 @@ def start_on_terrain(
     patch: float,
     rng: wp.array[wp.uint32],
 ) -> wp.vec3:
-    """Choose the patch of a new episode, and return its middle, m; for ``randomize``.
+    """Choose the patch of a new episode, and return its centre, m; for ``randomize``.
 
-    The first episode of a world is at level 0, in a random column, which stays. Later levels follow ``next_level``.
+    A world's first episode is at level 0, in a random column. The column never changes; ``next_level`` chooses later
+    levels.
 
     Args:
         level: Lasting memory of one number: the level, from 0.
@@ -165,9 +167,9 @@ def follow_walk(
     """Write the distances by which ``start_on_terrain`` chooses the next level; for ``advance``.
 
     Args:
-        level: See ``start_on_terrain``, as for the other rows.
+        level: The level; see ``start_on_terrain``.
         column: The column.
-        walked: Gets the horizontal distance from the middle of the patch, m.
+        walked: Gets the horizontal distance from the centre of the patch, m.
         commanded: Gets the commanded distance, m.
         origins: ``lw.Terrain.origins``.
         position: Position of the robot.

@@ -1,9 +1,9 @@
 """Interpolate plans from spline knots, and move the knots forward in time.
 
 K knots over a horizon of H steps are H / K steps apart, on a grid that is fixed in time. The horizon moves over the
-grid, so a plan that moves forward in time keeps the actions of its remaining steps (a sliding plan in MuJoCo MPC).
-Positions are whole numbers, in units of 1 / H of the knot spacing: a step advances by K units, and the phase, the
-position of the first step after its knot, is from 0 to H - 1.
+grid, so a plan that moves forward in time keeps the actions of its remaining steps (MuJoCo MPC calls this a sliding
+plan). Positions are whole numbers, in units of 1 / H of the knot spacing: a step advances by K units, and the phase,
+the position of the first step after its knot, is from 0 to H - 1.
 """
 
 import math

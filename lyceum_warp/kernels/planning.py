@@ -17,7 +17,7 @@ DRAWS = wp.constant(-3)
 
 _TILES = f"{__name__}.tiles"
 """Warp module of the kernels with tiles. On the CPU all kernels of a module write a shared variable, the address of the
-tiles; ``graphs.capture`` serialises only kernels with tiles, so the others need a module of their own."""
+tiles; ``graphs.capture`` serialises only kernels with tiles, so kernels without tiles need a separate module."""
 
 
 @wp.func

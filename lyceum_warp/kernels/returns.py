@@ -1,4 +1,4 @@
-"""Compute advantages and returns of rollouts: one thread per world goes through its steps backwards."""
+"""Compute advantages and returns of rollouts: one thread per world processes its steps backwards."""
 
 import warp as wp
 
@@ -19,7 +19,7 @@ def advantages(
 
     Advantages are generalised advantage estimates (Schulman et al. 2016, "High-dimensional continuous control using
     generalized advantage estimation", eq. 16). ``next_value`` is the value of the state after a step, before any reset.
-    Episodes that a time limit or the end of the rollout truncates bootstrap from it; terminated episodes do not.
+    Episodes that are truncated by a time limit or the end of the rollout bootstrap from it; terminated episodes do not.
     """
     w = wp.tid()
     last = reward_in.shape[0] - 1

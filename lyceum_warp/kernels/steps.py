@@ -44,8 +44,8 @@ class Counters:
     episode: wp.array[int]
     """Index of the episode."""
     rng: wp.array2d[wp.uint32]
-    """Stream that a task's function draws from, (observation groups * nworld, 1), one row per thread that draws. Every
-    kernel starts it again."""
+    """Stream that a task's function draws from, (observation groups * nworld, 1), with one row per drawing thread.
+    Every kernel resets it to its start."""
 
 
 @wp.struct
@@ -116,7 +116,7 @@ class TaskCode:
     """
 
     module: str  # name of the task's Warp module
-    functions: Mapping[str, wp.Function]  # by name, defaults included
+    functions: Mapping[str, wp.Function]  # functions by name, including defaults
     written: Collection[str]  # names of the functions that the task defines
     World: Any
     Params: Any
@@ -503,7 +503,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
 
 @dataclasses.dataclass(frozen=True)
 class BeginKernels:
-    """Kernels that begin episodes, draw model fields, and run events between steps."""
+    """Kernels that begin episodes, randomize model fields, and run events between steps."""
 
     restart: wp.Kernel
     reject_worlds: wp.Kernel | None
@@ -599,8 +599,8 @@ class RolloutKernels:
 def rollout_kernels(task: TaskCode) -> RolloutKernels:
     """Make the kernels of ``RolloutKernels`` around a task's functions.
 
-    Row t * nworld + w is world w after t steps. Its transition leads to the row nworld further on, so ``before`` and
-    ``after`` are views of the same arrays.
+    Row t * nworld + w is world w after t steps. The next state is nworld rows later, so ``before`` and ``after`` are
+    views of the same arrays.
     """
     Batch, Params = task.Batch, task.Params  # noqa: N806
     view = task.view
@@ -716,8 +716,8 @@ class Kernels(ActKernels, JudgeKernels, BeginKernels, RolloutKernels, SharedKern
     """The kernels of a step, and the structs of their arrays. Kernels that the task does not need are None."""
 
     views: Mapping[Any, wp.Function]
-    """By the task's structs, the functions that make them: World of a batch and a world's index, and the structs of
-    observations of a row."""
+    """For each struct of the task, the function that makes it: World from a batch and a world's index, observation
+    structs from a row."""
     terms: Mapping[str, wp.Function]
     """The generated functions of a task with terms: ``reward``, ``score`` and ``terminated``."""
     Batch: Any

@@ -77,7 +77,7 @@ def put(row: wp.array[float], at: int, value: wp.array[Any]) -> int:
     return put(row, at, value, 0, value.shape[0])
 
 
-# the last overload, because Warp takes the first that fits
+# this overload comes last, because Warp uses the first overload that fits
 @wp.func
 def put(row: wp.array[float], at: int, value: Any) -> int:
     for i in range(len(value)):

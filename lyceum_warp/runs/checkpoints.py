@@ -100,8 +100,8 @@ def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | No
             with torch.device("meta"):  # compare shapes before memory is allocated
                 module = _made(name, saved)
         if different := _difference(module, saved["state"]):
-            fix = _FIX if given is None else "give one like that of the run"
-            raise ValueError(f"it holds a {name} of other parameters ({different}): {fix}")
+            fix = _FIX if given is None else "give one with the same structure as the run's"
+            raise ValueError(f"its {name} has other parameters ({different}): {fix}")
         module = _made(name, saved) if given is None else given
         module.load_state_dict(saved["state"])
     except ValueError as error:
@@ -189,7 +189,7 @@ def read_checkpoint(
     if wrong := [name for name, value in content.items() if not _KINDS.get(name, lambda value: True)(value)]:
         raise ValueError(f"the checkpoint {path} has other content than lyceum_warp writes as {wrong[0]}: {_FIX}")
     if "state" in content and content["state"].get("iteration", content["iteration"]) != content["iteration"]:
-        raise ValueError(f"the checkpoint {path} has a policy and a state of different iterations: {_FIX}")
+        raise ValueError(f"the policy and the state in the checkpoint {path} are from different iterations: {_FIX}")
     return content
 
 
@@ -220,10 +220,10 @@ def _check_records(data: bytes) -> None:
         ValueError: A record is damaged.
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        # torch reads no content of a record that is marked as a folder
+        # torch ignores the content of records that are marked as folders
         folders = (record.filename for record in archive.infolist() if record.external_attr & 0x10)
         if (name := archive.testzip() or next(folders, None)) is not None:
-            raise ValueError(f"its record {name} has other content than was written")
+            raise ValueError(f"its record {name} is corrupt")
 
 
 def check_format(path: Path, number: Any) -> None:

@@ -93,7 +93,7 @@ class Configuration:
         try:
             # earlier releases accepted options as --param and stored them in "params", or had no "physics"
             words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
-            words.pop("unroll", None)  # their option, which changed no numbers
+            words.pop("unroll", None)  # an option of earlier releases, which changed no numbers
             base = EnvOptions(
                 engine=config["engine"], device=config["device"], nworld=config["nworld"], seed=config["seed"]
             )  # fmt: skip
@@ -125,8 +125,8 @@ class Configuration:
             run: The run whose task to use. Its copies replace files that have moved or changed.
             networks: The initial policy and value function; None for new ones.
             note: Called with messages about the task's files.
-            task: A task to use, in its current version, instead of the run's.
-            trust: Whether to execute the task of a run that this user did not make on this machine.
+            task: A task to use instead of the run's; its current version is used.
+            trust: Whether to execute a run's task although this user did not make the run on this machine.
 
         Raises:
             ValueError: A value is not valid, or ``run`` is not trusted.
@@ -158,8 +158,8 @@ def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, 
 
     Args:
         run: The run of the networks.
-        which: Which policy of the run; None if the run is resumed. The networks are then None, unless the
-            hyperparameters do not describe them, as in a run that started from another run's networks or that uses
+        which: Which policy of the run; None to resume the run. The networks are then None if the hyperparameters
+            describe them completely, which they do not if the run started from another run's networks or uses
             ``limit``.
 
     Raises:

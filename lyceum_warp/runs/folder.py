@@ -202,7 +202,7 @@ class Run:
             now: The current versions, from ``versions()``.
 
         Returns:
-            The changed entries, as (then, now). The file lists them under "resumed".
+            The changed entries, as (then, now). ``versions.json`` lists them under "resumed".
         """
         then = self.versions()
         changed, noted = {}, {}
@@ -274,7 +274,7 @@ class Run:
         try:
             content = read_checkpoint(self.best, parts=("iteration", "policy", "score"))
         except ValueError as error:
-            note(f"{str(error).rpartition(': ')[0]}: the next best policy replaces it, whatever its return")
+            note(f"{str(error).rpartition(': ')[0]}: the next evaluated policy replaces it, whatever its return")
             return None
         return content["iteration"], content["score"]["value"]
 
@@ -338,7 +338,7 @@ def load(
     Raises:
         FileNotFoundError: There is no such run, or it has no such policy.
         ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release; or ``policy``
-            is required but missing, or does not fit.
+            is missing although required, or does not fit.
     """
     check_kind("policy", policy, torch.nn.Module | None, "as lw.GaussianPolicy(nobs, nact, network=...)")
     content, path = _content(run, which, device)

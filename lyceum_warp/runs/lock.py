@@ -57,7 +57,7 @@ class RunLock:
             file.truncate(0)
             file.write(self._own)
             file.flush()
-            os.utime(self._path, (time.time(),) * 2)  # of this host, not of a file server
+            os.utime(self._path, (time.time(),) * 2)  # the time of this host, not of a file server
         self._thread.start()
         return self
 
@@ -124,10 +124,13 @@ def _named(owner: dict[str, Any]) -> str:
 
 
 def _started(pid: int) -> str:
-    """The start time of a process, to distinguish it from later ones with its pid; "" if it does not exist."""
+    """The start time of a process, to distinguish it from later processes with the same pid.
+
+    "" if it does not exist.
+    """
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        return "" if state[0] == "Z" else state[19]  # a zombie has ended
+        return "" if state[0] == "Z" else state[19]  # a zombie process counts as ended
     except OSError:
         if Path("/proc/self/stat").exists():
             return ""

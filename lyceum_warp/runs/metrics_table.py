@@ -40,7 +40,7 @@ def read_metrics(path: Path, *, lines: list[str] | None = None) -> list[dict[str
 
     Args:
         path: The table.
-        lines: Lines to read in place of the table's.
+        lines: Lines to read instead of the file's.
 
     Raises:
         ValueError: A cell is not a number, or the rows differ in length.

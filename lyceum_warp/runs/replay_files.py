@@ -1,8 +1,9 @@
-"""Keep a replay buffer beside a run's checkpoint, in files that are written once.
+"""Save a replay buffer beside a run's checkpoint, in files that are written only once.
 
-Each file holds the steps of one of the equal parts of the stream of all steps, about 1/64 of the buffer. A save writes
-the parts that have grown, so it takes time in proportion to the new steps. A part that has grown gets a new name. The
-old files are deleted after the checkpoint has been replaced, so the checkpoint always finds its steps.
+The sequence of all steps is divided into equal parts, each about 1/64 of the buffer, with one file per part. A save
+only writes the parts that have grown, so its duration is proportional to the new steps. A part that has grown gets a
+new file name. The old files are deleted after the checkpoint has been replaced, so the checkpoint always finds its
+steps.
 """
 
 from collections.abc import Callable, Iterator
@@ -28,7 +29,7 @@ def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, ch
     oldest = replay.stored - replay.count
     for start, end in _parts(replay, max(since, oldest), replay.stored):
         first = max(start, oldest)
-        rows = {  # worlds come first while they are gathered
+        rows = {  # the axis of the worlds comes first while they are gathered
             name: team.gather(part.transpose(0, 1).contiguous()).transpose(0, 1).cpu().contiguous()
             for name, part in replay.rows(first, end).items()
         }
@@ -75,7 +76,7 @@ def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
 
 
 def _parts(replay: Replay, first: int, stored: int) -> Iterator[tuple[int, int]]:
-    """Start and end of the parts with steps from ``first`` to ``stored``."""
+    """Start and end of each part that has steps from ``first`` to ``stored``."""
     each = -(-replay.steps // _PARTS)
     for start in range(first // each * each, stored, each):
         yield start, min(start + each, stored)

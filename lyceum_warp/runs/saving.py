@@ -68,7 +68,7 @@ class Saver:
         self._stored = learner.replay.stored if learner.replay is not None and saved >= 0 else 0
 
     def write(self, iteration: Iteration) -> float | None:
-        """Write an iteration's row, and its policy if it is the best so far or is to be numbered.
+        """Write an iteration's row, and its policy if it is the best so far or due as a numbered policy.
 
         Returns:
             The return that selects the best policy; None if the iteration has no return.

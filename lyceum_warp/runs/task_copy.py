@@ -30,11 +30,12 @@ Files = dict[Path, Path | bytes]
 
 _MODEL, _TABLES = "model", "tables"
 _APART = 2
-"""If a task's file lies deeper than this below the common folder with its model, both get separate folders."""
+"""If a task's file is nested deeper than this below the common folder with its model, both get separate folders."""
 _LARGEST = 512 * 2**20
-"""Models whose files exceed this size, bytes, are not copied."""
+"""Models whose files exceed this number of bytes are not copied."""
 _MOST_MODULES, _LARGEST_MODULES = 100, 8 * 2**20
-"""Modules imported from a task's folder are not copied if their number or total size, bytes, exceeds these limits."""
+"""Modules imported from a task's folder are not copied if their number, or their total size in bytes, exceeds these
+limits."""
 
 
 def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
@@ -68,7 +69,7 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
 
 
 def json_value(name: str, value: Any) -> Any:
-    """A task parameter as a JSON value, for config.json."""
+    """Convert a task parameter to a JSON value for config.json."""
     if (table := _table(value)) is not None:
         return str(value) if isinstance(value, str | Path) else f"{name}.npy" if table.size else []
     if isinstance(value, bool | int | float | str):
@@ -144,7 +145,8 @@ def run_env(
         where = "a notebook" if chosen is None else chosen.partition(":")[0]
         raise ValueError(
             f"the task {run.task_name!r} of the run in {run.folder} was defined in {where}, which trained it: give a "
-            "file that only defines it (eval --task my_task.py, train my_task.py --from), or go on there (resume=True)"
+            f"file that only defines it (eval --task my_task.py, train my_task.py --from), or resume in "
+            "that program (resume=True)"
         )
     path, colon, attribute = chosen.partition(":")
     copy = run.task_folder / kept.get("file", "")
@@ -193,13 +195,15 @@ def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, b
 
 
 def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = True) -> None:
-    """Report differences between an environment's task or model and the run's; the environment's are used.
+    """Report differences between an environment's task and model and those of the run.
+
+    The environment's versions are used.
 
     Args:
         run: The run.
         env: The environment.
         note: Called with each message.
-        model: Whether to compare the compiled model, which other physics change, too.
+        model: Whether to compare the compiled model, too. Other physics also change it.
     """
     kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
     file = next(iter(loaded), None)
@@ -211,7 +215,7 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = 
 
 
 def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
-    """The task parameters, with missing tables replaced by the run's own copies."""
+    """The task parameters; the run's own copies replace missing tables."""
     found = dict(params)
     for name, value in params.items():
         copy = run.task_folder / _TABLES / f"{name}.npy"

@@ -1,4 +1,4 @@
-"""Make views of Warp arrays, also as torch tensors, and launch kernels over worlds and their rows."""
+"""Make views of Warp arrays, including torch tensors, and launch kernels over worlds and their rows."""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -51,12 +51,12 @@ def torch_view(array: wp.array) -> torch.Tensor:
 
 
 _PART: ContextVar[tuple[int, int]] = ContextVar("_PART", default=(0, 1))
-"""The part of the worlds that the functions below launch kernels for, and the number of parts."""
+"""The index of the part of the worlds for which the functions below launch kernels, and the number of parts."""
 
 
 @contextlib.contextmanager
 def part_of_worlds(part: int, parts: int) -> Iterator[None]:
-    """Context in which the functions below launch kernels for only one part of the worlds.
+    """Context in which the functions below launch kernels only for one part of the worlds.
 
     Args:
         part: Index of the part.
@@ -70,7 +70,7 @@ def part_of_worlds(part: int, parts: int) -> Iterator[None]:
 
 
 def _launch(kernel: wp.Kernel, dim: Sequence[int], axis: int, args: Sequence[Any], device: Any, **options: Any) -> None:
-    """Launch a kernel for the current part of the worlds, which ``axis`` of ``dim`` counts.
+    """Launch a kernel for the current part of the worlds; ``axis`` is the axis of ``dim`` for worlds.
 
     The kernel's last argument is the first world of the part.
     """
@@ -116,7 +116,7 @@ def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.
 
 
 PAIRS_A_LAUNCH = 4
-"""Pairs of arrays that one launch of ``narrow_four`` or ``widen_four`` copies."""
+"""Number of pairs of arrays that one launch of ``narrow_four`` or ``widen_four`` copies."""
 
 
 def launch_several_rows(kernel: wp.Kernel, mask: wp.array, pairs: Sequence[tuple[wp.array, wp.array]]) -> None:

@@ -63,11 +63,11 @@ def document_overloads(function: Any) -> None:
 
 
 def document_arguments(function: Any, meanings: Mapping[str, str]) -> None:
-    """Append the meanings of a Warp function's arguments, those of all its overloads, to its docstring.
+    """Append the meanings of a Warp function's arguments, of all its overloads, to its docstring.
 
     Args:
         function: The function.
-        meanings: A meaning for each argument, by name; it may have further names.
+        meanings: A meaning for each argument, by name; additional names are ignored.
     """
     overloads = (*function.user_overloads.values(), *function.user_templates.values())
     names = dict.fromkeys(name for overload in overloads for name in overload.input_types)

@@ -1,4 +1,4 @@
-"""Make environments raise an error in forked children, where they would wait forever for the parent's threads."""
+"""Make environments raise an error in forked children, because they would wait forever for the parent's threads."""
 
 import os
 import weakref
@@ -10,7 +10,7 @@ _kept: list[object] = []
 
 
 class LeftInParent:
-    """Placeholder for an attribute that a forked child cannot use."""
+    """Placeholder for an attribute that a forked child must not use."""
 
     def __getattr__(self, name: str) -> Any:
         raise RuntimeError(

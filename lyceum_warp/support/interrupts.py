@@ -1,4 +1,4 @@
-"""Turn Ctrl-C, SIGTERM and SIGHUP into an exception, at once or once the caller handles it."""
+"""Turn Ctrl-C, SIGTERM and SIGHUP into an exception, raised immediately or when the caller can handle it."""
 
 import contextlib
 import signal
@@ -18,7 +18,7 @@ class Interrupted(BaseException):
 
 
 def _ignore(number: int, frame: Any) -> None:
-    """Ignore a signal after Interrupted was raised; ``obeyed`` replaces this handler, but not SIG_IGN."""
+    """Ignore a signal after Interrupted was raised. Unlike SIG_IGN, this handler is replaced by ``obeyed``."""
 
 
 def _interrupt(number: int, frame: Any) -> None:
@@ -66,7 +66,10 @@ def _is_active(handler: Any) -> bool:
 
 @contextlib.contextmanager
 def signals() -> Iterator[None]:
-    """Within the context the first Ctrl-C, SIGTERM or SIGHUP raises Interrupted; later ones only within ``obeyed``."""
+    """Within the context, the first Ctrl-C, SIGTERM or SIGHUP raises Interrupted.
+
+    Later signals do so only within ``obeyed``.
+    """
     with _handling(_interrupt, _is_active):
         yield
 
@@ -75,7 +78,7 @@ def signals() -> Iterator[None]:
 def ending() -> Iterator[None]:
     """Within the context SIGTERM and SIGHUP raise SystemExit, unless the program handles them.
 
-    By default they end a program at once, without its ``finally`` blocks.
+    By default these signals end a program immediately, without running its ``finally`` blocks.
     """
     with _handling(_leave, lambda handler: handler is signal.SIG_DFL):
         yield
@@ -83,7 +86,7 @@ def ending() -> Iterator[None]:
 
 @contextlib.contextmanager
 def obeyed() -> Iterator[None]:
-    """Within the context another Ctrl-C, SIGTERM or SIGHUP raises Interrupted after the first one of ``signals``.
+    """Within the context, a second Ctrl-C, SIGTERM or SIGHUP (after the first in ``signals``) raises Interrupted, too.
 
     This allows the user to cancel long work at the end of a program.
     """

@@ -1,4 +1,4 @@
-"""Compute confidence intervals of means and of differences between paired shares."""
+"""Compute confidence intervals of means and of differences between paired proportions."""
 
 import math
 from collections.abc import Sequence
@@ -39,14 +39,14 @@ def mean_interval(values: Sequence[float] | np.ndarray, confidence: float = 0.95
 
 
 def share_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
-    """Compute the difference of two paired shares, and the half-width of its 95 % confidence interval.
+    """Compute the difference of two paired proportions, and the half-width of its 95 % confidence interval.
 
     Half an observation is added to each of the four outcomes of a pair (Agresti and Min 2005, "Simple improved
     confidence intervals for comparing matched proportions"), so that the interval has a width if all pairs agree.
 
     Args:
         first: Whether something happened in each pair, (pairs,) bool.
-        second: The same for the other half of each pair.
+        second: The same for the other member of each pair.
 
     Returns:
         The difference, second minus first, at the centre of the interval, and the half-width.

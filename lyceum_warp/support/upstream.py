@@ -1,6 +1,6 @@
 """Access and patch internals of Warp and MuJoCo Warp.
 
-Only this module does, so that no other depends on their versions.
+No other module does this, so only this one depends on their versions.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ def builtin_functions() -> Mapping[str, Any]:
 
 
 def extend_structs() -> None:
-    """Let Python classes extend a ``wp.struct``: ``class World(go1.World)`` under ``@wp.struct`` has its fields, too.
+    """Let Python classes extend a ``wp.struct``: ``class World(go1.World)`` under ``@wp.struct`` inherits its fields.
 
     Warp refuses such a class, because a struct is not a type. A class derived from the struct's Python class
     would lose the inherited fields, because Warp reads only the annotations of the class itself.
@@ -44,7 +44,7 @@ def extend_structs() -> None:
 def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
     """Whether a module of kernels is loaded or in Warp's cache, for a block size.
 
-    Returns False if Warp's internals have changed, which only costs time.
+    If Warp's internals have changed it returns False, which only costs time.
     """
     if (device.context, block) in module.execs:
         return True

@@ -44,11 +44,11 @@ def start_warp() -> list[str]:
 
 
 def _stderr_of_start() -> list[str]:
-    """The lines that Warp writes to stderr while it is initialised."""
+    """Capture the lines that Warp writes to stderr while it is initialised."""
     with contextlib.ExitStack() as restored:
         try:
             stderr = os.dup(2)
-        except OSError:  # closed, as under pythonw
+        except OSError:  # stderr is closed, as under pythonw
             wp.init()
             return []
         restored.callback(os.close, stderr)
