@@ -1,4 +1,4 @@
-"""Declare the mirror image of a task, in which left and right change places, by the names of its parts."""
+"""Declare the mirror image of a task, in which left and right are exchanged, by the names of its parts."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 
 Reflection = tuple[Sequence[int], Sequence[float]]
-"""An order of columns and their signs: the mirror image of a row is ``signs * row[order]``."""
+"""A permutation of columns with signs: the mirror image of a row is ``signs * row[order]``."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Mirror:
     """The mirror image of a task in the plane between left and right, for ``lw.Task.mirror``.
 
-    A reflection belongs to the name of a part, wherever it occurs: in observations, actions and states. It is the signs
-    of the part's columns, such as ``"command": (1, -1, -1)`` for velocities forwards and to the left and a yaw rate; or
-    an order of the columns and the signs after it, such as ``"foot_force": ([1, 0], [1, 1])`` for a left and a right
+    A reflection applies to a part's name wherever it occurs: in observations, actions and states. It gives the signs of
+    the part's columns, such as ``"command": (1, -1, -1)`` for velocities forwards and to the left and a yaw rate; or an
+    order of the columns followed by their signs, such as ``"foot_force": ([1, 0], [1, 1])`` for a left and a right
     foot. In the base's axes, a vector has the signs (1, -1, 1), and an angular velocity (-1, 1, -1). The reflection
-    "action" is of a whole action whose parts are actuators.
+    "action" applies to a whole action whose parts are actuators.
 
     Args:
         parts: Reflections by the names of parts.
@@ -30,7 +30,7 @@ class Mirror:
     parts: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        """Complete the reflections that are only signs, and check all."""
+        """Complete reflections given only by signs, and check all reflections."""
         parts = {name: _complete(part) for name, part in self.parts.items()}
         for name, (order, signs) in parts.items():
             places, factors = np.asarray(order), np.asarray(signs)
@@ -43,7 +43,7 @@ class Mirror:
         object.__setattr__(self, "parts", parts)
 
     def columns(self, parts: Mapping[str, slice], *, task: str, whole: str | None = None) -> Reflection:
-        """The reflection of a row of parts.
+        """Combine the reflections of the parts into the reflection of a row.
 
         Args:
             parts: The columns of each part, as ``Space.parts``.
@@ -51,7 +51,7 @@ class Mirror:
             whole: Name of a reflection of the whole row, if there is one.
 
         Raises:
-            ValueError: A part has no reflection, or one of another size.
+            ValueError: A part has no reflection, or its reflection has another size.
         """
         if whole is not None and whole in self.parts:
             parts = {whole: slice(0, max(part.stop for part in parts.values()))}

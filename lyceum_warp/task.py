@@ -33,7 +33,7 @@ else:
 
 @dataclasses.dataclass(frozen=True)
 class TaskFunction:
-    """One of a task's functions: its signature, its purpose and its default."""
+    """A function that a task may have: its signature, its purpose and its default."""
 
     name: str
     arguments: str
@@ -41,18 +41,18 @@ class TaskFunction:
     result: type | None
     """The type of its result: float, bool, or None for a function that writes into its arguments."""
     about: str
-    """Its purpose and its default, for the documentation."""
+    """Purpose and default of the function, for the documentation."""
     default: str | None = None
     """The body of the default function; None for no default."""
     optional: str = ""
     """Optional arguments at the end, as in a task's file."""
     writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """The fields that it may write, by argument: "inputs", "memory", "lasting" (lasting memory and the model), or
-    "start" (all that a reset may write). Rows for results, such as ``obs``, may always be written."""
+    """The fields that the function may write, by argument: "inputs", "memory", "lasting" (lasting memory and the
+    model), or "start" (all that a reset may write). Rows for results, such as ``obs``, may always be written."""
 
     @property
     def signature(self) -> str:
-        """The line that defines it, without ``def``."""
+        """The first line of the function's definition, without ``def``."""
         return f"{self.name}({self.arguments})" + (f" -> {self.result.__name__}" if self.result else "")
 
     @property
@@ -137,7 +137,7 @@ RESULTS = ("obs", "ctrl", "metrics", "rng", "sums", "shared")
 """Arguments that are rows for results, which a function may write."""
 
 MEMORIES = ("memory", "lasting_memory")
-"""The rows of numbers, one of each for every world, of which the memory in World is parts."""
+"""The rows of floats that hold the parts of memory in World, one row of each kind per world."""
 
 GROUP_PREFIX = "observe_"
 """``observe_critic`` writes the group ``critic`` of the observations."""
@@ -160,16 +160,16 @@ def _document_functions(cls: type["Task"]) -> type["Task"]:
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """A part of a world's memory or of an observation. ``memory``, ``lasting_memory`` and ``part`` make it."""
+    """A part of a world's memory or of an observation, made by ``memory``, ``lasting_memory`` or ``part``."""
 
     kind: str
     """One of ``MEMORIES``, or "obs"."""
     size: int | str
-    """Number of elements, or the name of a table in Params, which has as many."""
+    """Number of elements, or the name of a table in Params with this number of rows."""
 
 
 def memory(size: int | str = 1) -> Any:
-    """As a default in World: a row that the task writes in ``advance`` or ``substep``, and that a reset clears.
+    """Declare task memory, as a default in World: a row that ``advance`` or ``substep`` writes and a reset clears.
 
     It belongs to the state. Its type is ``Row[float]``, ``Row[wp.vec3]`` or another row of numbers.
 
@@ -180,10 +180,9 @@ def memory(size: int | str = 1) -> Any:
 
 
 def lasting_memory(size: int | str = 1) -> Any:
-    """As a default in World: memory that outlives episodes, for instance the level of a curriculum.
+    """Declare memory that outlives episodes, as a default in World: for instance the level of a curriculum.
 
-    It is cleared only when a world's random stream starts, by ``rand_reset(seed=...)``, and ``startup`` may write it
-    then.
+    It is cleared only when a world's random stream starts (``rand_reset(seed=...)``); ``startup`` may then write it.
 
     Args:
         size: Number of elements, or the name of a table in Params: one element for each of its rows.
@@ -192,7 +191,7 @@ def lasting_memory(size: int | str = 1) -> Any:
 
 
 def part(size: int | str = 1) -> Any:
-    """As a default in the struct of a group of observations, in Shared or in Sums: a part of it.
+    """Declare a part, as a default in the struct of an observation group, in Shared or in Sums.
 
     Args:
         size: Number of elements, or the name of a table in Params: one element for each of its rows.
@@ -201,7 +200,7 @@ def part(size: int | str = 1) -> Any:
 
 
 class Element(int):
-    """A named element of the model, whose index is looked up in the compiled model. ``site`` and others make it."""
+    """A named element, whose index is looked up in the compiled model; made by ``site`` and similar functions."""
 
     field: str
     name: str
@@ -325,20 +324,20 @@ def mocap(body: str) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class FromModel:
-    """A parameter that is computed from the compiled model. ``from_model`` makes it."""
+    """A parameter that is computed from the compiled model, made by ``from_model``."""
 
     function: Callable[[mujoco.MjModel, Any], Any]
 
 
 def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
-    """As a default in Params: a value that a function computes from the compiled model and from other parameters.
+    """Declare a value that is computed from the compiled model and other parameters, as a default in Params.
 
     ``mass: float = lw.from_model(lambda model, p: model.body_subtreemass[p.trunk])`` is the mass of the robot. It is
-    computed again if another parameter changes, unless it was given itself.
+        recomputed if another parameter changes, unless its own value was given.
 
     Args:
-        function: A function of the MjModel and of an object with the parameters as attributes: those with other
-            defaults, and those computed before this one, in the order of Params.
+        function: A function of the MjModel and of an object with parameters as attributes: the parameters with ordinary
+            defaults, and those that Params computes before this one.
     """
     return FromModel(function)
 
@@ -358,7 +357,7 @@ class Planning:
     """Options of the planner's worlds, by the names of ``lw.make``, such as ``{"physics": "fast"}``."""
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Parameters of the planner's worlds, by the names of the task's ``Params``. They are ignored if MPPI has a value
-    function, because that was fitted to the rewards of the unchanged task."""
+    function, because it was fitted to the rewards of the unchanged task."""
 
     def __post_init__(self) -> None:
         """Check the type of every part."""
@@ -370,7 +369,7 @@ class Planning:
 @_document_functions
 @document_attributes
 class Task:
-    """The base class of tasks: a model, the fields that functions read, and a few functions of one world.
+    """Base class of tasks: a model, the fields that functions read, and a few functions of one world.
 
     A subclass names its model and the parts of its observation. Its module has two Warp structs, ``World`` (the
     fields that the functions read, by MuJoCo's names) and ``Params`` (the keyword arguments of ``make``, with
@@ -412,8 +411,8 @@ class Task:
 
     ``reject`` sees an initial state before it settles. While a new episode settles, no ``substep`` runs.
 
-    An event runs after the transition is judged and before the next observation, and not in worlds that restart.
-    Open-loop rollouts and planners leave events out.
+    An event runs after the transition is judged and before the next observation, but not in worlds that restart.
+    Open-loop rollouts and planners omit events.
 
     Quaternions in fields are in MuJoCo's order w, x, y, z, and typed ``Row[lw.quat]``. Warp's own quaternion functions
     expect x, y, z, w and refuse them: use ``lw.quat_rotate``, ``lw.quat_mul``, ``lw.quat_from_axis_angle`` and others.
@@ -428,8 +427,8 @@ class Task:
     """The observation's parts and their sizes, in order, such as ``{"position": 5, "velocity": 6}``; or a static method
     of the Params that returns them. A task may have several groups of observations, such as
     ``{"policy": {"position": 5}, "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy``,
-    which is ``env.obs``, and ``observe_critic``, with the same arguments, writes the group ``critic``. A task leaves
-    ``obs`` out if the last argument of these functions is a Warp struct, whose fields ``lw.part`` gives sizes."""
+    which is ``env.obs``, and ``observe_critic``, with the same arguments, writes the group ``critic``. A task omits
+    ``obs`` if the last argument of these functions is a Warp struct, whose fields have defaults ``lw.part(size)``."""
     rewards: ClassVar[Mapping[str, float]] = {}
     """The terms of the reward and their weights per second, such as ``{"upright": 1.0, "effort": -0.1}``, in place of
     ``reward``. A term is a function of the module that returns a float; its arguments are found by name: ``s0``,
@@ -438,29 +437,30 @@ class Task:
     weights, and each term is a metric, with its weight and dt. ``env.task.reward_text`` shows the generated source."""
     terminations: ClassVar[tuple[str, ...]] = ()
     """Names of functions that end the episode if one returns True, in place of ``terminated``. They may take ``s``,
-    ``p`` and what a term may take by name. Each is a metric: 1 if it holds after the step, otherwise 0."""
+    ``p`` and the named arguments of terms. Each is a metric: 1 if it returns True after the step, otherwise 0."""
     metrics: ClassVar[tuple[str, ...]] = ()
-    """Names of the metrics that ``measure`` writes. Without ``measure``, they are functions that return a float or a
-    bool and take what terms take."""
+    """Names of the metrics that ``measure`` writes. Without ``measure``, they are functions with the arguments of terms
+    that return a float or a bool."""
     horizon: ClassVar[int] = 1000
     """Steps after which an episode is truncated; 0 for never."""
     success_steps: ClassVar[int] = 1
     """Number of successive steps that must end with ``success`` before ``env.success`` is True. If it is more than 1,
-    the state has the count so far, in its part ``success_steps``, and a reset clears it."""
+    the part ``success_steps`` of the state holds the current count, which a reset clears."""
     lagged: ClassVar[tuple[str, ...]] = ()
-    """Fields that keep the values that ``mj_step`` leaves, one substep behind the state, as in some Gymnasium tasks."""
+    """Fields that keep the values left by ``mj_step``, one substep behind the state, as in some Gymnasium tasks."""
     cleared: ClassVar[tuple[str, ...]] = ()
-    """Fields left by the last substep, such as contact forces, to zero at the start of an episode. Otherwise they are
-    computed then, which takes a forward pass of the worlds that restart. A reset clears them before ``initialize``."""
+    """Fields left by the last substep, such as contact forces, to zero at the start of an episode. Other such fields
+    are computed at that time, which takes a forward pass of the worlds that restart. A reset clears them before
+    ``initialize``."""
     actions: ClassVar[Mapping[str, int | str] | None] = None
     """The parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls;
     ``control`` then turns them into inputs. A size may be the name of a table in Params: one number for each of its
-    rows. None: an action has one number for each control."""
+    rows. If None, an action has one number for each control."""
     action_range: ClassVar[tuple[float, float] | None] = None
-    """The range of an action, which the default ``control`` scales to the model's control ranges; None: actions are
-    controls, or, with ``actions``, have no bounds."""
+    """The range of actions, which the default ``control`` scales to the model's control ranges. If None, actions are
+    controls, or have no bounds if the task has ``actions``."""
     keyframe: ClassVar[str | None] = None
-    """Name of the model's keyframe at which ``reset`` starts, before ``initialize``; None: the model's ``qpos0``."""
+    """Name of the model's keyframe at which ``reset`` starts, before ``initialize``; None for the model's ``qpos0``."""
     draws: ClassVar[int] = 10
     """The most random initial states that a reset draws while ``reject`` returns True; the last is kept."""
     settle: ClassVar[int] = 0
@@ -470,8 +470,8 @@ class Task:
     """Id of the Gymnasium environment that the task reimplements, with its model, observation, reward, termination,
     reset and parameters, such as "Hopper-v5"; None if there is none. Subclasses do not inherit it."""
     trace: ClassVar[str | None] = None
-    """Name of the site or body whose path the viewer draws for a planner's samples. None: the centre of mass of a robot
-    whose base moves freely, or the end of an arm."""
+    """Name of the site or body whose path the viewer draws for a planner's samples. If None, the viewer draws the
+    centre of mass of a robot with a floating base, or the end of an arm."""
     mirror: ClassVar[Any] = None
     """The task's mirror image, ``lw.Mirror(...)``, or a static method ``mirror(model, p)`` that returns it, to learn
     symmetric policies; None if there is none."""
@@ -481,16 +481,18 @@ class Task:
     planning: ClassVar[Planning] = Planning()
     """The task's settings for MPPI, such as ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
 
-    # World, Params and Warp functions of the module at the time of the class's definition
+    # World, Params and Warp functions of the module when the class was defined
     scope: ClassVar[dict[str, Any]]
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Change the model before it is compiled, also one that was passed to ``make``. Default: keeps it."""
+        """Change the model, or the model passed to ``make``, before it is compiled. The default keeps the model."""
 
     @staticmethod
     def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
-        """What a robot needs to run a policy, for the metadata of ONNX files: JSON values by name. Default: nothing.
+        """Return what a robot needs to run a policy, for the metadata of ONNX files: JSON values by name.
+
+        The default is empty.
 
         ``model`` is the compiled model, and ``p`` has the parameters as attributes.
         """

@@ -1,4 +1,4 @@
-"""Make rough ground: a height field of patches by difficulty, as an asset of a model and as a table for kernels."""
+"""Make rough ground: a height field of patches with increasing difficulty, for models and as a table for kernels."""
 
 import dataclasses
 import difflib
@@ -13,17 +13,17 @@ from lyceum_warp.task import from_model
 
 Shape = Callable[[np.ndarray, np.ndarray, float, np.random.Generator], np.ndarray]
 """``shape(x, y, amount, rng)``: the heights of a square patch, m, (n, n), from the coordinates of its points relative
-to its middle, m, (n, n) each. The outline of a patch is then set to 0, so that patches meet without a step."""
+to its centre, m, (n, n) each. The outline of a patch is then set to 0, so that patches meet without a step."""
 
 _PLATFORM = 1.0
-"""Half the side of the flat square in the middle of a patch, m."""
+"""Half the side length of the flat square at the centre of a patch, m."""
 
 _BASE = 1.0
 """Thickness of the ground below its lowest point, m."""
 
 
 def _inwards(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Distance from the outline of a patch towards its middle, m, up to the edge of the platform."""
+    """Distance from the outline of a patch, m, limited to the distance of the platform's edge."""
     half = float(x.max())
     return np.clip(half - np.maximum(abs(x), abs(y)), 0.0, max(half - _PLATFORM, 0.0))
 
@@ -82,7 +82,7 @@ _KINDS: dict[str, tuple[Shape, float]] = {
     "stairs_up": (_stairs, -0.2), "stairs_down": (_stairs, 0.2),
     "steps": (_steps, 0.2), "rough": (_rough, 0.08), "waves": (_waves, 0.2), "stones": (_stones, 0.4),
 }  # fmt: skip
-"""The shapes of patches, and their amounts at difficulty 1."""
+"""The shapes of patches, and their sizes (``amount``) at difficulty 1."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,19 +108,19 @@ class Terrain:
     kinds: Mapping[str | Shape, int]
     """Kinds of patches, in order, each with its number of columns. A kind is a name from the table, or a function
     ``shape(x, y, difficulty, rng)`` that returns the heights of a patch, m, (n, n); x and y are the coordinates of its
-    points relative to its middle, (n, n)."""
+    points relative to its centre, (n, n)."""
     levels: int = 10
     """Number of rows."""
     patch: float = 8.0
     """Side of a patch, m; a multiple of ``resolution``."""
     resolution: float = 0.1
-    """Distance between neighbouring points of the field, m. A wall takes one such distance."""
+    """Distance between neighbouring points of the field, m. A vertical wall becomes a slope of this width."""
     border: float = 4.0
     """Width of the border, m; a multiple of ``resolution``."""
     seed: int = 0
     """Seed of all random heights."""
     scale: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Amounts at difficulty 1 that replace those of the table, by kind."""
+    """Sizes at difficulty 1 that replace the table's, by kind."""
 
     def __post_init__(self) -> None:
         """Check the description.
@@ -164,7 +164,7 @@ class Terrain:
 
     @functools.cached_property
     def origins(self) -> np.ndarray:
-        """Middles of the patches relative to the plane that the field replaces, m, (levels, columns, 3).
+        """Centres of the patches relative to the plane that the field replaces, m, (levels, columns, 3).
 
         z is the greatest height within 0.5 m.
         """
@@ -178,11 +178,11 @@ class Terrain:
         return found
 
     def add_to(self, spec: mujoco.MjSpec, *, name: str = "terrain") -> None:
-        """Add the ground to a model, in place of the world's plane.
+        """Add the ground to a model, replacing the world's plane.
 
         The plane becomes the height field and keeps its name, friction and material; without a plane the model gets a
-        geom ``name``. A corner of patches in the middle of the field is at the plane's position, so that a robot that
-        stood on the plane stands on the field. The extent of the model stays, on which cameras depend.
+        geom ``name``. A corner between patches in the middle of the field is at the plane's position, so a robot that
+        stood on the plane stands on the field. The model's extent, on which cameras depend, does not change.
 
         Args:
             spec: The model, changed in place; for instance in a task's ``edit_model``.
@@ -239,7 +239,7 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
     """The table of a model's height field, m, (1 + points along y, 1 + points along x); see ``height_field``.
 
     Raises:
-        ValueError: The model has no such height field, or not exactly one fixed and upright geom has it.
+        ValueError: The model has no such height field, or it is not used by exactly one fixed and upright geom.
     """
     number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_HFIELD, name)
     if number < 0:
@@ -266,11 +266,13 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
 
 
 def height_field(name: str) -> Any:
-    """As a default in Params: the table of a height field of the model, for ``lw.ground_height`` and ``height_scan``.
+    """Declare the table of a model's height field, as a default in Params.
 
-    The first row of the table has the coordinates x of the points, its first column their y, the rest their heights z
-    in the world's frame, m, (1 + points along y, 1 + points along x). All worlds share it. Declare it as
-    ``ground: wp.array2d[float] = lw.height_field("terrain")``.
+    For ``lw.ground_height`` and ``height_scan``.
+
+    The first row of the table holds the x coordinates of the points, its first column their y coordinates, and the rest
+    their heights z in the world's frame, m, (1 + points along y, 1 + points along x). All worlds share it. Declare it
+    as ``ground: wp.array2d[float] = lw.height_field("terrain")``.
 
     Args:
         name: The name of the height field, as in the model; ``lw.Terrain.add_to`` names it "terrain".
@@ -279,10 +281,10 @@ def height_field(name: str) -> Any:
 
 
 def scan_grid(length: float, width: float, *, spacing: float = 0.1) -> np.ndarray:
-    """As a default in Params: points of a rectangle around a robot for ``lw.height_scan``, (n, 2), m.
+    """Declare a grid of points around a robot for ``lw.height_scan``, (n, 2), m, as a default in Params.
 
-    The first point is behind on the right; y, to the left, increases first. ``lw.scan_grid(1.6, 1.0)`` has 17 x 11
-    points. Declare it as ``scan: wp.array[wp.vec2] = lw.scan_grid(1.6, 1.0)``.
+    The first point is at the rear right. Points are ordered by x (forwards), then by y (to the left).
+    ``lw.scan_grid(1.6, 1.0)`` has 17 x 11 points. Declare it as ``scan: wp.array[wp.vec2] = lw.scan_grid(1.6, 1.0)``.
 
     Args:
         length: Extent along x, forwards, m.

@@ -56,8 +56,8 @@ def servos(model: mujoco.MjModel, p: Any) -> list[int]:
     for joint, actuators in zip(p.joints, found, strict=True):
         if len(actuators) != 1:
             raise ValueError(
-                f"the joint {_name(model, _JOINT, joint)} has {len(actuators)} actuators of its own and needs one "
-                "(those of tendons do not count): change the model, or leave it out of the joints that act"
+                f"the joint {_name(model, _JOINT, joint)} has {len(actuators)} actuators of its own but needs "
+                f"exactly one (tendon actuators do not count): change the model, or omit the joint from ``joints``"
             )
     return [int(actuators[0]) for actuators in found]
 
@@ -68,7 +68,7 @@ def controls(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """A quarter of the angle at which each joint's servo reaches its force limit, rad, (joints,).
+    """A quarter of the position error at which each joint's servo reaches its force limit, rad, (joints,).
 
     0.25 * limit / kp, mjlab's scale of actions.
 
@@ -108,9 +108,13 @@ def home_height(model: mujoco.MjModel, p: Any) -> float:
 
 
 def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
-    """What a robot needs to run a policy of a velocity task, for ``lw.Task.deployment``; lists follow ``joints``."""
+    """Collect what a robot needs to run a velocity policy, for ``lw.Task.deployment``.
+
+    Lists are in the order of ``joints``.
+    """
     actuators, stages = servos(model, p), np.asarray(p.stages)
-    damping = model.dof_damping[joint_dof(model, p)].reshape(len(actuators), -1)[:, 0]  # the model's, part of the gain
+    # the model's own value, part of the gain
+    damping = model.dof_damping[joint_dof(model, p)].reshape(len(actuators), -1)[:, 0]
     yaw, lateral = float(stages[:, 3].max()), float(np.max(p.lateral_velocity))
     return {
         "base": model.body(base(model)).name,
@@ -132,8 +136,8 @@ def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
 def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
     """The mirror image of a velocity task in the plane y = 0 of the base, for ``lw.Task.mirror``.
 
-    With all joints at 0, the mirror image of a joint's position and axis is that of its partner, on the other side or
-    itself. Masses need not be symmetric.
+    With all joints at 0, a joint's position and axis are the mirror image of its partner's. The partner is the joint on
+    the other side, or the joint itself. Masses need not be symmetric.
 
     Raises:
         ValueError: A joint or a foot has no partner, or the default pose or the scale of actions is not symmetric.
@@ -151,7 +155,9 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
         partner[joint], sign[joint] = hinges[best], np.sign(cosines[best])
     acting = [int(joint) for joint in p.joints]
     if alone := [joint for joint in acting if partner[joint] not in acting]:
-        raise ValueError(f"the joint {name(alone[0])} acts, but {name(partner[alone[0]])}, its mirror image, does not")
+        raise ValueError(
+            f"the joint {name(alone[0])} is actuated, but its mirror image {name(partner[alone[0]])} is not"
+        )
     joints = [acting.index(partner[joint]) for joint in acting], sign[acting]
     for table, signs in (("default_pose", joints[1]), ("action_scale", 1.0)):
         values = np.asarray(getattr(p, table))
@@ -182,11 +188,11 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
 # legs
 #
 # With all joints at 0, every joint of a leg has a constant axis in the base's axes, and a constant position relative to
-# the joint before it. A joint turns all that is behind it.
+# the joint before it. Turning a joint turns everything beyond it.
 
 
 def leg_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The joints from the base to each foot, (feet, longest leg); -1 behind the end of a shorter leg.
+    """The joints from the base to each foot, (feet, longest leg); -1 fills the rows of shorter legs.
 
     Raises:
         ValueError: A foot is not connected to the base by hinges.
@@ -197,13 +203,13 @@ def leg_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def leg_qpos(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The index of each of ``leg_joints`` in ``qpos``, -1 behind the end of a leg."""
+    """The index of each of ``leg_joints`` in ``qpos``; -1 fills the rows of shorter legs."""
     joints = leg_joints(model, p)
     return np.where(joints < 0, -1, model.jnt_qposadr[joints])
 
 
 def leg_dof(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The index of each of ``leg_joints`` in ``qvel``, -1 behind the end of a leg."""
+    """The index of each of ``leg_joints`` in ``qvel``; -1 fills the rows of shorter legs."""
     joints = leg_joints(model, p)
     return np.where(joints < 0, -1, model.jnt_dofadr[joints])
 
@@ -215,7 +221,7 @@ def leg_axes(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def leg_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The position of each of ``leg_joints`` relative to the joint before it, the first to the base, m."""
+    """The position of each of ``leg_joints`` relative to the previous joint, or to the base for the first joint, m."""
     anchors = _straight(model).xanchor[leg_joints(model, p)]
     return np.diff(anchors, axis=1, prepend=0.0)
 
@@ -229,8 +235,9 @@ def foot_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
 def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
     """Spheres that touch a plane if and only if the foot does, (feet, most spheres, 4): centre and radius, m.
 
-    Centres are relative to the foot's last joint. A sphere is itself, a capsule its ends, a box its corners; other
-    geoms are the corners of their bounding boxes. Radii include the margin from which a contact has a force.
+    Centres are relative to the foot's last joint. A capsule becomes two spheres at its ends, a box becomes its corners,
+    and any other geom the corners of its bounding box. Radii include the margin at which a contact starts to exert
+    force.
 
     Raises:
         ValueError: A foot has no geom in ``foot_geoms``.
@@ -245,14 +252,14 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
         found[:, :3] -= data.xanchor[_last_joint(model, foot)]
         spheres.append(found)
     most = max(map(len, spheres))
-    return np.array([np.resize(found, (most, 4)) for found in spheres])  # repeats the spheres of a foot with fewer
+    return np.array([np.resize(found, (most, 4)) for found in spheres])  # repeat spheres of feet that have fewer
 
 
 def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
-    """The geoms of the bodies of the feet that can touch the ground, that is, a geom of the world.
+    """The geoms of the feet's bodies that can touch the ground (any geom of the world body).
 
     Raises:
-        ValueError: A foot has none.
+        ValueError: A foot has no such geom.
     """
     found = []
     for foot in p.feet:
@@ -264,7 +271,7 @@ def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
 
 
 def contact_geoms(model: mujoco.MjModel, body: int) -> list[int]:
-    """The geoms of a body that can touch a geom of the world."""
+    """The geoms of a body that can touch a geom of the world body."""
     ground = np.flatnonzero(model.geom_bodyid == 0).tolist()
     pairs = {frozenset(pair) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
     geoms = np.flatnonzero(model.geom_bodyid == body).tolist()
@@ -275,7 +282,7 @@ def foot_forces(model: mujoco.MjModel, p: Any) -> list[int]:
     """The index in ``sensordata`` of the force on each foot, from the sensor FOOT_force, (feet,).
 
     Raises:
-        ValueError: There is no such sensor of three numbers.
+        ValueError: There is no sensor of three numbers with this name.
     """
     found = []
     for foot in p.feet:
@@ -312,7 +319,7 @@ def _last_joint(model: mujoco.MjModel, foot: int) -> int:
 
 
 def _straight(model: mujoco.MjModel) -> mujoco.MjData:
-    """The model's kinematics with the base's frame at the world's and all other coordinates 0."""
+    """Compute the model's kinematics with the base at the world's origin and all other coordinates 0."""
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = 0.0
     start = int(model.jnt_qposadr[0])
@@ -327,7 +334,7 @@ def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[
 
 
 def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.ndarray:
-    """Spheres of a geom, enlarged by the margin of its contacts with the ground, less their gap."""
+    """Enlarge spheres of a geom by the margin of its contacts with the ground, minus their gap."""
     ground = np.flatnonzero(model.geom_bodyid == 0)
     margin = model.geom_margin[geom] + model.geom_margin[ground].max()
     gap = model.geom_gap[geom] + model.geom_gap[ground].max()
@@ -364,17 +371,17 @@ def prepare_walker(
     timestep: float | None = None,
     iterations: tuple[int, int] | None = None,
 ) -> None:
-    """Prepare a model for a velocity task: add sensors of the forces on the feet; the feet set the friction.
+    """Prepare a model for a velocity task: add force sensors to the feet, and let the feet determine the friction.
 
     The model's own sensors are removed, because each costs time and the task reads none of them. Geoms of the feet get
-    priority in contacts, so that friction that is drawn for them holds. Pairs of a foot's geom with the ground become
-    contacts of these geoms.
+    priority in contacts, so that their randomized friction applies. Explicit contact pairs of a foot with the ground
+    are replaced by ordinary contacts.
 
     Args:
         spec: The model, changed in place.
         feet: Names of the sites of the feet.
         timestep: Seconds in a substep; None keeps the model's.
-        iterations: The most iterations of the solver and of its line search; None keeps the model's.
+        iterations: Maximum numbers of iterations of the solver and of its line search; None keeps the model's.
 
     Raises:
         ValueError: A site of a foot is missing.
@@ -412,7 +419,7 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
 
     Args:
         spec: The model.
-        feet: By the names of the sites, the body of each, or a joint or geom of this body, and the position in it, m.
+        feet: For each site by name: its body, or a joint or geom of this body, and its position in the body, m.
 
     Raises:
         ValueError: There is no such element.
@@ -426,10 +433,10 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
 
 
 def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0) -> None:
-    """Turn the motors of joints into position servos, in place; servos stay as they are.
+    """Turn the motors of joints into position servos, in place; existing servos do not change.
 
-    The force limit stays. A servo reaches it at an error of ``reach`` rad: kp = limit / reach. Its damping is critical
-    for the inertia that the joint has in ``qpos0``: kp + kd s + M s^2 has a double root.
+    The force limit does not change. A servo reaches it at a position error of ``reach`` rad: kp = limit / reach. The
+    servo is critically damped for the joint's inertia at ``qpos0``: kp + kd s + M s^2 has a double root.
 
     Args:
         spec: The model.
@@ -464,10 +471,10 @@ def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0
 
 
 def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.015) -> None:
-    """Let two capsules collide in place of each box of a foot, along its longer side; for height fields.
+    """Replace each colliding box of a foot by two capsules along its longer side, for height fields.
 
     MuJoCo Warp 4.0 finds contacts of boxes and height fields with wrong normals and depths, which throw a robot away.
-    The capsules lie within the outline of the sole and have its lowest plane; masses stay.
+    The capsules lie within the outline of the sole and touch its lowest plane; masses do not change.
 
     Args:
         spec: The model, changed in place, after ``prepare_walker``.

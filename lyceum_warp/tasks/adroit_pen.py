@@ -3,7 +3,7 @@
 The hand's model needs the extra "hand". The target is a mocap body here, so it is part of the state. The target does
 not collide; in the original, the pen can collide with it. The model lists the contact pair of ring and little fingertip
 twice; here it is listed once. As in the original, positions lag by one substep, as ``mj_step`` leaves them.
-Success: the pen has been in the goal orientation for more than 20 steps of the episode.
+Success: the pen has been in the goal orientation in more than 20 steps of the episode.
 """
 
 import mujoco
@@ -32,7 +32,7 @@ class Params:
     goal_steps: float = 20.0
     near_similarity: float = 0.9
     drop_height: float = 0.075
-    target_range: float = 1.0  # +-, of the target's first two Euler angles, rad
+    target_range: float = 1.0  # bound of the target's first two Euler angles, rad
     pen: int = lw.body("Object")
     pen_top: int = lw.site("object_top")
     pen_bottom: int = lw.site("object_bottom")

@@ -1,7 +1,7 @@
 """AlohaLift: lift a pot by its two handles with two arms (ALOHA and pot of mujoco_warp's test data).
 
-Meshes are visual only. Collision geoms are capsules fitted to the arms, which do not collide with each other, and the
-simple shapes of the MJCF file beside this one. Actions are velocities of the targets of the model's position servos.
+Meshes are visual only. Collision geoms are the simple shapes of the MJCF file beside this one, and capsules fitted to
+the arms, which do not collide with each other. Actions are velocities of the targets of the model's position servos.
 Success: the pot has been above the goal height for ten consecutive steps.
 """
 
@@ -28,7 +28,7 @@ class Params:
     dt: float
     goal_height: float = 0.1
     rest_height: float = 0.0658  # of the pot on the table
-    place: wp.vec3 = wp.vec3(0.03, 0.03, 0.25)  # +-, of the pot at the start: x, y (m) and yaw (rad)
+    place: wp.vec3 = wp.vec3(0.03, 0.03, 0.25)  # bounds of the pot's initial pose: x, y (m) and yaw (rad)
     pot: int = lw.body("partnet_100015/")
     left_grip: int = lw.site("lift/left_grip")
     right_grip: int = lw.site("lift/right_grip")
@@ -55,7 +55,7 @@ def evaluate(s: World, p: Params) -> float:  # height of the pot above the table
 @wp.func
 def arm(s: World, grip: int, handle: int, finger: int) -> wp.vec4:
     near, reach, grasp = lw.grasp_terms(wp.length(s.site_xpos[grip] - s.site_xpos[handle]), s.qpos[finger], 0.015)
-    # best: the fingers' sliding axis, y of the gripper, is perpendicular to the handle's bar, x of the pot
+    # best if the fingers' sliding axis (y of the gripper) is perpendicular to the handle's bar (x of the pot)
     orient = 1.0 - wp.abs(wp.dot(s.site_xmat[grip][:, 1], s.site_xmat[handle][:, 0]))
     return wp.vec4(reach, orient, grasp, near)
 

@@ -29,8 +29,8 @@ class World:
 @wp.struct
 class Params:
     dt: float
-    far: float = 0.5  # m; longer distances are clipped to this
-    near: float = 0.03  # m between palm and ball, below which the reward includes the goal
+    far: float = 0.5  # upper limit of distances, m
+    near: float = 0.03  # the reward includes the goal if palm and ball are closer than this, m
     finger_weight: float = 0.1
     success_distance: float = 0.05
     ball: int = lw.body("table/ball")
@@ -40,7 +40,8 @@ class Params:
 
 
 @wp.func
-def distances(s: World, p: Params) -> wp.vec3:  # from the ball to the palm, to the goal, and summed to the fingertips
+# distances from the ball: to the palm, to the goal, and the sum of those to the fingertips
+def distances(s: World, p: Params) -> wp.vec3:
     d = wp.vec3(wp.length(s.site_xpos[p.palm] - s.xpos[p.ball]), wp.length(s.site_xpos[p.goal] - s.xpos[p.ball]), 0.0)
     d = wp.min(d, wp.vec3(p.far))
     for i in range(3):
@@ -104,7 +105,8 @@ class ArmHandPickup(lw.Task):
         spec.attach(jaco("jaco_hand.xml").spec(), site=spec.site("wristsite"), prefix="hand/")
         for geom in spec.geoms:
             geom.contype, geom.conaffinity = 0, 1  # arm and hand collide with table and ball, not with each other
-        for i, joint in enumerate(spec.joints):  # large joints, small joints, fingers: gain, maximum rad/s and N m
+        # gain, maximum rad/s and maximum N m of large joints, small joints and fingers
+        for i, joint in enumerate(spec.joints):
             gain, speed, torque = ((500, 0.628, 30.5), (500, 0.838, 6.8), (100, 1.0, 1.0))[i // 3]
             motor = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             motor.set_to_velocity(kv=gain)

@@ -1,7 +1,7 @@
 """HumanoidStandup: stand up from the floor (Gymnasium's HumanoidStandup-v5).
 
-The contact forces are from MuJoCo's sensor stage, as in humanoid. Here they are also in the first observation of an
-episode, in which Gymnasium has zeros. The solver is Newton instead of the model's PGS. Gymnasium documents
+The contact forces are from MuJoCo's sensor stage, as in humanoid. The first observation of an episode also contains
+them, whereas Gymnasium's contains zeros. The solver is Newton instead of the model's PGS. Gymnasium documents
 ``uph_cost_weight`` but does not use it; here it weighs the height.
 """
 

@@ -23,14 +23,14 @@ class World:
     site_xpos: Row[wp.vec3]
     mocap_pos: Row[wp.vec3]
     jnt_range: Row[wp.vec2]
-    distances: Row[float] = lw.memory(REMEMBERED)  # m, the latest at the end
+    distances: Row[float] = lw.memory(REMEMBERED)  # distances, m; the latest is last
 
 
 @wp.struct
 class Params:
     dt: float
     success_distance: float = 0.05
-    random_start: bool = False  # draw joints from their ranges, as in the paper's text; zero, as in its code
+    random_start: bool = False  # the paper's text draws joints from their ranges; its code sets them to zero
     target_range: wp.vec3 = wp.vec3(0.3, 0.2, 0.25)
     finger: int = lw.site("finger")
     target: int = lw.mocap("target")

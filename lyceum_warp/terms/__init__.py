@@ -1,7 +1,7 @@
 """Offer reward terms, commands, contact clocks, noise, random draws and motors as functions of values and rows.
 
 Every function is a ``wp.func`` of numbers, vectors, rows of ``World`` and tables of ``Params``, so it works in any
-task. A name of an argument means the same in all functions; ``ARGUMENTS`` explains it.
+task. Arguments of the same name mean the same in all functions; ``ARGUMENTS`` explains them.
 """
 
 from lyceum_warp.support.docstrings import document_arguments

@@ -1,7 +1,6 @@
-"""Judge how actions change from step to step.
+"""Compute reward terms for the change of actions between steps.
 
-``advance`` keeps earlier actions in memory, so that ``s1`` has all that a term needs, also ``last_action`` for the
-observation::
+A task's ``advance`` stores earlier actions in memory, so that terms and observations can read them from ``s1``::
 
     lw.put(s1.earlier_action, 0, s0.previous_action)
     lw.put(s1.previous_action, 0, s0.last_action)

@@ -1,8 +1,8 @@
-"""Time the contacts of feet, and judge their swings, slips and landings.
+"""Time the contacts of feet, and compute reward terms for their swings, slips and landings.
 
-The tables of feet list them in one order: ``feet`` (sites), ``foot_velocities``, ``foot_forces`` and ``foot_contacts``
-(sensors), and the rows of memory, which have one element for each foot. Clocks run in ``substep``, swings are followed
-in ``advance``. Heights are above the plane z = 0; on other ground, add up ``clearance`` over the feet.
+All tables list the feet in the same order: ``feet`` (sites), ``foot_velocities``, ``foot_forces`` and ``foot_contacts``
+(sensors), and rows of memory with one element per foot. Call the clocks in ``substep`` and ``follow_swing`` in
+``advance``. Heights are measured from the plane z = 0; on other ground, sum ``clearance`` over the feet.
 """
 
 import warp as wp

@@ -1,7 +1,7 @@
 """Keep the last values of a row in a ring, for observation histories and delays.
 
-The last n values of ``width`` numbers take ``history: Row[float] = lw.memory(1 + n * width)``: a counter, and the ring.
-Memory is 0 at the start of an episode, which is the empty history.
+To store the last n values of ``width`` numbers, declare ``history: Row[float] = lw.memory(1 + n * width)``: a counter,
+and the ring. At the start of an episode the memory is 0, which means an empty history.
 """
 
 import warp as wp

@@ -1,9 +1,9 @@
 """Draw mass, centre of mass and inertia of a body together, so that they stay physically consistent.
 
-A body with these three numbers exists exactly if its pseudo-inertia matrix J (4 x 4) is positive definite. Multiplying
-its Cholesky factor by an upper triangular matrix U with a positive diagonal, J' = U J U^T, keeps it so (Rucker and
-Wensing 2022, "Smooth parameterization of rigid-body inertia", whose log-Cholesky parameters make up U). U is an affine
-map of the body's mass: x -> D x + t, with the density scaled.
+These values are physically consistent if and only if the pseudo-inertia matrix J (4 x 4) is positive definite. J' = U J
+U^T, with an upper triangular matrix U with a positive diagonal, is positive definite, too (Rucker and Wensing 2022,
+"Smooth parameterization of rigid-body inertia", whose log-Cholesky parameters make up U). U is an affine map of the
+body's mass: x -> D x + t, with the density scaled.
 """
 
 import warp as wp

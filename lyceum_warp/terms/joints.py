@@ -1,6 +1,6 @@
-"""Judge a robot's joints: their pose, limits, velocities, accelerations, torques and power.
+"""Compute reward terms for a robot's joints: pose, limits, velocities, accelerations, torques and power.
 
-The tables of joints list them in one order: ``joints``, ``joint_qpos``, ``joint_dof``, the default pose and the
+All tables list the joints in the same order: ``joints``, ``joint_qpos``, ``joint_dof``, the default pose and the
 standard deviations.
 """
 

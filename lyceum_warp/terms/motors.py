@@ -1,6 +1,6 @@
 """Compute torques of servos and of DC motors.
 
-A task's ``control`` runs once a step: its torques hold for all substeps of the step.
+A task's ``control`` runs once per step, so its torques are constant over the step's substeps.
 """
 
 import warp as wp

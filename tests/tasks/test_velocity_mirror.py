@@ -139,7 +139,7 @@ def test_a_robot_without_a_mirror_image_is_refused() -> None:
     made = bound("go1_velocity")
     p = SimpleNamespace(**made.params)
     p.joints = p.joints[:3]
-    with pytest.raises(ValueError, match="the joint 'FR_hip' acts, but 'FL_hip', its mirror image, does not"):
+    with pytest.raises(ValueError, match="the joint 'FR_hip' is actuated, but its mirror image 'FL_hip' is not"):
         walkers.mirror(made.model, p)
     p.joints, p.default_pose = made.params["joints"], np.arange(12.0)
     with pytest.raises(ValueError, match="default_pose is not symmetric"):

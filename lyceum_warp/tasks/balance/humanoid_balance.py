@@ -1,8 +1,8 @@
 """HumanoidStand: Gymnasium's humanoid stands, and steps to keep its balance when it is pushed.
 
-Actions are offsets of the joints' targets from a default pose with bent knees; the motors act as servos with these
-targets, within Gymnasium's torques, at the rate of control. The feet are spheres: only steps and swings of the body
-keep the balance. Its measure is the distance from the line between the feet to the capture point, at which a foot must
+Actions are offsets of the joints' targets from a default pose with bent knees. The motors act as servos at the control
+rate, within Gymnasium's torque limits. The feet are spheres, so the robot can only balance by stepping and by swinging
+its body. Balance is measured by the distance from the line between the feet to the capture point, where a foot must
 stand to stop the robot (Pratt et al. 2006, "Capture point: a step toward humanoid push recovery").
 
 At each of ``push_times`` the robot gets an impulse in a random horizontal direction: the velocities of all bodies
@@ -71,12 +71,12 @@ def observe(s: World, p: Params, obs: Row[float]):
 
 
 @wp.func
-def velocity(s0: World, s1: World, p: Params) -> wp.vec2:  # of the centre of mass, relative to the wanted one
+def velocity(s0: World, s1: World, p: Params) -> wp.vec2:  # height of the centre of mass, relative to the target height
     moved = (s1.subtree_com[0] - s0.subtree_com[0]) / p.dt
     return wp.vec2(moved[0] - p.forward_speed, moved[1])
 
 
-# terms of the reward, which find their arguments by name
+# reward terms; their arguments are found by name
 
 
 @wp.func

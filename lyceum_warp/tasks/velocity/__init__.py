@@ -10,4 +10,4 @@ TASKS = {
     "h1_velocity": "h1",
     "t1_velocity": "t1",
 }
-"""The modules of the tasks, by the tasks' names; the registry reads them without running this file."""
+"""Modules of the tasks, by task name; the registry reads this dict without running the file."""

@@ -41,7 +41,7 @@ class G1Velocity(walking.Biped):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Sense forces on the feet, and let their friction decide."""
+        """Add force sensors to the feet, and let the feet determine the friction."""
         walkers.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))
 
 

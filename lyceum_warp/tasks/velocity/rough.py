@@ -1,6 +1,6 @@
 """Add rough ground to velocity tasks: patches by level, a height scan in both groups, and levels by distance walked.
 
-The kinds of patches and their columns are those of Isaac Lab's rough terrain, the scan is that of legged_gym.
+The kinds of patches and their columns are from Isaac Lab's rough terrain, the scan from legged_gym.
 """
 
 import warp as wp
@@ -19,7 +19,7 @@ TERRAIN = lw.Terrain(
 class World(walking.World):
     level: Row[float] = lw.lasting_memory()
     column: Row[float] = lw.lasting_memory()
-    walked: Row[float] = lw.lasting_memory()  # distance from the middle of the patch, m
+    walked: Row[float] = lw.lasting_memory()  # distance from the centre of the patch, m
     commanded: Row[float] = lw.lasting_memory()  # distance that an episode at the present command would cover, m
 
 

@@ -32,5 +32,5 @@ class SpotVelocity(walking.Velocity):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Let friction of the feet decide, and take the physics of the humanoids."""
+        """Let the feet determine the friction, and use the physics of the humanoids."""
         walkers.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))

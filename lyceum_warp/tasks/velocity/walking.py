@@ -1,13 +1,13 @@
-"""Define velocity tasks for any walking robot: it follows commands of velocity and yaw rate on flat ground.
+"""Define velocity tasks for walking robots, which follow commanded velocities and yaw rates on flat ground.
 
-Actions are offsets of the joints' servo targets from the default pose. A robot's file names the model, the joints that
-act and the feet, and gives its numbers; other tables follow from the model. Observations, rewards, commands, pushes and
-resets are those of mjlab 1.6.0's velocity tasks.
+Actions are offsets of the joints' servo targets from the default pose. A robot's file names the model, the actuated
+joints and the feet, and sets robot-specific numbers; other tables are computed from the model. Observations, rewards,
+commands, pushes and resets are taken from mjlab 1.6.0's velocity tasks.
 
-The base is the body of the first joint, which is free. Functions read the state after the last substep. Only the
-forces on the feet are from the beginning of that substep, and 0 at the start of an episode. Positions and velocities of
-the feet are computed from the joints, which saves a forward pass. A foot is in contact if a sphere of its sole, see
-``soles``, reaches the ground; only ``ground`` and ``distance`` know its shape.
+The base is the body of the first joint, which is free. Functions read the state after the last substep. Only the forces
+on the feet belong to the beginning of that substep; they are 0 at the start of an episode. Positions and velocities of
+the feet are computed from the joints, which saves a forward pass. A foot is in contact if a sphere of its sole
+(``soles``) reaches the ground. Only ``ground`` and ``distance`` depend on the shape of the ground.
 """
 
 import math
@@ -48,7 +48,7 @@ class World:
     body_ipos: Row[wp.vec3]
     jnt_range: Row[wp.vec2]
     geom_friction: Row[wp.vec3]
-    drawn_velocity: Row[wp.vec3] = lw.memory()  # commanded forward and lateral velocity and yaw rate, as drawn
+    drawn_velocity: Row[wp.vec3] = lw.memory()  # drawn command: forward velocity, lateral velocity and yaw rate
     heading_target: Row[float] = lw.memory()  # commanded heading, rad
     heading_controlled: Row[float] = lw.memory()  # 1 if the heading determines the yaw rate
     standing: Row[float] = lw.memory()  # 1 if the command is to stand
@@ -68,7 +68,7 @@ class World:
 class Params:
     dt: float
     substep_dt: float
-    # the robot: joints that act, sites of the feet, and what follows from them
+    # the robot: actuated joints, sites of the feet, and values computed from them
     joints: wp.array[int] = lw.joints()
     feet: wp.array[int] = lw.sites()
     trunk: int = lw.from_model(walkers.base)
@@ -93,22 +93,22 @@ class Params:
     soft_limit: float = 0.9  # share of a joint's range
     swing_target: float = 0.1  # height of a foot's site in a swing, m
     longest_step: float = 0.4  # seconds in single stance from which the term is constant
-    least_command: float = 0.05  # below it, the gait terms are 0 and the pose term uses standing_pose_std
+    least_command: float = 0.05  # for smaller commands, the gait terms are 0 and the pose term uses standing_pose_std
     fall_angle: float = math.radians(70.0)
     least_height: float = 0.0  # of the base, m
     # actions
     default_pose: wp.array[float] = lw.from_model(walkers.home_pose)  # rad
     action_scale: wp.array[float] = lw.from_model(walkers.quarter_of_force)  # rad
-    # commands: first step of the stage, minimum and maximum forward velocity (m/s), maximum yaw rate (rad/s)
+    # command stages: first step, minimum and maximum forward velocity (m/s), maximum yaw rate (rad/s)
     stages: wp.array2d[float] = [[0.0, -1.0, 1.0, 0.5], [120e3, -1.5, 2.0, 0.7], [240e3, -2.0, 3.0, 0.7]]
     lateral_velocity: float = 1.0
     command_seconds: wp.vec2 = wp.vec2(3.0, 8.0)
-    heading_share: float = 0.3  # share of commands whose yaw rate follows a heading
+    heading_share: float = 0.3  # fraction of commands whose yaw rate follows a heading
     heading_gain: float = 0.5  # 1/s
     standing_share: float = 0.1
-    forward_share: float = 0.2  # share of commands that are forward only
+    forward_share: float = 0.2  # fraction of commands that are forward only
     least_forward_velocity: float = 0.3
-    # uniform noise of the policy's observations, +-
+    # bounds of the uniform noise on the policy's observations
     linear_velocity_noise: float = 0.5
     angular_velocity_noise: float = 0.2
     gravity_noise: float = 0.05
@@ -340,7 +340,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     draw_command(s, p, rng)
 
 
-# terms of the reward, which find their arguments by name; the command is that of the state before the step
+# reward terms; their arguments are found by name, and the command belongs to the state before the step
 
 
 @wp.func
@@ -407,7 +407,7 @@ class Velocity(lw.Task):
     metrics = ("velocity_error", "yaw_rate_error")
     terminations = ("fell_over", "too_low")
     deployment, mirror = staticmethod(walkers.deployment), staticmethod(walkers.mirror)
-    cleared = ("sensordata",)  # zero before the first substep; mjlab computes it for the first state
+    cleared = ("sensordata",)  # zero before the first substep; mjlab computes the value for the first state
 
 
 @wp.struct
@@ -419,7 +419,7 @@ class BipedParams(Params):
 
 
 class Biped(Velocity):
-    """A robot with two legs, which is rewarded for steps and for a calm trunk; its feet are the two sites."""
+    """A robot with two legs, which is rewarded for steps and for a calm trunk. Its feet are given by two sites."""
 
     frame_skip, keyframe = 5, "home"
     rewards = Velocity.rewards | {"action_rate_l2": -0.05, "single_stance": 2.0, "roll_pitch_rate_l2": -0.05}
