@@ -102,9 +102,9 @@ def train(
         camera: Camera of the videos: a camera of the model by name or index, a ``viz.cameras.FreeCamera``, or "free"
             for MuJoCo's default free camera.
         transfer: Whether to judge the policy's transfer at the end, by ``lw.transfer``, and to write ``transfer.json``
-            into the folder. By default this costs seconds: worlds on a GPU are compared with the C engine, and physics
-            other than the task's exact one with the exact one. True also plays on the Warp engine after training on CPU
-            cores, and under each physics of the task.
+            into the folder. By default only cheap comparisons run, for a few seconds: a GPU with the C engine, and the
+            run's physics with the task's exact physics. True also compares with the Warp engine after training on CPU
+            cores, and with each physics of the task.
         resume: Whether to continue the run in the folder. ``learner`` must be made with the same arguments.
         take_over: Whether to continue a run that another process has locked, on this or another host. The other process
             then ends at its next write.
@@ -187,11 +187,11 @@ def train(
 
 
 _PAIRS = 64
-"""Pairs of episodes of the verdict at the end of training."""
+"""Pairs of episodes for the transfer verdict at the end of training."""
 
 
 def _judge_transfer(run: Run, learner: Learner, wanted: bool | None, display: Display) -> None:
-    """Write the verdict on the policy into the run, if it is wanted or costs only seconds."""
+    """Write the transfer verdict on the policy into the run, if requested or if it takes only seconds."""
     env, exact = learner.env, task_physics(learner.env)[1] == EXACT
     on_gpu = env.device.is_cuda and env.engine.name == "warp"
     if wanted is False or (wanted is None and exact and not on_gpu):
@@ -202,7 +202,7 @@ def _judge_transfer(run: Run, learner: Learner, wanted: bool | None, display: Di
             env, learner.policy, _PAIRS, seed=env.options.seed + 1, warp=on_gpu or wanted is True,
             physics=wanted is True, progress=progress,
         )  # fmt: skip
-    except Exception as error:  # of any kind: the training is worth more than its verdict
+    except Exception as error:  # an error of any kind must not discard the training
         display.note(f"no verdict on transfer ({one_line(error)})")
         return
     with replaced(run.transfer) as temporary:
@@ -213,7 +213,7 @@ def _learn(
     learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None,
     limit: float,
 ) -> None:  # fmt: skip
-    """Iterate for about ``limit`` seconds at most. All ranks agree on when the run is saved and when it ends."""
+    """Iterate for at most about ``limit`` seconds. All ranks save and end at the same iterations."""
     team, run, deadline = learner.team, saver.run, time.monotonic() + limit
     ended = False
     with ending(), postponed(insist=team.size == 1) as noted:
@@ -283,7 +283,7 @@ def _check_equal(run: Run, learner: Learner) -> None:
     old, new, algorithm = then.options, env.options, run.config["algorithm"]
     now["engine"] = engine_name(now["engine"], now["device"])
     own = {"engine": engine_name(old.engine, old.device), "algorithm": algorithm, "nworld": old.nworld}
-    # options that do not affect the results are omitted; note_changes compares the model
+    # omit options that do not affect the results; note_changes compares the model
     options = {"horizon": old.horizon, "fields": old.fields, "dynamics": old.dynamics}
     params = dict.fromkeys(now["params"]) | run_params(run, then.params)
     # a run of an earlier release lacks the newest hyperparameters
@@ -296,6 +296,6 @@ def _check_equal(run: Run, learner: Learner) -> None:
         for name, value in before.items():
             if value != after.get(name):
                 raise ValueError(
-                    f"the run in {run.folder} has {name} {value}, not {after.get(name)}, and a run keeps its settings: "
-                    "omit it, or start a new run in another folder"
+                    f"the run in {run.folder} has {name} {value}, not {after.get(name)}, and a run keeps its "
+                    f"settings: omit it, or start a new run in another folder"
                 )

@@ -53,7 +53,7 @@ class Report:
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     """Duration of each check, by the name of its rule."""
     unused: list[str] = dataclasses.field(default_factory=list)
-    """Parts of the task without use: functions that nothing calls, and memory that nothing reads."""
+    """Unused parts of the task: functions that are never called, and memory that is never read."""
 
     def __str__(self) -> str:
         head = f"{self.task} on the {self.engine} engine ({self.device}, {self.nworld} worlds) keeps the rules:"
@@ -111,7 +111,7 @@ def check_task(
     for check in checks:
         ctx.rule = check.__name__.removeprefix("check_")
         start = time.perf_counter()
-        ctx.restart()  # so that a verdict does not depend on the checks before it
+        ctx.restart()  # so that a result does not depend on earlier checks
         try:
             check(ctx)
         except AssertionError as error:

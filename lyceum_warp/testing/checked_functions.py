@@ -1,8 +1,8 @@
-"""Copy a task's functions with a check of every index, and make kernels that run the copies.
+"""Copy a task's functions with a bounds check for every index, and make kernels that run the copies.
 
 In a copy each index of a row, a vector or a matrix goes through a function that compares it with the size, and each
-``while`` loop counts its rounds. Everything else stays as it is, so that a copy computes the same numbers. Native
-functions (``wp.func_native``) are C++ and cannot be checked.
+``while`` loop counts its iterations. Nothing else changes, so a copy computes the same numbers. Native functions
+(``wp.func_native``) are C++ and cannot be checked.
 """
 
 import ast
@@ -47,7 +47,7 @@ _HELPERS = {
     "bounds_at": index_checks.at, "bounds_from_end": index_checks.from_end, "bounds_element": index_checks.element,
     "bounds_is_endless": index_checks.is_endless,
 }  # fmt: skip
-"""Functions that the copies call, by names that no task is likely to use."""
+"""Functions that the copies call, under names that a task is unlikely to use."""
 
 
 class Unchecked(Exception):  # noqa: N818
@@ -97,7 +97,7 @@ class CheckedFunctions:
         return len(self.places) - 1
 
     def number(self, function: wp.Function) -> int:
-        """The number of a function's copy; the first call makes the copy."""
+        """Number the copy of a function; the first call makes the copy."""
         if function not in self._numbers:
             number = self._numbers[function] = len(self._numbers)
             for overload in overloads(function):
@@ -165,7 +165,7 @@ class _Rewriter(ast.NodeTransformer):
         self.callees: list[int] = []
         self.loops = 0
         self.writes = False
-        """Whether the current expression is a part of an assignment's target."""
+        """Whether the current expression is part of an assignment target."""
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
         """Do not visit the annotation."""
@@ -188,7 +188,7 @@ class _Rewriter(ast.NodeTransformer):
         return visited
 
     def _refused(self, node: ast.Name | ast.Attribute) -> ast.AST:
-        """Refuse a function that is used as a value, because its copy has an additional argument."""
+        """Refuse a function used as a value, because its copy has an additional argument."""
         function = self.source.value(node)
         if isinstance(function, wp.Function) and function.func is not None:
             raise Unchecked(
@@ -251,7 +251,7 @@ class _Rewriter(ast.NodeTransformer):
         return node
 
     def _is_constant(self, node: ast.Subscript) -> bool:
-        """Whether the subscript belongs to a type, a tuple or a shape, where Warp itself requires a constant."""
+        """Whether the subscript belongs to a type, a tuple or a shape, for which Warp requires a constant index."""
         value = self.source.value(node.value)
         type_or_tuple = value is not None and not hasattr(value, "_wp_scalar_type_")
         return type_or_tuple or (isinstance(node.value, ast.Attribute) and node.value.attr in _SHAPES)
@@ -301,9 +301,9 @@ _made: dict[Any, CheckedFunctions] = {}
 def checked_functions(
     name: str, functions: Mapping[str, wp.Function], views: Mapping[Any, wp.Function], device: wp.Device
 ) -> CheckedFunctions:
-    """The copies of a task's functions, compiled for a device and made once for the same functions.
+    """Get the copies of a task's functions, compiled for a device and cached for equal functions.
 
-    ``name`` is for their Warp module; ``views`` are those of the task's kernels.
+    ``name`` names their Warp module; ``views`` come from the task's kernels.
 
     Raises:
         Unchecked: A function can't be checked.

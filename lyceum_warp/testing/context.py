@@ -1,4 +1,4 @@
-"""Hold the environments under test, and compare their numbers for the checks."""
+"""Hold the environments under test, and compare their values for the checks."""
 
 import contextlib
 import dataclasses
@@ -86,7 +86,7 @@ class Context:
         return (low + draws * (high - low)).to(env.action)
 
     def mask(self, *worlds: int) -> torch.Tensor:
-        """A mask of the given worlds, or by default of every second world, (nworld,) bool."""
+        """Mask of the given worlds, by default of every second world, (nworld,) bool."""
         numbers = torch.arange(self.a.nworld)
         mask = torch.isin(numbers, torch.tensor(worlds)) if worlds else numbers % 2 == 0
         return mask.to(self.a.action.device)

@@ -10,7 +10,8 @@ from lyceum_warp.done import Done
 from lyceum_warp.env import Env
 from lyceum_warp.testing.context import Context
 
-_PYTHON_BYTES = 2_048  # for the interpreter's caches; a leak of one float per step is 3,200 bytes after 100 steps
+# tolerance for the interpreter's caches; a leak of one float per step is 3,200 bytes after 100 steps
+_PYTHON_BYTES = 2_048
 
 
 def _check_flags(ctx: Context, env: Env) -> None:
@@ -21,7 +22,9 @@ def _check_flags(ctx: Context, env: Env) -> None:
 
 
 def check_truncation(ctx: Context) -> None:
-    """At the horizon an episode is truncated; ``final_obs`` is its last observation, ``obs`` the first of the next.
+    """At the horizon an episode is truncated.
+
+    ``final_obs`` is its last observation, ``obs`` the first of the next episode.
 
     Truncation does not set ``terminated``. In worlds that continue, both observations are equal. All of this holds for
     every group of observations.
@@ -38,7 +41,7 @@ def check_truncation(ctx: Context) -> None:
             _check_flags(ctx, a)
             ctx.equal(a.truncated, steps >= horizon, f"truncated after {steps.tolist()} steps of an episode")
             going, state = ~a.done & ctx.calm(a), a.get_state()
-            # until its first end, a world has the same numbers without automatic resets
+            # until a world's first episode ends, its values are the same without automatic resets
             for name, obs in a.obs_groups.items():
                 final = a.final_obs_groups[name]
                 ctx.equal(final[alive], b.final_obs_groups[name][alive], f"the final group {name} without resets")

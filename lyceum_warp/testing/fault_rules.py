@@ -11,7 +11,7 @@ from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 
 
 def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, what: str) -> None:
-    """Cause a fault in one world of env a, and compare with env b, which has none."""
+    """Cause a fault in one world of env a, and compare with env b, which has no fault."""
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
     ctx.restart()
     others = ~ctx.mask(bad)
@@ -96,12 +96,12 @@ def check_bad_warmstart(ctx: Context) -> None:
 def check_not_finite(ctx: Context) -> None:
     """A reward or an observation that is not finite is a fault of its world, and changes no other world.
 
-    Each parameter of the task in turn is infinite in one world.
+    Each parameter of the task is made infinite in one world, in turn.
     """
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
     others, actions = ~ctx.mask(bad), ctx.actions(2)
     names = [name for name, value in a.task.params.items() if name not in ("dt", "substep_dt") and _is_real(value)]
-    with ctx.changed(a, b, graphs=False):  # values per world would capture new graphs
+    with ctx.changed(a, b, graphs=False):  # values per world would require new graphs
         for name in names:
             kept = a.task.params[name]
             ctx.restart()

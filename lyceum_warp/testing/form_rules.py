@@ -37,7 +37,7 @@ def check_noise(ctx: Context) -> None:
     state = env.get_state()
     ctx.equal(env.get_obs(state), env.obs, "the noise of a state")
     parts = env.state_space.parts
-    # copies of one state that differ only in the position in the random stream
+    # copies of one state that differ only in their position in the random stream
     same = state[:1].expand_as(state).contiguous()
     changes: dict[str, torch.Tensor] = {"key": state[:, parts["key"]]}
     for name in ("episode", "step"):
@@ -48,13 +48,13 @@ def check_noise(ctx: Context) -> None:
         moved[:, parts[name]] = values
         shown = [env.get_obs(moved, group=group) for group in env.task.noisy_groups]
         differ[name] = any(bool((obs[1:] != obs[:1]).any(dim=1).all()) for obs in shown)
-    if any(differ.values()):  # its scale may be 0
+    if any(differ.values()):  # the scale of the noise may be 0
         for name, found in differ.items():
             ctx.that(found, f"the noise is the same for every {'world' if name == 'key' else name}")
 
 
 def check_metrics(ctx: Context) -> None:
-    """``episode_metrics`` are the sums of ``metrics`` over an episode, belong to the state, and skip faults."""
+    """``episode_metrics`` sum ``metrics`` over an episode, belong to the state, and skip faults."""
     a, b, horizon = ctx.a, ctx.b, 4
     if not a.metrics:
         return
@@ -86,7 +86,9 @@ def check_metrics(ctx: Context) -> None:
 
 
 def check_success_steps(ctx: Context) -> None:
-    """``success`` needs ``success_steps`` good steps in a row; their count is part of the state, and a reset clears it.
+    """``success`` requires ``success_steps`` successful steps in a row.
+
+    The count belongs to the state; a reset clears it.
 
     To see whether a state meets the goal, the check sets it with a full count and reads ``success``.
     """

@@ -74,7 +74,7 @@ class _Run:
         env = self.env
         self._keep_start()
         self.ctx.restart()
-        # the functions are the same on every engine: a few steps suffice on a slow one
+        # the functions are the same on every engine, so a few steps suffice on a slow engine
         slow = env.engine.capturable and env.device.is_cpu
         for i, action in enumerate(self.ctx.actions(min(self.ctx.steps, _FEW) if slow else self.ctx.steps)):
             ended = env.done.clone()
@@ -92,7 +92,7 @@ class _Run:
             self._run_step(self.worlds)
 
     def _run_before_restart(self, state: torch.Tensor, action: torch.Tensor) -> None:
-        """Run the functions of a step on the state in which a fault ended the episode, before ``env`` restarted.
+        """Run a step's functions on the state in which a fault ended the episode, before ``env`` restarts.
 
         A read out of range may return NaN and so cause the fault.
         """
@@ -112,7 +112,7 @@ class _Run:
                 continue
             if dirty:
                 self._copy(worlds.after, self.after)
-            if name == "advance":  # it gets the memory of the previous step
+            if name == "advance":  # the function gets the memory of the previous step
                 for memory in MEMORIES:
                     if memory in self.env.task.types:
                         wp.copy(getattr(self.after, memory), getattr(self.before, memory))
@@ -138,7 +138,7 @@ class _Run:
         env.reset()
 
     def _run(self, name: str, state: Any) -> None:
-        """Run the copy of a function, if the task has the function; ``state`` is ``s`` or ``s1``."""
+        """Run the copy of a function, if the task has it; ``state`` is ``s`` or ``s1``."""
         if name not in self.functions:
             return
         draws = self.rng.integers(0, 2**32, (self.env.nworld, 1), dtype=np.uint32)
@@ -149,7 +149,7 @@ class _Run:
             values["obs"] = self.obs[name]
         types = self.functions[name].input_types
         form = FUNCTIONS.get("observe" if name in self.obs else name)
-        names = form.argument_names[: len(types)] if form else types  # of a generated function
+        names = form.argument_names[: len(types)] if form else types  # problems of a generated function
         given = [values[argument] for argument in names]
         kernel = self.checked.kernels[name]
         wp.launch(kernel, self.env.nworld, [self.report, *given], device=self.env.device)

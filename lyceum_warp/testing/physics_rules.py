@@ -1,6 +1,6 @@
 """Check the effects of inputs and of model fields that differ between worlds.
 
-The reference is ``mj_step``: an engine must be nearer to it than to a simulation without the inputs or the fields.
+The reference is ``mj_step``: an engine's result must be nearer to it than to a simulation without inputs or fields.
 """
 
 import copy
@@ -16,7 +16,7 @@ from lyceum_warp.testing.context import SHORT, Context
 from lyceum_warp.world_arrays import memory_columns
 
 _SMALLEST = 1e-4
-"""Coordinates are compared only if inputs or model fields move one by at least this much."""
+"""Coordinates are compared only if inputs or model fields move at least one of them by this much."""
 
 
 def predicted(
@@ -85,7 +85,7 @@ def check_inputs(ctx: Context) -> None:
             before = env.get_state()
             b.set_state(before)
             b.action.copy_(action)
-            b.worlds.act()  # writes the inputs, and does not step
+            b.worlds.act()  # writes the inputs without stepping
             env.step(action)
             after = env.get_state()
             calm = ctx.calm(env) & ~ctx.faulty(env)
@@ -143,7 +143,7 @@ def check_dynamics(ctx: Context) -> None:
         b.rand_reset(ctx.seed + 7)
         b.set_state(after)
         compare(b, after, "after set_state")
-    # after many resets the next draw is the same as after one
+    # the next draw is the same after many resets as after one reset
     for _ in range(3 * SHORT):
         a.rand_reset()
     late = a.get_state()

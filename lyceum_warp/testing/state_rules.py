@@ -81,7 +81,7 @@ def check_set_state_shows(ctx: Context) -> None:
             if has_evaluate:
                 ctx.equal(b.eval[calm], a.eval[calm], "eval after set_state")
             ctx.that((b.reward == 0).all(), f"the reward after set_state is {b.reward.tolist()}")
-            for name in ("terminated", "done", "done_reason"):  # an end stays set
+            for name in ("terminated", "done", "done_reason"):  # the end of an episode stays set
                 ctx.equal(getattr(b, name)[calm], getattr(a, name)[calm], f"{name} after set_state")
             judged = calm & ~ctx.faulty(a)  # a world with a fault restarted at once
             ended |= a.get_terminated(state) & judged
@@ -147,7 +147,7 @@ def _lasting_columns(env: Env) -> list[slice]:
 def check_reset(ctx: Context) -> None:
     """``reset`` leads to the same state regardless of the past, with zero actions.
 
-    It may depend on columns that resets keep, so these are made equal before both resets and in all worlds.
+    The state may depend on columns that resets keep, so the check first makes these columns equal in all worlds.
     """
     env = ctx.a
     lasting = _lasting_columns(env)

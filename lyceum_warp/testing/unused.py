@@ -1,4 +1,4 @@
-"""Find the functions of a task that nothing calls, and memory that nothing reads."""
+"""Find the unused parts of a task: functions that are never called, and memory that is never read."""
 
 import ast
 import sys
@@ -12,12 +12,12 @@ from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, Task
 
 
 def unused(task: BoundTask) -> list[str]:
-    """One line for each part of a task without use: a term that is not in ``rewards``, memory that is only written."""
+    """List a task's unused parts, one per line: terms missing from ``rewards``, and memory that is only written."""
     return [*_functions(task), *_memory(task)]
 
 
 def _functions(task: BoundTask) -> list[str]:
-    """Functions of the task's file that no function calls, no task has, and no argument of a term names."""
+    """Functions of the task's file that are not called, not used by a task, and not an argument of a term."""
     module = vars(sys.modules[task.task.__module__])
     own = {name: value for name, value in module.items() if isinstance(value, wp.Function) and has_source(value)}
     used = {*FUNCTIONS, *task.source.terms.functions}
@@ -30,7 +30,7 @@ def _functions(task: BoundTask) -> list[str]:
             used |= {*kind.rewards, *kind.terminations, *kind.metrics}
             used |= {name for name, value in own.items() if value in vars(kind).values()}
     return [
-        f"nothing calls {name}: name it in rewards, terminations or metrics, call it, or remove it"
+        f"{name} is never called: list it in rewards, terminations or metrics, call it, or remove it"
         for name, function in own.items()
         if name not in used
         and not hasattr(function, "replaces")
@@ -40,7 +40,7 @@ def _functions(task: BoundTask) -> list[str]:
 
 
 def _memory(task: BoundTask) -> list[str]:
-    """Memory in World that the task's functions write at most."""
+    """Memory in World that the task's functions never read."""
     roots = (*task.functions.values(), *task.observers.values(), *task.kernels.terms.values())
     waiting: list[Any] = [overload for root in roots if root is not None for overload in overloads(root)]
     seen, read = set[wp.Function](), set[str]()
@@ -55,4 +55,4 @@ def _memory(task: BoundTask) -> list[str]:
         read |= {n.attr for n in nodes if isinstance(n, ast.Attribute) and id(n) not in written}
         calls = [source.call(node) for node in nodes if isinstance(node, ast.Call)]
         waiting += [overload for kind, callee in calls if kind == "helper" for overload in overloads(callee)]
-    return [f"nothing reads World.{name}: remove it" for name in task.source.memory if name not in read]
+    return [f"World.{name} is never read: remove it" for name in task.source.memory if name not in read]

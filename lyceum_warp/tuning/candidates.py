@@ -1,4 +1,4 @@
-"""List the physics settings to try for a task, and write a setting as flags and as Python."""
+"""List the physics settings to try for a task, and format a setting as flags or as Python."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
@@ -9,12 +9,12 @@ from lyceum_warp.options import CONES, INTEGRATORS, JACOBIANS
 
 _ITERATIONS = (4, 2, 1)
 _LS_ITERATIONS = (10, 5)
-"""Limits to try, if they are below the model's."""
+"""Iteration limits to try, if they are below the model's limit."""
 
 _AUTO_SPARSE = {"mujoco": 60, "warp": 33}
-"""Degrees of freedom from which each engine chooses a sparse Jacobian."""
+"""Number of degrees of freedom from which each engine uses a sparse Jacobian."""
 _DENSE_LIMIT = 60
-"""MuJoCo Warp takes a dense Jacobian up to this number of degrees of freedom."""
+"""MuJoCo Warp supports a dense Jacobian up to this number of degrees of freedom."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,11 +24,11 @@ class Setting:
     name: str
     """Short description; empty for the task as it is."""
     group: str
-    """What it changes. A combination takes at most one setting of each group."""
+    """The kind of change. A combination has at most one setting of each group."""
     physics: Mapping[str, Any]
     """Options that differ from the task's, by their names in ``lw.PhysicsOptions``."""
     parts: tuple["Setting", ...] = ()
-    """The settings of a combination, in their order."""
+    """The settings of a combination, in order."""
 
 
 def candidates(env: Env) -> list[Setting]:
@@ -67,20 +67,20 @@ def candidates(env: Env) -> list[Setting]:
 
 
 def not_tried(env: Env) -> list[str]:
-    """What is not tried on this engine, each with the reason."""
+    """The settings that are not tried on this engine, each with the reason."""
     found = ["the PGS solver: MuJoCo Warp lacks it, so the package uses Newton on both engines"]
     if env.engine.name == "warp":
         if env.task.model.nv > _DENSE_LIMIT:
-            found.append(f"a dense Jacobian: MuJoCo Warp takes it up to {_DENSE_LIMIT} degrees of freedom")
+            found.append(f"a dense Jacobian: MuJoCo Warp supports it up to {_DENSE_LIMIT} degrees of freedom")
     else:
         found.append("nconmax and njmax: the C engine allocates contacts and constraints as they appear")
     return found
 
 
 def combined(settings: Iterable[Setting]) -> Setting | None:
-    """A combination of settings, in which earlier ones override later ones; None if it is one of the settings.
+    """Combine settings; earlier settings override later ones. None if the result is one of the settings.
 
-    A setting is left out if an earlier one is of the same group, or sets one of its options.
+    A setting is omitted if an earlier setting has the same group or sets one of its options.
     """
     parts: list[Setting] = []
     physics: dict[str, Any] = {}
@@ -95,14 +95,14 @@ def combined(settings: Iterable[Setting]) -> Setting | None:
 
 
 def flags(physics: Mapping[str, Any]) -> str:
-    """The flags that choose a setting in lyceum-warp train and plan."""
+    """The flags that select a setting in lyceum-warp train and plan."""
     words = [f"--solver {name}={limit}" for name, limit in physics.get("solver", {}).items()]
     words += [f"--{name.replace('_', '-')} {value}" for name, value in physics.items() if name != "solver"]
     return " ".join(words)
 
 
 def task_line(physics: Mapping[str, Any]) -> str:
-    """The line of a task that offers a setting as its fast physics."""
+    """The line of Python that offers a setting as a task's fast physics."""
     words = ", ".join(f"{name}={value!r}" for name, value in physics.items()).replace("'", '"')
     return f'physics = {{"fast": lw.PhysicsOptions({words})}}'
 
@@ -121,7 +121,7 @@ def _fewer(substeps: int) -> list[int]:
 
 
 def _other_jacobian(env: Env) -> list[str]:
-    """The form of the Jacobian that the engine does not use yet, if it takes it."""
+    """The other form of the Jacobian, if the engine supports it."""
     nv, engine = env.task.model.nv, env.engine.name
     now = _name(JACOBIANS, env.task.model.opt.jacobian)
     if now == "auto":

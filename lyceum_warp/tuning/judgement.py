@@ -1,4 +1,4 @@
-"""Judge a setting: intervals of the difference of returns, and the verdict within a tolerance."""
+"""Judge a setting by the confidence interval of its difference in returns and a tolerance."""
 
 import dataclasses
 import math
@@ -10,19 +10,19 @@ import numpy as np
 from lyceum_warp.support.intervals import mean_interval
 
 TOLERANCES = {"strict": 0.02, "loose": 0.05, "any": math.inf}
-"""Largest difference of returns, relative to the mean absolute return of the task as it is."""
+"""Largest accepted difference of returns, relative to the mean absolute return of the unchanged task."""
 
 RANK_CORRELATIONS = {"strict": 0.9, "loose": 0.8, "any": -1.0}
-"""Smallest rank correlation of a planner's physics with the plant's, by the same names."""
+"""Smallest accepted rank correlation between a planner's physics and the plant's, by name of the tolerance."""
 
 LEAST_GAIN = 1.03
-"""A setting that is not at least this many times faster, and takes no less memory, is not judged further."""
+"""A setting must be faster by at least this factor, or take less memory, to be judged further."""
 _LEAST_SAVING = 0.95
 
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """The difference of returns between a setting and the task as it is, relative to the mean absolute return."""
+    """The difference of returns between a setting and the unchanged task, relative to the mean absolute return."""
 
     mean: float
     low: float
@@ -46,7 +46,7 @@ class Difference:
 def difference(reference: np.ndarray, returns: np.ndarray) -> Difference:
     """Compare the returns of the same episodes, (episodes,) each.
 
-    If all returns of the task as it is are 0, there is no scale, and every difference is infinite.
+    If all returns of the unchanged task are 0, every difference is infinite.
     """
     change, scale = returns - reference, float(np.abs(reference).mean())
     if not change.any():
@@ -73,9 +73,10 @@ class Correlation:
 
 
 def episodes_needed(found: Difference, half_width: float) -> int:
-    """The number of episodes for an interval of the given half width, estimated from some episodes.
+    """Estimate the number of episodes for an interval of the given half-width from some episodes.
 
-    Only their spread counts, not their mean: the number does not depend on the result (Stein's two stages).
+    Only their spread is used, not their mean, so the number does not depend on the result (Stein's two-stage
+    procedure).
     """
     now = (found.high - found.low) / 2
     return found.episodes if now <= half_width else math.ceil(min(found.episodes * (now / half_width) ** 2, 1e9))
@@ -87,7 +88,7 @@ def buys(speedup: float, memory: float) -> bool:
 
 
 def verdict(row: Mapping[str, Any], tolerance: str) -> str:
-    """What a row of results shows; see ``Tuning.rows``."""
+    """Derive the verdict of a row of results; see ``Tuning.rows``."""
     if row["refused"]:
         return "refused"
     if "ranks" in row:

@@ -1,4 +1,4 @@
-"""Compare a planner's physics with the plant's: time of a plan, and whether both rank the same samples alike."""
+"""Compare a planner's physics with the plant's: the planning time, and the ranking of the same samples."""
 
 import dataclasses
 import statistics
@@ -19,18 +19,18 @@ _SAMPLES = 64
 _MOVING_STEPS, _FALLING_STEPS, _LYING_STEPS = 30, 200, 10
 _REPLAN_EVERY = 6
 _IMPROVEMENTS = 2
-"""Improvements of the plan around which the compared samples are drawn."""
+"""Number of improvements of the plan before the compared samples are drawn around it."""
 
 
 class Rankings:
-    """Measures a planner's physics against the plant's.
+    """Compares a planner's physics with the plant's.
 
     From each state, planners with both physics draw the same samples around the same plan. A planner only uses the
     order and the differences of returns, so the rank correlation of the returns shows whether it can plan with coarser
     physics. There are states of three kinds:
 
     - standing: random initial states;
-    - moving: states of the plant after 30 steps under the planner with the plant's physics, with a plan every 6 steps;
+    - moving: states of the plant after 30 steps under the planner with the plant's physics, replanning every 6 steps;
     - fallen: states after random actions until the end of the episode, at most 200 steps, and 10 steps more.
 
     Args:
@@ -46,7 +46,7 @@ class Rankings:
         self, task: type[Task], *, states: int, repeats: int, samples: int = _SAMPLES, seed: int = 0, **words: Any
     ) -> None:
         self.task, self.states, self.repeats, self.seed = task, states, repeats, seed
-        # several improvements would adapt the samples to each planner's own physics
+        # with several improvements, each planner's samples would adapt to its own physics
         self.words = {"iterations": 1, "seed": seed, "samples": samples, **words}
         self.exact, self.one = self._planner({}, states), self._planner({}, 1)
         self.reference = self.exact.env
@@ -81,7 +81,7 @@ class Rankings:
         return found
 
     def _prepared(self, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """The plans from some states, and the returns of samples around them in the plant, (states, samples)."""
+        """Plan from some states; return the plans and the plant's returns of samples around them, (states, samples)."""
         self.exact.reset(self.seed)
         for _ in range(_IMPROVEMENTS):
             self.exact(start, shift=0)
@@ -126,7 +126,7 @@ class Rankings:
 
 
 def rank_correlations(first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
-    """Spearman's rank correlation of each row, (rows, n) each; rows without any difference are left out.
+    """Compute Spearman's rank correlation of each row of two (rows, n) arrays; rows of equal numbers are omitted.
 
     Equal numbers have their mean rank.
     """

@@ -1,4 +1,4 @@
-"""Keep the results of settings in a file of JSON lines, from which a stopped search resumes."""
+"""Store the results of settings in a JSON Lines file, from which a stopped search resumes."""
 
 import hashlib
 import json
@@ -15,7 +15,7 @@ _VERSIONS = ("lyceum_warp", "mujoco", "mujoco_warp")
 
 
 def identity(env: Env, **more: Any) -> dict[str, Any]:
-    """What the results of a setting depend on besides the setting: task, machine, worlds and versions.
+    """Everything except the setting that results depend on: task, machine, worlds and versions.
 
     Args:
         env: The task as it is.
@@ -44,7 +44,7 @@ class RowFile:
     """
 
     def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
-        self.path, self.identity = path, json.loads(json.dumps(identity))  # with lists for tuples
+        self.path, self.identity = path, json.loads(json.dumps(identity))  # JSON has lists in place of tuples
         self._rows: dict[str, dict[str, Any]] = {}
         self._whole = 0
         lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
@@ -53,7 +53,8 @@ class RowFile:
                 row = json.loads(line)
                 found, key = row["identity"], _key(row["physics"])
             except (ValueError, TypeError, KeyError):
-                if number == len(lines) and line.startswith(_BEGIN):  # its process was killed; the next row replaces it
+                # the writing process was killed; the next row replaces this line
+                if number == len(lines) and line.startswith(_BEGIN):
                     break
                 raise ValueError(f"line {number} of {path} is not a result of tune: give another file") from None
             self._whole += len(line)
@@ -65,7 +66,7 @@ class RowFile:
         return self._rows.get(_key(physics))
 
     def add(self, row: Mapping[str, Any]) -> dict[str, Any]:
-        """Append a row to the file, and return it as the file has it."""
+        """Append a row to the file, and return it as read from JSON."""
         line = json.dumps({**row, "identity": self.identity})
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.open("ab") as file:

@@ -39,11 +39,11 @@ class Tuning:
     (more than twice as many as in the task as it is), "no gain" (less than 3 % faster and no smaller: returns are not
     compared), "refused" (by MuJoCo or the engine, whose reason is in ``refused``), or for a planner "ranks badly"."""
     reference: Row
-    """The results of the task as it is, measured against itself."""
+    """The results of the unchanged task, measured against itself."""
     not_tried: list[str]
-    """What was not tried, with reasons."""
+    """Settings that were not tried, with reasons."""
     path: Path
-    """The file of the results."""
+    """Path of the results file."""
 
     @property
     def best(self) -> Row | None:
@@ -75,26 +75,27 @@ def tune(
     progress: Callable[[Row], object] | None = None,
     **words: Any,
 ) -> Tuning:
-    """Measure what each physics option of a task buys and what it changes, and find the fastest with equal returns.
+    """Measure the gain and the side effects of each physics option of a task, and find the fastest with equal returns.
 
-    Every setting is compared with the task as it is, in the same process: steps per second in alternation, memory,
-    faults, divergence, and the returns of the same episodes under random actions and under a policy. Settings are
-    tried alone first; then the best of each kind are combined, without those that buy least if the returns differ.
+    Every setting is compared with the unchanged task in the same process: steps per second in alternation, memory,
+    faults, divergence, and the returns of the same episodes under random actions and under a policy. Settings are tried
+    alone first; then the best of each group are combined; while the returns differ, the least useful setting is
+    removed.
 
     Args:
         task: Name of a task, a file with one, or its class.
-        run: Folder of a run of this task, whose policy runs the same episodes; its parameters are the defaults.
+        run: Folder of a run of this task. Its policy also plays the episodes, and its parameters are the defaults.
         which: Which policy of the run: "last", "best", or the number of a saved iteration.
         tolerance: "strict": the 95 % interval of the difference of returns lies within 2 % of the mean absolute
             return; "loose": within 5 %; "any": only faults count.
         short: Whether to compare the first 100 steps of episodes, for a few seconds, instead of whole episodes.
-        episodes: Number of episodes of each setting, rounded up to a multiple of the number of worlds. By default as
-            many as the interval needs, within the time limit: a minute, or 5 s if ``short``.
-        planning: Whether to find physics for the task's planner instead of its worlds: compares the time of a plan,
-            and the ranks that both physics give to the same samples, from standing, moving and fallen states. A setting
-            is suggested if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8 ("loose").
+        episodes: Number of episodes of each setting, rounded up to a multiple of the number of worlds. By default it is
+            chosen for the width of the interval, within the time limit: a minute, or 5 s if ``short``.
+        planning: Whether to find physics for the task's planner instead of its worlds: compares planning times, and the
+            rankings of the same samples under both physics, from standing, moving and fallen states. A setting is
+            suggested if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8 ("loose").
             ``nworld`` is then the number of samples, by default 64, and ``episodes`` the number of states of each kind.
-        out: File of the results, to which rows are appended; rows that it has are not measured again. By default
+        out: File of the results, to which rows are appended; existing rows are not measured again. By default
             tune/TASK.jsonl, or tune/TASK-planning.jsonl.
         seed: Seed of initial states and actions.
         progress: Called with each row.
@@ -115,7 +116,7 @@ def tune(
     trials: Rankings | Trials
     if planning:
         if run is not None:
-            raise ValueError("planning compares samples of the task's planner, without a run: omit one of them")
+            raise ValueError("planning=True compares samples of the planner and uses no run: omit planning or the run")
         states, repeats = (4, 3) if short else (16, 15)
         if "nworld" in words:
             words["samples"] = words.pop("nworld")
@@ -133,7 +134,7 @@ def _trials(
     task: type[Task], run: str | Path | None, which: str, words: Mapping[str, Any], *, effort: Effort, seed: int,
     episodes: int | None,
 ) -> Trials:  # fmt: skip
-    """The task as it is, and the policy of a run."""
+    """Make the trials of the unchanged task, with the policy of a run if one is given."""
     options, params = EnvOptions.split(words)
     if "nworld" not in words:
         options = options.changed({"nworld": GPU_NWORLD if str(options.device).startswith("cuda") else NWORLD})
@@ -154,7 +155,7 @@ def _params_of(run: str | Path, task: type[Task]) -> Mapping[str, Any]:
     """The task parameters of a run.
 
     Raises:
-        ValueError: The run is one of another task.
+        ValueError: The run belongs to another task.
     """
     opened = Run.open(run)
     if opened.task_name != task_name(task):
@@ -181,11 +182,11 @@ class _Search:
         settings = [setting for setting, _ in good]
         while (both := combined(settings)) is not None:
             row = self._row(both)
-            if row["name"] == both.name:  # otherwise it was tried alone
+            if row["name"] == both.name:  # a single setting was already tried alone
                 rows.append(row)
             if row["verdict"] == "same":
                 break
-            settings = settings[: settings.index(both.parts[-1])]  # without the part that buys least
+            settings = settings[: settings.index(both.parts[-1])]  # remove the least useful part
         rows.sort(key=lambda row: -row.get("speedup", 0.0))
         return Tuning(rows, reference, not_tried(env), self.file.path)
 

@@ -1,4 +1,4 @@
-"""Measure a physics setting against the task as it is: speed, memory, faults, divergence, returns."""
+"""Compare a physics setting with the unchanged task: speed, memory, faults, divergence, returns."""
 
 import dataclasses
 import gc
@@ -21,9 +21,9 @@ from lyceum_warp.tuning.judgement import TOLERANCES, Difference, buys, differenc
 
 DIVERGENCE_STEPS = (1, 10, 50)
 NUDGE = 1e-6
-"""Standard deviation of the change of positions and velocities, to see how chaotic the task is."""
+"""Standard deviation of the perturbation of positions and velocities that shows how chaotic the task is."""
 _HALF_WIDTH = TOLERANCES["strict"] / 2
-"""Half width of the interval of the difference of returns that the number of episodes aims at."""
+"""Target half-width of the confidence interval of the difference of returns; it determines the number of episodes."""
 _CONTACT_STATES = 64
 
 Policy = Callable[[torch.Tensor], torch.Tensor]
@@ -34,15 +34,15 @@ class Effort:
     """How long to measure."""
 
     repeats: int
-    """Blocks of steps for the speed, each in the task as it is and in the setting."""
+    """Number of timed blocks of steps, each with the unchanged task and with the setting."""
     block_seconds: float
-    """Duration of a block in the task as it is."""
+    """Duration of a block with the unchanged task."""
     judging_seconds: float
-    """Time limit for all episodes of the task as it is, for random actions and for the policy each."""
+    """Time limit for all episodes of the unchanged task, separately for random actions and for the policy."""
     steps: int
     """Longest episode; 0 for the task's own horizon."""
     recorded_at: tuple[int, ...]
-    """Steps of a run after which states are recorded, from which speed and divergence are measured."""
+    """Numbers of steps after which states are recorded; speed and divergence are measured from these states."""
 
 
 FULL = Effort(repeats=15, block_seconds=0.3, judging_seconds=60.0, steps=0, recorded_at=(5, 20, 50, 100))
@@ -50,14 +50,15 @@ SHORT = Effort(repeats=7, block_seconds=0.1, judging_seconds=5.0, steps=100, rec
 
 
 class Trials:
-    """Measures settings against the task as it is, in alternation within this process.
+    """Compares settings with the unchanged task, alternating between them in this process.
 
     Args:
-        reference: The task as it is, with ``autoreset=False``.
+        reference: The unchanged task, with ``autoreset=False``.
         policy: The policy, or None.
         effort: How long to measure.
         seed: Seed of initial states and actions.
-        episodes: Number of episodes of each setting, instead of as many as the interval needs within the time limit.
+        episodes: Number of episodes of each setting; by default chosen for the width of the interval, within the time
+            limit.
     """
 
     def __init__(
@@ -165,10 +166,10 @@ class Trials:
         return free_memory(self.reference.device) or 0
 
     def _speed(self, env: Env) -> tuple[float, float, float]:
-        """Steps per second of all worlds; how many times faster than the task as it is, in the median and at least.
+        """Steps per second of all worlds, and the median and the lower bound of the speed-up over the unchanged task.
 
-        The last is the smaller of the lower quartile and the ratio of the fastest blocks, because other processes slow
-        some blocks down.
+        The lower bound is the smaller of the lower quartile and the ratio of the fastest blocks, because other
+        processes may slow down some blocks.
         """
         count = self._block * env.nworld
         starts = [repeat % len(self._starts) for repeat in range(self.effort.repeats)]
@@ -201,13 +202,13 @@ class Trials:
         return torch.stack(found)
 
     def _distance(self, velocities: list[torch.Tensor]) -> list[float]:
-        """Median distance to the exact velocities after 1, 10 and 50 steps, in root mean squares of each velocity."""
+        """Median distance to the exact velocities after 1, 10 and 50 steps, in units of each velocity's RMS."""
         exact, found = torch.cat(self._exact, 1), torch.cat(velocities, 1)
         scale = exact.square().nanmean(1, keepdim=True).sqrt().clamp_min(1e-9)
         return ((found - exact) / scale).square().mean(2).sqrt().nanmedian(1).values.tolist()
 
     def _compare(self, env: Env, source: str) -> tuple[Difference, np.ndarray, np.ndarray]:
-        """The difference of returns, and the numbers of faults and of steps in the setting and in the task as it is.
+        """The difference of returns, and the numbers of faults and steps with the setting and the unchanged task.
 
         The spread in the first batch of episodes determines the number of batches, within the time limit.
         """
@@ -256,7 +257,7 @@ class Trials:
 
 
 def random_actions(env: Env, seed: int) -> Iterator[torch.Tensor]:
-    """Draw uniformly random actions, (nworld, nact), one batch after another; actions without bounds from -1 to 1."""
+    """Yield batches of uniform random actions, (nworld, nact); actions without bounds are drawn from -1 to 1."""
     device, low, high = env.obs.device, env.action_space.low, env.action_space.high
     assert low is not None and high is not None
     generator = torch.Generator(device).manual_seed(seed)

@@ -109,7 +109,7 @@ def camera_values(camera: mujoco.MjvCamera) -> tuple[float, ...]:
 
 def tracking_camera(model: mujoco.MjModel) -> int | None:
     """Index of the model's first camera that follows a body, ``model.cam_bodyid``; None without one."""
-    # as int, because MuJoCo's enums do not equal NumPy's integers
+    # convert to int, because MuJoCo's enums do not equal NumPy integers
     tracking = (int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK), int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
     return next((i for i, mode in enumerate(model.cam_mode) if int(mode) in tracking), None)
 

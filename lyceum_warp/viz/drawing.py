@@ -126,7 +126,7 @@ class DrawingProcess:
         mujoco.mj_saveModel(self._model, str(Path(self._folder, "model.mjb")), None)
         self._errors = tempfile.TemporaryFile("w+", errors="replace")  # noqa: SIM115
         self._ends.enter_context(self._errors)
-        # with -P, modules beside render.py do not shadow packages
+        # -P keeps modules beside render.py from shadowing packages
         command = [sys.executable, "-P", str(Path(__file__).with_name("render.py")), self._folder]
         with self._lock:
             if self._abandoned:
@@ -172,7 +172,7 @@ class DrawingProcess:
         else:
             assert process.stdin is not None and process.stdout is not None
             with contextlib.suppress(OSError):
-                process.stdin.close()  # it then ends
+                process.stdin.close()  # EOF makes the process end
             try:
                 process.wait(_PATIENCE)
             except BaseException as error:

@@ -29,7 +29,7 @@ def policy_states(env: Env, policy: Policy, seed: int, *, progress: Progress | N
         env: An environment of the policy's task.
         policy: The policy.
         seed: Seed of the initial state.
-        progress: Called regularly with the number of steps so far and the horizon.
+        progress: Called regularly with the current number of steps and the horizon.
     """
     one = evaluation_worlds(env, 1, autoreset=False)
     policy = moved(policy, one) if isinstance(policy, torch.nn.Module) else policy
@@ -70,7 +70,7 @@ class Videos:
                 self.learner.env, self.learner.policy, self.seed, progress=self._progress("running an episode", "steps")
             )
             write_video(env, states, path, camera=self.camera, progress=self._progress("drawing the video", "frames"))
-        except Exception as error:  # of any kind: the training is worth more than its video
+        except Exception as error:  # an error of any kind must not end the training
             self.note(f"no further videos ({one_line(error)})")
             self.every = 0
 

@@ -150,7 +150,7 @@ def main(folder: str) -> int:
         painter = Painter(mujoco, model, job["size"], job["camera"])
         painter.renderer.update_scene(painter.data, painter.view)
         painter.renderer.render()  # some drivers fail only here
-    except Exception as error:  # of different types, depending on the library
+    except Exception as error:  # the type of the error depends on the library
         print(str(error).strip() or type(error).__name__, file=sys.stderr)
         return CANNOT_DRAW
     try:

@@ -100,7 +100,7 @@ def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
 
 
 class Recorder:
-    """A video of shots that come one by one, as from the viewer.
+    """A video of shots that arrive one by one, as from the viewer.
 
     A subprocess draws them at a low priority, and ``add`` never waits for it. Shots wait in a queue; if it is full,
     further ones are dropped, and the last one in the queue is shown longer, so that the video keeps its duration. The
@@ -161,7 +161,7 @@ class Recorder:
             self._changed.notify_all()
 
     def end(self) -> None:
-        """Accept no further shots, and finish the video in the background."""
+        """Stop accepting shots, and finish the video in the background."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()
