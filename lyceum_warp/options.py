@@ -79,7 +79,8 @@ class PhysicsOptions:
     """
 
     base: str | None = None
-    """Name of one of the task's ``physics``, from which the other options differ; "exact" is the task's own."""
+    """Name of one of the task's ``physics``, to which the other options are applied; "exact" means the task's own
+    physics."""
     frame_skip: int | None = None
     """Substeps in a step."""
     timestep: float | None = None
@@ -101,8 +102,8 @@ class PhysicsOptions:
     """Constraint capacity of each world (Warp engine); by default twice the peak of random rollouts, plus room for
     inactive equality constraints."""
     deterministic: bool = _for_engine(False)
-    """Make two runs on a CUDA device equal to the bit. Costs 5 to 18 times the time and 5 to 7 times the memory on
-    hopper, half_cheetah and humanoid. Runs on the CPU are always equal to the bit."""
+    """Make runs on a CUDA device reproducible bit for bit, as runs on the CPU always are. Takes 5 to 18 times the time
+    and 5 to 7 times the memory on hopper, half_cheetah and humanoid."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -188,7 +189,7 @@ class EnvOptions:
         check_kind("device", self.device, str | None, "as 'cpu' or 'cuda:0'")
         if not isinstance(self.engine, str) and not callable(self.engine):
             raise ValueError(f"engine must be 'auto', 'mujoco', 'warp' or a callable, not {described(self.engine)}")
-        if self.model is not None and not isinstance(self.model, mujoco.MjModel):  # MjModel raises its own error
+        if self.model is not None and not isinstance(self.model, mujoco.MjModel):  # MjModel has a specific error
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         object.__setattr__(self, "physics", _physics(self.physics))
         _flags(self, "autoreset", "graphs")
@@ -211,7 +212,7 @@ class EnvOptions:
         return (base or cls()).changed(options), rest
 
     def changed(self, words: Mapping[str, Any]) -> "EnvOptions":
-        """A copy with some options changed, by name, including physics options."""
+        """Copy with some options changed, by name, including physics options."""
         physics = {name: value for name, value in words.items() if name in _PHYSICS}
         others = {name: value for name, value in words.items() if name not in _PHYSICS}
         if physics:
@@ -224,7 +225,7 @@ class EnvOptions:
         return {field.name: getattr(options, field.name) for options, field in both if field.metadata.get("engine")}
 
     def given(self) -> dict[str, Any]:
-        """The options that differ from their defaults, physics options included, by name."""
+        """The options that differ from their defaults, by name, including physics options."""
         own = _given(self)
         own.pop("physics", None)
         return own | self.physics.given()

@@ -67,7 +67,7 @@ COUNTERS = ("step", "key", "episode", "done_reason")
 """Counters in a state: steps since the reset, key of the random stream, episode number, bits of ``Done``."""
 
 OWN_PARTS = (*COUNTERS, "metrics", "success_steps")
-"""Parts of a state that an environment adds to MuJoCo's and to the task's memory."""
+"""Parts that an environment adds to a state, besides MuJoCo's state and the task's memory."""
 
 
 def action_space(
@@ -93,7 +93,7 @@ def _controls(model: mujoco.MjModel) -> dict[str, int]:
     sizes: dict[str, int] = {}
     for i in np.argsort(model.actuator_ctrladr, kind="stable").tolist():
         name = given[i] or f"actuator_{i}"
-        while not given[i] and name in given:  # another actuator has this name
+        while not given[i] and name in given:  # the name belongs to another actuator
             name = f"{name}_"
         if model.actuator_ctrlnum[i]:
             sizes[name] = int(model.actuator_ctrlnum[i])
@@ -112,7 +112,8 @@ def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | Non
     if not np.isfinite(ranges).all():
         unlimited = np.flatnonzero(~np.isfinite(ranges).all(axis=1)).tolist()
         raise ValueError(
-            f"action_range maps actions to the controls' ranges, but the model gives none to the controls {unlimited}: "
+            f"action_range maps actions to the controls' ranges, but the controls {unlimited} have no range in the "
+            f"model: "
             "set their ctrlrange, or omit action_range"
         )
     low, high = action_range

@@ -28,7 +28,7 @@ def own_bytes_per_world(task: BoundTask) -> int:
 
 
 def own_parts(task: BoundTask) -> dict[str, int]:
-    """The sizes of the parts that ``Worlds`` adds to a state beside the counters."""
+    """Sizes of the parts that ``Worlds`` adds to a state, besides the counters."""
     form, found = task.task, dict[str, int]()
     for layout in task.memory.values():
         found |= sizes(layout)
@@ -37,7 +37,7 @@ def own_parts(task: BoundTask) -> dict[str, int]:
 
 
 def memory_columns(task: BoundTask, space: Space) -> dict[str, slice]:
-    """The columns of the rows ``memory`` and ``lasting_memory`` in a state, without those that the task lacks."""
+    """The columns of ``memory`` and ``lasting_memory`` in a state, if the task has them."""
     ends = {name: [space.parts[part] for part in layout] for name, layout in task.memory.items() if layout}
     return {name: slice(parts[0].start, parts[-1].stop) for name, parts in ends.items()}
 
@@ -71,7 +71,8 @@ class WorldArrays:
         self.metric_sums = wp.zeros((n, len(self.task.metrics)), dtype=float)
         """Sums of the metrics over the episode so far."""
         self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
-        """Successful steps in a row, up to ``success_steps``; has no columns if one step is enough."""
+        """Number of successive successful steps, up to ``success_steps``; the array has no columns if one step is
+        enough."""
         own = ("memory", "lasting_memory", "metric_sums", "success_counts")
         self._clearable = {name: getattr(self, name) for name in own}
         self._clearable |= {name: flat(self.engine.arrays[name]) for name in task.cleared}
@@ -101,7 +102,7 @@ class WorldArrays:
         self.state_space = state_space(model, self.engine.snapshots, self.task.dynamics, own_parts(self.task))
 
     def _allocate_shared(self) -> None:
-        """The memory that all worlds share, and the sums over worlds from which it is updated."""
+        """Allocate the memory that all worlds share, and the sums over worlds that update it."""
         layouts = self.task.shared
         shared, sums = (sum(sizes(layouts.get(name, {})).values()) for name in ("Shared", "Sums"))
         self.shared, self.sums = wp.zeros((1, shared), dtype=float), wp.zeros(sums, dtype=wp.int64)
@@ -112,7 +113,7 @@ class WorldArrays:
                 batch.shared = self.shared
 
     def _allocate_outcome(self) -> None:
-        """Rewards, ends, metrics and observations."""
+        """Allocate rewards, ends of episodes, metrics and observations."""
         n, kernels = self.nworld, self.task.kernels
         self.outcome = steps.Outcome()
         self.buffers: dict[str, torch.Tensor] = {}
@@ -126,14 +127,14 @@ class WorldArrays:
         self.outcome.metrics = self.metrics  # type: ignore[assignment]
         self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
         parts = int(steps.OBSERVE_FIRST) + len(self.obs_spaces)
-        self._judging = parts if self.device.is_cuda else 1  # threads that judge a world
+        self._judging = parts if self.device.is_cuda else 1  # number of threads that judge a world
         self._found = steps.Findings()
         self._found.reward, self._found.eval = wp.zeros(n, dtype=float), wp.zeros(n, dtype=float)
         self._found.terminated, self._found.success = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
         self._found.fault = wp.zeros((parts, n), dtype=int)  # type: ignore[assignment]
         self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
         self._finite_obs = wp.zeros((len(self.obs_spaces), n), dtype=bool)
-        self._observing = len(self.obs_spaces) if self.device.is_cuda else 1  # threads that observe a world
+        self._observing = len(self.obs_spaces) if self.device.is_cuda else 1  # number of threads that observe a world
         self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
         self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}
 
@@ -210,7 +211,7 @@ class WorldArrays:
             launch_rows(state.narrow, self.mask, columns, array)
 
     def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
-        """The arrays of ``own_parts``, with their columns of the state."""
+        """The arrays of ``own_parts``, with their columns in the state."""
         columns = memory_columns(self.task, self.state_space)
         columns |= {name: self.state_space.parts[name] for name in own_parts(self.task) if name in OWN_PARTS}
         arrays = {"metrics": self.metric_sums, "success_steps": self.success_counts}

@@ -104,7 +104,7 @@ class Worlds(WorldArrays):
         ]
 
     def _phases_of_a_graph(self) -> list[Phase]:
-        """``step_phases`` for a step that is one graph, in which parts are skipped if they concern no world."""
+        """``step_phases`` for a step that is a single graph, which skips the parts that concern no world."""
         if not self.engine.capturable:
             return self.step_phases()
         restart = self._restart_phases(self.restarting, randomly=True)
@@ -141,7 +141,7 @@ class Worlds(WorldArrays):
         ]
 
     def _tally_phases(self) -> list[Phase]:
-        """Add up the task's sums over all worlds, in one thread, because atomic additions on a CPU need that."""
+        """Add up the task's sums over all worlds, in one thread because atomic additions on a CPU require it."""
         kernel = self.task.kernels.tally_worlds if self.autoreset else None
         return [] if kernel is None else [Phase("tally", partial(self._tally, kernel))]
 
@@ -194,7 +194,7 @@ class Worlds(WorldArrays):
         return [Phase("observe", partial(self._observe, changed), by_world=True)]
 
     def _refresh_phases(self, mask: wp.array) -> list[Phase]:
-        if self.engine.reset_stage == Stage.NONE:  # no field follows from the state
+        if self.engine.reset_stage == Stage.NONE:  # no field is derived from the state
             return []
         return [Phase("refresh", partial(self.engine.refresh, mask), engine=True)]
 
@@ -203,7 +203,7 @@ class Worlds(WorldArrays):
         return [Phase("read state", self._read_state)]
 
     def restore_phases(self) -> list[Phase]:
-        """The phases that put the worlds of ``mask`` into the states in ``state``, for all getters too."""
+        """The phases that restore the masked worlds from ``state``, and update everything that getters read."""
         engine_columns = self.state[:, : self.engine.state_size]
         return [
             Phase("restore engine", partial(self.engine.set_state, engine_columns, self.mask), engine=True),
@@ -350,7 +350,7 @@ class Worlds(WorldArrays):
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         """Observe and judge the states of the masked worlds, without a transition."""
-        # a state that was set unchecked may be a fault; its world keeps the last valid observation
+        # a state set without a check may be a fault; its world keeps the last valid observation
         self.engine.find_faults(self.mask)
         keep_reason = keep_reason and not self.autoreset
         self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)
@@ -359,12 +359,12 @@ class Worlds(WorldArrays):
         # with automatic resets done_reason lasts for one step only; without them it is part of the state
         self.pack_state(self._no_fault if self.autoreset else self.outcome.done_reason)
 
-    # for environments and open-loop rollouts
+    # used by environments and open-loop rollouts
 
     def judge_transition(self, action: torch.Tensor) -> None:
         """Judge the transition from ``before`` to the current state under given actions; ignore engine faults."""
         torch_view(self.safe_action).copy_(action)
-        self._judged.zero_()  # receives the faults of this transition
+        self._judged.zero_()  # receives this transition's faults
         self._judge(self.everyone, self._judged, self._no_fault, transition=True)
 
     def seed_streams(self, seed: int) -> None:

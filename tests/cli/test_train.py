@@ -311,7 +311,7 @@ def test_a_broken_best_policy_is_replaced_with_a_message(
     assert cli.main(["eval", str(tmp_path / "run"), "--which", "best"]) == 2
     refused(capsys, str(best), "is damaged")
     assert cli.main(resume) == 0
-    refused(capsys, str(best), "is damaged", "the next best policy replaces it")
+    refused(capsys, str(best), "is damaged", "the next evaluated policy replaces it")
 
 
 def test_train_refuses_to_overwrite_a_run(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
