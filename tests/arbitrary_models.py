@@ -161,4 +161,4 @@ PLUGINS = {
         ARM, actuated('<orientation name="aim" site="tip" refsite="here" kp="1"/>', '<motor joint="wrist"/>')
     ),
 }
-"""Models that only the C engine supports, by the error of the Warp engine."""
+"""Models that only the C engine supports, by the Warp engine's error message."""

@@ -1,4 +1,4 @@
-"""Use one world as a Gymnasium environment; Gymnasium's own checker accepts it."""
+"""Use one world as a Gymnasium environment, and run Gymnasium's checker on it."""
 
 import warnings
 from collections.abc import Iterator
@@ -37,10 +37,10 @@ def draws() -> bool:
 
 
 THEIRS = ("is -infinity. This is probably too low", "is infinity. This is probably too high")
-"""The checker's warnings about unbounded observations, which Gymnasium's own robots cause, too."""
+"""Warnings of the checker about unbounded observations; Gymnasium's own robots also cause them."""
 
 
-def test_gymnasiums_checker_has_no_complaint(hopper: gymnasium.Env, draws: bool) -> None:
+def test_gymnasiums_checker_accepts_the_adapter(hopper: gymnasium.Env, draws: bool) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(hopper.unwrapped, skip_render_check=not draws)
@@ -77,7 +77,7 @@ def test_a_fault_truncates_the_episode_with_its_last_good_observation(hopper: gy
     np.testing.assert_array_equal(obs, before)
 
 
-def test_gymnasiums_own_vector_environments_take_it() -> None:
+def test_gymnasiums_vector_environments_accept_the_adapter() -> None:
     envs = gymnasium.make_vec("lyceum_warp.gym:lyceum/PointMass-v0", num_envs=2, vectorization_mode="sync")
     obs, _ = envs.reset()
     assert (obs[0] != obs[1]).any()

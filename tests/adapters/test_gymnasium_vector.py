@@ -22,7 +22,7 @@ N = 4
 
 @pytest.fixture(scope="module")
 def made() -> Callable[..., lw.Env]:
-    """Return a function that makes environments of ``Full`` (horizon 20), one with automatic resets and one without."""
+    """Return a function that makes two environments of ``Full`` (horizon 20), with and without automatic resets."""
     envs: dict[bool, lw.Env] = {}
 
     def get(*, autoreset: bool = True) -> lw.Env:
@@ -140,7 +140,7 @@ def test_without_copies_results_are_the_buffers(vector: Callable[..., GymnasiumV
     assert np.shares_memory(obs["policy"], envs.env.obs.numpy())
 
 
-def test_a_disabled_reset_leaves_ended_worlds_until_the_mask_resets_them(
+def test_with_disabled_resets_an_ended_world_waits_for_a_masked_reset(
     vector: Callable[..., GymnasiumVectorEnv],
 ) -> None:
     envs = vector(autoreset_mode=AutoresetMode.DISABLED)
@@ -189,7 +189,7 @@ def test_a_fault_truncates_the_episode_with_its_last_good_observation(
     assert reward[1] == 0 and infos["done_reason"][1] == lw.Done.ACTION
 
 
-def test_a_next_step_reset_follows_in_the_step_after_the_end(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_in_mode_next_step_a_world_resets_in_the_step_after_its_end(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector(autoreset_mode=AutoresetMode.NEXT_STEP)
     envs.reset(seed=5)
     ended, ends = np.zeros(N, dtype=bool), 0
@@ -217,7 +217,9 @@ def test_an_ignored_action_never_faults(tensors: bool, vector: Callable[..., Gym
     assert ends > 3 and envs.env.fault_counts == faults
 
 
-def test_a_seed_gives_the_same_worlds_and_no_seed_different_ones(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_equal_seeds_give_equal_worlds_and_no_seed_gives_different_worlds(
+    vector: Callable[..., GymnasiumVectorEnv],
+) -> None:
     envs = vector()
     first, again = (envs.reset(seed=2**40 + 3)[0]["policy"] for _ in range(2))
     other, going_on = envs.reset(seed=4)[0]["policy"], envs.reset()[0]["policy"]
@@ -253,7 +255,7 @@ OBSERVATION_WRAPPERS = {
     "DtypeObservation": lambda envs: wrappers.vector.DtypeObservation(envs, np.float64),
     "TransformObservation": lambda envs: wrappers.vector.TransformObservation(envs, lambda obs: np.clip(obs, -9, 9)),
 }
-"""Wrappers of observations, which Gymnasium refuses in the mode SAME_STEP."""
+"""Observation wrappers, which Gymnasium refuses in the mode SAME_STEP."""
 
 OTHER_WRAPPERS = {
     "ClipAction": wrappers.vector.ClipAction,
@@ -286,7 +288,7 @@ def test_a_wrapper_of_gymnasium_works(
     assert ends
 
 
-def test_a_picture_shows_each_world_as_it_is(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_pictures_show_the_current_state_of_each_world(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector(render_mode="rgb_array", render_size=(64, 48))
     envs.reset(seed=0)
     try:
@@ -331,7 +333,7 @@ def test_a_step_before_a_reset_is_refused(vector: Callable[..., GymnasiumVectorE
 
 
 @pytest.mark.parametrize("seed", [None, 3])
-def test_a_reset_of_some_worlds_before_one_of_all_is_refused(
+def test_a_partial_reset_before_the_first_full_reset_is_refused(
     seed: int | None, vector: Callable[..., GymnasiumVectorEnv]
 ) -> None:
     with pytest.raises(ResetNeeded, match="no reset came before this reset_mask: call reset.. without it first"):

@@ -10,7 +10,7 @@ from lyceum_warp.adapters.libraries import check_library
 
 
 def install(folder: Path, package: str, version: str) -> None:
-    """Make a folder claim that a version of a package is installed in it."""
+    """Write metadata into a folder, as if a version of a package were installed in it."""
     info = folder / f"{package.replace('-', '_')}-{version}.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: {version}\n")

@@ -78,14 +78,16 @@ def test_ppo_updates_its_policy_and_keeps_statistics_of_episodes(hopper: StableB
     assert len(returns) == len(lengths) == 6 and len(set(returns)) > 1 and min(lengths) > 1
 
 
-def test_an_off_policy_learner_stores_the_last_observation_and_no_time_limit(full: StableBaselines3VecEnv) -> None:
+def test_an_off_policy_learner_stores_final_observations_and_does_not_store_time_limits_as_ends(
+    full: StableBaselines3VecEnv,
+) -> None:
     model = SAC("MlpPolicy", full, learning_starts=40, batch_size=16, buffer_size=2000, seed=0, device="cpu")
     model.learn(200)
     buffer = model.replay_buffer
     assert buffer is not None and buffer.pos == 50 and buffer.timeouts[:50].any()
     ended = np.argwhere(buffer.dones[:49])
     assert len(ended)
-    for step, world in ended:  # the stored next observation is not the next episode's first one
+    for step, world in ended:  # the stored next observation is not the first observation of the next episode
         assert (buffer.next_observations[step, world] != buffer.observations[step + 1, world]).any()
 
 

@@ -54,7 +54,7 @@ def copied(s: Coin, action: Row[float], p: CoinParams, ctrl: Row[float]):
 
 
 class TossedAfter(lw.Task):
-    """The coin of the reward is tossed in ``advance``, after the action: no action is better than any other."""
+    """The reward's coin is tossed in ``advance``, after the action, so all actions are equally good."""
 
     model = staticmethod(lambda: rail(limits='ctrllimited="true" ctrlrange="-1 1"'))
     obs = {"coin": 1}
@@ -72,6 +72,6 @@ class TossedAfterWithControl(TossedAfter):
 
 
 class TossedBefore(TossedAfter):
-    """The coin of the reward was tossed in the previous step, and is stored in memory."""
+    """The reward's coin was tossed in the previous step, and is stored in memory."""
 
     reward = paid_by_coin_before_action

@@ -70,7 +70,7 @@ def test_samples_and_predictions_equal_the_modules() -> None:
 
 
 class Own(nn.Sequential):
-    """A subclass, which may compute anything."""
+    """A user's subclass, which may compute anything."""
 
 
 def hooked(network: nn.Module) -> nn.Module:

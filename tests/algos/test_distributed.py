@@ -1,4 +1,5 @@
-"""Train in several processes: the worlds and updates equal one process's, and any number of processes can resume."""
+"""Train in several processes: worlds and updates equal those of a single process, and any number of processes can
+resume."""
 
 import csv
 import os

@@ -10,7 +10,7 @@ import lyceum_warp as lw
 from lyceum_warp.algos.evaluation import evaluation_seed
 
 
-def test_evaluate_takes_the_same_number_of_episodes_of_every_world() -> None:
+def test_evaluate_counts_equally_many_episodes_of_every_world() -> None:
     """A world with short episodes contributes no additional episodes; the results equal a plain loop's."""
     env = lw.make("hopper", nworld=4, horizon=60)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
@@ -67,7 +67,7 @@ def test_parameters_of_each_world_reach_the_worlds_of_the_mean_policy() -> None:
     assert it.mean_success == it.success == 1.0
 
 
-def test_each_episode_has_dynamics_of_its_own() -> None:
+def test_each_episode_has_its_own_dynamics() -> None:
     """Values drawn at resets differ between all episodes; values drawn at the start differ between worlds."""
     env = lw.make(Varied, nworld=3)
     policy = lw.GaussianPolicy(1, 1)

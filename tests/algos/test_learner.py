@@ -1,4 +1,4 @@
-"""Test the contract of a learner: the base class is enough for a run, an export and a resumption."""
+"""Test the learner interface: runs, export and resumption need only the base class."""
 
 import dataclasses
 from pathlib import Path
@@ -57,7 +57,7 @@ def env(shared_env: SharedEnv) -> lw.Env:
     return shared_env("point_mass", nworld=2)
 
 
-def test_a_learner_of_few_lines_resumes_to_the_bit(env: lw.Env) -> None:
+def test_a_minimal_learner_resumes_bit_for_bit(env: lw.Env) -> None:
     one = Drift(env)
     next(one)
     saved = one.state_dict()
@@ -89,7 +89,7 @@ def test_a_policy_that_is_not_gaussian_is_saved_and_exported(env: lw.Env, tmp_pa
 @pytest.mark.parametrize("config, best_by", [
     (lw.NPGConfig(), "mean_return"), (lw.PPOConfig(mean_every=0), "return_mean"), (DriftConfig(), "mean_return"),
 ])  # fmt: skip
-def test_the_best_policy_is_chosen_by_the_returns_that_the_learner_reports(
+def test_the_best_policy_has_the_largest_return_that_the_learner_reports(
     config: Any, best_by: str, env: lw.Env
 ) -> None:
     drift = Drift(env)

@@ -39,7 +39,7 @@ def weighed(s0: VariedWorld, action: Row[float], s1: VariedWorld, p: VariedParam
 
 
 class Weighed(Varied):
-    """A task whose rewards depend on the randomized masses and lengths."""
+    """A task whose reward depends on randomized masses and lengths."""
 
     reward = weighed
 
@@ -121,7 +121,7 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
         settings["model"] = settings["model"]()
     plan = MPPI(task, engine=engine, seed=5, iterations=iterations, **settings)
     plain = kind(task, engine=engine, count=len(plan.knot_actions), **settings)
-    # random numbers depend on the seed and on the number of previous draws: a twin draws the noise of each iteration
+    # random numbers depend on the seed and the number of previous draws, so a twin can draw the noise of each iteration
     knots = {name: settings[name] for name in ("knots", "spline") if name in settings}
     twin = MPPI(task, seed=5, samples=plan.samples, horizon=plan.horizon, iterations=1, **knots)
     plant = lw.make(task, engine=engine, seed=3, autoreset=False)
@@ -161,7 +161,7 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
     assert len(starts) == 5
 
 
-def test_the_terminal_value_belongs_to_samples_that_did_not_end() -> None:
+def test_samples_that_terminated_get_no_terminal_value() -> None:
     state = falling_hopper(lw.make("hopper"))
     stop = MPPI(seed=1, **HOPPER)
     value = MPPI(seed=1, **HOPPER | dict(value=lambda obs: torch.full((len(obs),), 100.0)))
@@ -183,7 +183,7 @@ def same(a: list[torch.Tensor], b: list[torch.Tensor]) -> bool:
 
 
 @pytest.mark.parametrize("update", ["mppi", *UPDATES])
-def test_equal_seeds_give_equal_plans_and_a_reset_starts_again(update: str) -> None:
+def test_equal_seeds_give_equal_plans_and_a_reset_restarts_the_noise(update: str) -> None:
     words = UPDATES.get(update, {})
     plan, twin, other = (MPPI("reach", seed=seed, horizon=8, samples=10, **words) for seed in (4, 4, 5))
     _, state = reached(0)
@@ -316,7 +316,7 @@ def test_failed_samples_are_not_among_the_best(update: str, elites: int | None) 
     assert plan.summary["effective_samples"] == pytest.approx(count)
 
 
-def test_actions_stay_within_the_bounds_of_the_controls() -> None:
+def test_actions_stay_within_the_control_ranges() -> None:
     plan = MPPI("reach", noise=10.0, temperature=1e-3)
     low, high = (torch.from_numpy(bound) for bound in (plan.env.action_space.low, plan.env.action_space.high))
     plant, _ = reached(1)
@@ -362,7 +362,7 @@ def test_a_shifted_plan_with_knots_keeps_its_actions(knots: int, spline: Any) ->
     assert (plan.nominal == plan.nominal[0]).all(), "the last knot fills the plan"
 
 
-def test_a_shift_beyond_the_horizon_leaves_only_the_fill() -> None:
+def test_a_shift_beyond_the_horizon_fills_the_whole_plan() -> None:
     for knots in (None, 4):
         plan = MPPI("point_mass", horizon=8, samples=4, knots=knots, fill=0.25)
         plan(plan.state_of())
@@ -397,7 +397,7 @@ def test_a_value_function_gets_the_step_at_the_end_of_the_plan(engine: str) -> N
     value = lw.ValueFunction(6, (16,), scale=50.0, time_orders=2, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         torch.nn.init.xavier_uniform_(value.network[-1].weight)  # a new value function predicts 0
-        value.network[0].weight[:, 6:] *= 300  # so that ten steps make a difference
+        value.network[0].weight[:, 6:] *= 300  # so that ten steps change the value
     settings = POINT | dict(engine=engine, noise=0.5)
     plan = MPPI(value=value, **settings)
 
@@ -488,7 +488,7 @@ def test_half_cheetah_runs() -> None:
 
 @pytest.mark.long
 def test_hopper_hops_without_falling() -> None:
-    """With the settings of other tasks it falls after about 100 steps."""
+    """With other tasks' settings, it falls after about 100 steps."""
     plant, rewards, evals = drive("hopper", 130, 1)
     assert len(evals) == 130 and not plant.terminated.item()
     assert evals[-1] > 0.3 and rewards.sum() > 165, (evals[-1], rewards.sum())
@@ -516,13 +516,13 @@ def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("task", [TossedAfter, TossedAfterWithControl])
-def test_a_coin_tossed_after_the_action_earns_a_planner_nothing(task: type[lw.Task]) -> None:
+def test_a_planner_cannot_exploit_a_coin_tossed_after_the_action(task: type[lw.Task]) -> None:
     mean, deviation = earned(task)
     assert 0.5 < deviation < 2.3, "the planner should act"
     assert abs(mean) < 3 * deviation
 
 
-def test_a_coin_tossed_before_the_action_earns_a_planner_almost_everything() -> None:
+def test_a_planner_exploits_a_coin_tossed_before_the_action() -> None:
     mean, _ = earned(TossedBefore)
     assert mean > 80
 

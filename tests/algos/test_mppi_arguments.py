@@ -1,4 +1,4 @@
-"""Sort keyword arguments of MPPI into settings, options and parameters, as a task's planning lists them."""
+"""Sort MPPI's keyword arguments into settings, options and parameters."""
 
 import dataclasses
 import json
@@ -32,7 +32,7 @@ def observe_noisy(s: Rail, p: NoisyParams, obs: Row[float]):
 
 
 class Noisy(lw.Task):
-    """A task with a parameter that has the name of a setting."""
+    """A task with a parameter named like a setting."""
 
     model, obs = staticmethod(rail), {"x": 1}
     World, Params, observe = Rail, NoisyParams, observe_noisy
@@ -100,7 +100,7 @@ REACH = task_config(find_task("reach"))
         ("reach", MPPIConfig(horizon=3, samples=8), {"samples": 7}, MPPIConfig(horizon=3, samples=7)),
     ],
 )
-def test_flat_settings_replace_the_configuration_which_replaces_planning(
+def test_keyword_settings_override_config_which_overrides_planning(
     task: str, config: MPPIConfig | None, words: dict[str, Any], expected: MPPIConfig
 ) -> None:
     assert arguments(task, config, **words)[0] == expected.completed()
@@ -116,7 +116,7 @@ def test_arguments_are_sorted_into_settings_options_and_parameters() -> None:
     assert arguments(task, physics=physics)[1].physics == physics
 
 
-def test_a_name_of_both_a_setting_and_a_parameter_must_be_given_explicitly() -> None:
+def test_an_ambiguous_name_must_be_given_in_config_or_params() -> None:
     message = (
         r"'noise' is a setting of MPPI and a parameter of the task 'noisy': give the setting as "
         r"config=lw.MPPIConfig\(noise=...\), or the parameter as params=\{'noise': ...\}"
@@ -198,7 +198,7 @@ def test_omitted_settings_get_the_updates_defaults() -> None:
         return config.include_plan, config.elites, config.min_noise
 
     assert chosen() == chosen(update="mppi") == chosen(update="predictive_sampling") == (True, None, None)
-    assert chosen(samples=1)[0] is False  # with the plan as its only sample it would try nothing new
+    assert chosen(samples=1)[0] is False  # if the only sample were the plan itself, the planner would try nothing new
     assert chosen(update="cem", samples=50) == (False, 5, (0.05,) * 7)
     assert [chosen(update="cem", samples=n)[1] for n in (1, 2, 19, 40)] == [1, 2, 2, 4]
 

@@ -86,7 +86,7 @@ def test_settings_for_a_different_number_of_actions_are_refused(name: str, value
         MPPI("point_mass", horizon=3, samples=4, **{name: value})
 
 
-def test_the_action_of_a_fill_is_within_the_bounds() -> None:
+def test_fill_actions_are_clipped_to_the_bounds() -> None:
     low, high = np.array([-1.0, 0.2]), np.array([1.0, 0.4])
     space = dataclasses.replace(MPPI("point_mass", samples=1).env.action_space, low=low, high=high)
     assert isinstance(space, Space)
@@ -95,7 +95,7 @@ def test_the_action_of_a_fill_is_within_the_bounds() -> None:
 
 
 @pytest.mark.parametrize("task", [name for name in lw.task_names() if find_task(name).planning != lw.Planning()])
-def test_the_settings_of_a_task_make_a_plan(task: str) -> None:
+def test_every_task_can_plan_with_its_own_settings(task: str) -> None:
     plan = lw.MPPI(task, horizon=8, samples=4)
     action = plan(plan.env.get_state()[0])
     assert torch.isfinite(action).all() and action.abs().max() > 0.0

@@ -83,7 +83,7 @@ def test_a_value_function_gets_the_samples_of_every_plant(kind: str) -> None:
         torch.testing.assert_close(together.returns[i], alone.returns)
 
 
-def test_some_plants_restart() -> None:
+def test_a_masked_reset_restarts_only_some_plants() -> None:
     plan = lw.MPPI("point_mass", horizon=5, samples=6, update="cem", elites=2, knots=2, plants=3, seed=1)
     states = states_of("point_mass", 3)
     first = plan(states)
@@ -97,7 +97,7 @@ def test_some_plants_restart() -> None:
     plan.reset([4, 9, 1])
     assert not torch.allclose(*plan(states)[:2])
     plan.reset(9, where=torch.tensor([False, False, True]))
-    assert plan.seeds == [4, 9, 11]  # the others keep their seeds
+    assert plan.seeds == [4, 9, 11]  # the other plants keep their seeds
     torch.testing.assert_close(plan(states)[2], lw.MPPI("point_mass", horizon=5, samples=6, update="cem", elites=2,
                                                         knots=2, seed=11)(states[2]))  # fmt: skip
 
@@ -142,7 +142,7 @@ def test_a_plan_for_each_world_controls_an_environment() -> None:
     assert (now < 0.3 * far)[[0, 2, 3]].all()
 
 
-def test_bad_input_gets_one_line() -> None:
+def test_bad_input_raises_a_one_line_error() -> None:
     with pytest.raises(ValueError, match="plants must be a whole number .*, not 0"):
         lw.MPPI("point_mass", plants=0)
     plan = lw.MPPI("point_mass", horizon=3, samples=4, plants=2)

@@ -36,7 +36,7 @@ def test_a_step_has_the_kl_divergence_that_delta_sets(env: lw.Env) -> None:
 
 
 @pytest.mark.parametrize("rollout", ["episodes", "segments"])
-def test_a_run_is_reproducible_and_resumes_to_the_bit(env: lw.Env, rollout: str) -> None:
+def test_a_run_is_reproducible_and_resumes_bit_for_bit(env: lw.Env, rollout: str) -> None:
     config = dataclasses.replace(SMALL, rollout=rollout, time_orders=2, normalize=True)
     if rollout == "segments":  # iterations are shorter than an episode, and worlds restart between them
         config = dataclasses.replace(config, samples=16 * 5, min_restarts=1.5)
@@ -76,7 +76,7 @@ def learned(env: lw.Env, iterations: int, change: Callable[[torch.Tensor, int], 
     return [next(npg) for _ in range(iterations)]
 
 
-def test_rewards_of_any_scale_learn_alike(env: lw.Env) -> None:
+def test_learning_does_not_depend_on_the_scale_of_rewards(env: lw.Env) -> None:
     plain = learned(env, 5, lambda *_: None)
     for exponent in (-14, 14):  # a power of two does not change the rounding
         scaled = learned(env, 5, lambda reward, _, by=2.0**exponent: reward.mul_(by))  # type: ignore[misc]
@@ -104,7 +104,7 @@ def test_one_extreme_reward_is_bounded_and_counted(env: lw.Env) -> None:
     assert learned(env, 6, first)[-1].explained_variance > 0.5
 
 
-def test_a_step_that_the_fisher_information_misjudges_is_shortened(env: lw.Env) -> None:
+def test_a_step_that_exceeds_the_kl_limit_is_shortened(env: lw.Env) -> None:
     env.rand_reset(0)
     one_sample = dataclasses.replace(SMALL, fisher_fraction=1e-6, delta=0.1, mean_every=0)
     npg = lw.NPG(env, config=one_sample, seed=0)
@@ -116,7 +116,7 @@ def test_a_step_that_the_fisher_information_misjudges_is_shortened(env: lw.Env) 
 
 
 def test_changed_observation_statistics_count_towards_the_kl_limit() -> None:
-    """In iteration 4 observations jump; the KL divergence between the sampling policies stays below its limit."""
+    """Observations jump in iteration 4, but the KL divergence between sampling policies stays below its limit."""
     env = lw.make("hopper", nworld=16, seed=1, nthread=1)
     config = lw.NPGConfig(samples=1600, hidden=(16,), value_hidden=(16,), mean_every=0, log_std=-2.0)
     npg = lw.NPG(env, config=config, seed=0)
@@ -172,7 +172,7 @@ def test_a_state_of_another_number_of_worlds_is_refused(env: lw.Env) -> None:
         lw.NPG(lw.make("point_mass", nworld=3), config=SMALL).load_state_dict(npg.state_dict())
 
 
-def test_segments_continue_at_the_end_of_the_previous_ones(env: lw.Env) -> None:
+def test_segments_continue_the_previous_episodes(env: lw.Env) -> None:
     env.rand_reset(0)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=16 * 5, mean_every=0))
     assert npg.segments  # selected automatically: 5 steps are shorter than an episode of 12

@@ -51,7 +51,7 @@ def test_it_learns_for_a_fixed_seed() -> None:
     {}, {"std_type": "log", "whiten_minibatches": True, "schedule": "fixed", "final_entropy_coef": 0.1,
          "entropy_decay": (1, 3), "minibatches": 5, "stagger": False, "normalize": False},
 ])  # fmt: skip
-def test_a_run_is_reproducible_and_resumes_to_the_bit(changes: dict[str, Any], env: lw.Env) -> None:
+def test_a_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], env: lw.Env) -> None:
     def fresh(seed: int, **others: Any) -> lw.PPO:
         env.rand_reset(7)
         return made(env, seed=seed, **changes | others)

@@ -1,4 +1,4 @@
-"""The replay buffer: contents, n-step returns across ends, sampling and saved states."""
+"""Test the replay buffer: contents, n-step returns across episode ends, sampling and saved states."""
 
 from typing import Any
 
@@ -39,8 +39,8 @@ def filled(env: lw.Env, steps: int, *, capacity: int = 45, bad: int = -1) -> tup
 
 @pytest.mark.parametrize("n_step", [1, 3, 20])
 @pytest.mark.parametrize("steps", [7, 40])
-def test_returns_of_several_steps_equal_a_plain_sum_across_ends(steps: int, n_step: int, env: lw.Env) -> None:
-    """40 steps overwrite the oldest; episodes end by termination, the time limit, and a fault."""
+def test_n_step_returns_across_episode_ends_equal_a_plain_sum(steps: int, n_step: int, env: lw.Env) -> None:
+    """40 steps overwrite the oldest steps; episodes end by termination, by the time limit and by a fault."""
     replay, plain = filled(env, steps, bad=5)
     kept, gamma, ends = plain[-15:], 0.9, set()
     assert len(replay) == 3 * len(kept)
@@ -65,7 +65,7 @@ def test_returns_of_several_steps_equal_a_plain_sum_across_ends(steps: int, n_st
     assert (False, True) in ends and (steps == 7 or (True, False) in ends)
 
 
-def test_what_is_not_finite_never_enters_the_buffer(env: lw.Env) -> None:
+def test_non_finite_values_are_not_stored(env: lw.Env) -> None:
     replay, plain = filled(env, 7, bad=5)
     assert plain[5]["truncated"][1] and plain[5]["reward"][1] == 0.0
     batch = replay.at(torch.arange(len(replay)), n_step=1, gamma=0.9)
@@ -83,7 +83,7 @@ def test_samples_are_uniform_and_counted(env: lw.Env) -> None:
     assert len(counts) == 45 and counts.min() > 300 and counts.max() < 600  # 444 each
 
 
-def test_a_saved_state_samples_the_same_and_goes_on_the_same(env: lw.Env) -> None:
+def test_a_restored_buffer_samples_and_continues_identically(env: lw.Env) -> None:
     replay, _ = filled(env, 20)
     other = lw.Replay(env, 45)
     other.load_state_dict(replay.state_dict())
@@ -99,7 +99,7 @@ def test_a_saved_state_samples_the_same_and_goes_on_the_same(env: lw.Env) -> Non
         lw.Replay(env, 90).load_state_dict(replay.state_dict())
 
 
-def test_the_capacity_follows_a_rule(env: lw.Env, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_capacity_depends_on_worlds_and_memory(env: lw.Env, monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(lw.Replay(env).reward) == 333_334
     each = 4 * (2 * 3 + 1 + 1) + 2
     monkeypatch.setattr("lyceum_warp.algos.replay.free_memory", lambda device: 1000 * each)

@@ -1,4 +1,4 @@
-"""SAC as a whole: an update equals plain torch, it learns, and it resumes exactly."""
+"""Test SAC as a whole: an update equals plain torch, a run learns and resumes exactly."""
 
 import copy
 import dataclasses
@@ -146,7 +146,7 @@ def test_the_density_of_actions_integrates_to_one() -> None:
 
 
 @pytest.mark.parametrize("changes", [{}, {"n_step": 3, "actor_every": 2, "normalize": False, "layer_norm": False}])
-def test_a_run_is_reproducible_and_resumes_to_the_bit(changes: dict[str, Any], env: lw.Env) -> None:
+def test_a_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], env: lw.Env) -> None:
     def fresh(seed: int) -> lw.SAC:
         env.rand_reset(7)
         return made(env, seed=seed, **changes)
@@ -195,7 +195,7 @@ def test_a_run_continues_with_the_replay_buffer_of_its_folder(tmp_path: Path) ->
         lw.train(made(sac.env), tmp_path / "parts", iterations=7, resume=True)
 
 
-def test_it_goes_on_with_given_networks(env: lw.Env) -> None:
+def test_given_networks_are_trained_further(env: lw.Env) -> None:
     sac = made(env)
     for _ in range(2):
         next(sac)
@@ -238,13 +238,13 @@ def test_every_step_updates_the_statistics_of_observations(env: lw.Env) -> None:
     assert sac.target.normalizer is sac.value.normalizer
 
 
-def test_a_reward_that_is_not_finite_is_a_fault_and_learning_goes_on(env: lw.Env) -> None:
+def test_a_non_finite_reward_is_a_fault_and_learning_continues(env: lw.Env) -> None:
     sac = made(env)
     next(sac)
     step = env.step
 
     def faulty() -> None:
-        env.action[1] = 1e30  # its square is infinite
+        env.action[1] = 1e30  # the square of this reward is infinite
         step()
 
     with pytest.MonkeyPatch.context() as patch:

@@ -1,4 +1,4 @@
-"""Policies that are symmetric exactly, or learn to be."""
+"""Test policies that are exactly symmetric, or learn symmetry."""
 
 import dataclasses
 from pathlib import Path
@@ -33,7 +33,7 @@ def asymmetry(policy: lw.GaussianPolicy, env: lw.Env) -> float:
         return (policy(mirror.obs(obs)) - mirror.action(policy(obs))).abs().mean().item()
 
 
-def test_an_exact_policy_is_equivariant_to_the_bit_also_from_a_file(env: lw.Env, tmp_path: Path) -> None:
+def test_an_exact_policy_is_equivariant_bit_for_bit_also_after_loading(env: lw.Env, tmp_path: Path) -> None:
     """The normaliser's statistics need not be symmetric."""
     ppo = learner(env, "exact")
     run = lw.train(ppo, tmp_path / "run", iterations=2)
@@ -80,7 +80,7 @@ def test_losses_and_mirrored_samples_make_a_policy_more_symmetric(symmetry: str,
 
 
 @pytest.mark.parametrize("symmetry", ["exact", "loss", "augment"])
-def test_a_symmetric_run_resumes_to_the_bit(symmetry: str, tmp_path: Path) -> None:
+def test_a_symmetric_run_resumes_bit_for_bit(symmetry: str, tmp_path: Path) -> None:
     def made() -> lw.PPO:
         return lw.PPO(lw.make("point_mass", nworld=8), config=dataclasses.replace(CONFIG, symmetry=symmetry))
 

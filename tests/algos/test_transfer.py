@@ -26,7 +26,7 @@ def test_both_engines_play_the_same_episodes(shared_env: SharedEnv) -> None:
     assert returns.first == pytest.approx(own.returns.mean().item())
     assert lengths.first == pytest.approx(own.lengths.mean().item())
     assert falls.first == pytest.approx(own.terminated.mean().item())
-    # starts differ by far more than the engines, so that only pairs show this
+    # initial states differ by far more than the engines, so only paired episodes show the agreement
     assert returns.verdict == lengths.verdict == "same" and own.lengths.std() > 1.0
     assert returns.high - returns.low < 0.2 * own.returns.std().item()
     assert shown[-1][0] <= shown[-1][1] == 400 and torch.equal(env.get_state(), before)
@@ -39,7 +39,7 @@ def test_each_physics_of_the_task_is_compared_with_the_exact_one() -> None:
     found = lw.transfer(env, still, 8, warp=False)
     ((exact, coarse),) = [(pair.first, pair.second) for pair in found.comparisons]
     assert (exact, coarse) == ("exact physics", "coarse physics")
-    assert found.comparisons[0].verdict == "different"  # it falls in half the number of steps
+    assert found.comparisons[0].verdict == "different"  # the robot falls in half the number of steps
     own = lw.make(Coarse, horizon=200, frame_skip=2)
     assert task_physics(own)[1] == "own" and task_physics(lw.make(Coarse, frame_skip=8))[1] == "coarse"
     pairs = [pair.second for pair in lw.transfer(own, still, 2, warp=False, physics=False).comparisons]
@@ -55,7 +55,7 @@ def test_verdict_compares_the_interval_with_the_margin(low: float, high: float, 
     assert Difference(quantity="return", first=0.0, second=0.0, low=low, high=high, margin=1.0).verdict == verdict
 
 
-def test_wrong_arguments_are_one_line(shared_env: SharedEnv) -> None:
+def test_wrong_arguments_raise_a_one_line_error(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", horizon=200)
     with pytest.raises(ValueError, match="episodes must be"):
         lw.transfer(env, still, 1)

@@ -175,7 +175,7 @@ def test_figures_and_tables_need_only_results(toy: Any, tmp_path: Path, capsys: 
         plot.main(plot.Options((), tmp_path / "empty"))
 
 
-def test_peer_has_an_environment_of_its_own(
+def test_a_peer_runs_in_a_separate_virtual_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(venvs, "FOLDER", tmp_path)

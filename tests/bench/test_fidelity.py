@@ -35,7 +35,7 @@ def test_different_dynamics_diverge(monkeypatch: pytest.MonkeyPatch) -> None:
     make = fidelity.lw.make
 
     def replaced(task: str, **words: Any) -> lw.Env:
-        """Use the C engine with longer steps in place of the Warp engine."""
+        """Replace the Warp engine by the C engine with longer steps."""
         return make(task, **(words | ({"engine": "mujoco", "frame_skip": 60} if words["engine"] == "warp" else {})))
 
     monkeypatch.setattr(fidelity.lw, "make", replaced)
@@ -43,9 +43,10 @@ def test_different_dynamics_diverge(monkeypatch: pytest.MonkeyPatch) -> None:
     assert pairs["engines"]["half_apart"] <= 4 and pairs["moved"]["half_apart"] is None
 
 
-def test_half_apart_counts_worlds_that_have_ever_diverged() -> None:
+def test_worlds_that_have_diverged_once_stay_counted() -> None:
     error = torch.zeros(6, 4)
-    error[2:, 0], error[4:, 1], error[3, 2] = 1.0, 1.0, 1.0  # worlds drift apart after 3, 5 and 4 steps, and never
+    # three worlds diverge after 3, 5 and 4 steps, and one never diverges
+    error[2:, 0], error[4:, 1], error[3, 2] = 1.0, 1.0, 1.0
     assert fidelity.half_apart(error) == 4
     assert fidelity.half_apart(error[:, [1, 3]]) == 5
     assert fidelity.half_apart(error[:, [3]]) is None and fidelity.half_apart(error[:, []]) is None

@@ -22,7 +22,7 @@ def test_the_short_mode_runs_and_resumes(tmp_path: Path, capsys: pytest.CaptureF
         assert found["age_steps"] <= found["age_steps_max"] and found["episodes"] == 1
 
 
-def test_a_task_that_suggests_physics_is_also_planned_with_its_own() -> None:
+def test_a_task_with_suggested_physics_is_also_planned_with_its_exact_physics() -> None:
     cases = latency.cases(latency.Options(tasks=("humanoid", "reach"), threads=2))
     assert {(case.task, case.physics) for case in cases} == {
         ("humanoid", "fast"), ("humanoid", "exact"), ("reach", "own"),

@@ -1,4 +1,4 @@
-"""Binding checks a task's class, the types of its fields, and the size of its observation."""
+"""Test the checks of a task's class, its field types and its observation size."""
 
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ def bound(file: Path, **options: Any) -> BoundTask:
         ("action_range = (0.0, float('inf'))", r"must be two finite numbers, lowest first"),
     ],
 )
-def test_a_line_of_the_class_that_does_not_fit_is_refused(line: str, message: str, tmp_path: Path) -> None:
+def test_an_invalid_attribute_of_the_class_is_refused(line: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         bound(tiny_task.write(tmp_path, f"{tiny_task.TINY}    {line}\n"))
 
@@ -77,7 +77,7 @@ def test_an_observation_that_does_not_fit_obs_is_refused(case: str, task_file: T
 CONTROL = "def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):\n"
 
 
-def test_the_check_of_a_control_leaves_the_inputs_as_they_are(tmp_path: Path) -> None:
+def test_checking_control_does_not_change_the_inputs(tmp_path: Path) -> None:
     source = tiny_task.changed(
         ("qpos: Row[float]", "qpos: Row[float]\n    qfrc_applied: Row[float]"),
         ("class Tiny", f"@wp.func\n{CONTROL}    s.qfrc_applied[0] = 1.0\n\nclass Tiny"),

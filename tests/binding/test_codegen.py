@@ -1,4 +1,4 @@
-"""The same functions produce one set of kernels, with the same names in every process."""
+"""Test that equal functions share their kernels, whose names are the same in every process."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""A task's structs and functions are found in its class or module and checked against ``task.FUNCTIONS``."""
+"""Find a task's structs and functions in its class or module, and check them against ``task.FUNCTIONS``."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from lyceum_warp.task import FUNCTIONS, Task
 MEANT = {
     name: f"def {function.signature}:\n    {function.default or 'obs[0] = 1.0'}"
     for name, function in FUNCTIONS.items()
-    if name not in ("tally", "share")  # the functions with shared memory need each other and structs of their own
+    if name not in ("tally", "share")  # the functions for shared memory need each other and additional structs
 }
 """Every function of the table, as written in a task's file."""
 
@@ -75,7 +75,7 @@ def test_an_incomplete_file_says_what_is_missing(old: str, new: str, message: st
 
 
 @pytest.mark.parametrize("name", ["World", "Params"])
-def test_a_class_in_the_place_of_a_struct_is_refused(name: str, tmp_path: Path) -> None:
+def test_an_ordinary_class_in_place_of_a_struct_is_refused(name: str, tmp_path: Path) -> None:
     text = tiny_task.TINY.replace("    model =", f"    class {name}:\n        qpos: Row[float]\n\n    model =")
     with pytest.raises(ValueError, match=f"{name} of the task 'tiny' must be a Warp struct: decorate it with @wp.st"):
         source_of(tmp_path, text)
@@ -123,7 +123,7 @@ USERS = {
 
 
 @pytest.mark.parametrize("user", USERS)
-def test_a_function_named_like_a_groups_must_be_called_in_its_module(user: str, tmp_path: Path) -> None:
+def test_an_unlisted_observe_function_must_be_called_in_its_module(user: str, tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, tiny_task.changed(("class Tiny", f"{CRITIC}class Tiny")) + USERS[user])
     task = find_task(f"{file}:Tiny")
     source = TaskSource(task, task_name(task))

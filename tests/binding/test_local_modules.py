@@ -63,7 +63,7 @@ def test_modules_of_one_name_in_two_folders_are_distinct(tmp_path: Path) -> None
     assert [find_task(file).frame_skip for file in (*files, *files)] == [4, 5, 4, 5]
 
 
-def test_a_module_that_changed_is_read_again(tmp_path: Path) -> None:
+def test_a_changed_module_is_reloaded(tmp_path: Path) -> None:
     file = shared(tmp_path, 6)
     first = find_task(file)
     assert find_task(file) is first
@@ -71,7 +71,7 @@ def test_a_module_that_changed_is_read_again(tmp_path: Path) -> None:
     assert (find_task(file).frame_skip, first.frame_skip) == (17, 6)
 
 
-def test_a_module_that_fails_leaves_the_loaded_modules(tmp_path: Path) -> None:
+def test_a_failing_module_does_not_replace_loaded_modules(tmp_path: Path) -> None:
     file = shared(tmp_path, 8)
     first, module = find_task(file), sys.modules["aaa_size"]
     (tmp_path / "aaa_size.py").write_text("from aaa_inner.number import SKIP\n1 / 0\n")

@@ -1,4 +1,4 @@
-"""A task's model is found, and changed so that both engines run the same physics."""
+"""Find a task's model, and change it so that both engines run the same physics."""
 
 import importlib.util
 from pathlib import Path
@@ -199,7 +199,7 @@ def test_a_model_of_a_relative_path_and_its_meshes_are_found_from_another_folder
     assert env.replicate().model.nmesh == 1
 
 
-def test_the_text_of_a_model_is_refused_with_the_way_to_give_it() -> None:
+def test_xml_text_is_refused_with_a_suggestion() -> None:
     with pytest.raises(
         ValueError, match=r"^the model '<mujoco><asset><mesh \.\.\.' is XML.*mujoco.MjSpec.from_string\(\.\.\.\)"
     ):

@@ -235,7 +235,8 @@ def test_each_kind_of_element_has_a_table(model: mujoco.MjModel) -> None:
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_functions_read_tables_which_change_in_place(engine: str) -> None:
-    """Graphs were captured before; new tables have the same shape, a different shape, or one value per world."""
+    """After graphs are captured, tables are replaced by tables of the same shape, of a different shape, or with one
+    value per world."""
     env = lw.make(Follow, engine=engine, nworld=2)
 
     def first_steps() -> torch.Tensor:
@@ -279,7 +280,7 @@ def test_other_environments_get_the_tables() -> None:
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("found", ["number", "nan"])
-def test_check_task_finds_a_read_out_of_a_table(task_file: Any, found: str, engine: str) -> None:
+def test_check_task_finds_an_out_of_range_read_of_a_table(task_file: Any, found: str, engine: str) -> None:
     """The read is reported even if it returns NaN, which ends the episode with a fault."""
     source = (Path(__file__).parent.parent / "table_task.py").read_text()
     wrong = source.replace("p.motion.shape[0] - 1)", "p.motion.shape[0])")

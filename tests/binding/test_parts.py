@@ -173,8 +173,8 @@ def test_a_mistake_in_a_part_raises_one_line_that_names_it(
     assert "\n" not in str(caught.value)
 
 
-def test_a_function_that_others_call_writes_no_group(tmp_path: Path) -> None:
-    """Its name begins like a group's function, but ``observe`` calls it as a helper."""
+def test_a_helper_named_like_an_observe_function_defines_no_group(tmp_path: Path) -> None:
+    """The function's name resembles a group's function, but ``observe`` calls it as a helper."""
     helper = struct_of(PART, "observe_all(s, p, obs)").replace(
         "@wp.func\n",
         "@wp.func\ndef observe_all(s: World, p: Params, obs: Policy):\n    obs.x[0] = s.qpos[0]\n\n@wp.func\n",

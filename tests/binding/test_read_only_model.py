@@ -1,4 +1,4 @@
-"""An environment's model refuses edits, and otherwise behaves like any MjModel."""
+"""Test that an environment's model refuses edits, but otherwise behaves like any MjModel."""
 
 import copy
 import pickle
@@ -37,7 +37,7 @@ def test_an_edit_is_refused(edit: Callable[[mujoco.MjModel], object], pickled: b
         model = pickle.loads(pickle.dumps(model))
         assert type(model) is ReadOnlyModel
     own = r"^env\.model is read-only, .* in startup or randomize, or .* as model=$"
-    message = rf"{own}|^(assignment destination|output array) is read-only$"  # NumPy raises the second one
+    message = rf"{own}|^(assignment destination|output array) is read-only$"  # NumPy raises the second message
     with pytest.raises((AttributeError, ValueError), match=message):
         edit(model)
     assert (model.body_mass == mujoco.MjModel.from_xml_string(XML).body_mass).all()
@@ -54,7 +54,7 @@ def test_a_copy_can_be_edited() -> None:
     assert model.opt.timestep == 0.002 and model.body_mass[0] == 0.0
 
 
-def test_mujoco_takes_it_like_any_other() -> None:
+def test_mujoco_accepts_the_read_only_model() -> None:
     model = read_only(mujoco.MjModel.from_xml_string(XML))
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data)

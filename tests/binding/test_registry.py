@@ -52,7 +52,7 @@ def test_a_misspelt_name_is_refused_with_similar_ones() -> None:
 
 
 @pytest.mark.parametrize("task", [3, None, lw.Env])
-def test_something_else_than_a_task_is_refused(task: object) -> None:
+def test_an_object_that_is_not_a_task_is_refused(task: object) -> None:
     with pytest.raises(ValueError, match=r"a task is a name, a file or a subclass of lw\.Task, not "):
         find_task(task)  # type: ignore[arg-type]
 
@@ -66,7 +66,7 @@ def test_a_registered_class_is_found_by_name(load: Load) -> None:
     assert find_task("registered_here") is module.RegisteredHere
 
 
-def test_a_name_of_another_file_or_of_the_package_is_taken(load: Load) -> None:
+def test_a_name_used_by_another_file_or_the_package_is_refused(load: Load) -> None:
     load("first_taker", "import lyceum_warp as lw\n@lw.register\nclass TakenHere(lw.Task):\n    pass\n")
     with pytest.raises(ValueError, match=r"'taken_here' is taken by first_taker.TakenHere: rename yours"):
         load("second_taker", "import lyceum_warp as lw\n@lw.register\nclass TakenHere(lw.Task):\n    pass\n")

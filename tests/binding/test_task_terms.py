@@ -1,4 +1,4 @@
-"""Terms of the reward, terminations and metrics are functions, whose arguments are found by name."""
+"""Test reward terms, terminations and metrics: functions whose arguments are found by name."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
 
 
 def stepped(env: lw.Env, steps: int = 12) -> list[dict[str, np.ndarray]]:
-    """The states before and after each step, its action, reward, metrics and end."""
+    """Collect the states before and after each step, the action, the reward, the metrics and the end."""
     found = []
     generator = torch.Generator().manual_seed(0)
     for _ in range(steps):
@@ -111,7 +111,7 @@ TASK = "class Tiny(lw.Task):"
 
 
 def term(function: str, *lines: str, before: str = "") -> list[tuple[str, str]]:
-    """Changes that add a function, and lines to the class."""
+    """Make changes that add a function and lines of the class."""
     body = "\n".join(f"    {line}" for line in lines or ('rewards = {"upright": 1.0}',))
     return [(TASK, f"{before}@wp.func\n{function}\n\n{TASK}\n{body}")]
 

@@ -1,4 +1,4 @@
-"""A variant extends the structs of its parent, and its parent's functions run over them."""
+"""Test variants, which extend their parent's structs and run its functions over them."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Refuse functions that write out of range before they damage memory."""
+"""Detect functions that write out of range, before they damage memory."""
 
 import subprocess
 import sys
