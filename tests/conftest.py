@@ -14,7 +14,7 @@ import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.support.warp_log import start_warp
 
-# the tests' batches are too small to divide, and on a busy machine torch's threads wait for each other
+# the tests' batches are too small to parallelise, and on a busy machine torch's threads wait for each other
 torch.set_num_threads(1)
 
 SAME_FUNCTIONS = (
@@ -26,7 +26,7 @@ SAME_MODELS = (
     "adroit_door", "adroit_hammer", "adroit_relocate", "aloha_lift", "arm_hand_pickup", "herb_reach", "humanoid_get_up",
     "humanoid_standup", "inverted_double_pendulum", "pusher", "reacher", "swimmer", "walker2d",
 )  # fmt: skip
-"""Tasks whose models have nothing that others lack, so that they need no quick tests of the Warp engine."""
+"""Tasks whose models have no unique features, so that they need no quick tests on the Warp engine."""
 
 
 def long_if_alike(tasks: Iterable[str], *more: str) -> list[Any]:

@@ -1,4 +1,4 @@
-"""Tasks of arbitrary models obey the rules on every engine that supports the model; others refuse it in one line."""
+"""Test that tasks of arbitrary models obey the rules on every engine that supports the model; others raise one line."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from lyceum_warp.testing import CHECKS, check_task
 from lyceum_warp.testing import episode_rules as episodes
 
 OPTIONS: dict[str, dict[str, Any]] = {
-    "mujoco": {  # without a slow check that does not depend on the model
+    "mujoco": {  # omits a slow check that does not depend on the model
         "nworld": 3, "steps": 20, "frame_skip": 2, "checks": [c for c in CHECKS if c is not episodes.check_memory],
     },
     "warp": {"nworld": 2, "steps": 20, "horizon": 6, "frame_skip": 1, "checks": MODEL_CHECKS},
@@ -141,7 +141,7 @@ RICH = text(
 FIELDS = ("eq_active", "history", "plastic", "energy", "flexvert_xpos", "flexedge_length", "flexedge_velocity")
 
 
-def test_fields_of_some_models_are_the_same_on_both_engines_and_in_mujoco() -> None:
+def test_fields_of_only_some_models_are_equal_on_both_engines_and_in_mujoco() -> None:
     seen = []
     for engine in ("mujoco", "warp"):
         env = lw.make(moving(RICH), engine=engine, nworld=2, fields=FIELDS, seed=1)
@@ -162,7 +162,7 @@ def test_fields_of_some_models_are_the_same_on_both_engines_and_in_mujoco() -> N
         torch.testing.assert_close(*(fields[name] for fields in seen), rtol=1e-3, atol=1e-3, msg=name)
 
 
-def test_an_equality_constraint_is_switched_on_at_a_reset_alike_on_both_engines() -> None:
+def test_an_equality_constraint_activated_at_a_reset_acts_equally_on_both_engines() -> None:
     """The engine accepts boolean values, too."""
     ends = []
     for engine in ("mujoco", "warp"):
@@ -184,7 +184,7 @@ def test_an_equality_constraint_is_switched_on_at_a_reset_alike_on_both_engines(
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_an_empty_field_rolls_out(engine: str) -> None:
+def test_a_rollout_accepts_an_empty_field(engine: str) -> None:
     env = lw.make(sensing(SENSING["no sensors"]), engine=engine, nworld=2, autoreset=False, seed=1)
     rollout = lw.OpenLoop(env, 3)
     rollout.state.copy_(env.get_state()[0])

@@ -1,4 +1,4 @@
-"""Index-checked copies of Warp functions find mistakes and compute the same numbers."""
+"""Test that index-checked copies of Warp functions find mistakes and compute the same numbers."""
 
 import re
 import sys

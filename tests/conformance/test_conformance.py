@@ -1,4 +1,4 @@
-"""Every task of the package obeys the rules on both engines, and some tasks also on a toy engine."""
+"""Check the rules for every task of the package on both engines, and for some tasks on a toy engine."""
 
 import pytest
 from conftest import SAME_FUNCTIONS, SAME_MODELS, settle
@@ -30,7 +30,7 @@ PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.starts
 
 @pytest.fixture(autouse=True)
 def settled_again() -> None:
-    """Drop objects of earlier tests, because the memory rule counts all objects."""
+    """Free the objects of earlier tests, because the memory rule counts all objects."""
     settle()
 
 

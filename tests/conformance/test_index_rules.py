@@ -1,4 +1,4 @@
-"""The index rule finds mistakes in a task's file that otherwise give wrong numbers without an error."""
+"""Test that the index rule finds mistakes in a task's file that would silently give wrong numbers."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Every rule fails if one place of an environment is changed to violate it."""
+"""Test that every rule fails if an environment is patched to violate it."""
 
 import itertools
 from collections.abc import Callable, Iterable
@@ -74,7 +74,7 @@ def spoil_rewards(env: lw.Env) -> None:
 
 
 def count_steps_as_none(method: Function) -> Function:
-    """Judge states with the step counter at zero, so that they draw the reset's noise."""
+    """Set the step counter to zero while states are judged, so that their noise equals that of the reset."""
 
     def judge(self: Worlds, *args: Any, **kwargs: Any) -> None:
         kept = self.counters.step.numpy().copy()
@@ -184,7 +184,7 @@ FULL_BREAKS: list[Break] = [
 SETTLED_BREAKS: list[Break] = [
     ("settle", MujocoEngine, "settle", at_once),
 ]
-"""Rules with patched functions for its variant that settles."""
+"""Rules with patched functions for the variant of this task that settles."""
 
 ALL_BREAKS = [
     *(("hopper", *broken) for broken in BREAKS),
@@ -224,7 +224,7 @@ def test_a_task_with_every_feature_keeps_the_rules_of_the_form_on_the_warp_engin
     check_task(Full, engine="warp", nworld=2, frame_skip=1, checks=checks)
 
 
-def test_every_rule_is_broken_once() -> None:
+def test_every_rule_has_a_patch_that_breaks_it() -> None:
     rules = {f"check_{rule}" for _, rule, *_ in ALL_BREAKS}
     assert rules == {check.__name__ for check in CHECKS}
 

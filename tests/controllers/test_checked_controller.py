@@ -64,7 +64,7 @@ def test_a_bad_action_or_plan_is_refused(run: Run, env: lw.Env) -> None:
             run(env, controller)
 
 
-def test_action_holds_or_interpolates_a_plan_with_longer_steps_and_skips_in_a_finer_one(env: lw.Env) -> None:
+def test_action_holds_or_interpolates_a_coarser_plan_and_skips_steps_of_a_finer_plan(env: lw.Env) -> None:
     plan = torch.tensor([[0.0, 1.0], [1.0, 3.0], [2.0, 9.0]])
 
     def applied(timestep: float, steps: int, **words: str) -> list[float]:
@@ -110,7 +110,7 @@ def test_a_function_is_described_by_its_name(env: lw.Env, tmp_path: Path) -> Non
     assert Trajectory.load(episode.save(tmp_path / "a.npz")).seed is None
 
 
-def test_settings_are_described_as_json_holds_them(env: lw.Env, tmp_path: Path) -> None:
+def test_settings_are_described_by_json_values(env: lw.Env, tmp_path: Path) -> None:
     episode = control(env, SamplingPlanner(0), steps=1)
     assert episode.controller["name"] == "SamplingPlanner" and episode.controller["smoothing"] == [1.0, 0.0]
     assert isinstance(episode.controller["odd"], str)

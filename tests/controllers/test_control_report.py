@@ -61,7 +61,7 @@ def test_a_quantile_of_too_few_plans_is_missing(episode: Trajectory, times: np.n
     assert report.miss_share is None and ("planning time max", "-") in report.rows()
 
 
-def test_the_interval_of_the_success_is_wilsons(episode: Trajectory) -> None:
+def test_success_has_wilsons_confidence_interval(episode: Trajectory) -> None:
     for successes, low, high in ((8, 0.4902, 0.9433), (0, 0, 0.2775), (10, 0.7225, 1)):
         ten = [
             dataclasses.replace(episode, success=torch.ones(40, dtype=torch.bool) & (i < successes)) for i in range(10)

@@ -51,7 +51,7 @@ def test_the_seed_determines_the_episode(env: lw.Env) -> None:
     assert torch.equal(one.states, same.states) and not torch.equal(one.states, other.states)
 
 
-def test_shifts_start_with_zero_after_a_reset_and_with_one_without(env: lw.Env) -> None:
+def test_the_first_shift_is_zero_after_a_reset_and_one_otherwise(env: lw.Env) -> None:
     planner = StepPlanner(env)
     assert control(env, planner, seed=4, steps=4).done_reason == 0
     assert planner.shifts == [0, 1, 1, 1] and planner.resets == [4]
@@ -61,7 +61,7 @@ def test_shifts_start_with_zero_after_a_reset_and_with_one_without(env: lw.Env) 
 
 
 @pytest.mark.parametrize("ratio, shifts", [(2.0, [0, 0, 1, 0, 1, 0, 1]), (0.25, [0, 4, 4, 4, 4, 4, 4])])
-def test_a_run_in_two_parts_shifts_as_one_run(env: lw.Env, ratio: float, shifts: list[int]) -> None:
+def test_a_run_in_two_parts_shifts_plans_like_a_single_run(env: lw.Env, ratio: float, shifts: list[int]) -> None:
     planner = StepPlanner(env)
     planner.timestep = ratio * env.timestep
     control(env, planner, steps=3)

@@ -40,7 +40,7 @@ def test_policy_episodes_equals_evaluate(env: lw.Env, shared_env: SharedEnv) -> 
     ]
 
 
-def test_an_episode_can_be_replayed_to_the_bit(env: lw.Env) -> None:
+def test_an_episode_can_be_replayed_bit_for_bit(env: lw.Env) -> None:
     episode = list(policy_episodes(env, push, 2, seed=1))[1]
     one = lw.make("hopper", horizon=60, autoreset=False)
     one.set_state(episode.states[:1])

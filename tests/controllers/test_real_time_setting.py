@@ -9,7 +9,7 @@ SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 
 
 class Machine:
-    """A machine whose planning time is proportional to the samples and the horizon, beside a constant."""
+    """A machine whose planning time is a constant plus a part proportional to samples times horizon."""
 
     def __init__(self, microseconds: float, constant: float = 1e-3, **faster: float) -> None:
         self.cost, self.constant, self.faster = 1e-6 * microseconds, constant, faster
@@ -33,7 +33,7 @@ def test_the_largest_number_of_samples_that_meets_the_deadline_is_chosen(microse
     assert len(machine.measured) == len(set(machine.measured)) <= 5
 
 
-def test_the_choice_is_one_line_with_the_next_number_of_samples() -> None:
+def test_the_choice_is_printed_in_one_line_with_the_next_larger_number_of_samples() -> None:
     choice = choose_setting(SAMPLES, [32], ["fast"], Machine(3.5), deadline=0.015)
     assert str(choice) == "64 samples, horizon 32, physics fast: 8.17 ms of 15 ms; 128 would take 15.3 ms"
     assert str(choose_setting([64], [8], [None], Machine(1.0), deadline=0.02)) == (
@@ -41,7 +41,7 @@ def test_the_choice_is_one_line_with_the_next_number_of_samples() -> None:
     )
 
 
-def test_a_shorter_horizon_comes_before_other_physics_and_both_only_if_necessary() -> None:
+def test_a_shorter_horizon_is_tried_before_other_physics_and_both_only_if_necessary() -> None:
     physics = ["exact", "fast"]
     assert choose_setting(SAMPLES, [32, 16], physics, Machine(10.0, fast=10.0), deadline=0.015).setting == (
         RealTimeSetting(32, 32, "exact")
@@ -55,7 +55,7 @@ def test_a_shorter_horizon_comes_before_other_physics_and_both_only_if_necessary
     assert machine.measured[:2] == [RealTimeSetting(16, 32, "exact"), RealTimeSetting(16, 16, "exact")]
 
 
-def test_without_a_setting_in_time_the_fastest_is_replanned_less_often() -> None:
+def test_if_no_setting_meets_the_deadline_the_fastest_one_replans_less_often() -> None:
     choice = choose_setting(SAMPLES, [32, 16], [None], Machine(100.0), deadline=0.01)
     assert choice.setting == RealTimeSetting(16, 16) and choice.replan_every == 4  # 26.6 ms are 3.3 times 8 ms
     assert str(choice) == (

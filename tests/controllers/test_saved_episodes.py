@@ -41,7 +41,7 @@ def test_several_files_and_folders_are_loaded_in_order(folder: Path, episodes: l
         loaded[first].part("qpoz")
 
 
-def test_an_environment_of_the_episodes_shows_and_continues_them(folder: Path) -> None:
+def test_episode_env_restores_and_continues_episodes(folder: Path) -> None:
     loaded = load_episodes(folder)
     made = episode_env(loaded)
     assert (made.nworld, made.autoreset, made.horizon) == (1, False, 5)
@@ -160,7 +160,7 @@ def test_a_task_file_that_others_can_write_is_not_run(
     assert ran.exists()
 
 
-def test_a_task_that_is_not_a_text_is_refused(episodes: list[lw.Trajectory], tmp_path: Path) -> None:
+def test_a_task_name_that_is_not_a_string_is_refused(episodes: list[lw.Trajectory], tmp_path: Path) -> None:
     path = dataclasses.replace(episodes[0], source={"task": ["a"]}).save(tmp_path / "episode.npz")
     with pytest.raises(ValueError, match=r"episode.npz is broken.*source has \['a'\] as its task"):
         load_episodes(path)

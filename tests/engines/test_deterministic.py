@@ -1,4 +1,4 @@
-"""The deterministic mode sorts contacts and rows, and graphs share scratch memory."""
+"""Test the deterministic mode: contacts and rows are sorted, and graphs share scratch memory."""
 
 import contextlib
 import copy
@@ -87,7 +87,8 @@ def forwarded(request: pytest.FixtureRequest) -> tuple[WarpEngine, CanonicalOrde
 
 
 def contents(*owners: object) -> dict[str, np.ndarray]:
-    return {f.name: getattr(o, f.name).numpy().copy() for o in owners for f in dataclasses.fields(o)}  # type: ignore[arg-type]
+    # type: ignore[arg-type]
+    return {f.name: getattr(o, f.name).numpy().copy() for o in owners for f in dataclasses.fields(o)}
 
 
 def test_shuffled_contacts_are_sorted_into_the_same_order(forwarded: tuple[WarpEngine, CanonicalOrder]) -> None:
@@ -154,7 +155,8 @@ def test_a_contact_field_that_is_not_sorted_is_refused(
 ) -> None:
     """A new version of MuJoCo Warp may add such a field."""
     engine, _ = forwarded
-    known = {name: kind for name, kind in order.Contacts.vars.items() if name != "adhesion"}  # type: ignore[attr-defined]
+    # type: ignore[attr-defined]
+    known = {name: kind for name, kind in order.Contacts.vars.items() if name != "adhesion"}
     monkeypatch.setattr(order.Contacts, "vars", known)
     with pytest.raises(ValueError, match="can't sort contacts with the field 'adhesion' of this mujoco_warp"):
         CanonicalOrder(copy.copy(engine.m), engine.d)
@@ -199,7 +201,8 @@ def test_captured_launches_share_their_scratch(monkeypatch: pytest.MonkeyPatch) 
     scratch.deallocate(more, 2000)
     assert not device.freed
     for within in (True, False):
-        device.stream.is_capturing, device.is_capturing = within, within  # in the graph, or without any capture
+        # memory of the graph, or allocated without a capture
+        device.stream.is_capturing, device.is_capturing = within, within
         assert scratch.allocate(300) == -300
         scratch.deallocate(-300, 300)
     assert device.freed == [-300, -300] and scratch.peak == 4096 + 2048

@@ -60,7 +60,7 @@ def make(
     initial: np.ndarray | None = None,
     written: tuple[str, ...] = (),
 ) -> Engine:
-    """Return an engine whose named model fields differ between worlds, after a reset."""
+    """Return an engine after a reset, whose given model fields differ between worlds."""
     kept = [describe(model, name) for name in (*STATE, *fields)]
     kept += [describe(model, name, written=True) for name in written]
     dynamics = [describe_model_field(model, name) for name in names]
@@ -135,7 +135,7 @@ def test_constants_equal_a_recompiled_models(engine: type[Engine]) -> None:
 
 
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
-def test_worlds_run_as_plain_mujoco_does_on_their_models(engine: type[Engine]) -> None:
+def test_worlds_step_like_plain_mujoco_with_their_models(engine: type[Engine]) -> None:
     made, plain = make(engine, *DRAWN), make(ToyEngine, *DRAWN)
     draw(made)
     draw(plain)
@@ -157,7 +157,7 @@ CHANGES: Mapping[str, float] = {
 
 @pytest.mark.parametrize("name", CHANGES)
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
-def test_a_field_that_is_zero_in_the_model_acts_only_in_one_world(engine: type[Engine], name: str) -> None:
+def test_a_field_that_is_zero_in_the_model_can_act_in_a_single_world(engine: type[Engine], name: str) -> None:
     model = copy.copy(MODEL)
     if name == "wind":
         model.opt.density = 100.0

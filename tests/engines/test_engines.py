@@ -1,4 +1,5 @@
-"""Both engines treat fields, controls, resets and options alike, even those that no task of the package uses."""
+"""Test that both engines handle fields, controls, resets and options equally, even if no task of the package uses
+them."""
 
 import gc
 from pathlib import Path
@@ -151,7 +152,7 @@ def test_a_view_of_a_field_outlives_its_environment(engine: str) -> None:
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_additional_fields_leave_the_numbers_unchanged(file: Path, engine: str) -> None:
-    """Only the state grows, by the field of the acceleration stage."""
+    """Only the size of the state changes: it gains the field of the acceleration stage."""
     plain = lw.make(file, engine=engine, nworld=2, seed=3)
     other = lw.make(file, engine=engine, nworld=2, seed=3, fields=["qacc_warmstart", "xpos", "qacc"])
     parts = list(plain.state_space.parts)

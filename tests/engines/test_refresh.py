@@ -1,4 +1,5 @@
-"""A refresh equals a full forward pass to the bit, but computes only the parts that fields and sensors need."""
+"""Test that a refresh equals a full forward pass bit for bit, but computes only the parts that fields and sensors
+need."""
 
 from typing import Any
 
@@ -267,7 +268,7 @@ def test_a_refresh_uses_the_equality_constraints_of_each_world(kind: type[Engine
     assert (shown(engine)["sensordata"] != held).any(axis=1).tolist() == [False, True, False, False]
 
 
-def test_the_sensor_of_a_limit_that_ended_is_zero(kind: type[Engine]) -> None:
+def test_a_limit_sensor_is_zero_after_the_limit_is_left(kind: type[Engine]) -> None:
     engine = make(kind, "limits")
     knee = int(engine.model.joint("knee").qposadr[0])
     column = state_columns(engine.model, "qpos").start + knee
@@ -283,7 +284,7 @@ def test_the_sensor_of_a_limit_that_ended_is_zero(kind: type[Engine]) -> None:
         check_current(engine)
 
 
-def test_fields_of_two_states_do_not_mix_in_an_mjdata_that_worlds_use_in_turn() -> None:
+def test_worlds_that_share_an_mjdata_do_not_mix_their_fields() -> None:
     """The stage after the step runs in an MjData that worlds share. Fields that it does not compute hold another
     world's values."""
     model, device = model_of(SENSORS["mixed"]), wp.get_device("cpu")
@@ -305,7 +306,7 @@ def test_fields_of_two_states_do_not_mix_in_an_mjdata_that_worlds_use_in_turn() 
             rows = np.concatenate([engine.arrays[field.name].numpy() for engine in apart])
             np.testing.assert_array_equal(together.arrays[field.name].numpy(), rows, err_msg=f"{field.name} {lagged}")
             assert len(np.unique(rows.reshape(4, -1), axis=0)) == 4, field.name
-    early = early_sensor_columns(model)  # sensors of the current state; the others are the last substep's
+    early = early_sensor_columns(model)  # sensors of the current state; the other sensors belong to the last substep
     for state, shown in zip(together.batch.state, together.arrays["sensordata"].numpy(), strict=True):
         data = mujoco.MjData(model)
         mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)

@@ -1,4 +1,5 @@
-"""Buffers for contacts and constraints cover what a task may enable, or a warning is logged."""
+"""Test that contact and constraint buffers are large enough for everything a task may enable, or a warning is
+logged."""
 
 import mujoco
 import pytest
@@ -103,13 +104,13 @@ OBJECTS = {
 
 
 @pytest.mark.parametrize("kind", OBJECTS)
-def test_room_includes_the_rows_of_inactive_constraints_of_every_type(kind: str) -> None:
+def test_buffers_have_rows_for_inactive_constraints_of_every_type(kind: str) -> None:
     model = mujoco.MjModel.from_xml_string(JOINED.format(10 * OBJECTS[kind].format("false")))
     without = mujoco.MjModel.from_xml_string(JOINED.format(""))
     assert probe_sizes(model)[1] - probe_sizes(without)[1] == -(-10 * EQUALITIES[kind] // 8) * 8
 
 
-def test_drawn_ranges_count_every_limit() -> None:
+def test_randomized_ranges_reserve_rows_for_every_limit() -> None:
     joints = "".join(
         f'<body pos="{i} 0 0"><joint range="-900 900" limited="true"/><geom size=".1"/></body>' for i in range(20)
     )

@@ -1,4 +1,5 @@
-"""Compare the Warp engine's step with MuJoCo Warp's to the bit, with any element of a model and any field of World."""
+"""Compare the Warp engine's step with MuJoCo Warp's bit for bit, for all kinds of model elements and fields of
+World."""
 
 import copy
 import itertools
@@ -123,7 +124,7 @@ def check_or_refuse(case: Case, device: wp.Device) -> None:
 
 
 @pytest.mark.parametrize("case", table.covering(1), ids=table.title)
-def test_a_step_equals_mujoco_warps_own_to_the_bit(case: Case, device: wp.Device) -> None:
+def test_a_step_equals_mujoco_warps_own_bit_for_bit(case: Case, device: wp.Device) -> None:
     """The cases cover all levels of all factors."""
     check_or_refuse(case, device)
 
@@ -165,7 +166,7 @@ OF_ANOTHER_MODEL = {
     "tendon_solref_fri": {"tendons": "friction"}, "tendon_solimp_fri": {"tendons": "friction"},
     "pair_solreffriction": {"cone": "elliptic"},
 }  # fmt: skip
-"""Levels that a model needs in addition to ``DRAWN``, so that a field has an effect."""
+"""Levels that a model needs in addition to ``DRAWN`` for a field to have an effect."""
 
 
 def touching(model: mujoco.MjModel) -> np.ndarray:
@@ -195,7 +196,7 @@ def test_a_drawn_field_acts_as_in_an_edited_model(name: str, device: wp.Device) 
     model = spec.compile()
     edited, field = copy.copy(model), describe_model_field(model, name)
     value = field.value(edited)
-    # the friction force of a joint that slips, as most do, does not depend on solref
+    # most joints slip, and the friction force of a slipping joint does not depend on solref
     most = 3.0 if name == "dof_solref" else 1.1
     drawn = value * np.random.default_rng(0).uniform(1.0, most, size=value.shape) + 0.03 * (value == 0)
     if name.endswith("quat"):
@@ -239,7 +240,7 @@ def test_refused_combinations_are_refused(levels: dict[str, tuple[str, ...]], re
 
 
 def test_the_table_knows_every_member_of_mujocos_enums() -> None:
-    """An element of a new MuJoCo version fails here until the table has it or gives a reason."""
+    """A new MuJoCo element fails here until the table contains it or gives a reason for its absence."""
     models = [table.model_of(case) for case in table.singles()]
     for enum, members in table.ENUMS.items():
         found = {int(member) for model in models for member in members(model)}
