@@ -82,7 +82,7 @@ class Kind:
     mutate: Callable[[bytes, Random], bytes]
     readers: tuple[str, ...]
     names: tuple[str, ...] = ()
-    """Words that an error may contain in place of the file's name."""
+    """Words that an error may contain instead of the file's name."""
 
 
 _checkpoint = functools.partial(mutations.mutated_checkpoint, canary=CANARY)
@@ -251,7 +251,7 @@ def _make(folder: Path) -> None:
     command("train", "point_mass", "--horizon", "8", "--out", folder / "run", *options)
     motion = f"motion={folder / 'table.npy'}"
     command("train", folder / "slide.py", "--out", folder / "kept", "--param", motion, *options)
-    for run in ("run", "kept"):  # gives the files a constant length
+    for run in ("run", "kept"):  # makes the length of the files constant
         path = folder / run / "metrics.csv"
         path.write_text(re.sub(r"\d+\.\d{9,}", lambda found: found[0][:8], path.read_text()))
     config = json.loads((folder / "kept/config.json").read_text())

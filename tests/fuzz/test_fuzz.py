@@ -1,4 +1,5 @@
-"""Damage files, command lines and arguments at random: each works, or is refused with an error that gives the reason.
+"""Damage files, command lines and arguments at random; each must work or be refused with an error that gives the
+reason.
 
 A failure names its case and the command that repeats it.
 """

@@ -118,7 +118,7 @@ def run(env: lw.Env, steps: int) -> list[torch.Tensor]:
 
 
 def test_an_unused_torch_graph_does_not_break_a_capture() -> None:
-    """Python deletes it during any garbage collection, and CUDA forbids that during a capture."""
+    """Any garbage collection may delete the graph, which CUDA forbids during a capture."""
     env = lw.make("hopper", nworld=8, device=CUDA)
     env.step()
     graph, x = torch.cuda.CUDAGraph(), torch.zeros(4, device=CUDA)
@@ -164,7 +164,7 @@ def test_a_capture_does_not_break_running_graphs() -> None:
 
 
 @pytest.mark.parametrize("task", ["hopper", "humanoid", "half_cheetah"])
-def test_deterministic_runs_are_equal_to_the_bit(task: str) -> None:
+def test_deterministic_runs_are_equal_bit_for_bit(task: str) -> None:
     """Thousands of worlds need more blocks than the device runs at once."""
     env = lw.make(task, nworld=8192, device=CUDA, deterministic=True)
     first = run(env, 50)

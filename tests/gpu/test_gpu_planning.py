@@ -31,7 +31,7 @@ def plant(task: str) -> lw.Env:
 
 
 @pytest.mark.parametrize("task, horizon", [("reach", 16), ("half_cheetah", 8), ("cartpole_swingup", 20)])
-def test_plans_agree_with_the_cpus(task: str, horizon: int) -> None:
+def test_plans_agree_with_plans_on_the_cpu(task: str, horizon: int) -> None:
     env = plant(task)
     # at a low temperature rounding could choose between samples
     gpu, cpu = (
@@ -83,7 +83,7 @@ def test_actions_are_on_the_device_of_the_states(of_plants: str, of_plan: str) -
 
 
 @pytest.mark.parametrize("update", UPDATES)
-def test_every_update_on_a_gpu_equals_that_on_the_cpu_for_the_same_returns(update: str) -> None:
+def test_every_update_gives_equal_results_on_gpu_and_cpu_for_equal_returns(update: str) -> None:
     """The first improvement's returns differ by rounding, which may swap samples that are almost equal."""
     gpu, cpu = (
         lw.MPPI("reach", device=device, engine=engine, samples=200, seed=3, **UPDATES[update])
@@ -103,7 +103,7 @@ def test_every_update_on_a_gpu_equals_that_on_the_cpu_for_the_same_returns(updat
 
 
 @pytest.mark.parametrize("update", UPDATES)
-def test_replayed_plans_of_every_update_equal_those_without_graphs(update: str) -> None:
+def test_replayed_plans_of_every_update_equal_plans_without_graphs(update: str) -> None:
     env = plant("reach")
     replayed, direct = (
         lw.MPPI("reach", device=CUDA, engine="warp", deterministic=True, graphs=graphs, iterations=2, **UPDATES[update])
@@ -130,7 +130,7 @@ def test_plans_of_every_update_allocate_nothing_and_do_not_wait(update: str) -> 
 
 
 @pytest.mark.parametrize("risk", ["mean", "worst"])
-def test_plans_in_several_models_on_a_gpu_equal_those_on_the_cpu(risk: Any) -> None:
+def test_plans_in_several_models_are_equal_on_gpu_and_cpu(risk: Any) -> None:
     gpu, cpu = (
         lw.MPPI(Varied, device=device, engine=engine, horizon=4, samples=20, models=3, risk=risk, temperature=10.0)
         for device, engine in ((CUDA, "warp"), ("cpu", "mujoco"))

@@ -60,7 +60,7 @@ def test_a_loaded_state_continues_with_new_graphs() -> None:
         next(one)
     other = made(learning_rate=2e-3)
     next(other)
-    next(other)  # its graph holds the addresses of moments that loading replaces
+    next(other)  # the old graph holds the addresses of moments that loading replaces
     other.load_state_dict(one.state_dict())
     for _ in range(3):
         first, second = next(one), next(other)

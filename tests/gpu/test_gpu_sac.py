@@ -1,4 +1,4 @@
-"""SAC on a GPU: captured updates equal direct ones, no synchronization, and exact resumption."""
+"""Test SAC on a GPU: captured updates equal direct ones, nothing synchronizes, and resumption is exact."""
 
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ def made(**changes: Any) -> lw.SAC:
 
 
 @pytest.mark.parametrize("changes", [{}, {"n_step": 3, "actor_every": 2, "critic_bound": "mean", "replay": 640}])
-def test_captured_updates_have_the_numbers_of_direct_ones(changes: dict[str, Any]) -> None:
+def test_captured_updates_equal_direct_ones(changes: dict[str, Any]) -> None:
     captured, direct = made(**changes), made(**changes)
     direct._learn.enabled = False
     for _ in range(3):
@@ -63,7 +63,7 @@ def test_a_state_is_continued_after_other_graphs() -> None:
         next(one)
     other = made()
     next(other)
-    next(other)  # its graph holds the addresses of moments that loading replaces
+    next(other)  # the old graph holds the addresses of moments that loading replaces
     other.load_state_dict(one.state_dict())
     other.replay.load_state_dict(one.replay.state_dict())
     for _ in range(2):

@@ -54,7 +54,7 @@ def test_any_world_is_shown_after_one_frame() -> None:
     assert np.isfinite(session.stage.frame().samples).all() and all("fault" not in message for message in messages)
 
 
-def test_continuing_after_stepping_back_gives_the_same_numbers_to_the_bit() -> None:
+def test_continuing_after_stepping_back_gives_identical_numbers() -> None:
     env = lw.make("hopper", nworld=64, device="cuda", deterministic=True)
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=1)
     states = [env.get_state()]

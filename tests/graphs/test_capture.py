@@ -1,4 +1,4 @@
-"""Phases that consist of launches become graphs, with the same numbers in the same order."""
+"""Test that phases of launches become graphs that compute the same numbers in the same order."""
 
 import gc
 import threading
@@ -69,7 +69,7 @@ def follow(digit: int, number_inout: wp.array[int], first: int):
     number_inout[w] = 10 * number_inout[w] + digit
 
 
-def test_each_thread_steps_a_part_of_the_worlds_in_phases_that_allow_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_share_the_worlds_in_phases_that_allow_it(monkeypatch: pytest.MonkeyPatch) -> None:
     digits, sizes = wp.zeros(5, dtype=int, device="cpu"), []
     launch = wp.launch
 
@@ -103,7 +103,7 @@ def count_down(number_inout: wp.array[int], turns_inout: wp.array[int]):
 
 
 def test_a_graph_holds_only_the_launches_of_its_own_thread() -> None:
-    """Meanwhile another thread launches, copies, loops and captures its own graphs, and gets its own numbers."""
+    """Meanwhile another thread launches, copies, loops and captures its own graphs; it must get its own results."""
     mine, captured = Digits(), []
     cpu, number, turns, copied = wp.get_device("cpu"), *(wp.full(1, 3, dtype=int, device="cpu") for _ in range(3))
     own = Digits()

@@ -1,4 +1,4 @@
-"""Kernels are compiled ahead of the first step, with progress."""
+"""Test that kernels are compiled before the first step, and that progress is shown."""
 
 import os
 import runpy

@@ -1,4 +1,5 @@
-"""A rehearsal finds the kernels that a function would launch; it relies on names in Warp that must not change."""
+"""Test that a rehearsal finds the kernels that a function would launch, and that Warp still has the names it relies
+on."""
 
 import inspect
 import subprocess
@@ -51,7 +52,7 @@ def arrays() -> tuple[wp.array, wp.array, wp.array]:
     return mask, wp.full(2, 1, dtype=wp.float64, device="cpu"), wp.zeros((3, 2), dtype=wp.float64, device="cpu")
 
 
-def test_a_rehearsal_notes_launches_instead_of_making_them(arrays: tuple[wp.array, wp.array, wp.array]) -> None:
+def test_a_rehearsal_lists_launches_without_running_them(arrays: tuple[wp.array, wp.array, wp.array]) -> None:
     flag = wp.zeros(1, dtype=int, device="cpu")
     with rehearse() as rehearsal:
         launch(*arrays)

@@ -1,4 +1,4 @@
-"""Environments that are made, stepped and dropped in parallel threads give the same numbers as in one thread."""
+"""Test that environments in parallel threads give the same numbers as in one thread."""
 
 import threading
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Threads run all parts of a graph in parallel, raise any part's error, and end with their pool."""
+"""Test worker threads: they run the parts of a graph in parallel, raise any part's error, and end with their pool."""
 
 import gc
 import signal
@@ -28,7 +28,7 @@ def test_calls_run_side_by_side_on_the_threads() -> None:
     assert threads.count(threading.current_thread()) == 3 and len(set(threads)) == 3
 
 
-def test_calls_start_the_threads_that_they_need_and_the_last_reference_ends_them() -> None:
+def test_threads_start_on_demand_and_end_with_the_last_reference() -> None:
     before = own_threads()  # threads of other tests' engines may end in the meantime
     workers = Workers(3)
     assert not own_threads() - before
@@ -43,7 +43,7 @@ def test_calls_start_the_threads_that_they_need_and_the_last_reference_ends_them
     assert not own_threads() - before
 
 
-def test_an_interrupt_waits_for_the_calls_that_still_work() -> None:
+def test_an_interrupt_waits_for_running_calls() -> None:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell makes background processes ignore it
     ended: list[bool] = []
     begun = threading.Event()
@@ -64,7 +64,7 @@ def test_an_interrupt_waits_for_the_calls_that_still_work() -> None:
 
 
 @pytest.mark.parametrize("place", [0, 1])
-def test_an_error_of_any_call_is_raised_once_all_have_ended(place: int) -> None:
+def test_an_error_is_raised_after_all_calls_have_ended(place: int) -> None:
     ended = []
 
     def late() -> None:

@@ -1,4 +1,4 @@
-"""Compare heights of a height field with MuJoCo's rays, and changes of the level with their definition."""
+"""Compare heights of a height field with MuJoCo's rays, and level changes with their definition."""
 
 import mujoco
 import numpy as np
@@ -14,7 +14,7 @@ OFFSET = (0.5, -0.25, 0.125)
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    """A field of random heights, with cells of different sides, whose geom is not at the origin."""
+    """Make a field of random heights with rectangular cells, whose geom is not at the origin."""
     spec = mujoco.MjSpec()
     heights = np.random.default_rng(0).uniform(size=NROW * NCOL)
     spec.add_hfield(name="field", size=SIZE, nrow=NROW, ncol=NCOL, userdata=heights)
@@ -51,7 +51,7 @@ def look_up(ground: wp.array2d[float], points: wp.array[wp.vec2], out: wp.array2
 
 
 def looked_up(ground: wp.array, points: np.ndarray) -> np.ndarray:
-    """Height, normal, whether the field covers the point, and distance of the point 2 m above 0, (n, 6)."""
+    """Look up height, normal, coverage, and the distance of a point at height 2 m, (n, 6)."""
     out = wp.zeros((len(points), 6), dtype=float, device="cpu")
     wp.launch(look_up, len(points), [ground, wp.array(points, dtype=wp.vec2, device="cpu"), out], device="cpu")
     found: np.ndarray = out.numpy()
@@ -98,7 +98,7 @@ def test_heights_on_edges_and_diagonals_equal_mujocos_rays(model: mujoco.MjModel
     np.testing.assert_allclose(looked_up(ground, top)[:, 0], numbers[-1], atol=1e-6)
 
 
-def test_a_point_outside_has_the_height_of_the_nearest_point_of_the_edge(ground: wp.array) -> None:
+def test_a_point_outside_has_the_height_of_the_nearest_edge_point(ground: wp.array) -> None:
     center, half = np.array(OFFSET[:2]), np.array(SIZE[:2])
     points = center + np.array([(3.0, 0.3), (-9.0, 0.3), (0.3, 2.0), (0.3, -1e6), (5.0, 5.0)])
     nearest = np.clip(points, center - half, center + half)

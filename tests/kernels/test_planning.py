@@ -87,7 +87,7 @@ def test_noise_has_the_given_covariance() -> None:
     np.testing.assert_allclose(np.cov(added.T), wanted, atol=3e-5)
 
 
-def test_one_number_standard_deviations_and_a_diagonal_covariance_give_equal_samples() -> None:
+def test_equivalent_forms_of_the_noise_give_equal_samples() -> None:
     plans = [MPPI("point_mass", horizon=10, noise=noise) for noise in (0.1, [0.1, 0.1], np.diag([0.01, 0.01]))]
     for plan in plans:
         plan(plan.state_of())

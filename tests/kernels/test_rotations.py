@@ -121,7 +121,7 @@ def test_rotation_vectors_equal_mujocos(found: dict[str, np.ndarray]) -> None:
     assert found["angle"][12] == 0 and found["angle"].max() <= 3.1415928
 
 
-def test_small_rotations_keep_their_digits(found: dict[str, np.ndarray]) -> None:
+def test_small_rotations_do_not_lose_precision(found: dict[str, np.ndarray]) -> None:
     a, _, _, _ = inputs()
     np.testing.assert_allclose(found["to_rotvec"][8], 2 * a[8, 1:].astype(float), rtol=1e-6)
     np.testing.assert_allclose(found["to_rotvec"][9], -2 * a[9, 1:].astype(float), rtol=1e-6)
@@ -129,7 +129,7 @@ def test_small_rotations_keep_their_digits(found: dict[str, np.ndarray]) -> None
     np.testing.assert_allclose(found["from_rotvec"][1], [1, 0.5e-6, 0, 0], rtol=1e-6)
 
 
-def test_a_matrix_gives_its_quaternion_back(found: dict[str, np.ndarray]) -> None:
+def test_quaternion_to_matrix_and_back_is_the_identity(found: dict[str, np.ndarray]) -> None:
     a, _, _, _ = inputs()
     largest = np.abs(a).argmax(axis=1)
     assert set(largest) == {0, 1, 2, 3}

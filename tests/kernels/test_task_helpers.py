@@ -134,7 +134,7 @@ def bound(x: wp.array[float], limits: wp.vec2, one: wp.array[bool], every: wp.ar
     every[i] = lw.all_inside(x, i, x.shape[0], limits)
 
 
-def test_inside_leaves_out_the_bounds_and_nan() -> None:
+def test_inside_is_false_at_the_bounds_and_for_nan() -> None:
     x = np.array([np.nan, -1.0, INF, -INF, 2.0, 1.999, 0.0], dtype=np.float32)
     one, every = (wp.zeros(len(x), dtype=bool, device="cpu") for _ in range(2))
     wp.launch(bound, len(x), [wp.array(x, dtype=float, device="cpu"), wp.vec2(-1.0, 2.0), one, every], device="cpu")
@@ -168,7 +168,7 @@ def grasps(distance: wp.array[float], finger: wp.array[float], out: wp.array2d[f
     out[i, 2] = grasp
 
 
-def test_grasp_terms_ask_for_open_fingers_on_the_way_and_closed_ones_at_the_target() -> None:
+def test_grasp_terms_reward_open_fingers_on_the_way_and_closed_fingers_at_the_target() -> None:
     cases = {  # distance, finger: near, reach, grasp
         (0.0, 0.005): (1.0, 1.0, 1.0),
         (0.0, 0.04): (1.0, 1.0, 0.0),

@@ -35,8 +35,8 @@ PARAMS: dict[str, dict[str, Any]] = {
     "go1_velocity": {"fall_angle": 0.5},
     "soft_ball": {"reach": 0.15},
 }
-"""Parameters with which random field values end some episodes; and limits of the solver for robots whose own limits
-stop it before it converges, so that the engines differ by more than rounding."""
+"""Parameters with which random field values end some episodes, and solver limits for robots whose own limits stop the
+solver before it converges (the engines would then differ by more than rounding)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,7 +185,7 @@ def judge(env: lw.Env, before: Outcome, action: torch.Tensor, after: Outcome) ->
     for batch, values in ((env.worlds.before, before), (env.worlds.after, after)):
         for name, value in values.items():
             field = torch_view(getattr(batch, name))
-            if field.stride(0) == 0:  # a field of the model, which all worlds share
+            if field.stride(0) == 0:  # a model field that all worlds share
                 continue
             kept.append((field, field.clone()))
             field.copy_(value)
@@ -275,7 +275,7 @@ def test_after_one_substep_the_engines_differ_by_rounding(engines: Engines) -> N
     [(Pushed, {}), (Pushed, {"reach": 0.0}), (Pushed, {"force": 0.0}), (Drawn, {}), (Drawn, {"spread": 0.0})],
     ids=["pushes_and_moves", "pushes", "moves_a_mocap_body", "draws", "draws_gravity"],
 )
-def test_after_fifty_steps_the_engines_differ_by_rounding_also_if_the_task_writes_inputs(
+def test_the_engines_agree_over_fifty_steps_with_written_inputs_and_randomized_models(
     task: type[lw.Task], params: dict[str, float], device: str
 ) -> None:
     """``control`` writes inputs; masses, frictions and gravity are random; the steps take 150 substeps."""

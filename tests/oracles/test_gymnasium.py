@@ -249,7 +249,7 @@ def test_a_pendulum_is_evaluated_by_its_angle_or_height(task: str, metric: Calla
         assert pair.step().eval == pytest.approx(metric(pair.theirs.data), abs=1e-6)
 
 
-def test_the_force_at_the_end_of_the_rail_is_gymnasiums() -> None:
+def test_the_force_at_the_end_of_the_rail_equals_gymnasiums() -> None:
     """The test places the cart there, because the pole falls earlier under random actions."""
     pair = Pair(make_ours("inverted_double_pendulum"), make_theirs("inverted_double_pendulum"))
 
@@ -311,8 +311,9 @@ RANGES = [(task, name) for task in HEALTHY for name in inspect.signature(unchang
 
 
 @pytest.mark.parametrize(("task", "bounded"), [*((task, None) for task in HEALTHY), *RANGES])
-def test_a_state_is_terminal_if_it_is_in_gymnasium(task: str, bounded: str | None) -> None:
-    """Random states lie on both sides of all bounds, or on both sides of one range while all other ranges are wide."""
+def test_states_are_terminal_as_in_gymnasium(task: str, bounded: str | None) -> None:
+    """Random states lie on both sides of all bounds, or on both sides of a single range while the other ranges are
+    wide."""
     wide = {name: (-1e6, 1e6) for other, name in RANGES if other == task and bounded not in (None, name)}
     if bounded is not None and math.isinf(max(keywords(task)[bounded])):
         wide[bounded] = (keywords(task)[bounded][0], 2.0)
@@ -399,7 +400,7 @@ def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
     for edge in (np.min, np.max):
         assert np.abs(edge(a, axis=0) - edge(b, axis=0))[bounded].max(initial=0.0) < 0.05 * np.ptp(a)
     assert (ks_distance(a, b) < 2.6 * math.sqrt(2.0 / n)).all()
-    # dependence between coordinates: their correlation, and the distance of pairs from the mean
+    # dependence between coordinates: their correlation, and the distances of pairs from the mean
     assert np.abs(np.corrcoef(a.T) - np.corrcoef(b.T)).max() < 5.5 * math.sqrt(2.0 / n)
     pairs = np.array(list(itertools.combinations(range(a.shape[1]), 2)))[:200].T
     lengths = [np.hypot(x[:, pairs[0]], x[:, pairs[1]]) for x in (a, b)]
@@ -426,7 +427,7 @@ def keywords(task: str) -> dict[str, Any]:
 
 
 def variants(default: Any) -> list[Any]:
-    """Return values other than the default; for a range, the side to narrow."""
+    """Return values that differ from the default; for a range, return the side to narrow."""
     if isinstance(default, bool):
         return [not default]
     if isinstance(default, tuple):
@@ -437,12 +438,13 @@ def variants(default: Any) -> list[Any]:
 
 
 def cases() -> list[Any]:
-    """Return (task, parameter, variant) for every parameter; later variants are long, except sides of a range."""
+    """Return (task, parameter, variant) for every parameter. All variants after the first are marked long, except for
+    ranges."""
     found = []
     for task in TASKS:
         for name, default in keywords(task).items():
             if name == "reset_noise_scale":
-                continue  # the tests of distributions above cover it
+                continue  # the tests of distributions above cover this parameter
             for i, variant in enumerate(variants(default)):
                 marks = pytest.mark.long if i and not isinstance(default, tuple) else ()
                 found.append(pytest.param(task, name, variant, marks=marks))
@@ -457,7 +459,8 @@ class Numbers:
     steps: list[tuple[float, float, bool]]
 
     def changed(self, default: "Numbers") -> float:
-        """Return the share of terminal steps if terminations differ from the default's, or else of changed steps."""
+        """Return the fraction of terminal steps if terminations differ from the default's; otherwise of changed
+        steps."""
         ends, default_ends = ([step[2] for step in numbers.steps] for numbers in (self, default))
         if ends != default_ends:
             return float(np.mean(ends))

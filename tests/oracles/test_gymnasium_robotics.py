@@ -51,7 +51,7 @@ def geoms(pair: mujoco.MjsPair) -> set[str]:
 
 @functools.cache
 def oracle_class(name: str) -> type[MujocoEnv]:
-    """Return their environment with the task's changes of the model, and without duplicate contact pairs."""
+    """Return their environment with the task's changes to the model, and without duplicate contact pairs."""
     registered: Any = load_env_creator(ENTRIES[name])
 
     class Oracle(registered):  # type: ignore[misc]
@@ -245,7 +245,7 @@ def pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
     return list(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
 
 
-def test_the_registered_environment_agrees_until_contacts_differ(make_pair: MakePair, task: str) -> None:
+def test_their_unchanged_environment_agrees_until_contacts_differ(make_pair: MakePair, task: str) -> None:
     """Compare with their unchanged model until a contact occurs that ours lacks or that theirs counts twice."""
     pair = make_pair(registered(task))
     ours, theirs = pair.ours.model, pair.theirs.model

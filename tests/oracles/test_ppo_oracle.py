@@ -75,7 +75,7 @@ def test_an_update_gives_the_same_parameters_as_rsl_rl(
         torch.nn.init.xavier_uniform_(module.network[-1].weight, generator=torch.Generator().manual_seed(0))
     given = samples(ppo)
     other = theirs(ppo, given)
-    used = config.minibatches * ppo.minibatches.batch  # rsl_rl shuffles only these
+    used = config.minibatches * ppo.minibatches.batch  # rsl_rl shuffles only these tensors
     order = torch.randperm(used, generator=torch.Generator().manual_seed(0))
     order = torch.cat([order, torch.arange(used, STEPS * N)])
     monkeypatch.setattr(torch, "randperm", lambda count, **_: order[:count])

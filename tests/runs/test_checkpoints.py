@@ -21,7 +21,7 @@ def run(tmp_path: Path) -> Run:
 
 
 class Mine(torch.nn.Module):
-    """A policy of a user's own, which has no shape."""
+    """A user's policy, which has no shape."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -69,7 +69,7 @@ def test_broken_and_foreign_checkpoints_are_refused_in_one_line(run: Run, kind: 
 
 
 def read_or_refused(path: Path, data: bytes, bit: int) -> dict[str, Any] | None:
-    """The content of a file after one bit was flipped; None if the file is refused."""
+    """Read a file after one bit was flipped; return None if the file is refused."""
     damaged = bytearray(data)
     damaged[bit // 8] ^= 1 << bit % 8
     path.write_bytes(damaged)
@@ -119,7 +119,7 @@ def test_a_policy_of_any_class_is_saved_without_a_value_function(tmp_path: Path)
         load_value(run)
 
 
-def test_a_module_of_the_package_is_rebuilt_from_its_class_and_shape(tmp_path: Path) -> None:
+def test_a_module_of_the_package_is_recreated_from_its_class_and_shape(tmp_path: Path) -> None:
     """A value function in place of a policy represents policies of later releases."""
     run = Run.create(tmp_path / "run", {})
     run.save(policy_content(1, ValueFunction(3, (4,))), {})
@@ -128,7 +128,7 @@ def test_a_module_of_the_package_is_rebuilt_from_its_class_and_shape(tmp_path: P
 
 
 @pytest.mark.parametrize("name", ["os.system", "lyceum_warp.cli.__main__.main", "lyceum_warp.algos.npg.NPG"])
-def test_a_file_can_make_only_modules_of_the_package(name: str, run: Run) -> None:
+def test_a_file_can_only_create_modules_of_the_package(name: str, run: Run) -> None:
     content = read_checkpoint(run.policy, parts=("iteration", "policy"))
     content["policy"]["class"] = name
     torch.save(content, run.policy)

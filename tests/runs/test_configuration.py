@@ -41,7 +41,7 @@ def test_a_learner_is_rebuilt_from_its_description(kind: str) -> None:
 @pytest.mark.parametrize(
     ("saved", "options"),
     [
-        (None, PhysicsOptions()),  # a run that is older than this option
+        (None, PhysicsOptions()),  # the run is older than this option
         ({"integrator": None, "solver": {}, "deterministic": False, "unroll": False}, PhysicsOptions()),
         (
             {"integrator": "euler", "solver": {"iterations": 7}, "deterministic": True, "unroll": False},
@@ -58,7 +58,7 @@ def test_physics_of_a_run_are_read_from_its_configuration(saved: dict[str, objec
         assert found.hyperparameters == lw.NPGConfig(hidden=(8,))
 
 
-def test_options_among_the_parameters_of_an_earlier_run_are_options() -> None:
+def test_options_that_earlier_releases_stored_as_parameters_are_options() -> None:
     params = {"mass": 2, "horizon": 9, "nthread": 2, "frame_skip": 3, "graphs": False}
     found = read(BASE | {"engine": "warp", "device": "cuda:0", "params": params, "options": {"horizon": 5}})
     assert found.params == {"mass": 2}

@@ -118,7 +118,7 @@ def test_load_returns_the_same_policy(run: Run) -> None:
 
 
 def test_a_failed_save_keeps_the_old_checkpoint(run: Run) -> None:
-    """A file size limit stands for a full disk."""
+    """A file size limit simulates a full disk."""
     before, limits = run.checkpoint.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limits[1]))
     try:
@@ -130,7 +130,7 @@ def test_a_failed_save_keeps_the_old_checkpoint(run: Run) -> None:
     assert not list(run.folder.glob("*.tmp"))
 
 
-def test_a_checkpoint_keeps_the_one_before_it(run: Run, caplog: pytest.LogCaptureFixture) -> None:
+def test_saving_a_checkpoint_keeps_the_previous_one(run: Run, caplog: pytest.LogCaptureFixture) -> None:
     run.save(content(1, GaussianPolicy(3, 2)), {"counter": 6})
     assert run.read()["iteration"] == 1
     run.checkpoint.write_bytes(b"PK half")

@@ -27,7 +27,7 @@ os.kill(os.getpid(), 9)
 
 
 def held(folder: Path, *, seconds: float = 0.0, **changes: Any) -> None:
-    """Write the lock of a running process, last touched some seconds ago."""
+    """Write the lock of a running process, with its last heartbeat the given number of seconds ago."""
     pid = os.getppid()
     owner = {"host": platform.node(), "pid": pid, "started": lock._started(pid), "token": "theirs"}
     (folder / "lock").write_text(json.dumps(owner | changes))
@@ -130,7 +130,7 @@ def test_the_lock_of_another_host_is_only_taken_over_on_request(
 def test_a_writer_whose_lock_was_taken_over_writes_nothing_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """When it ends, it leaves the new holder's lock."""
+    """When the writer ends, it does not remove the new holder's lock."""
     folder, found, takers = tmp_path / "run", {}, []
 
     def callback(iteration: lw.Iteration) -> None:

@@ -43,7 +43,7 @@ def test_an_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.
 
 @pytest.mark.parametrize("gamma", [0.9, 0.995])
 def test_the_value_function_of_an_old_run_keeps_its_scale(gamma: float, old_run: Path) -> None:
-    """Its file lacks the scale, which was 1 / (1 - gamma)."""
+    """The file lacks the scale, which was 1 / (1 - gamma)."""
     content = torch.load(old_run / "checkpoint.pt", weights_only=True)
     content["value"]["shape"] |= {"scale": 1.0 / (1.0 - gamma), "discount": gamma}
     torch.save(content, old_run / "checkpoint.pt")
@@ -61,8 +61,8 @@ def test_the_value_function_of_an_old_run_keeps_its_scale(gamma: float, old_run:
 
 @pytest.fixture(params=["command", "python", "task_file"])
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A run of two iterations by release 0.1: by the command, in Python with the user's model, and of a task file whose
-    model, mesh and table are only in the run's copy."""
+    """A run of two iterations by release 0.1: from the command line, from Python with the user's model, or of a task
+    file whose model, mesh and table exist only in the run's copy."""
     return Path(shutil.copytree(DATA / "runs_0_1" / request.param, tmp_path / "run"))
 
 
@@ -74,7 +74,7 @@ def test_a_run_of_0_1_loads_and_is_evaluated(run: Path, capsys: pytest.CaptureFi
     assert "2 episodes of the mean policy" in capsys.readouterr().out
 
 
-def test_a_run_of_0_1_resumes_and_another_begins_with_it(run: Path, tmp_path: Path) -> None:
+def test_a_run_of_0_1_resumes_and_starts_another_run(run: Path, tmp_path: Path) -> None:
     before = Run.open(run)
     assert main(["train", "--resume", str(run), "--trust", "--iterations", "4", *QUIET]) == 0
     after = Run.open(run)
@@ -104,7 +104,9 @@ def test_a_run_of_rsl_rl_loads_is_evaluated_and_exported(rsl_rl_run: Path, capsy
     torch.testing.assert_close(exported(obs), policy(obs))
 
 
-def test_ppo_begins_with_a_run_of_rsl_rl(rsl_rl_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ppo_continues_from_a_run_of_rsl_rl(
+    rsl_rl_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out, begin = tmp_path / "new", ["train", "--from", str(rsl_rl_run), "--iterations", "1"]
     assert main(begin) == main(["train", "--resume", str(rsl_rl_run), "--iterations", "5"]) == 2
     assert "was trained by 'rsl-rl', a learner of a program" in capsys.readouterr().err
@@ -117,4 +119,4 @@ def test_ppo_begins_with_a_run_of_rsl_rl(rsl_rl_run: Path, tmp_path: Path, capsy
     change = (new.network[0].weight - old.network[0].weight).abs().max()
     assert 0.0 < change < 0.1
     ppo = lw.PPO(lw.make("point_mass", nworld=4), old, lw.load_value(rsl_rl_run), lw.PPOConfig(num_steps=12))
-    assert next(ppo).kl > 0.0  # in Python, too
+    assert next(ppo).kl > 0.0  # also from Python

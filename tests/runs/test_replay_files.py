@@ -1,4 +1,4 @@
-"""The replay buffer in a run's folder: what a killed save leaves, and what a save writes."""
+"""Test the replay buffer in a run's folder: killed saves, and the files that a save writes."""
 
 import signal
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from lyceum_warp.runs.folder import Run
 
 
 def made(replay: int = 80) -> lw.SAC:
-    """Make a learner of 12 steps an iteration; by default its buffer holds 20 steps."""
+    """Make a learner with 12 steps per iteration; by default its buffer holds 20 steps."""
     config = lw.SACConfig(
         hidden=(8,), value_hidden=(8,), num_steps=12, warmup=40, batch=16, updates=1, replay=replay, mean_every=0
     )
@@ -43,7 +43,7 @@ class Killed(BaseException):
     (replay_files, "write_content", 0), (replay_files, "write_content", 7), (Run, "save", 0),
     (saving, "clean_replay", 0),
 ])  # fmt: skip
-def test_a_save_killed_at_any_file_leaves_a_run_that_continues_to_the_same_numbers(
+def test_a_run_whose_save_was_killed_at_any_file_continues_identically(
     owner: Any, name: str, calls: int, whole: list[dict[str, Any]], tmp_path: Path
 ) -> None:
     """Each iteration overwrites 12 of 20 steps, so the kill comes while the checkpoint's files are being replaced."""
@@ -65,12 +65,12 @@ def test_a_save_killed_at_any_file_leaves_a_run_that_continues_to_the_same_numbe
     assert len(list((tmp_path / "run" / "replay").iterdir())) == 20
 
 
-def test_an_interrupted_run_continues_to_the_same_numbers(whole: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_an_interrupted_run_continues_identically(whole: list[dict[str, Any]], tmp_path: Path) -> None:
     def interrupting(iteration: lw.Iteration) -> None:
         if iteration.iteration == 3:
             signal.raise_signal(signal.SIGINT)
 
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may make its children ignore it
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may make its children ignore SIGINT
     try:
         with pytest.raises(KeyboardInterrupt):
             lw.train(made(), tmp_path / "run", iterations=5, callback=interrupting)
@@ -82,7 +82,7 @@ def test_an_interrupted_run_continues_to_the_same_numbers(whole: list[dict[str, 
 
 
 def test_a_save_writes_only_the_parts_that_have_grown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A part has 4 of 200 steps; an iteration fills three."""
+    """A part has 4 of 200 steps; an iteration fills three parts."""
     written: list[str] = []
     write: Callable[..., None] = replay_files.write_content
 
@@ -95,7 +95,7 @@ def test_a_save_writes_only_the_parts_that_have_grown(tmp_path: Path, monkeypatc
     lw.train(made(replay=800), folder, iterations=2, save_every=1)
     ends = [int(name.rpartition("-")[2]) for name in written]
     assert ends == [4, 8, 12, 16, 20, 24]
-    (folder / "checkpoint.pt").write_bytes(b"")  # a loss of power; previous.pt remains
+    (folder / "checkpoint.pt").write_bytes(b"")  # simulate a power loss; previous.pt remains
     notes: list[str] = []
     monkeypatch.setattr("lyceum_warp.training.log.warning", notes.append)
     lw.train(made(replay=800), folder, iterations=3, resume=True, save_every=1)

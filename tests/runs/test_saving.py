@@ -1,4 +1,4 @@
-"""Decide when a run is saved; a folder that cannot be written ends the run and keeps its last save."""
+"""Test when a run is saved, and that an unwritable folder ends the run but keeps its last save."""
 
 import os
 import resource
@@ -28,7 +28,7 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("seconds, wait", [(0.02, SHARE * 0.02), (1.0, SAVE_SECONDS), (9.0, LONG * 9.0)])
-def test_saves_take_a_small_share_of_the_time(seconds: float, wait: float, npg: lw.NPG, tmp_path: Path) -> None:
+def test_saving_takes_a_small_fraction_of_the_time(seconds: float, wait: float, npg: lw.NPG, tmp_path: Path) -> None:
     saver = Saver(Run.create(tmp_path / "run", {}), npg)
     saver.save()
     assert saver.saved == 0 and not saver.due()
@@ -52,7 +52,7 @@ def trained_with(folder: Path, at_three: Callable[[], Any]) -> OSError:
 
 
 def test_a_file_that_cannot_be_written_ends_the_run_and_leaves_its_last_save(six: Path, tmp_path: Path) -> None:
-    """A file size limit stands for a full disk: the policy fits, the complete state does not."""
+    """A file size limit simulates a full disk: the policy fits, but the complete state does not."""
     folder, limits = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
     size = 2 * os.path.getsize(six / "policy.pt")
     assert size < os.path.getsize(six / "checkpoint.pt")

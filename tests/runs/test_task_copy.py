@@ -97,7 +97,7 @@ def returns(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     capsys.readouterr()
     assert cli.main(["eval", *arguments, "--episodes", "2"]) == 0
     output = capsys.readouterr()
-    print(output.err)  # ``refused`` reads it
+    print(output.err)  # ``refused`` reads this line
     return next(line for line in output.out.splitlines() if line.strip().startswith("return"))
 
 
@@ -145,7 +145,7 @@ URDF = """<robot name="arm"><mujoco><compiler meshdir="../meshes" strippath="tru
 
 @pytest.mark.parametrize("kind", ["attached", "urdf", "python"])
 def test_all_files_of_a_model_are_copied(kind: str, folder: Path) -> None:
-    """The models attach another model, are a URDF, or are made in Python."""
+    """The models attach another model, come from a URDF, or are made in Python."""
     robot = folder / "mine" / "robot"
     (robot / "arm.urdf").write_text(URDF)
     (robot / "whole.xml").write_text(
@@ -231,7 +231,7 @@ def test_an_edited_model_is_reported_and_the_runs_copy_is_used(
 
 
 @pytest.mark.parametrize("moved", [False, True])
-def test_a_run_that_begins_with_another_uses_its_copy_of_the_model(
+def test_a_run_started_from_another_run_uses_its_copy_of_the_model(
     moved: bool, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, robot, warm = trained(folder), folder / "mine" / "robot", folder / "warm"
@@ -250,7 +250,7 @@ def test_a_run_that_begins_with_another_uses_its_copy_of_the_model(
     env = env_of(warm)
     assert np.array_equal(env.model.body_mass, masses)
     assert cli.main(["train", "--resume", str(warm), "--iterations", "2", *QUIET]) == 0
-    if not moved:  # a task that is given by name is used in its current form
+    if not moved:  # a task given by name is used in its current version
         arguments[4] = str(folder / "new")
         assert cli.main([*arguments, "1", str(folder / "mine" / "slide.py")]) == 0
         env = env_of(folder / "new")
@@ -292,7 +292,7 @@ def test_a_task_defined_in_a_program_is_evaluated_from_a_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=SMALL), tmp_path / "run", iterations=1)
-    Run.open(tmp_path / "run").amend(task=None)  # as saved for a class of a notebook
+    Run.open(tmp_path / "run").amend(task=None)  # as the configuration is saved for a class in a notebook
     assert cli.main(["eval", str(tmp_path / "run")]) == 2
     refused(
         capsys,

@@ -1,4 +1,4 @@
-"""A run folder of another user runs no code and reads no file that it names until this user trusts it."""
+"""Test that another user's run folder runs no code and reads no files that it names until this user trusts it."""
 
 import json
 import shutil
@@ -52,7 +52,8 @@ def witness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def theirs(made: Path, witness: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Copy the run of the task file as another user receives it: elsewhere, without the original files, untrusted."""
+    """Copy the run of the task file as another user would receive it: elsewhere, without the original files,
+    untrusted."""
     folder = made / "theirs"
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(made / "own", folder, copy_function=shutil.copy)
