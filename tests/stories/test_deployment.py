@@ -1,4 +1,4 @@
-"""A policy's ONNX file alone runs a robot in plain MuJoCo as the environment does."""
+"""Run a robot in plain MuJoCo with only the policy's ONNX file, and compare with the environment."""
 
 import copy
 import json

@@ -1,4 +1,4 @@
-"""Only a transition ends an episode, and both engines report the same reason for the same fault."""
+"""Test that only a transition ends an episode, and that both engines report the same reason for the same fault."""
 
 import gymnasium
 import numpy as np
@@ -76,7 +76,7 @@ def test_a_fresh_state_does_not_end_an_episode(autoreset: bool, engine: str) -> 
     assert env.get_terminated(fresh).any()
     assert not env.done.any() and not env.done_reason.any()
     env.step()
-    assert env.terminated.any()  # some worlds stay in such a state
+    assert env.terminated.any()  # some worlds stay in states for which ``terminated`` holds
     if not autoreset:
         assert torch.equal(env.terminated, env.get_terminated(env.get_state()))
     env.set_state(fresh)
@@ -107,7 +107,7 @@ def test_a_reset_clears_the_end_of_the_previous_episode() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_rule_gives_the_same_result_alone_and_among_all(seed: int) -> None:
+def test_a_rule_gives_the_same_result_alone_and_after_the_other_rules(seed: int) -> None:
     rule = next(check for check in CHECKS if check.__name__ == "check_set_state_shows")
     check_task(Leave, steps=20, seed=seed, nworld=8)
     check_task(Leave, steps=20, seed=seed, nworld=8, checks=[rule])

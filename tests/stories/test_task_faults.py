@@ -1,4 +1,5 @@
-"""Invalid values that a task writes stay in their world, are reported by name, and never produce an invalid state."""
+"""Test that invalid values written by a task affect only their world, are reported by name, and never produce an
+invalid state."""
 
 import mujoco
 import pytest

@@ -115,7 +115,7 @@ def test_draws_do_not_accumulate_over_resets(engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_the_draw_of_a_world_changes_no_other(engine: str) -> None:
+def test_randomizing_one_world_changes_no_other(engine: str) -> None:
     env, still = (lw.make(Drawn, nworld=3, engine=engine, horizon=0) for _ in range(2))
     mask = torch.tensor([False, True, False])
     for i, action in enumerate(random_actions(env, 8)):
@@ -148,7 +148,7 @@ def test_model_fields_can_be_set_in_an_environment_of_any_task(engine: str) -> N
     assert torch.equal(qpos[0, 1], qpos[2, 1])  # still in the air
     assert not torch.equal(qpos[0], qpos[1])
     env.rand_reset()
-    assert torch.equal(env.field("body_mass"), masses)  # no reset draws it again
+    assert torch.equal(env.field("body_mass"), masses)  # resets do not randomize this field again
     state = env.get_state()
     assert torch.equal(state[:, env.state_space.parts["body_mass"]].float(), masses)
     other = env.replicate(nworld=3)
@@ -195,7 +195,7 @@ def test_a_number_that_is_not_finite_is_a_fault_of_its_world(name: str, reason: 
     assert torch.isfinite(judged).all()
     env.set_params(**{name: value})
     assert torch.equal(env.get_reward(before, action, after)[others], judged[others])
-    assert env.get_reward(before, action, after)[1] != 0  # the fault ends with its episode
+    assert env.get_reward(before, action, after)[1] != 0  # the fault does not persist after its episode
 
 
 def test_a_rejected_draw_changes_no_lasting_memory() -> None:
@@ -219,7 +219,7 @@ def test_startup_draws_lasting_memory_once_for_each_world() -> None:
     assert torch.equal(env.obs[:, 1], drawn)
 
 
-def test_a_planners_state_has_no_startup_draws_of_memory() -> None:
+def test_lasting_memory_in_a_planners_state_is_not_randomized_by_startup() -> None:
     plan = lw.MPPI(Gifted, samples=4, horizon=2)
     columns = plan.env.state_space.parts["practice"]
     assert plan.env.get_state()[0, columns].item() >= 1
@@ -239,7 +239,7 @@ def test_model_fields_that_events_change_are_nominal_again_after_a_reset(engine:
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Drawn, DrawnWithControl])
-def test_a_rollout_takes_the_model_of_the_state_or_the_nominal_one(task: type[lw.Task], engine: str) -> None:
+def test_a_rollout_uses_the_model_in_the_state_or_the_nominal_model(task: type[lw.Task], engine: str) -> None:
     env = lw.make(task, nworld=3, engine=engine, autoreset=False, horizon=0, seed=4)
     state, actions = env.get_state()[1], random_actions(env, 4)
     nominal = env.state_space.split(state.clone())
@@ -273,7 +273,7 @@ def test_a_rollout_takes_the_model_of_the_state_or_the_nominal_one(task: type[lw
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Drawn, DrawnWithControl])
-def test_a_planner_takes_the_model_of_the_state_unless_asked_otherwise(task: type[lw.Task], engine: str) -> None:
+def test_a_planner_uses_the_model_in_the_state_unless_nominal_model_is_set(task: type[lw.Task], engine: str) -> None:
     env = lw.make(task, nworld=2, engine=engine)
     state = env.get_state()[:1].clone()
     heavy = state.clone()

@@ -53,7 +53,7 @@ def test_a_signal_after_postponed_without_signals_raises() -> None:
             signal.raise_signal(signal.SIGTERM)
 
 
-def test_a_second_signal_is_handled_at_once_if_it_may_insist() -> None:
+def test_with_insist_a_second_signal_is_handled_at_once() -> None:
     reached = []
     with signals():
         with pytest.raises(Interrupted) as raised, postponed(insist=True):

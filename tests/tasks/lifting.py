@@ -35,7 +35,7 @@ def joints_at(
 
 
 def follow(env: lw.Env, targets: np.ndarray, steps: int) -> None:
-    """Move the servos' targets to the given ones, (nworld, nu), at maximum speed."""
+    """Move the servo targets to the given targets, (nworld, nu), at maximum speed."""
     speed = torch.tensor(env.model.actuator_ctrlrange[:, 1])
     for _ in range(steps):
         act = env.state_space.split(env.get_state())["act"]

@@ -49,7 +49,7 @@ def test_palm_weight_sets_the_sign_of_the_first_term(shared_env: SharedEnv, task
         assert torch.equal(turned.metrics[name], env.metrics[name])
 
 
-def test_success_has_a_threshold(task: str) -> None:
+def test_success_is_a_distance_below_its_threshold(task: str) -> None:
     """The thresholds lie on both sides of the worlds' values."""
     env = lw.make(task, engine="mujoco", nworld=4, nthread=1)
     steps(env)

@@ -17,7 +17,7 @@ JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_ro
 SIDES = ("left", "right")
 
 
-def test_simple_shapes_replace_the_meshes_and_the_masses_stay(shared_env: SharedEnv) -> None:
+def test_simple_shapes_replace_colliding_meshes_without_changing_masses(shared_env: SharedEnv) -> None:
     model, original = shared_env("aloha_lift").model, AlohaLift.model.spec().compile()
     solid = (model.geom_contype | model.geom_conaffinity) > 0
     shapes = [mujoco.mjtGeom(kind) for kind in np.unique(model.geom_type[solid])]

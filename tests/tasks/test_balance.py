@@ -1,4 +1,4 @@
-"""Tasks of balance: servos, pushes, the capture point, and plans that keep the humanoid upright."""
+"""Test the balance tasks: servos, pushes, the capture point, and plans that keep the humanoid upright."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def test_motors_are_servos_within_the_torques_of_the_model(shared_env: SharedEnv
     env.step(action)
     joint = JOINTS.index("left_hip_y")
     column, motor = env.model.joint("left_hip_y").qposadr[0], env.model.actuator("left_hip_y").id
-    torque = 150.0 * (-0.3 + 1.0 * 0.01 - before[0, column])  # the servo has no damping of its own
+    torque = 150.0 * (-0.3 + 1.0 * 0.01 - before[0, column])  # the model's motor has no damping
     assert env.task.params["stiffness"][joint] == 150.0 and env.model.actuator_gear[motor, 0] == 300.0
     assert env.field("ctrl")[0, motor].item() == pytest.approx(torque.item() / 300.0, rel=1e-4)
     assert env.field("ctrl")[1, motor].item() == pytest.approx(0.4)
@@ -52,7 +52,7 @@ def test_capture_is_the_distance_of_the_capture_point_from_the_feet(shared_env: 
     assert moving - still == pytest.approx(np.sqrt(height / 9.81), rel=0.15)
 
 
-def test_a_plan_keeps_the_humanoid_up_that_falls_without(shared_env: SharedEnv) -> None:
+def test_a_planner_keeps_the_humanoid_up_which_falls_without_it(shared_env: SharedEnv) -> None:
     env = shared_env("humanoid_stand", autoreset=False)
     plan = lw.MPPI("humanoid_stand", samples=16, nthread=1)
     assert plan.env.options.physics.timestep == 0.015 and plan.timestep == env.timestep
@@ -63,11 +63,12 @@ def test_a_plan_keeps_the_humanoid_up_that_falls_without(shared_env: SharedEnv) 
     assert fallen.steps < 120
 
 
-def test_getting_up_starts_on_the_back_or_the_front_and_goes_on_while_lying(shared_env: SharedEnv) -> None:
+def test_humanoid_get_up_starts_lying_and_does_not_terminate_while_lying(shared_env: SharedEnv) -> None:
     env = shared_env("humanoid_get_up", nworld=16, autoreset=False)
     qpos = env.field("qpos")
     assert (qpos[:, 2] < 0.4).all()
-    forward = 2.0 * (qpos[:, 4] * qpos[:, 6] - qpos[:, 3] * qpos[:, 5])  # z of the torso's x axis: up on the back
+    # z component of the torso's x axis, which points up if the robot lies on its back
+    forward = 2.0 * (qpos[:, 4] * qpos[:, 6] - qpos[:, 3] * qpos[:, 5])
     assert forward.max() > 0.7 and forward.min() < -0.7
     for _ in range(5):
         env.step(torch.zeros(16, 17))

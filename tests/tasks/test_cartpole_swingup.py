@@ -41,7 +41,7 @@ def cartpole_reward(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, a
 def test_reward_evaluation_and_observation_equal_lyceums_formulas(shared_env: SharedEnv) -> None:
     """The states are random, beyond the rail and the margins; the actions exceed the control range.
 
-    The reward gets the given action, not the clipped control.
+    The reward receives the given action, not the clipped control.
     """
     env = shared_env("cartpole_swingup", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)

@@ -89,7 +89,7 @@ def test_every_term_of_the_reward_equals_its_formula(shared_env: SharedEnv) -> N
     assert min(seen[name] for name in terms) > 20
 
 
-def test_clocks_count_substeps_of_contact_and_of_flight(shared_env: SharedEnv) -> None:
+def test_clocks_count_substeps_in_contact_and_in_the_air(shared_env: SharedEnv) -> None:
     """Compare with MuJoCo's own contacts after every substep."""
     env = shared_env("go1_velocity", nworld=4, autoreset=False, **STILL)
     model = mujoco.MjModel.from_xml_path(GO1)

@@ -12,7 +12,7 @@ import lyceum_warp as lw
 NWORLD = 64
 SIDES = ("left", "right")
 
-MASSES = {  # kg; Barrett D1005 AC-02, and for the BH280 Barrett's mass properties
+MASSES = {  # masses, kg, from Barrett D1005 AC-02; for the BH280 hand from Barrett's mass properties
     "wam_base": 9.97059584,
     "wam1": 10.76768767,
     "wam2": 3.87493756,
@@ -42,7 +42,7 @@ ARM = {  # range in rad (Barrett D1001, tables 5 and 6; HERB turns the first joi
 }
 FINGERS = {"j00": 180, "j10": 180, "j01": 140, "j11": 140, "j21": 140, "j02": 48, "j12": 48, "j22": 48}  # degrees
 
-# the WAM's links in Barrett's frames, whose z axis is the next joint's: moments (xx, yy, zz, xy, xz, yz)
+# inertias (xx, yy, zz, xy, xz, yz) of the WAM's links in Barrett's frames, whose z axis is that of the next joint
 INERTIAS = {
     "wam1": (0.13488033, 0.11328369, 0.09046330, -0.00213041, -0.00012485, 0.00068555),
     "wam2": (0.02140958, 0.01377875, 0.01558906, 0.00027172, 0.00002461, -0.00181920),

@@ -27,7 +27,7 @@ def parts(env: lw.Env, group: str) -> Mapping[str, torch.Tensor]:
 
 
 def ray_height(model: mujoco.MjModel, data: mujoco.MjData, x: float, y: float) -> float:
-    """The height of the field."""
+    """Measure the height of the field by a ray."""
     (field,) = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)
     start, down = np.array([x, y, 9.0]), np.array([0.0, 0.0, -1.0])
     return 9.0 - float(mujoco.mj_rayHfield(model, data, field, start, down, None))
@@ -46,7 +46,7 @@ def put(env: lw.Env, world: int, x: float, y: float) -> None:
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_heights_contacts_and_scans_on_every_kind_of_patch_are_mujocos(task: str, env: lw.Env) -> None:
+def test_heights_contacts_and_scans_on_every_kind_of_patch_equal_mujocos(task: str, env: lw.Env) -> None:
     env.reset()
     for world, (x, y, _) in enumerate(TERRAIN.origins[LAST]):
         put(env, world, x + 2.0, y + 0.3)
@@ -111,7 +111,7 @@ def test_an_episode_ends_outside_the_field(task: str, env: lw.Env) -> None:
 
 @pytest.mark.parametrize("task", long_if_alike(TASKS))
 def test_a_robot_that_falls_on_rough_ground_is_not_thrown_away_by_mujoco_warp(task: str, shared_env: SharedEnv) -> None:
-    """The G1's own soles are boxes, with which MuJoCo Warp finds contacts whose normals point down."""
+    """The G1's own soles are boxes, for which MuJoCo Warp finds contacts with normals that point down."""
     env = shared_env(task, engine="warp", nworld=24)
     rng = np.random.default_rng(0)
     for _ in range(60):

@@ -1,4 +1,5 @@
-"""Compare feet, contacts and forces of every velocity task with MuJoCo's, and check that other joints keep still."""
+"""Compare the feet, contacts and forces of every velocity task with MuJoCo's, and check that other joints keep their
+pose."""
 
 import mujoco
 import numpy as np
@@ -26,7 +27,7 @@ def random_steps(env: lw.Env, steps: int, size: float) -> None:
 
 
 def feet(env: lw.Env, world: int) -> tuple[mujoco.MjData, list[bool]]:
-    """MuJoCo's kinematics of a world, and which feet touch the ground."""
+    """Compute a world's kinematics with MuJoCo, and find the feet that touch the ground."""
     model, data = env.model, mujoco.MjData(env.model)
     data.qpos, data.qvel = env.field("qpos")[world], env.field("qvel")[world]
     mujoco.mj_forward(model, data)
@@ -41,7 +42,7 @@ def feet(env: lw.Env, world: int) -> tuple[mujoco.MjData, list[bool]]:
 
 
 @pytest.mark.parametrize("task", long_if_alike(ROBOTS))
-def test_heights_and_contacts_of_feet_are_mujocos(task: str, env: lw.Env) -> None:
+def test_heights_and_contacts_of_feet_equal_mujocos(task: str, env: lw.Env) -> None:
     n = len(env.task.params["feet"])
     touched = 0
     for _ in range(5):
@@ -57,7 +58,7 @@ def test_heights_and_contacts_of_feet_are_mujocos(task: str, env: lw.Env) -> Non
 
 
 @pytest.mark.parametrize("task", long_if_alike(ROBOTS))
-def test_velocities_of_feet_are_mujocos(task: str, env: lw.Env) -> None:
+def test_velocities_of_feet_equal_mujocos(task: str, env: lw.Env) -> None:
     """Compare the metric: the squared horizontal speed of feet in contact, times the weight and the step's duration."""
     random_steps(env, 12, 1.0)
     env.set_params(least_command=-1.0)
@@ -112,7 +113,7 @@ def test_robots_with_equal_sizes_share_their_kernels(task: str, shared_env: Shar
     assert g1.task.kernels is t1.task.kernels
 
 
-def test_the_family_declares_the_tasks_of_its_modules() -> None:
+def test_tasks_lists_exactly_the_tasks_of_the_familys_modules() -> None:
     assert set(TASKS) <= set(package_task_names())
     for name, module in TASKS.items():
         assert find_task(name).__module__ == f"lyceum_warp.tasks.velocity.{module}"

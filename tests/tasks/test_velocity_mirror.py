@@ -1,4 +1,4 @@
-"""Mirror images of walking robots are those of the physics and of the observations."""
+"""Test that mirrored walking robots have mirrored physics and observations."""
 
 import copy
 from types import SimpleNamespace
@@ -30,7 +30,8 @@ def bound(task: str) -> BoundTask:
 def symmetric(model: mujoco.MjModel, mirror: lw.Mirror) -> mujoco.MjModel:
     """Average masses, gains and ranges of a model with those of its mirror image.
 
-    Published models are not symmetric: centres of mass by up to 6 mm, and the G1 has the left hip's range twice.
+    Published models are not symmetric: centres of mass differ by up to 6 mm, and both hips of the G1 have the left
+    hip's range.
     """
     model, data = copy.copy(model), mujoco.MjData(model)
     data.qpos[:] = 0.0

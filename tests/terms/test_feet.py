@@ -7,7 +7,7 @@ DT, SUBSTEP, SKIP = 0.02, 0.005, 4
 
 
 def test_clocks_and_swings_follow_a_contact_sequence() -> None:
-    """Each world has a contact sequence of its own; its clocks are compared with counts of substeps."""
+    """Each world has its own contact sequence; its clocks are compared with counts of substeps."""
     rng = np.random.default_rng(1)
     touching = rng.random((N, 200)) < 0.5
     touching = np.repeat(touching, rng.integers(1, 5), axis=1)[:, :200]

@@ -1,4 +1,4 @@
-"""Compare terms that only compute a value with their formulas in NumPy."""
+"""Compare terms that only return a value with their formulas in NumPy."""
 
 import inspect
 from collections.abc import Callable
@@ -52,7 +52,7 @@ VALUES: dict[str, Any] = {
     "qpos": QPOS, "qvel": normal(12), "qacc": normal(12), "qfrc_actuator": normal(12), "row": normal(6),
     "sensordata": normal(24), "subtree_angmom": normal(4, 3), "base": 2, "site_xpos": normal(6, 3),
 }  # fmt: skip
-"""Return a value of each argument, for all worlds or per world."""
+"""Functions that return a value for each argument, shared or per world."""
 
 
 def total(rows: np.ndarray) -> np.ndarray:
@@ -60,7 +60,7 @@ def total(rows: np.ndarray) -> np.ndarray:
 
 
 def matrix(qpos: np.ndarray) -> np.ndarray:
-    """The rotation of the base."""
+    """Compute the rotation matrix of the base."""
     w, x, y, z = qpos[:, 3:7].T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -83,7 +83,7 @@ def posture(qpos: np.ndarray, joint_qpos: Any, default_pose: np.ndarray, std: np
 
 
 def vectors(sensordata: np.ndarray, at: Any) -> np.ndarray:
-    """Three numbers of each sensor, (N, sensors, 3)."""
+    """Gather the three numbers of each sensor, (N, sensors, 3)."""
     return np.stack([sensordata[:, i : i + 3] for i in at], axis=1)
 
 

@@ -9,7 +9,7 @@ RNG = np.random.default_rng(0)
 
 
 def of_points(mass: np.ndarray, points: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass, centre of mass, and inertia about it in the body's axes, of point masses (k,) at (k, 3)."""
+    """Compute mass, centre of mass, and inertia about it in the body's axes, of point masses (k,) at (k, 3)."""
     centre = mass @ points / mass.sum()
     x = points - centre
     second = np.einsum("k,ki,kj->ij", mass, x, x)
@@ -17,7 +17,7 @@ def of_points(mass: np.ndarray, points: np.ndarray) -> tuple[float, np.ndarray, 
 
 
 def fields(mass: np.ndarray, points: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """The fields of a body of point masses."""
+    """Compute the model fields of a body that consists of point masses."""
     total, centre, inertia = of_points(mass, points)
     moments, axes = np.linalg.eigh(inertia)
     quat = np.zeros(4)
@@ -26,7 +26,7 @@ def fields(mass: np.ndarray, points: np.ndarray) -> tuple[float, np.ndarray, np.
 
 
 def tensor(moments: np.ndarray, quat: np.ndarray) -> np.ndarray:
-    """An inertia in the body's axes."""
+    """Compute an inertia tensor in the body's axes."""
     axes = np.zeros(9)
     mujoco.mju_quat2Mat(axes, quat.astype(float))
     axes = axes.reshape(3, 3)
@@ -34,7 +34,8 @@ def tensor(moments: np.ndarray, quat: np.ndarray) -> np.ndarray:
 
 
 def bodies(thickness: float) -> tuple[list[tuple[np.ndarray, np.ndarray]], dict[str, np.ndarray]]:
-    """Six point masses per world in a flat cloud, and the fields of two bodies; the masses form the second."""
+    """Draw six point masses per world in a flat cloud, and make the fields of two bodies; the second body consists of
+    them."""
     clouds = [
         (RNG.uniform(0.1, 2.0, 6), RNG.standard_normal((6, 3)) * [1.0, 0.3, thickness] + RNG.standard_normal(3))
         for _ in range(N)

@@ -103,7 +103,7 @@ def robots(s: World, rng: Row[wp.uint32]):
         (robots, "encoder_bias body_mass body_ipos body_inertia body_iquat"),
     ],
 )
-def test_a_function_that_passes_fields_to_be_written_writes_them(function: wp.Function, fields: str) -> None:
+def test_passing_a_field_to_a_function_that_writes_it_counts_as_a_write(function: wp.Function, fields: str) -> None:
     assert written_fields(function) == {*fields.split()}
     assert {write.use for write in find_writes(function)} <= {None}
 
@@ -192,7 +192,7 @@ def test_a_task_draws_robots_and_pushes_them_with_library_functions(task_file: T
     assert np.isfinite(env.reward.numpy()).all()
 
 
-def test_a_library_function_may_write_only_what_its_caller_may(task_file: TaskFile) -> None:
+def test_a_library_function_may_write_only_fields_that_its_caller_may_write(task_file: TaskFile) -> None:
     source = TASK.replace("{further}", "terms.push(s.qpos, s.qvel, wp.vec3(0.5), wp.vec3(0.5), rng)")
     with pytest.raises(ValueError, match=r"observe of the task .* writes s\.qvel in push \(pushes\.py, line \d+\)"):
         lw.make(str(task_file("library_push.py", source)), nworld=1)

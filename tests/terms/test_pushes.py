@@ -1,4 +1,4 @@
-"""Pushes change velocities in the world's axes."""
+"""Test that pushes change velocities in the world's axes."""
 
 import mujoco
 import numpy as np

@@ -43,7 +43,7 @@ def test_a_timer_is_due_after_its_seconds() -> None:
 
 
 @pytest.mark.parametrize(("standing", "controlled"), [(0, 0), (0, 1), (1, 0), (1, 1)])
-def test_the_command_stands_or_follows_a_heading(standing: int, controlled: int) -> None:
+def test_a_command_is_zero_or_turns_towards_its_heading(standing: int, controlled: int) -> None:
     rng = np.random.default_rng(0)
     drawn, target, heading = rng.uniform(-1, 1, (N, 1, 3)), rng.uniform(-3, 3, (N, 1)), rng.uniform(-3, 3, N)
     found = call(

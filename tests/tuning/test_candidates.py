@@ -1,4 +1,4 @@
-"""Settings to try: only what differs from the task and what the engine takes; as flags and as Python."""
+"""Test the settings to try, which must differ from the task and fit the engine, and their flags and Python lines."""
 
 import mujoco
 import pytest

@@ -1,4 +1,4 @@
-"""lw.tune: its results, resuming from their file, and wrong arguments."""
+"""Test lw.tune: results, resuming from their file, and wrong arguments."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -53,7 +53,8 @@ def test_a_stopped_search_resumes_from_its_file(tuned: lw.Tuning, no_measuring: 
         file.write('{"name": "cut off by a ki')
     again = lw.tune("half_cheetah", out=tuned.path, tolerance="loose", **QUICK)
     assert again == tuned
-    rows = lw.tune("half_cheetah", out=tuned.path, tolerance="strict", **QUICK).rows  # only judged again
+    # results are judged again, not measured
+    rows = lw.tune("half_cheetah", out=tuned.path, tolerance="strict", **QUICK).rows
     assert len(rows) <= len(tuned.rows)
 
 
@@ -80,7 +81,7 @@ def test_a_new_row_follows_a_line_that_was_cut_off(tmp_path: Path, monkeypatch: 
     lw.tune("point_mass", out=out, **QUICK)
     assert len(out.read_text().splitlines()) > 1
     monkeypatch.undo()
-    lw.tune("point_mass", out=out, **QUICK)  # reads every line
+    lw.tune("point_mass", out=out, **QUICK)  # getting a row reads every line
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +92,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_runs_policy_is_compared_with_the_runs_parameters(run: Path, tmp_path: Path) -> None:
+def test_a_runs_policy_plays_with_the_runs_parameters(run: Path, tmp_path: Path) -> None:
     rows: list[dict[str, Any]] = []
 
     def stop(row: dict[str, Any]) -> None:
@@ -103,7 +104,7 @@ def test_a_runs_policy_is_compared_with_the_runs_parameters(run: Path, tmp_path:
     assert set(rows[0]["returns"]) == {"random", "policy"}
 
 
-def test_wrong_arguments_are_one_error_each(run: Path, tmp_path: Path) -> None:
+def test_each_wrong_argument_raises_an_error(run: Path, tmp_path: Path) -> None:
     other = tmp_path / "notes.txt"
     other.write_text("bread\nmilk\n")
     wrong: list[tuple[str, dict[str, Any], str]] = [

@@ -1,4 +1,4 @@
-"""Measurements of settings on real tasks."""
+"""Measure settings on real tasks."""
 
 import pytest
 import torch
@@ -30,7 +30,7 @@ def trials(task: str = "half_cheetah", *, policy: bool = False, episodes: int | 
     return Trials(env, lean if policy else None, effort=BRIEF, episodes=episodes)
 
 
-def test_the_task_as_it_is_differs_from_itself_by_exactly_zero() -> None:
+def test_the_unchanged_task_differs_from_itself_by_exactly_zero() -> None:
     row = trials(policy=True).measure(SAME)
     assert row["divergence"] == [0.0, 0.0, 0.0] and row["memory"] == 1.0
     assert set(row["returns"]) == {"random", "policy"}
@@ -39,7 +39,7 @@ def test_the_task_as_it_is_differs_from_itself_by_exactly_zero() -> None:
     assert row["faults_per_million"] == row["reference_faults_per_million"] == 0.0
 
 
-def test_a_crude_setting_is_different_and_diverges_beyond_chaos() -> None:
+def test_a_crude_setting_changes_returns_and_diverges_faster_than_chaos() -> None:
     own = trials(policy=True)
     row = own.measure(CRUDE)
     assert verdict({**row, "speedup_low": 2.0}, "loose") in ("different", "faults")
@@ -57,7 +57,7 @@ def test_the_spread_determines_the_number_of_episodes_within_the_time_limit() ->
     own = trials("hopper", episodes=None, nworld=8)
     coarse = Setting("", "", {"integrator": "implicitfast", "frame_skip": 2, "timestep": 0.004})
     assert own.measure(coarse)["returns"]["random"]["episodes"] > 8
-    assert own.measure(SAME)["returns"]["random"]["episodes"] == 8  # without spread, one batch
+    assert own.measure(SAME)["returns"]["random"]["episodes"] == 8  # if the returns do not vary, one batch suffices
 
 
 def test_a_setting_that_mujoco_refuses_has_its_reason() -> None:
