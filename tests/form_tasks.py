@@ -185,7 +185,7 @@ def count_steps(s0: PracticedWorld, action: Row[float], s1: PracticedWorld, p: P
 
 
 class Practiced(lw.Task):
-    """The longer a world has practiced, the further away its puck starts; the practice is observed."""
+    """A task in which the puck starts further away the longer a world has practiced; the practice is observed."""
 
     model = Drawn.model
     frame_skip = 3

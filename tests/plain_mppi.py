@@ -27,7 +27,7 @@ def hermite(before: Any, left: Any, right: Any, after: Any, f: float) -> Any:
 
 
 class Grid:
-    """Knots at fixed times: of K knots over H steps, knot j is at step j H / K."""
+    """Knots at fixed times: with K knots over H steps, knot j is at step j H / K."""
 
     def __init__(self, horizon: int, knots: int, spline: str) -> None:
         self.horizon, self.distance, self.spline, self.now = horizon, Fraction(horizon, knots), spline, 0
@@ -37,7 +37,7 @@ class Grid:
         return self.now // self.distance - (self.spline == "cubic")
 
     def actions(self, knots: np.ndarray) -> np.ndarray:
-        """Return the actions of all steps; ``knots``, (n, ...), begins with knot ``first()``."""
+        """Interpolate the actions of all steps. The first row of ``knots``, (n, ...), is knot number ``first()``."""
         result = []
         for t in range(self.horizon):
             place = (self.now + t) / self.distance

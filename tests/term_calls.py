@@ -49,7 +49,7 @@ class Call:
 def call(name: str, overload: int = 0, **values: Any) -> Call:
     """Call a function with a value for each argument: one for all worlds, or one for each of the N worlds.
 
-    ``rng`` is a stream of its own in each world. Of the overloads with these arguments, ``overload`` chooses one.
+    Each world has its own stream ``rng``. If several overloads take these arguments, ``overload`` selects one.
     """
     matching = [
         (function, kernel) for function, kernel in KERNELS[name] if {*function.input_types} - {"rng"} == {*values}

@@ -38,7 +38,7 @@ class World:
     sensordata: Row[float]
     level: Row[float] = lw.lasting_memory()
     column: Row[float] = lw.lasting_memory()
-    walked: Row[float] = lw.lasting_memory()  # m, in the episode so far
+    walked: Row[float] = lw.lasting_memory()  # distance in the episode so far, m
     commanded: Row[float] = lw.lasting_memory()
 
 
@@ -50,7 +50,7 @@ class Params:
     patch: float = TERRAIN.patch
     command: float = 1.0  # m/s
     seconds: float = 5.0  # in an episode
-    spread: float = 0.5  # m, of starts around the middle of a patch
+    spread: float = 0.5  # offset of starts from the centre of a patch, m
 
 
 @wp.struct

@@ -56,7 +56,7 @@ MISTAKES = WRONG.findall((ROOT / "docs" / "warp_for_python.md").read_text())
 
 
 @pytest.mark.parametrize("number", range(len(MISTAKES)))
-def test_a_mistake_on_the_page_about_warp_gives_the_message_shown_there(number: int, task_file: TaskFile) -> None:
+def test_mistakes_in_warp_for_python_md_give_the_messages_shown_there(number: int, task_file: TaskFile) -> None:
     function, message = MISTAKES[number]
     task = python_of(ROOT / "docs" / "warp_for_python.md")
     assert task.count("class Measured") == 1
@@ -108,7 +108,7 @@ class Walkthrough:
 
     def command(self, words: list[str]) -> None:
         match words:
-            case ["git", "clone", address]:  # a checkout with one robot, for which another model is substituted
+            case ["git", "clone", address]:  # a checkout with one robot, whose model is replaced by another one
                 robot = self.folder / Path(address).name / "unitree_go1" / "scene.xml"
                 robot.parent.mkdir(parents=True)
                 robot.write_text(lw.gymnasium_model("ant.xml").spec().to_xml())
@@ -128,7 +128,7 @@ class Walkthrough:
 
 @pytest.fixture(autouse=True)
 def short_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replace windows by ones in memory that close after two frames."""
+    """Replace windows by in-memory windows that close after two frames."""
 
     def opened(*words: object, **options: object) -> MemoryWindow:
         return MemoryWindow(lambda frame, number: [] if number < 1 else None)
@@ -160,7 +160,7 @@ def test_commands_and_python_of_a_page_run_in_order(
 
 
 @pytest.mark.long
-def test_tasks_of_the_page_on_your_own_task_keep_the_rules(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tasks_in_own_task_md_pass_check_task(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         check_video()
     except NoVideoError as error:

@@ -15,7 +15,7 @@ import torch
 import lyceum_warp as lw
 
 
-def test_a_field_that_is_not_kept_is_refused_with_the_way_to_get_it() -> None:
+def test_a_field_that_is_not_kept_is_refused_with_a_suggestion() -> None:
     env = lw.make("hopper")
     size = env.state_space.size
     with pytest.raises(ValueError, match=r"does not keep the field 'site_xpos': make it with fields=\['site_xpos'\]"):
@@ -54,7 +54,7 @@ def _use(env: lw.Env, plan: lw.MPPI, loop: lw.OpenLoop, state: torch.Tensor, con
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no fork")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_an_environment_in_a_forked_child_says_that_it_belongs_to_the_parent() -> None:
+def test_an_environment_in_a_forked_child_raises_an_error() -> None:
     env = lw.make("hopper", nworld=64)
     env.step()
     plan, loop = lw.MPPI("hopper", samples=64, horizon=4), lw.OpenLoop(lw.make("hopper", nworld=64, autoreset=False), 4)
@@ -85,8 +85,8 @@ def _make_another(connection: Connection) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no fork")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_an_engine_goes_with_its_environment_before_a_fork(engine: str) -> None:
-    gc.disable()  # reference cycles would stay
+def test_a_deleted_environment_frees_its_engine_before_a_fork(engine: str) -> None:
+    gc.disable()  # reference cycles would keep the engine alive
     try:
         env = lw.make("hopper", nworld=64, engine=engine)
         env.get_reward(state := env.get_state(), env.action, state)
@@ -106,7 +106,7 @@ def test_an_engine_goes_with_its_environment_before_a_fork(engine: str) -> None:
         gc.enable()
 
 
-def test_follow_takes_over_every_parameter_that_either_was_given() -> None:
+def test_follow_copies_parameters_given_to_either_environment() -> None:
     first = lw.make("hopper", nworld=2, healthy_reward=3.0)
     second = first.replicate(nworld=4, ctrl_cost_weight=0.5)
     second.follow(first)
@@ -126,7 +126,7 @@ def test_scratch_worlds_follow_changed_parameters() -> None:
     assert torch.allclose(judged - changed, torch.full((2,), 3 * (1.0 - 1e-3)))
 
 
-def test_an_option_given_as_a_parameter_is_named_as_one() -> None:
+def test_an_option_passed_to_set_params_is_reported_as_an_option() -> None:
     with pytest.raises(ValueError, match=r"'nworld' is an option, not a parameter .* env.replicate\(nworld=...\)"):
         lw.make("hopper").set_params(nworld=3)
 

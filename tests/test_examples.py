@@ -51,7 +51,7 @@ def test_own_policy_improves(run) -> None:
     assert lines[-1].endswith("370 parameters")
 
 
-def test_random_search_gets_a_run_without_code_for_it(run, tmp_path: Path) -> None:
+def test_random_search_gets_a_complete_run_folder(run, tmp_path: Path) -> None:
     """The run has a folder, resumes to the bit, and can be evaluated and exported."""
     once = numbers(r"return (-?[\d.]+)", run("random_search.py", "--out", "once", "--iterations", "6"))
     assert max(once) == 200.0 > 1.5 * once[0]  # the policy earns a reward in every step
@@ -62,7 +62,7 @@ def test_random_search_gets_a_run_without_code_for_it(run, tmp_path: Path) -> No
     assert cli.main(["eval", "twice", "--which", "best", "--episodes", "4"]) == 0
     assert cli.main(["export", "twice", "--to", "policy.pt2"]) == 0
     assert torch.export.load("policy.pt2").module()(torch.zeros(3, 4)).shape == (3, 1)
-    assert cli.main(["train", "--resume", "twice", "--iterations", "9"]) == 2  # the class is defined in a program
+    assert cli.main(["train", "--resume", "twice", "--iterations", "9"]) == 2  # the class is defined in a script
 
 
 def test_td3_learns_and_resumes_with_its_replay_buffer(run, tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ def hopper(engine: str, **options: Any) -> lw.Env:
 
 
 def lay_down(env: lw.Env, world: int) -> None:
-    """Lay a hopper on the floor, with five contacts; a standing one has none."""
+    """Lay a hopper on the floor, where it has five contacts; a standing hopper has none."""
     state, start = env.get_state(), env.state_space.parts["qpos"].start
     state[world, start + 1 : start + 3] = torch.tensor([0.05, 1.5], dtype=state.dtype)
     env.set_state(state, torch.arange(N) == world)
@@ -63,7 +63,7 @@ def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
 def test_too_little_memory_of_the_c_engine_is_a_fault() -> None:
     """As memory shrinks, MuJoCo drops constraints, then contacts; in between it raises an error.
 
-    The version determines which size causes which of these; all three must occur and be reported.
+    Which size causes which fault depends on the MuJoCo version; all three must occur and be reported.
     """
     found = Done(0)
     for memory in range(3000, 14_000, 1000):
@@ -116,7 +116,7 @@ def test_another_overflow_of_the_warp_engine_is_an_engine_warning() -> None:
         env = hopper("warp", model=spec, nconmax=16, njmax=64)
         opt = env.engine.m.opt  # type: ignore[attr-defined]
         opt.contact_sensor_maxmatch = 1
-        opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # they are off, because the task needs no sensor
+        opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # sensors are off, because the task needs none
         return env
 
     env, clean = make(), make()
@@ -140,7 +140,7 @@ def test_faults_print_nothing_over_300_steps(
             state = env.get_state()
             state[BAD, start + i % 6] = (np.nan, np.inf, 1e200, -1e15)[i % 4]
             env.set_state(state, only, check=False)
-            assert torch.isfinite(env.obs).all() and not env.done[BAD]  # the next step finds it
+            assert torch.isfinite(env.obs).all() and not env.done[BAD]  # the next step detects the fault
             assert Done.NAN in step_both(env, clean, 5)  # other faults of such a state may accompany it
     assert env.fault_counts["nan"] == 60
     assert sum(clean.fault_counts.values()) == 0

@@ -62,7 +62,7 @@ def test_an_unknown_field_is_refused_with_similar_ones(model: mujoco.MjModel) ->
 
 
 @pytest.mark.parametrize("name", ["subtree_linvel"])
-def test_a_field_that_only_a_sensor_computes_is_refused_without_one(name: str, model: mujoco.MjModel) -> None:
+def test_a_field_that_needs_a_sensor_is_refused_without_one(name: str, model: mujoco.MjModel) -> None:
     with pytest.raises(ValueError, match=f"MuJoCo computes the field {name!r} only for a sensor, .*fields="):
         describe(model, name)
 
@@ -101,7 +101,7 @@ def test_a_field_that_only_a_sensor_computes_is_refused_without_one(name: str, m
         ("mocap_pos", "target", slice(0, 1)),
     ],
 )
-def test_a_named_element_has_its_place_in_the_field(
+def test_a_named_element_has_the_indices_of_its_rows(
     name: str, element: str, where: slice, model: mujoco.MjModel
 ) -> None:
     assert elements(model, name, element) == where
@@ -110,7 +110,7 @@ def test_a_named_element_has_its_place_in_the_field(
 @pytest.mark.parametrize(
     ("element", "place"),
     [
-        (lw.actuator("turn"), 3),  # follows the three outputs of another actuator
+        (lw.actuator("turn"), 3),  # this index follows the three outputs of another actuator
         (lw.ctrl("turn"), 3),
         (lw.act("slow"), 0),
         (lw.tendon("string"), 0),

@@ -51,7 +51,7 @@ def test_an_unknown_task_gets_no_id(tmp_path: Path) -> None:
         gymnasium.make("lyceum_warp.gym:lyceum/Hoper-v0")
 
 
-def test_a_task_whose_package_is_missing_says_so_when_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_making_a_task_whose_package_is_missing_raises_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     class Missing(Full):
         """A task with a model from a package that is not installed."""
 

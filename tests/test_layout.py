@@ -1,4 +1,4 @@
-"""Modules import only from lower rooms, private names stay private, and every room has tests."""
+"""Check that modules import only from lower rooms, that private names stay private, and that every room has tests."""
 
 import ast
 import functools
@@ -236,7 +236,7 @@ def in_new_process(program: str) -> str:
 
 
 def test_no_submodule_has_a_public_name() -> None:
-    """Importing it would set an attribute of the package, which would hide the function of that name."""
+    """Importing such a submodule would set an attribute of the package, which would hide the function of that name."""
     assert not {room(name) for name in MODULES} & set(lw.__all__)
 
 
@@ -249,7 +249,7 @@ def test_importing_the_package_loads_neither_torch_nor_warp_nor_mujoco() -> None
 
 
 @pytest.mark.parametrize("first", ["import warp as wp", "from lyceum_warp import Row"])
-def test_warp_is_quiet_in_whatever_order_a_task_file_imports(first: str) -> None:
+def test_warp_prints_nothing_for_any_import_order_of_a_task_file(first: str) -> None:
     program = f"""
         {first}
         import warp as wp

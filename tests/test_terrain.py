@@ -15,13 +15,13 @@ from lyceum_warp.testing import check_task
 
 
 def patch(kind: str, *, level: int = 0, levels: int = 1, **options: object) -> np.ndarray:
-    """Heights of one patch of 8 m, with a point every 0.1 m."""
+    """Make the heights of one 8 m patch, with a point every 0.1 m."""
     terrain = lw.Terrain({kind: 1}, levels=levels, border=0.0, **options)
     return terrain.heights[80 * level : 80 * level + 81]
 
 
 def row_of(kind: str, **options: object) -> np.ndarray:
-    """Heights from the middle of a patch to its outline along x, (41,)."""
+    """Make the heights from the centre of a patch to its outline along x, (41,)."""
     return patch(kind, **options)[40, 40:]
 
 
@@ -45,11 +45,11 @@ def test_stones_have_gaps_of_the_given_width_rounded_up(width: float, cells: int
         tops = np.flatnonzero(row == 0.0)
         gaps = np.diff(tops)[np.diff(tops) > 1]
         assert len(gaps) >= 3 and (gaps == cells).all()
-    assert not patch("stones", scale={"stones": 0.1}).any()  # no point lies within so narrow a gap
+    assert not patch("stones", scale={"stones": 0.1}).any()  # the gap is too narrow to contain a point
 
 
 @pytest.mark.parametrize(("kind", "amount"), [("steps", 0.2), ("rough", 0.08), ("waves", 0.2)])
-def test_other_terrains_reach_their_amount_up_and_down(kind: str, amount: float) -> None:
+def test_other_terrains_reach_their_full_height_and_depth(kind: str, amount: float) -> None:
     heights = patch(kind)
     assert -amount <= heights.min() < -0.9 * amount and 0.9 * amount < heights.max() <= amount
 
@@ -71,7 +71,7 @@ def test_a_seed_repeats_the_field_and_another_column_leaves_the_rest_unchanged()
     np.testing.assert_allclose(more.heights[40:200, 40:200], field[40:200, 40:200], atol=1e-12)
 
 
-def test_a_function_makes_patches_of_its_own_kind() -> None:
+def test_a_custom_function_makes_patches() -> None:
     def ridge(x: np.ndarray, y: np.ndarray, difficulty: float, rng: np.random.Generator) -> np.ndarray:
         return difficulty * (abs(x) < 0.25)
 
@@ -170,9 +170,7 @@ def test_a_table_of_a_missing_or_moving_field_is_refused() -> None:
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_a_ball_rests_on_every_kind_of_patch_at_the_height_that_is_looked_up(
-    shared_env: SharedEnv, engine: str
-) -> None:
+def test_a_ball_rests_on_every_kind_of_patch_at_the_height_from_the_table(shared_env: SharedEnv, engine: str) -> None:
     env = shared_env(OnTerrain, engine=engine, nworld=96, spread=1.8)
     for _ in range(75):
         env.step()
@@ -182,7 +180,7 @@ def test_a_ball_rests_on_every_kind_of_patch_at_the_height_that_is_looked_up(
     obs = env.obs.cpu().numpy().astype(float)
     away = (lw.scan_grid(0.1, 0.1, spacing=0.005) ** 2).sum(axis=1)
     nearest = np.sqrt(away + obs[:, 4:] ** 2).min(axis=1)
-    # the ball's radius; MuJoCo Warp drops a contact of a ball that lies between two walls
+    # tolerance of the ball's radius: MuJoCo Warp drops a contact of a ball between two walls
     np.testing.assert_allclose(nearest, 0.05, atol=2e-3 if engine == "mujoco" else 5e-3)
     assert np.median(abs(nearest - 0.05)) < 5e-4
     assert np.ptp(obs[:, 2]) > 0.4
@@ -198,7 +196,7 @@ def test_heights_of_a_state_are_the_same_on_both_engines(shared_env: SharedEnv, 
     torch.testing.assert_close(env.obs[:, 4:], shared_env(OnTerrain, nworld=8).obs[:, 4:], rtol=0, atol=1e-6)
 
 
-def test_worlds_that_walk_far_rise_a_level_and_fall_when_they_stop(shared_env: SharedEnv) -> None:
+def test_walking_far_raises_a_worlds_level_and_standing_lowers_it(shared_env: SharedEnv) -> None:
     env = shared_env(OnTerrain, nworld=48)
 
     def episode(*speed: float) -> torch.Tensor:
@@ -215,7 +213,7 @@ def test_worlds_that_walk_far_rise_a_level_and_fall_when_they_stop(shared_env: S
     assert easy.any() and not memory("level").any()
     assert (episode(0.7, 0.0)[easy] == 1.0).all()
     middle = torch.as_tensor(TERRAIN.origins)[1, column.long()]
-    assert ((env.obs[easy, :2].cpu() - middle[easy, :2]).abs() <= 0.5 + 1e-6).all()  # the middle of the next patch
+    assert ((env.obs[easy, :2].cpu() - middle[easy, :2]).abs() <= 0.5 + 1e-6).all()  # the centre of the next patch
     assert (episode(-0.7, 0.0)[easy] == 2.0).all()
     assert (episode(0.0, 0.0)[easy] == 1.0).all()
 

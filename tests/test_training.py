@@ -48,7 +48,7 @@ def test_a_run_of_python_is_evaluated_and_resumed_by_the_command(six: Path, tmp_
     assert metrics(run)[:6] == metrics(six)
 
 
-def test_python_resumes_a_run_to_the_same_numbers(six: Path, tmp_path: Path) -> None:
+def test_a_run_resumed_in_python_gives_identical_numbers(six: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=2)
     run = lw.train(algorithm(lw.make("point_mass", nworld=2, seed=5)), folder, iterations=6, resume=True)
@@ -86,7 +86,7 @@ def test_a_learner_that_has_iterated_begins_a_complete_run(six: Path, tmp_path: 
 
     lw.train(npg, folder, iterations=9, callback=callback, save_every=100)
     assert begun == [3, 3]
-    previous = folder / "previous.pt"  # the state after kill -9 in iteration 6
+    previous = folder / "previous.pt"  # simulate the state after kill -9 in iteration 6
     previous.replace(folder / "checkpoint.pt")
     lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
     assert metrics(folder) == metrics(six)[3:]
@@ -160,7 +160,7 @@ def test_an_error_in_the_callback_leaves_a_complete_run(six: Path, tmp_path: Pat
 def test_an_interrupted_iteration_leaves_the_last_save(
     error: type[BaseException], six: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Worlds and networks may have changed since."""
+    """Worlds and networks may have changed since the save."""
     npg, folder = algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run"
     fit = ValueFit.__call__
 
@@ -249,7 +249,7 @@ def test_training_ends_after_its_minutes(tmp_path: Path, capsys: pytest.CaptureF
     assert not (tmp_path / "other").exists()
 
 
-def test_a_run_continues_from_the_last_complete_state_to_the_same_numbers(six: Path, tmp_path: Path) -> None:
+def test_a_run_continues_identically_from_the_last_complete_state(six: Path, tmp_path: Path) -> None:
     """The state is as after kill -9 in iteration 5: iteration 3 was saved, and iteration 4 wrote the last row."""
     folder = tmp_path / "run"
     states = {}
@@ -346,8 +346,9 @@ def test_ppo_trains_by_the_same_loop_from_the_shell(six: Path, tmp_path: Path) -
     assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # PPO does not take NPG's settings
 
 
-def test_a_run_gets_a_verdict_on_its_policys_transfer(env: lw.Env, tmp_path: Path) -> None:
-    """By default only if the worlds' physics are not exact, because the other engine's kernels may take minutes."""
+def test_a_run_contains_the_transfer_verdict_of_its_policy(env: lw.Env, tmp_path: Path) -> None:
+    """By default the verdict is only made if the physics are not exact, because the other engine's kernels may take
+    minutes to compile."""
     run = lw.train(algorithm(env), tmp_path / "exact", iterations=1)
     assert not run.transfer.exists()
     coarse = algorithm(lw.make("point_mass", nworld=2, frame_skip=2, horizon=20))

@@ -40,7 +40,8 @@ XML = """
   <sensor><gyro site="ankle"/></sensor>
 </mujoco>
 """
-"""A robot whose legs have 3 joints and 1: two joints in one body, off its origin, with a reference; a fixed body."""
+"""A robot with one leg of 3 joints and one of 1: two joints share a body, are off its origin and have a reference; one
+body is fixed."""
 
 
 def made(shape: str = "box", feet: tuple[str, ...] = ("ankle", "peg_end")) -> tuple[mujoco.MjModel, SimpleNamespace]:
@@ -57,7 +58,7 @@ def rotated(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 def last_joint(model: mujoco.MjModel, p: SimpleNamespace, data: mujoco.MjData, foot: int) -> list[np.ndarray]:
-    """Position and rotation of a foot's last joint, from the tables."""
+    """Compute position and rotation of a foot's last joint from the tables."""
     qpos, axes, offsets = (table(model, p)[foot] for table in (walkers.leg_qpos, walkers.leg_axes, walkers.leg_offsets))
     x, turn = data.qpos[:3].copy(), data.qpos[3:7].copy()
     for at, axis, offset in zip(qpos, axes, offsets, strict=True):
@@ -133,7 +134,7 @@ def test_models_without_a_base_or_legs_are_refused() -> None:
         walkers.quarter_of_force(model, p)
 
 
-def test_a_prepared_model_senses_the_forces_on_its_feet_and_has_their_friction() -> None:
+def test_a_prepared_model_has_force_sensors_and_the_friction_of_its_feet() -> None:
     spec = mujoco.MjSpec.from_string(XML.format(shape="box"))
     walkers.prepare_walker(spec, ["ankle", "peg_end"], timestep=0.004, iterations=(3, 5))
     model = spec.compile()

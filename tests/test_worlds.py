@@ -1,4 +1,4 @@
-"""The phases of a step, a reset and a restored state write the expected numbers."""
+"""Test the results of the phases of a step, of a reset and of restoring a state."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ ENGINES = ["mujoco", "warp"]
 
 
 class Held(PointMass):
-    """A point_mass whose point must stay at its target for three steps."""
+    """A point_mass task whose point must stay at its target for three steps."""
 
     model = lw.package_model("lyceum_warp", "tasks/point_mass.xml")
     success_steps = 3
@@ -172,7 +172,7 @@ def test_parameters_that_become_per_world_reach_captured_graphs(engine: str) -> 
     env = lw.make("hopper", nworld=2, engine=engine)
     action = torch.ones(2, 3)
     for _ in range(3):
-        env.step(action)  # the third step replays
+        env.step(action)  # the third step replays the graph
     env.set_params(ctrl_cost_weight=[0.0, 1.0])
     env.reset()
     env.step(action)

@@ -91,7 +91,7 @@ class Block(lw.Task):
 
 
 class WatchedWindow(Window):
-    """Store the last frame and the user's commands, and send the commands of a test."""
+    """Stores the last frame and the user's commands, and sends a test's commands."""
 
     def __init__(self, *given: Any) -> None:
         self.last: Frame | None = None
@@ -215,7 +215,7 @@ def push(action: float) -> Callable[[torch.Tensor], torch.Tensor]:
 @pytest.fixture(scope="module")
 def launch() -> Iterator[Callable[[], Browser]]:
     """Start a headless browser: LYCEUM_WARP_BROWSER, playwright's own, or the system's."""
-    with sync_playwright() as playwright:  # it runs an event loop in this thread until it is closed
+    with sync_playwright() as playwright:  # playwright runs an event loop in this thread until it is closed
         candidates = [os.environ.get("LYCEUM_WARP_BROWSER"), playwright.chromium.executable_path]
         candidates += map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"))
         program = next((found for found in candidates if found and Path(found).exists()), None)

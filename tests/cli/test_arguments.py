@@ -74,7 +74,7 @@ def test_every_option_of_the_physics_has_a_flag() -> None:
     assert sorted(names) == sorted(options) and Physics().given() == {}
 
 
-def test_every_option_of_an_environment_is_a_flag_or_left_to_the_commands() -> None:
+def test_every_option_of_an_environment_has_a_flag_or_is_listed_in_no_flags() -> None:
     names = {field.name for field in dataclasses.fields(EnvOptions)}
     for flags, others in ((EnvFlags, set()), (Placement, {"horizon"})):
         assert {field.name for field in dataclasses.fields(flags)} == names - {*NO_FLAGS} - others
@@ -90,7 +90,7 @@ def test_an_option_among_the_parameters_is_refused(name: str) -> None:
         parameters(["mass=1", f"{name}=any"], Train())
 
 
-def test_the_last_value_of_a_parameter_counts_and_an_option_names_its_flag() -> None:
+def test_the_last_value_of_a_repeated_parameter_counts() -> None:
     assert parameters(["mass=1", "size=1,2", "mass=3"], Train()) == {"mass": 3, "size": [1, 2]}
     with pytest.raises(ValueError, match="horizon is an option, not a parameter of the task: use --steps"):
         parameters(["horizon=9"], Train(), instead={"horizon": "--steps"})

@@ -22,7 +22,7 @@ def npg() -> lw.NPG:
 
 @pytest.fixture(scope="module")
 def first(npg: lw.NPG) -> lw.Iteration:
-    """The first iteration on worlds whose episodes have not ended yet."""
+    """Run the first iteration, in which no episode ends."""
     return next(npg)
 
 

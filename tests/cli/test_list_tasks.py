@@ -17,7 +17,7 @@ INSTALL = "pip install 'lyceum-warp[hand]'"
 
 
 def rows(out: str) -> dict[str, list[str]]:
-    """Return the words of each task's row, by name; descriptions and notes are indented."""
+    """Return the words of each task's row, by task name. Descriptions and notes are indented lines."""
     table, _, legend = out.partition("\n\n")
     assert legend.startswith("obs, act: ")
     heading, *lines = table.splitlines()
@@ -84,12 +84,12 @@ def test_a_word_selects_by_name_description_and_model(
     assert found in listed and other not in listed
 
 
-def test_a_word_that_no_task_has_is_refused_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_word_without_matching_tasks_raises_a_one_line_error(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["tasks", "submarine"]) == 2
     refused(capsys, "'submarine'", "lyceum-warp tasks")
 
 
-def test_a_task_whose_extra_is_missing_is_listed_with_all_that_is_known_without_its_model(
+def test_a_task_with_a_missing_extra_is_listed_without_its_sizes(
     without_the_hand: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["tasks"]) == 0

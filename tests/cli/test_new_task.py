@@ -70,7 +70,7 @@ def test_a_new_task_keeps_the_rules_on_both_engines(engine: str, folder: Path) -
     check_task(str(file), engine=engine, nworld=2, horizon=6, frame_skip=1, checks=MODEL_CHECKS)
 
 
-def test_a_new_task_observes_the_state_and_those_sensors_that_measure_it(folder: Path) -> None:
+def test_a_new_task_observes_the_state_and_the_sensors_that_measure_it(folder: Path) -> None:
     env = lw.make(str(new("everything", RICH)), nworld=2, seed=3)
     task = env.task.task
     assert task.obs == {"position": 13, "velocity": 11, "activation": 1, "sensors": 4}
@@ -217,7 +217,7 @@ def test_a_model_of_a_package_or_of_menagerie_is_named_by_its_source(
         ("/proc/walk", ["can't write /proc/walk.py"]),
     ],
 )
-def test_a_name_that_cannot_be_used_is_refused_in_a_line(
+def test_an_invalid_name_raises_a_one_line_error(
     name: str, words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("robot.xml").write_text(text(ARM))
@@ -240,7 +240,7 @@ def test_a_name_that_cannot_be_used_is_refused_in_a_line(
         ("stuck.xml", ["stuck.xml has no joints"]),
     ],
 )
-def test_a_model_that_cannot_be_used_is_refused_in_a_line(
+def test_an_invalid_model_raises_a_one_line_error(
     model: str, words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mesh = (

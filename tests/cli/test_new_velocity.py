@@ -1,4 +1,4 @@
-"""``lyceum-warp new --template velocity`` writes a task of the family of walking robots for a model."""
+"""Test ``lyceum-warp new --template velocity``, which writes a velocity task for a robot's model."""
 
 from pathlib import Path
 
@@ -45,7 +45,8 @@ SLED = """
   </actuator>
 </mujoco>
 """
-"""Two legs with boxes as feet, in bodies without joints, and a tail. Actuators have another order than the joints."""
+"""Two legs with boxes as feet, in bodies without joints, and a tail. The order of actuators differs from that of
+joints."""
 
 
 @pytest.fixture
@@ -95,7 +96,7 @@ def test_a_robot_learns_for_an_iteration(folder: Path, tmp_path: Path) -> None:
 
 
 def test_feet_and_joints_are_found_on_the_legs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """New sites are in the middle of the soles; a site that is there stays; other joints keep their pose."""
+    """New sites are at the centres of the soles; an existing site is kept; other joints keep their pose."""
     assert new("sled_walk", "--model", "sled.xml") == 0
     assert capsys.readouterr().out.startswith("sled_walk.py: feet foot_1, toe; joints left_hip, right_hip; check")
     env = lw.make("sled_walk.py", nworld=1, **{"push_seconds": (1e6, 1e6), "sliding_friction": (1.0, 1.0)})

@@ -67,7 +67,7 @@ def test_a_run_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.Captu
     assert torch.equal(again.states, Trajectory.load(out / "episode-001.npz").states)
 
 
-def test_a_planner_has_the_suggested_physics_unless_others_are_named(
+def test_a_planner_uses_the_suggested_physics_unless_others_are_given(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name, flags, timestep in (("fast", [], 0.015), ("exact", ["--physics", "exact"], None)):
@@ -109,7 +109,7 @@ def measured_by(microseconds: float) -> Any:
     return lambda plant, planner: 1e-6 * microseconds * planner.samples * planner.horizon
 
 
-def test_real_time_chooses_what_is_not_given(
+def test_real_time_chooses_only_settings_that_are_not_given(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plan_command, "planning_time", measured_by(30.0))
@@ -191,7 +191,7 @@ def test_a_planner_param_changes_only_the_planner(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("options, name, integrator", [
-    ([], "euler", mujoco.mjtIntegrator.mjINT_EULER),  # the task's planning sets it
+    ([], "euler", mujoco.mjtIntegrator.mjINT_EULER),  # the task's planning sets this parameter
     (["--integrator", "implicitfast"], "implicitfast", mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
 ])  # fmt: skip
 def test_physics_options_change_only_the_planner(
@@ -353,7 +353,7 @@ def test_a_parameter_with_the_name_of_a_setting_is_given_by_param(task_file: Tas
     assert Trajectory.load(tmp_path / "run" / "episode-000.npz").params["temperature"] == 0.5
 
 
-def test_nthread_is_that_of_the_planner(tmp_path: Path, made_envs: list[lw.Env]) -> None:
+def test_nthread_sets_the_planners_threads(tmp_path: Path, made_envs: list[lw.Env]) -> None:
     assert plan(tmp_path / "run", *QUIET, "--steps", "1", "--nthread", "2", "--engine", "mujoco") == 0
     assert [env.options.nthread for env in made_envs] == [1, 2]
     config = json.loads((tmp_path / "run" / "config.json").read_text())

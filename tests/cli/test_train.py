@@ -286,7 +286,7 @@ def test_resume_refuses_broken_checkpoints(trained: Path, tmp_path: Path, capsys
 
 
 @pytest.mark.parametrize("damage", ["cut off", "a flipped bit"])
-def test_a_broken_checkpoint_falls_back_to_the_one_before_it(
+def test_resume_falls_back_from_a_broken_checkpoint_to_the_previous_one(
     damage: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
@@ -452,7 +452,7 @@ def test_a_killed_run_continues(trained: Path, tmp_path: Path) -> None:
     assert len(metrics(out)) == total
 
 
-def test_the_verdict_on_transfer_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_train_prints_the_transfer_verdict_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--iterations", "1", "--horizon", "20"]
     assert train(tmp_path / "exact", *options) == 0
     assert "transfer:" not in capsys.readouterr().out

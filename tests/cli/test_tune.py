@@ -1,4 +1,4 @@
-"""lyceum-warp tune: its table, the flags that it prints, and errors."""
+"""Test lyceum-warp tune: its table, the flags that it prints, and errors."""
 
 import dataclasses
 from pathlib import Path
@@ -12,7 +12,7 @@ from lyceum_warp.tuning.trial import SHORT
 QUICK = ["--short", "--episodes", "8", "--nworld", "8", "--nthread", "1", "--tolerance", "any"]
 
 
-def test_tune_prints_the_table_and_flags_that_another_command_takes(
+def test_tune_prints_a_table_and_flags_that_other_commands_accept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(search, "SHORT", dataclasses.replace(SHORT, repeats=2, block_seconds=0.005, steps=40))
@@ -33,7 +33,7 @@ def test_tune_prints_the_table_and_flags_that_another_command_takes(
         (["hopper", "--run", "none"], "there is no run in none"),
     ],
 )
-def test_wrong_words_are_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_arguments_print_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["tune", *words]) == 2
     err = capsys.readouterr().err
     assert message in err and err.count("\n") == 1

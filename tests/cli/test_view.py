@@ -14,7 +14,7 @@ from lyceum_warp.viewer.protocol import Frame, Scene
 
 
 class Opened:
-    """Collect the scenes and frames of the windows that the command opens."""
+    """Collects the scenes and frames of the windows that the command opens."""
 
     def __init__(self) -> None:
         self.scenes: list[Scene] = []

@@ -67,7 +67,7 @@ def trained(folder: Path, callback: Callable[[lw.Iteration], object] | None = No
     return [list(map(str, row.items())) for row in rows], list(lw.load(run).state_dict().values())
 
 
-def test_a_run_with_a_viewer_has_the_same_numbers_to_the_bit(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_viewer_does_not_change_a_runs_numbers(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     alone = trained(tmp_path / "alone")
     begun, printed = time.monotonic(), ""
     with lw.RunViewer(tmp_path / "shown", nworld=2) as viewer:
@@ -106,7 +106,7 @@ def runs(process: int) -> bool:
 
 @pytest.mark.parametrize("kill", [pytest.param(True, marks=pytest.mark.long), False])
 def test_a_viewer_ends_with_its_program_also_while_it_waits_for_the_run(kill: bool, tmp_path: Path) -> None:
-    """A program that is killed, and one that closes the viewer at once."""
+    """Test a program that is killed, and a program that closes the viewer at once."""
     command = [sys.executable, "-c", PROGRAM.format(seconds=60 if kill else 0), str(tmp_path / "run")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None
@@ -122,7 +122,7 @@ def test_a_viewer_ends_with_its_program_also_while_it_waits_for_the_run(kill: bo
 
 def test_train_shows_its_run_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folders: list[Path] = []
-    training = importlib.import_module("lyceum_warp.cli.train")  # the package has a function of this name
+    training = importlib.import_module("lyceum_warp.cli.train")  # the package also has a function of this name
     monkeypatch.setattr(training, "RunViewer", lambda folder: folders.append(folder) or contextlib.nullcontext())
     assert train(tmp_path / "run", "--iterations", "1", "--view") == 0
     assert folders == [tmp_path / "run"]

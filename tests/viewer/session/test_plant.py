@@ -71,7 +71,7 @@ def test_an_episode_of_a_plant_that_ends_is_followed_by_another() -> None:
 
 
 class Slow:
-    """A controller whose calls block from the seventh on, and that logs its calls and resets in order."""
+    """A controller that logs its calls and resets in order, and blocks from the seventh call on."""
 
     def __init__(self) -> None:
         self.inside, self.log, self.release = 0, [], threading.Event()
@@ -88,7 +88,7 @@ class Slow:
         self.log.append("reset" if not self.inside else "reset within a call")
 
 
-def test_a_plan_that_takes_long_does_not_hold_up_commands(shared_env: SharedEnv) -> None:
+def test_a_slow_plan_does_not_delay_commands(shared_env: SharedEnv) -> None:
     env, slow = shared_env("point_mass", nworld=3), Slow()
     session = Session(env, controllers={"slow": slow}, seed=0)
     run(
@@ -104,7 +104,7 @@ def test_a_plan_that_takes_long_does_not_hold_up_commands(shared_env: SharedEnv)
         lambda frame: frame.status.speed == 2.0,
     )
     calls = len(slow.log)
-    assert slow.inside == 1  # the same call
+    assert slow.inside == 1  # still the same call
     slow.release.set()
     while slow.inside:
         time.sleep(0.01)

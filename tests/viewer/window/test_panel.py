@@ -37,7 +37,7 @@ def test_panel_draws_every_mode_with_all_windows_open(bench: Bench, mode: str) -
         samples=np.array([[0.0, 1.0, np.nan], [0.1, 2.0, 3.0]]), messages=("world 3: terminated",),
     )  # fmt: skip
     assert bench.sent == [Opened("http://here")]
-    assert bench.draw() == bench.draw(frame) == bench.draw() == []  # before, with and after the first frame
+    assert bench.draw() == bench.draw(frame) == bench.draw() == []  # draw before, with and after the first frame
     small = Bench(bench.model, scene_of(bench.model, nworld=1, controllers=(), episodes=(), curves=()))
     small.panel.actions.windows |= set(WINDOWS)
     assert small.draw(frame_of(small.model, small.data, status_of(controller=None, world=0))) == []
@@ -62,7 +62,7 @@ def test_ghosts_and_traces_are_drawn_up_to_a_limit(limit: int, drawn: int) -> No
     model = robot()
     bench = Bench(model, scene_of(model), limit=limit)
     bench.draw(frame_of(model, bench.data, ghosts=(ghost_beside(bench.data),) * 2, traces=np.zeros((2, 5, 3))))
-    assert len(bench.viewer.extra_geoms) == drawn  # the goal does not move
+    assert len(bench.viewer.extra_geoms) == drawn  # the goal body does not move
 
 
 # keys

@@ -271,7 +271,7 @@ def test_pages_are_forwarded_without_the_clients_headers(proxy: Proxy, upstream:
         assert b"Cookie" not in received and b"X-Forwarded-For" not in received
 
 
-def test_an_endless_head_is_refused_without_buffering_it(proxy: Proxy) -> None:
+def test_an_endless_head_is_refused_without_being_buffered(proxy: Proxy) -> None:
     with socket.create_connection(("127.0.0.1", proxy.port), timeout=10) as client:
         sent = 0
         with contextlib.suppress(OSError):
@@ -297,7 +297,7 @@ def test_a_slow_head_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
         socket.create_connection(("127.0.0.1", proxy.port), timeout=10) as client,
         pytest.raises(ConnectionError),
     ):
-        for byte in b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + 600 * b"a":  # all bytes take too long
+        for byte in b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + 600 * b"a":  # the complete head takes too long
             client.send(bytes([byte]))
             time.sleep(0.02)
 
@@ -322,7 +322,7 @@ def test_a_client_that_does_not_read_is_dropped(monkeypatch: pytest.MonkeyPatch)
             client.connect(("127.0.0.1", proxy.port))
             client.sendall(f"GET {path}/ HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: {key}\r\n\r\n".encode())
             wait_until(lambda: upstream.ended == 1)
-            with pytest.raises(ConnectionError):  # a connection that waits for the client would accept this
+            with pytest.raises(ConnectionError):  # a connection that waits for the client would accept these bytes
                 for _ in range(1000):
                     client.send(b"x")
                     time.sleep(0.01)
