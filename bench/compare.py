@@ -1,4 +1,4 @@
-"""Report every difference, to the bit, between the numbers of two checkouts.
+"""Report every bitwise difference between the results of two checkouts.
 
     lyceum-warp bench compare main
     lyceum-warp bench compare v0.1.0 HEAD --parts env plans --tasks hopper reach --out differences.json
@@ -58,7 +58,7 @@ SHORT = ("point_mass", "reach", "hopper", "go1_velocity")
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Report every difference, to the bit, between the numbers of two checkouts."""
+    """Report every bitwise difference between the results of two checkouts."""
 
     old: tyro.conf.Positional[str]
     """A git revision, or a folder with a checkout."""
@@ -240,7 +240,7 @@ class Side:
 
     def start(self) -> None:
         path = os.pathsep.join([str(self.root), *filter(None, [os.environ.get("PYTHONPATH")])])
-        # a killed process leaves temporary files of Warp's compiler behind
+        # a killed process leaves temporary files of Warp's compiler
         own = {"PYTHONPATH": path, "TMPDIR": str(self.folder), "CUBLAS_WORKSPACE_CONFIG": ":4096:8"}
         with self._log.open("w") as log:
             # -P omits bench/ from the path, because its modules could shadow others; a new session can be killed as a
@@ -496,7 +496,7 @@ def run(options: Options) -> int:
 
 def main(options: Options) -> int:
     """Run the program; return 0, 1 with differences, 2 for bad input, 130 or 143 after a signal."""
-    for number in (signal.SIGTERM, signal.SIGHUP):  # so that temporary folders are removed
+    for number in (signal.SIGTERM, signal.SIGHUP):  # SIGTERM raises SystemExit, so temporary folders are removed
         signal.signal(number, lambda number, frame: sys.exit(128 + number))
     try:
         return run(options)

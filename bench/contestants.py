@@ -159,4 +159,4 @@ class Native:
         )
 
     def wait(self) -> None:
-        """Do nothing, because steps are synchronous."""
+        """Does nothing, because steps are synchronous."""

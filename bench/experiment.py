@@ -201,7 +201,7 @@ def read(path: Path) -> list[Row]:
 
 
 def _read(path: Path) -> tuple[list[Row], int]:
-    """Return the rows, and the offset at which the last row ends."""
+    """Return the rows and the end offset of the last row."""
     rows, size = [], 0
     for number, line in enumerate(path.read_bytes().splitlines(keepends=True), start=1):
         try:
@@ -375,7 +375,7 @@ def run(experiment: Experiment, options: Options) -> int:
                 print(f"skipped: {result}", flush=True)
             skipped.add(str(result))
             continue
-        if isinstance(result, Exception):  # the remaining cases run in any case
+        if isinstance(result, Exception):  # a failed case does not stop the remaining cases
             failed += 1
             traceback.print_exception(result)
             print(f"failed: {_text(case)}", file=sys.stderr, flush=True)
@@ -415,7 +415,7 @@ def outcomes(
         try:
             with concurrent.futures.ProcessPoolExecutor(1, context) as process:
                 result = process.submit(_measure_apart, experiment.measure, case, options).result()
-        except Exception as error:  # raised by the case, or because its process died
+        except Exception as error:  # the case raised an error, or its process died
             result = error
         places.put(place)
         return case, result, time.perf_counter() - began

@@ -4,9 +4,9 @@
 
 Worlds of both engines start in the same float32 states and get the same random actions. The C engine (float64) is
 compared with the Warp engine (float32), with itself when its state is rounded to float32 after every step, and with
-itself from an initial state perturbed by float32 rounding. The last two give the scale: chaos separates any two
-trajectories, so the Warp engine is as accurate as float32 allows if it diverges from the C engine no earlier than they.
-A difference is the largest difference of a world's observations, relative to the larger of 1 and the value. Contact
+itself from an initial state perturbed by float32 rounding. The last two comparisons give the scale: chaos separates any
+two trajectories, so the Warp engine is as accurate as float32 allows if it diverges no earlier than they do. A
+difference is the largest difference of a world's observations, relative to the larger of 1 and the value. Contact
 forces are excluded, because a solver is accurate only to its tolerance. Worlds continue after the end of an episode,
 and are dropped at a fault.
 """
@@ -43,7 +43,7 @@ APART = 0.01
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Agreement of the engines."""
+    """Options of the comparison of engines."""
 
     steps: int = 1000
     """Number of compared steps, at most an episode's."""

@@ -1,4 +1,4 @@
-"""Plan a humanoid in real time, at its own 67 Hz: it stands and walks under pushes, and gets up.
+"""Plan for a humanoid in real time, at its control rate of 67 Hz: standing and walking under pushes, and getting up.
 
     lyceum-warp bench humanoid
     lyceum-warp bench humanoid --tasks humanoid_stand --contestants real_time --repeats 20
@@ -31,9 +31,9 @@ TASKS = {
 }  # fmt: skip
 """Parameters of the plant, in addition to ``STARTS``."""
 FIRST_SEED = 1000
-"""Seed of the first episode: of its start, its pushes and the planner's noise."""
+"""Seed of the first episode's start, pushes and planner noise."""
 WALKS, UP = 0.5, 1.1
-"""The least mean speed of a walk, m/s, and the least height of a standing torso, m."""
+"""Minimum mean speed of a walk, m/s, and minimum height of a standing torso, m."""
 CONTESTANTS = {"real_time": "in real time", "in_turn": "the plant waits"}
 
 

@@ -1,4 +1,4 @@
-"""Measure planning in real time: planning time, deadlines met, age of actions and rewards.
+"""Measure planning in real time: planning times, deadlines, ages of actions and rewards.
 
     lyceum-warp bench latency
     lyceum-warp bench latency --tasks reach humanoid --samples 256 1024 --horizons 32 --device cuda
@@ -6,8 +6,8 @@
 Each case is one cell of the table: a task, the physics of the planner's worlds, a number of samples, a horizon, an
 engine and its device. Episodes run in real time (``lw.control_async``) until their steps take ``--seconds``: the plant
 keeps its rate, and the planner plans as often as it can. A plan meets its deadline if it takes at most a step of the
-plant. Run this on idle cores: other work on them delays plans. Without --samples and --horizons, cells are left out
-whose plans take long on two cores.
+plant. Run this on idle cores: other work on them delays plans. Without --samples and --horizons, cells whose plans take
+long on two cores are omitted.
 """
 
 import dataclasses
@@ -56,7 +56,7 @@ class Case:
 
     task: str
     physics: str
-    """Name of the planner's physics; "own" for the task's suggestion without a name."""
+    """Name of the planner's physics; "own" if the task suggests unnamed options."""
     samples: int
     horizon: int
     contestant: str
@@ -86,7 +86,7 @@ def cases(options: Options) -> list[Case]:
 
 
 def physics_of(task: str, names: Sequence[str]) -> Sequence[str]:
-    """Return those of the given names that the task knows, or else its default cells."""
+    """Return the given names that the task knows, or else its default physics."""
     found = find_task(task)
     if names:
         return [name for name in names if name == "exact" or name in found.physics]

@@ -62,11 +62,11 @@ TASKS = {
 }  # fmt: skip
 """Worlds, steps per chunk, chunks, and seconds for a million steps on two cores."""
 OTHERS = (256, 10**6, 1, 300.0)
-"""The same numbers for all other tasks."""
+"""The same values for all other tasks."""
 SHORT = (64, 20_000, 2, 0.0)
 GPU_TASKS = {"half_cheetah": (16_384, 10**8, 10, 0.5)}
 SAME_BITS = {"half_cheetah": (4096, 10**6, 10, 20.0)}
-"""The same numbers in the deterministic mode, without which a GPU's results are not reproducible to the last bit."""
+"""The same values for the deterministic mode, which makes a GPU's results reproducible bit for bit."""
 TRAININGS = {
     "hopper": "--iterations 400 --nthread 2",
     "point_mass": "--algorithm ppo --iterations 300 --nworld 256 --nthread 2",
@@ -140,7 +140,7 @@ class Options(experiment.Options):
 
 @dataclasses.dataclass(frozen=True)
 class Faults:
-    """A chunk of a task's run."""
+    """One chunk of a task's run."""
 
     task: str
     chunk: int
@@ -219,7 +219,8 @@ def estimate(case: Any) -> float:
 
 def measure(case: Any, options: Options) -> dict[str, Any]:
     options.work.mkdir(parents=True, exist_ok=True)
-    return {"faults": inject, "memory": make_and_delete, "kills": kill}[case.part](case, options)  # type: ignore[operator]
+    # type: ignore[operator]
+    return {"faults": inject, "memory": make_and_delete, "kills": kill}[case.part](case, options)
 
 
 # faults
@@ -265,7 +266,7 @@ def draw(
 ):  # fmt: skip
     """Draw actions, and faults that start in this step, as a function of seed, step and world; launched over (nworld,).
 
-    Every fourth world gets no fault, nor does a world with a fault that is not reported yet.
+    Every fourth world gets no fault. A world whose last fault is not reported yet gets no further fault.
     """
     w = wp.tid()
     rng = wp.rand_init(int(wp.rand_init(seed, step)), w)
@@ -317,7 +318,7 @@ def tally(
 def inject(case: Faults, options: Options) -> dict[str, Any]:
     """Step a task for a chunk with injected faults, together with a twin without faults."""
     torch.set_num_threads(1)
-    gc.collect()  # free the environments of the previous chunk
+    gc.collect()  # frees the environments of the previous chunk
     before = case.state(options.work, case.chunk)
     if case.chunk and not before.exists():
         raise Skipped(f"there is no {before}: give the folder in which chunk {case.chunk - 1} ran as --work")

@@ -67,7 +67,7 @@ def _made(name: str) -> tuple[Path, str]:
                 shutil.rmtree(folder, ignore_errors=True)
                 said = [line for line in (done.stderr or done.stdout).splitlines() if line.strip()] or ["no message"]
                 return python, f"{name} cannot be installed: {said[-1].strip()}"
-        complete.touch()  # written last, because the program may be killed during the installation
+        complete.touch()  # this file is written last, because the program may be killed during the installation
     return python, ""
 
 

@@ -10,13 +10,13 @@ PLACE = re.compile(r"(<!-- rooms -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def job(path: Path) -> str:
-    """The first line of a module's docstring, without its full stop."""
+    """Get the first line of a module's docstring, without its full stop."""
     text = ast.get_docstring(ast.parse(path.read_text())) or ""
     return re.sub(r"``(.+?)``", r"`\1`", text.split("\n\n")[0].replace("\n", " ")).removesuffix(".").replace("|", "\\|")
 
 
 def rows(folder: Path, prefix: str = "") -> list[str]:
-    """The rows of a folder's modules; a folder within it is a row, and its modules follow. Tasks are one row."""
+    """List the rows of a folder's modules. Subfolders get a row, followed by their modules; tasks share one row."""
     found = []
     for path in sorted(folder.iterdir(), key=lambda path: (path.is_dir(), path.name)):
         if path.is_dir() and (path / "__init__.py").exists():
@@ -28,7 +28,7 @@ def rows(folder: Path, prefix: str = "") -> list[str]:
 
 
 def written(page: str) -> str:
-    """The page with a current map."""
+    """Return the page with an up-to-date map."""
     table = "\n".join(["| module | job |", "|---|---|", *rows(ROOT / "lyceum_warp")])
     return PLACE.sub(lambda found: f"{found[1]}\n{table}\n\n{found[2]}", page)
 

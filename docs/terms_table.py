@@ -12,12 +12,12 @@ PLACE = re.compile(r"(<!-- (functions|arguments) -->\n).*?(<!-- end -->)", re.DO
 
 
 def cell(text: str) -> str:
-    """A docstring as a cell of a table."""
+    """Format a docstring as a table cell."""
     return re.sub(r"``(.+?)``", r"`\1`", " ".join(text.split())).replace("|", "\\|")
 
 
 def functions() -> list[str]:
-    """A table for each module, with a row for each function in the order of the source."""
+    """Make a table for each module, with a row for each function in source order."""
     lines = []
     for path in sorted(Path(terms.__file__).parent.glob("[!_]*.py")):
         tree = ast.parse(path.read_text())
@@ -36,13 +36,13 @@ def functions() -> list[str]:
 
 
 def arguments() -> list[str]:
-    """A table of all arguments."""
+    """Make a table of all arguments."""
     rows = [f"| `{name}` | {cell(meaning)} |" for name, meaning in terms.ARGUMENTS.items()]
     return ["| argument | meaning |", "|---|---|", *rows]
 
 
 def written(page: str) -> str:
-    """The page with current tables."""
+    """Return the page with up-to-date tables."""
     tables = {"functions": functions(), "arguments": arguments()}
     return PLACE.sub(lambda found: "\n".join([found[1], *tables[found[2]], "", found[3]]), page)
 

@@ -3,7 +3,7 @@
     python examples/td3.py
     python examples/td3.py --task half_cheetah --nworld 8 --iterations 200
 
-lw.train keeps the replay buffer in the run's folder, so the run resumes to the bit.
+lw.train keeps the replay buffer in the run's folder, so the run resumes bit for bit.
 """
 
 import copy
@@ -29,7 +29,7 @@ class TD3Config:
     n_step: int = 1
     gamma: float = 0.99
     tau: float = 0.005
-    """Part of the way from the targets to the networks in an update."""
+    """Step size of the target networks: each update moves them by this fraction towards the networks."""
     learning_rate: float = 1e-3
     noise: float = 0.2
     """Standard deviation of the exploration noise."""

@@ -125,7 +125,8 @@ def dm_control_env(task: str, seed: int) -> Any:
         return suite.load("cartpole", "balance", task_kwargs={"random": seed})
 
     class FromGymnasium(control.Task):
-        """A task that takes observation, reward and end from a Gymnasium environment on dm_control's model and data."""
+        """A dm_control task with the observation, reward and end of a Gymnasium environment, on dm_control's model and
+        data."""
 
         def __init__(self, env: Any, physics: Any) -> None:
             self.env, self.position = env, POSITIONS.get(task, lambda env: env.data.qpos[0])
@@ -157,7 +158,7 @@ def dm_control_env(task: str, seed: int) -> Any:
             return 0.0 if ends and not self.env.is_healthy else None
 
     class FromStep(FromGymnasium):
-        """A task that judges only the new state, by Gymnasium's step without its physics."""
+        """A task that evaluates only the new state, with Gymnasium's step function without its physics."""
 
         def __init__(self, env: Any, physics: Any) -> None:
             super().__init__(env, physics)
