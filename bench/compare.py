@@ -143,7 +143,7 @@ def unequal(old: np.ndarray, new: np.ndarray) -> np.ndarray:
 
 
 def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] = ()) -> Difference | None:
-    """Return the difference between two arrays, or None if they are equal to the bit.
+    """Return the difference between two arrays, or None if they are bitwise equal.
 
     Args:
         name: Their name.
@@ -465,7 +465,7 @@ def run(options: Options) -> int:
         ValueError: An option is invalid.
     """
     if options.steps < 1 or options.iterations < 2:
-        raise ValueError("--steps must be at least 1 and --iterations at least 2, so that a run can have a break")
+        raise ValueError("--steps must be at least 1 and --iterations at least 2, so that a run can be interrupted")
     if options.out is not None and not options.out.resolve().parent.is_dir():
         raise ValueError(f"there is no folder {options.out.resolve().parent} for --out")
     report, began = Report(options.ignore), time.perf_counter()
@@ -487,7 +487,7 @@ def run(options: Options) -> int:
     if report.skipped:
         print(f"skipped, because of missing models: {', '.join(report.skipped)}")
     if report.ignored:
-        print(f"left out by --ignore: {report.ignored} names")
+        print(f"excluded by --ignore: {report.ignored} names")
     compared = f"{report.arrays:,} arrays in {len(report.units)} units, {seconds:.0f} s"
     print(f"{len(report.found)} differences in {differing} units; {compared}" if report.found
           else f"no difference: {compared}")  # fmt: skip

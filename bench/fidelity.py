@@ -1,4 +1,4 @@
-"""Measure how long trajectories of the two engines stay together.
+"""Measure after how many steps trajectories of the two engines diverge.
 
     lyceum-warp bench fidelity --device cuda --jobs 4
 

@@ -41,7 +41,7 @@ SETTINGS: dict[str, dict[str, Any]] = {"default": {}, "desired_kl 0.01": {"desir
 """Hyperparameters that differ from the algorithm's defaults."""
 
 JUDGED, RECENT, WALKED = 16, 100, (256, 500)
-"""Episodes per evaluation, episodes in a run's mean return, and worlds and steps of the walk."""
+"""Episodes per evaluation, episodes in a run's mean return, and (worlds, steps) of the walking test."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,7 @@ def main() -> None:
         table.add_row(name, found.summary, *map(experiment.duration, times))
     Console(width=120).print(table)
     print("\nlyceum-warp bench NAME --help     options of an experiment; every program in bench/ runs in this way")
-    print("lyceum-warp bench compare OLD     every difference, to the bit, between a revision and this working tree")
+    print("lyceum-warp bench compare OLD     every bitwise difference between a revision and this working tree")
     print("lyceum-warp bench plot [NAME]     figures from stored results: bench/results/NAME-MACHINE.png")
     print("lyceum-warp bench tables [NAME]   tables from stored results: bench/results/NAME.md")
 

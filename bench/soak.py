@@ -7,8 +7,8 @@ Part faults: worlds step under random actions, and every thousandth step of a wo
 states, and actions that are not finite, are written from outside. For the other faults the program writes a variant of
 the task beside a copy of its source (``VARIANT``), in which an additional action number requests a NaN reward, a NaN
 observation or a negative mass. Every fault must be reported in its world and step, nothing else may be reported, and
-``env.fault_counts`` must agree. A second environment without faults must give equal numbers, to the bit, for each world
-up to its first fault, and throughout for every fourth world, which gets no faults.
+``env.fault_counts`` must agree. A second environment without faults must give bitwise equal numbers for each world
+until its first fault. Every fourth world gets no faults, so its numbers must always be equal.
 
 A run is divided into chunks. A chunk is one result, and ends with a file of the worlds' states in the folder
 ``--work``. The next chunk continues from this file, also on another machine with a copy of the folder.

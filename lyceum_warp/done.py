@@ -21,9 +21,9 @@ class Done(enum.IntFlag):
     NAN = 4
     """A state or a control is NaN or exceeds 1e10 in magnitude, or task memory is not finite."""
     CONTACT_OVERFLOW = 8
-    """More contacts than the engine had room for."""
+    """The contacts exceeded the engine's capacity."""
     CONSTRAINT_OVERFLOW = 16
-    """More constraints than the engine had room for."""
+    """The constraints exceeded the engine's capacity."""
     ENGINE_WARNING = 32
     """Any other engine warning."""
     ACTION = 64

@@ -568,7 +568,7 @@ class Env:
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
         """The values of the named parameters, for ``nworld`` worlds."""
         known, worlds = self.task.parameters, np.arange(nworld) % self.nworld
-        # other values stay as given, for instance as an element's name instead of its index
+        # keep other values in the form in which they were given, for instance an element's name instead of its index
         given = {name: value for name, value in self._given_params.items() if name not in known.tables}
         values = {name: (known.values | given)[name] for name in names}
         return values | {name: known.values[name][worlds] for name in names if name in known.per_world}

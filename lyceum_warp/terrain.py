@@ -71,7 +71,7 @@ def _waves(x: np.ndarray, y: np.ndarray, amount: float, rng: np.random.Generator
 
 def _stones(x: np.ndarray, y: np.ndarray, amount: float, rng: np.random.Generator) -> np.ndarray:
     pitch, depth, tiny = 0.8, 0.5, 1e-6
-    into = [(side + tiny) % pitch for side in (x, y)]  # from the near edge of a gap
+    into = [(side + tiny) % pitch for side in (x, y)]  # distance from the near edge of a gap
     gap = np.logical_or(*[(phase > 2 * tiny) & (phase < amount) for phase in into])
     return np.where(gap & _around_platform(x, y), -depth, 0.0)
 

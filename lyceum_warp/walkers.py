@@ -49,15 +49,15 @@ def servos(model: mujoco.MjModel, p: Any) -> list[int]:
     """The actuator of each joint, (joints,).
 
     Raises:
-        ValueError: A joint has no actuator of its own or several.
+        ValueError: A joint does not have exactly one actuator.
     """
     moved = np.where(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, model.actuator_trnid[:, 0], -1)
     found = [np.flatnonzero(moved == joint) for joint in p.joints]
     for joint, actuators in zip(p.joints, found, strict=True):
         if len(actuators) != 1:
             raise ValueError(
-                f"the joint {_name(model, _JOINT, joint)} has {len(actuators)} actuators of its own but needs "
-                f"exactly one (tendon actuators do not count): change the model, or omit the joint from ``joints``"
+                f"the joint {_name(model, _JOINT, joint)} has {len(actuators)} actuators but needs exactly one "
+                f"(tendon actuators do not count): change the model, or omit the joint from ``joints``"
             )
     return [int(actuators[0]) for actuators in found]
 

@@ -30,7 +30,7 @@ SAME_MODELS = (
 
 
 def long_if_alike(tasks: Iterable[str], *more: str) -> list[Any]:
-    """Return parameters for a test of every task; tasks of ``SAME_FUNCTIONS``, and ``more``, are marked long."""
+    """Return test parameters for all tasks; tasks in ``SAME_FUNCTIONS`` and in ``more`` are marked long."""
     alike = (*SAME_FUNCTIONS, *more)
     return [pytest.param(task, marks=pytest.mark.long) if task in alike else task for task in tasks]
 

@@ -52,7 +52,7 @@ def test_own_policy_improves(run) -> None:
 
 
 def test_random_search_gets_a_complete_run_folder(run, tmp_path: Path) -> None:
-    """The run has a folder, resumes to the bit, and can be evaluated and exported."""
+    """The run has a folder, resumes bit for bit, and can be evaluated and exported."""
     once = numbers(r"return (-?[\d.]+)", run("random_search.py", "--out", "once", "--iterations", "6"))
     assert max(once) == 200.0 > 1.5 * once[0]  # the policy earns a reward in every step
     run("random_search.py", "--out", "twice", "--iterations", "3")

@@ -39,7 +39,7 @@ def lay_down(env: lw.Env, world: int) -> None:
 
 
 def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
-    """Step an environment with a fault and one without; all other worlds must be equal to the bit."""
+    """Step an environment with a fault and one without; all other worlds must be bitwise equal."""
     others, found = torch.arange(N) != BAD, Done(0)
     generator = torch.Generator().manual_seed(0)
     for i in range(steps):
@@ -87,7 +87,7 @@ def test_a_constraint_overflow_of_the_warp_engine_is_a_fault_of_one_world() -> N
     assert env.fault_counts.pop("constraint_overflow") == sum(env.fault_counts.values()) == 1
 
 
-def test_a_contact_overflow_of_the_warp_engine_is_a_fault_of_every_world_without_room() -> None:
+def test_a_contact_overflow_of_the_warp_engine_faults_every_world_whose_contacts_do_not_fit() -> None:
     """All worlds share one contact pool, and each world without room is flagged."""
     env = hopper("warp", nconmax=1, njmax=64)
     lay_down(env, BAD)

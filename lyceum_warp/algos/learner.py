@@ -116,7 +116,7 @@ class Learner(abc.ABC):
     """The random generator, if the algorithm has one."""
     replay: Replay | None = None
     """The replay buffer, if the algorithm has one. ``state_dict`` does not contain it, because it may be large: a run
-    keeps it in files of its own, which are updated step by step."""
+    keeps it in separate files, which are updated incrementally."""
     own_worlds: slice
     """Range of this process's worlds among the worlds of all processes."""
     iteration: int

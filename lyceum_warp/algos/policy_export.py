@@ -95,7 +95,7 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
     ``actuators``     names of the model's actuators, in order
     ================  ===================================================================================
 
-    A task adds entries of its own (``lw.Task.deployment``); ``walkers.deployment`` lists those of velocity tasks.
+    A task may add entries (``lw.Task.deployment``); ``walkers.deployment`` lists the entries of velocity tasks.
 
     Args:
         policy: The policy.

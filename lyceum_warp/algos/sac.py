@@ -377,7 +377,7 @@ class GradientStep:
     """Makes steps of Adam on some parameters, with gradients summed over all processes.
 
     Args:
-        parameters: The parameters; frozen ones stay as they are.
+        parameters: The parameters; frozen parameters do not change.
         rate: Learning rate.
         team: The processes.
     """
@@ -422,6 +422,6 @@ def _check_sizes(policy: SquashedPolicy, value: TwinCritic, env: Env, low: list[
             )
     if (policy.shape["low"], policy.shape["high"]) != (low, high):
         raise ValueError(
-            f"the policy's actions are from {policy.shape['low']} to {policy.shape['high']}, and those of the task "
+            f"the policy's actions are from {policy.shape['low']} to {policy.shape['high']}, but those of the task "
             f"{name!r} from {low} to {high}"
         )

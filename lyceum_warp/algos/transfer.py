@@ -130,9 +130,9 @@ def transfer(
     over the pairs; the interval of the terminated share is Agresti and Min's.
 
     Args:
-        env: An environment of the task; its worlds stay unchanged.
+        env: An environment of the task; its worlds do not change.
         policy: A module with a method ``act``, or a function; maps observations to actions, without noise.
-        episodes: Number of pairs, each in a world of its own.
+        episodes: Number of pairs, each in a separate world.
         seed: Seed of the initial states.
         margin: Largest irrelevant difference: for returns and lengths, a fraction of the mean absolute return or mean
             length in the first simulation; for the terminated share, an absolute difference.

@@ -392,7 +392,7 @@ class BoundTask:
             )
         if self.functions["control"] is None:
             raise ValueError(
-                f"the task {self.name!r} has actions of its own, so it needs {FUNCTIONS['control'].signature}"
+                f"the task {self.name!r} defines its own actions, so it needs {FUNCTIONS['control'].signature}"
             )
         return {
             name: parts.length(f"the size of the action {name!r} of the task {self.name!r}", size, self.params)

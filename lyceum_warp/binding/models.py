@@ -103,8 +103,8 @@ def compile_model(
     - Sleep is turned off, because a saved state does not say which bodies are asleep.
     - Fields that MuJoCo computes only for a sensor get such a sensor, after the model's own; if no field needs sensors,
       they are turned off. The energy is turned on if it is read.
-    - If ``contact`` lists a pair of geoms twice, the first entry stays: MuJoCo would make the contact twice, MuJoCo
-      Warp once.
+    - If ``contact`` lists a pair of geoms twice, only the first entry is kept: MuJoCo would make the contact twice,
+      MuJoCo Warp once.
 
     Args:
         spec: The model; changed in place.

@@ -10,7 +10,7 @@ _BY_NAME = "actuator body cam camera eq equality geom jnt joint key keyframe lig
 
 def _refuse(self: Any, name: str, value: Any) -> None:
     raise AttributeError(
-        "env.model is read-only, because the engine has a copy of its own: list model fields in the task's World and "
+        "env.model is read-only, because the engine has its own copy: list model fields in the task's World and "
         "write them in startup or randomize, or pass an edited MjSpec as model="
     )
 

@@ -201,8 +201,8 @@ class Engine(abc.ABC):
     def refresh_current(self, mask: wp.array) -> None:
         """Compute the masked worlds' derived fields and sensors that belong to the current state.
 
-        Fields and sensors of the acceleration stage stay as the last substep left them. Other worlds and all sensor
-        histories do not change.
+        Fields and sensors of the acceleration stage keep their values from the last substep. Other worlds and all
+        sensor histories do not change.
         """
 
     # rollouts

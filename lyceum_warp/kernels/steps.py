@@ -313,7 +313,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
     ):
         """Evaluate a transition or a state in the masked worlds without a fault; launched over (threads, nworld).
 
-        The parts are independent. On a GPU each part has a thread of its own, which is several times faster than one
+        The parts are independent. On a GPU each part runs in a separate thread, which is several times faster than one
         thread per world.
         """
         start, k = wp.tid()

@@ -102,5 +102,5 @@ class AdroitDoor(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Make the door's frame a mocap body, so that each world has a door position of its own."""
+        """Make the door's frame a mocap body, so that the door's position can differ between worlds."""
         spec.body("frame").mocap = True

@@ -109,7 +109,7 @@ class AdroitPen(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Make the target a mocap body without collisions, so that each world has an orientation of its own."""
+        """Make the target a mocap body without collisions, so that its orientation can differ between worlds."""
         spec.body("target").mocap = True
         for geom in spec.body("target").geoms:
             geom.contype = geom.conaffinity = 0

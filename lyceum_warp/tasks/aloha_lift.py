@@ -14,7 +14,8 @@ from lyceum_warp import Row
 
 @wp.struct
 class World:
-    qpos: Row[float]  # left arm: 6 joints, 2 fingers; right arm alike; position and quaternion of the pot; its lid
+    # per arm, left first: 6 joints and 2 fingers; then position and quaternion of the pot, and its lid
+    qpos: Row[float]
     qvel: Row[float]
     act: Row[float]  # servo targets of both arms
     xpos: Row[wp.vec3]

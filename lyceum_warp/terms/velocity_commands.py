@@ -8,8 +8,7 @@ The parts of a command are rows of memory, each drawn by one call::
     terms.draw_flag(s.standing, p.standing_share, rng)
     terms.draw_forward_only(s.drawn_velocity, p.forward_share, p.least_forward_velocity, rng)
 
-The order is that of ``UniformVelocityCommand`` in mjlab 1.6.0. ``velocity_command`` computes the command from the
-parts.
+The order follows ``UniformVelocityCommand`` of mjlab 1.6.0. ``velocity_command`` computes the command from the parts.
 """
 
 import warp as wp

@@ -22,7 +22,7 @@ class Setting:
     """Physics options to try together."""
 
     name: str
-    """Short description; empty for the task as it is."""
+    """Short description; empty for the unchanged task."""
     group: str
     """The kind of change. A combination has at most one setting of each group."""
     physics: Mapping[str, Any]
@@ -35,7 +35,7 @@ def candidates(env: Env) -> list[Setting]:
     """The settings to try one by one, in order.
 
     Args:
-        env: The task as it is.
+        env: The unchanged task.
     """
     option, limits = env.task.model.opt, env.options.physics.solver or {}
     cone, integrator = _name(CONES, option.cone), _name(INTEGRATORS, option.integrator)

@@ -18,7 +18,7 @@ def identity(env: Env, **more: Any) -> dict[str, Any]:
     """Everything except the setting that results depend on: task, machine, worlds and versions.
 
     Args:
-        env: The task as it is.
+        env: The unchanged task.
         more: Additional entries, JSON values.
     """
     kept, _ = task_copy(env)

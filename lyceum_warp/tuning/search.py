@@ -36,7 +36,7 @@ class Tuning:
     rows: list[Row]
     """The results of each setting, the fastest first; docs/physics.md describes the entries. ``verdict`` is "same",
     "different" or "not shown" (the interval of the returns lies within, outside or across the tolerance), "faults"
-    (more than twice as many as in the task as it is), "no gain" (less than 3 % faster and no smaller: returns are not
+    (more than twice as many as in the unchanged task), "no gain" (less than 3 % faster and no smaller: returns are not
     compared), "refused" (by MuJoCo or the engine, whose reason is in ``refused``), or for a planner "ranks badly"."""
     reference: Row
     """The results of the unchanged task, measured against itself."""

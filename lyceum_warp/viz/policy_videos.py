@@ -40,8 +40,7 @@ def policy_states(env: Env, policy: Policy, seed: int, *, progress: Progress | N
 class Videos:
     """Writes a video of the mean policy every few iterations.
 
-    An error, as on a machine that cannot draw, is reported once; no further videos are made then, and the
-    training goes on.
+    An error, such as on a machine that cannot draw, is reported once; training then continues without further videos.
 
     Args:
         learner: The algorithm.

@@ -213,7 +213,7 @@ def test_given_networks_are_trained_further(env: lw.Env) -> None:
     with pytest.raises(ValueError, match="value of PPO must be of type ValueFunction.* not TwinCritic"):
         lw.PPO(env, value=value)  # type: ignore[arg-type]
     wide = lw.SquashedPolicy(1, 1, (8,), low=[-2.0], high=[2.0])
-    with pytest.raises(ValueError, match=r"actions are from \[-2.0\] to \[2.0\], and those of the task 'metered' from"):
+    with pytest.raises(ValueError, match=r"actions are from \[-2.0\] to \[2.0\], but those of the task 'metered' from"):
         lw.SAC(env, wide)
     with pytest.raises(ValueError, match="the TwinCritic takes 1 observations and 1 actions, .* has 2 and 1"):
         lw.SAC(env, value=lw.TwinCritic(1, 1, group="critic"))

@@ -52,6 +52,6 @@ def test_worlds_that_have_diverged_once_stay_counted() -> None:
     assert fidelity.half_apart(error[:, [3]]) is None and fidelity.half_apart(error[:, []]) is None
 
 
-def test_worlds_with_faults_are_left_out() -> None:
+def test_worlds_with_faults_are_excluded() -> None:
     error = torch.tensor([[0.0, 2.0, 4.0, math.nan], [math.nan] * 4])
     assert fidelity.quantiles(error, [1, 2]) == {"median": [2.0, None], "p99": [pytest.approx(3.96), None]}

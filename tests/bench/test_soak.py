@@ -41,7 +41,7 @@ def test_every_injected_fault_is_found_and_counted(
     assert re.search(r"\| point_mass, cpu \| 16 \| 1.92e\+04 \|", capsys.readouterr().out)
 
 
-def test_chunks_equal_an_uninterrupted_run_to_the_bit(work: Path, tmp_path: Path) -> None:
+def test_chunks_equal_an_uninterrupted_run_bit_for_bit(work: Path, tmp_path: Path) -> None:
     for name, steps in (("two", "4800"), ("one", "9600")):
         run(tmp_path / f"{name}.jsonl", *FAULTS, "--steps", steps, "--work", str(work))
     ends = [torch.load(work / f"point_mass-auto-cpu-16-{steps}-0-same-bits-{chunk}.pt", weights_only=True)

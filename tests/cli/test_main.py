@@ -90,6 +90,6 @@ def test_a_wrong_value_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert "--samples" in capsys.readouterr().err
 
 
-def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_prints_the_packages_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out == f"lyceum-warp {lw.__version__}\n"

@@ -124,9 +124,9 @@ def test_options_name_feet_and_joints(folder: Path) -> None:
         (("<freejoint/>", ""), [], "sled.xml: the first joint of the model is not a free joint"),
         (('<geom name="floor" type="plane" size="5 5 .1"/>', ""), [], "sled.xml: the model has no floor"),
         (('<position name="left_hip" joint="left_hip" kp="40" kv="2"/>', ""), ["--joints", "left_hip"],
-         "sled.xml: the joint 'left_hip' has 0 actuators of its own but needs exactly one"),
+         "sled.xml: the joint 'left_hip' has 0 actuators but needs exactly one"),
         (('<position name="left_hip" joint="left_hip" kp="40" kv="2"/>', '<motor tendon="left" ctrlrange="-1 1"/>'), [],
-         "sled.xml: the joint 'left_hip' has 0 actuators of its own but needs exactly one "
+         "sled.xml: the joint 'left_hip' has 0 actuators but needs exactly one "
          "(tendon actuators do not count)"),
     ],
 )  # fmt: skip

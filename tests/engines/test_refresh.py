@@ -209,7 +209,9 @@ def test_a_refresh_on_warp_runs_no_collisions_and_no_constraints(sensors: str, m
 
 
 @pytest.mark.parametrize("sensors", ["mixed", "histories"])
-def test_sensors_of_the_acceleration_stage_stay_as_the_last_substep_left_them(kind: type[Engine], sensors: str) -> None:
+def test_sensors_of_the_acceleration_stage_keep_their_values_from_the_last_substep(
+    kind: type[Engine], sensors: str
+) -> None:
     engine = make(kind, sensors)
     late = np.setdiff1d(np.arange(engine.model.nsensordata), early_sensor_columns(engine.model))
     engine.step(3)

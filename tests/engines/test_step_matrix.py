@@ -27,7 +27,7 @@ SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 @pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
 def device(request: pytest.FixtureRequest) -> wp.Device:
-    """Return a device on which steps are reproducible to the bit; on a GPU the mode is deterministic."""
+    """Return a device on which steps are reproducible bit for bit; on a GPU the mode is deterministic."""
     return wp.get_device(request.param)
 
 
@@ -188,7 +188,7 @@ def drawn_fields() -> list[Any]:
 
 @pytest.mark.parametrize("name", drawn_fields())
 def test_a_drawn_field_acts_as_in_an_edited_model(name: str, device: wp.Device) -> None:
-    """Some fields are zero in the model. Results are equal to the bit if no constants are derived."""
+    """Some fields are zero in the model. Results are bitwise equal if no constants are derived."""
     case = DRAWN | OF_ANOTHER_MODEL.get(name, {})
     spec = mujoco.MjSpec.from_string(table.xml(case))
     for body in spec.bodies[1:]:

@@ -93,7 +93,7 @@ def test_a_metric_that_is_not_written_is_zero(engine: str) -> None:
 
 
 @ENGINES
-def test_a_metric_that_is_not_finite_stays_out_of_the_state(engine: str) -> None:
+def test_a_non_finite_metric_does_not_enter_the_state(engine: str) -> None:
     env = lw.make(Faulty, nworld=2, engine=engine, metric=[1.0, 1.0])
     env.step()
     env.set_params(metric=[float("inf"), 1.0])

@@ -145,7 +145,7 @@ def test_model_fields_can_be_set_in_an_environment_of_any_task(engine: str) -> N
     for _ in range(3):
         env.step(torch.full((3, 3), 0.5))
     qpos = env.field("qpos")
-    assert torch.equal(qpos[0, 1], qpos[2, 1])  # still in the air
+    assert torch.equal(qpos[0, 1], qpos[2, 1])  # the robot is still in the air
     assert not torch.equal(qpos[0], qpos[1])
     env.rand_reset()
     assert torch.equal(env.field("body_mass"), masses)  # resets do not randomize this field again
@@ -466,7 +466,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     "a keyframe by its number": (
         [line("keyframe = 0")], "keyframe of the task 'tiny' must be the name of a keyframe .*, such as 'home', not 0",
     ),
-    "actions without control": ([line('actions = {"speed": 1}')], "has actions of its own, so it needs control"),
+    "actions without control": ([line('actions = {"speed": 1}')], "defines its own actions, so it needs control"),
     "actions without sizes": (
         [line('actions = ("speed",)')], r"must be a dict of names and sizes, such as \{'speed': 1\}",
     ),

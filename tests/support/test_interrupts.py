@@ -80,7 +80,7 @@ def test_a_second_signal_raises_within_obeyed_and_a_third_is_ignored() -> None:
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
-def test_obeyed_keeps_ignored_signals_and_other_handlers() -> None:
+def test_obeyed_does_not_replace_ignored_signals_and_other_handlers() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with signals():
         with pytest.raises(Interrupted):

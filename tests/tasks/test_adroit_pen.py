@@ -82,7 +82,7 @@ def test_the_target_has_no_contacts() -> None:
     env = lw.make("adroit_pen", engine="mujoco", nworld=2, nthread=1)
     state = env.get_state()
     parts = env.state_space.split(state)
-    parts["qpos"][:, 26] = 0.2  # along x, into the target
+    parts["qpos"][:, 26] = 0.2  # move the pen along x, into the target
     parts["mocap_pos"][1, 3:] = 5.0
     env.set_state(state)
     for _ in range(10):

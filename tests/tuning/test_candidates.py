@@ -25,11 +25,11 @@ def test_settings_of_hopper_are_below_its_limits_and_keep_its_control_interval(s
         if setting.group == "substeps"
     )
     limited = next(setting for setting in settings if setting.name == "ls_iterations=10")
-    assert limited.physics == {"solver": {"iterations": 3, "ls_iterations": 10}}  # the given limit stays
+    assert limited.physics == {"solver": {"iterations": 3, "ls_iterations": 10}}  # the given limit is kept
     assert not {"noslip", "impratio", "room"} & {setting.group for setting in settings}
 
 
-def test_an_elliptic_cone_and_noslip_have_settings_of_their_own(shared_env: SharedEnv) -> None:
+def test_an_elliptic_cone_and_noslip_add_settings(shared_env: SharedEnv) -> None:
     spec = lw.gymnasium_model("hopper.xml").spec()
     spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10
     spec.option.noslip_iterations = 5

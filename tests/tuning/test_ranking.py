@@ -16,7 +16,7 @@ def test_rank_correlations_are_spearmans_with_mean_ranks_of_equal_numbers() -> N
     first = torch.tensor([order, [1.0, 2.0, 2.0, 3.0], [0.0, 1.0, 5.0, FAILED], [7.0] * 4, order])
     second = torch.tensor([[1.0, 3.0, 2.0, 4.0], order, [9.0, 4.0, 1.0, 90.0], order, [2.0] * 4])
     found = rank_correlations(first, second)
-    assert found.tolist() == pytest.approx([0.8, 0.9487, -1.0, 0.0], abs=1e-4)  # a row without differences is left out
+    assert found.tolist() == pytest.approx([0.8, 0.9487, -1.0, 0.0], abs=1e-4)  # a row of equal numbers is omitted
 
 
 @pytest.fixture(scope="module")

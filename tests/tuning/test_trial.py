@@ -16,7 +16,7 @@ CRUDE = Setting("crude", "", {"frame_skip": 1, "timestep": 0.05, "solver": {"ite
 
 @pytest.fixture(autouse=True)
 def judge_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compare the returns of every setting, whatever the speeds on a busy machine."""
+    """Compare the returns of every setting, independently of measured speeds."""
     monkeypatch.setattr(trial, "buys", lambda speedup, memory: True)
 
 

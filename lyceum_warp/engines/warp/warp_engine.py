@@ -43,9 +43,9 @@ class WarpEngine(Engine):
         dynamics: The model fields that differ between worlds. Contact and constraint capacities are probed with the
             model's own values; see ``sizes.probe_sizes``.
         initial: The state that ``reset`` puts worlds into, rounded to float32; None for the model's own.
-        nconmax: Contacts that each world has room for, on average. None probes the model, and reserves additional room
-            for one world in which everything touches.
-        njmax: Constraints that each world has room for; None probes the model.
+        nconmax: Contact capacity per world, on average. None probes the model, and adds capacity for one world in which
+            all geoms touch.
+        njmax: Constraint capacity of each world; None probes the model.
 
     Raises:
         ValueError: MuJoCo Warp does not support the model, or an option is out of range.
@@ -364,7 +364,7 @@ def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied
 
 
 def _check_sdf_plugins(model: mujoco.MjModel) -> None:
-    """Refuse SDF plugins unless a distance function was registered with MuJoCo Warp, which has none of its own."""
+    """Refuse SDF plugins unless a distance function was registered with MuJoCo Warp, which has none itself."""
     if (model.geom_plugin >= 0).any() and not has_sdf_functions():
         raise NotImplementedError("it cannot evaluate SDF plugins")
 

@@ -14,7 +14,7 @@ from lyceum_warp.viewer.session.live import HISTORY_BYTES, PLANT_HISTORY_BYTES
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_steps_back_and_forth_restore_the_states_to_the_bit(shared_env: SharedEnv, engine: str) -> None:
+def test_steps_back_and_forth_restore_the_states_bit_for_bit(shared_env: SharedEnv, engine: str) -> None:
     env = shared_env("hopper", engine=engine, nworld=3)
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=1)
     states = [env.get_state()]

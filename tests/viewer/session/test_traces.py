@@ -41,7 +41,7 @@ def test_a_site_a_body_or_the_tasks_choice_is_traced() -> None:
         trace_point(model, "nose")
 
 
-def test_paths_are_those_that_the_samples_take(shared_env: SharedEnv) -> None:
+def test_traces_equal_the_paths_of_the_samples(shared_env: SharedEnv) -> None:
     """The plant follows each path under the actions of the sample."""
     plant = lw.make("reach", autoreset=False, fields=["site_xpos"])
     mppi = lw.MPPI("reach", samples=6, horizon=5)

@@ -33,7 +33,7 @@ def test_hidden_groups_have_no_ghosts() -> None:
     assert ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(2.0)], groups=groups) == []
 
 
-def test_a_ghost_leaves_out_geoms_that_coincide_with_the_worlds() -> None:
+def test_a_ghost_omits_geoms_that_coincide_with_the_worlds() -> None:
     geoms = ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(0.0), ghost(0.5)])
     np.testing.assert_allclose([geom.pos[0] for geom in geoms], [0.5])
 

@@ -17,7 +17,7 @@ NAMES = {"imgui": studio.imgui, "implot": studio.implot, "ux": studio.ux, "input
 
 
 def used_names(path: Path) -> set[str]:
-    """Attributes of studio's modules that a file reads, as "ux.GuiTheme.LIGHT"."""
+    """List the attributes of studio's modules that a file reads, such as "ux.GuiTheme.LIGHT"."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Attribute):
