@@ -125,7 +125,7 @@ class Placement:
 
 @optional_flags(EnvOptions, omit=NO_FLAGS, default="")
 class EnvFlags:
-    """Where the worlds run, and the length of their episodes: by default those of the run, if there is one."""
+    """Where the worlds run, and the length of their episodes. The defaults come from the run, if there is one."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto (the default): warp on a CUDA device and mujoco on the CPU."""

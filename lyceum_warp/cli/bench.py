@@ -54,7 +54,8 @@ class Bench:
             close = difflib.get_close_matches(self.name, programs, 1)
             hint = f"did you mean {close[0]}?" if close else "lyceum-warp bench lists the experiments"
             raise ValueError(f"there is no program {self.name!r} in bench/: {hint}")
-        path = os.pathsep.join([str(FOLDER.parent), *filter(None, [os.environ.get("PYTHONPATH")])])  # this very package
+        # the child imports this package, not an installed one
+        path = os.pathsep.join([str(FOLDER.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
         command = [sys.executable, str(FOLDER / f"{self.name}.py"), *arguments]
         child = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": path})
         try:

@@ -193,7 +193,7 @@ def curve_table(rows: list[dict[str, float | None]], console: Console) -> Table:
 
 
 def _known(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row without empty cells and NaN."""
+    """Copy a row without empty and NaN cells."""
     return {name: value for name, value in row.items() if value is not None and not math.isnan(value)}
 
 

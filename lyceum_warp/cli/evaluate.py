@@ -172,7 +172,7 @@ def run_worlds(
         params: Parameters that override the run's.
         nworld: Number of worlds.
         task: A different task, with its own options and parameters.
-        trust: Whether to execute the task of a run that this user did not make on this machine.
+        trust: Whether to execute a run's task although this user did not make the run on this machine.
     """
     saved = Configuration.of(run)
     known, own = saved.options.changed({"seed": 0}), dict(saved.params)

@@ -87,7 +87,7 @@ class _Entry:
     about: str = ""
     source: str = _UNKNOWN
     note: str = ""
-    """Why a value is unknown."""
+    """Reason why a value is unknown."""
 
     def has(self, word: str) -> bool:
         """Whether the entry contains a word, in any case."""
@@ -149,7 +149,7 @@ def _source(task: type[Task]) -> str:
 
 
 def _reason(error: Exception) -> str:
-    """An error in one line; if it names a pip command that fixes it, only that."""
+    """Shorten an error to one line, or to the pip command in it, if there is one."""
     text = " ".join(str(error).split())
     command = text.rpartition(": ")[2]
     if command.startswith("pip install"):

@@ -52,15 +52,15 @@ class New:
     of these packages. A relative path is written relative to the task file."""
 
     template: Literal["plain", "velocity"] = "plain"
-    """velocity: a task of the family of walking robots, which follow velocity commands. The robot needs a base that
-    moves freely, and legs of hinges with an actuator each. Its file is short, because functions, rewards and most
-    numbers are the family's."""
+    """velocity: a task of the family of walking robots, which follow velocity commands. The robot needs a floating
+    base, and legs made of hinges with one actuator each. Its file is short, because the family defines functions,
+    rewards and most parameters."""
     feet: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
     """With --template velocity: sites, geoms or bodies that are feet. By default, the ends of the legs that reach
     lowest."""
     joints: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
-    """With --template velocity: joints that act, with an actuator each. By default, all joints of the legs with an
-    actuator; others keep their pose."""
+    """With --template velocity: names of the actuated joints, with one actuator each. By default, all leg joints with
+    an actuator; other joints keep their pose."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -120,7 +120,7 @@ def _class_name(path: Path) -> str:
         or keyword.iskeyword(class_name)
     ):
         raise ValueError(f"a task can't be named {name!r}: use letters, digits and _, as in my_robot")
-    if snake_case(class_name) != name:  # the task's name is derived from the class's
+    if snake_case(class_name) != name:  # the task's name is derived from the name of the class
         raise ValueError(f"a task can't be named {name!r}: use {snake_case(class_name)!r}, for the class {class_name}")
     if class_name in _TAKEN:
         raise ValueError(f"a task can't be named {name!r}: its file uses {class_name} for something else")
@@ -133,7 +133,7 @@ def _class_name(path: Path) -> str:
 
 
 def _model(text: str, path: Path) -> tuple[str, str, mujoco.MjSpec]:
-    """The expression for a model in a task file, its description, and the model itself.
+    """Return the expression for a model in a task file, its description, and the model.
 
     Args:
         text: The model as given on the command line.

@@ -88,7 +88,7 @@ class Plan:
 
     With --real-time the world keeps its rate. The command then measures planning times for a few seconds, and chooses
     the largest number of samples that meets the deadline on this machine, or if none does, a shorter horizon or other
-    physics of the task. It chooses only what is not given: --samples, --horizon, --physics.
+    physics of the task. It does not change given values of --samples, --horizon and --physics.
 
     The command writes config.json, versions.json, report.json, plan.png, a video of the first episode (video.mp4), and
     one file per episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy) into a
@@ -213,7 +213,7 @@ def _stem(task: str) -> str:
 def _worlds(
     options: Plan, params: dict[str, Any], planner_params: dict[str, Any]
 ) -> tuple[Env, Callable[[RealTimeSetting | None], MPPI]]:
-    """Make the controlled world, and a function that makes its planner with a chosen setting, or with the flags."""
+    """Make the controlled world, and a function that makes its planner from a chosen setting or from the flags."""
     steps: dict[str, Any] = {} if options.steps is None else {"horizon": whole_number("steps", options.steps, low=1)}
     plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
     if plant.horizon == 0:
@@ -228,7 +228,8 @@ def _worlds(
     def make(setting: RealTimeSetting | None) -> MPPI:
         chosen, physics = config, {}
         if setting is not None:
-            knots = config.knots and max(1, config.knots * setting.horizon // config.horizon)  # as far apart as before
+            # the time between plans does not change
+            knots = config.knots and max(1, config.knots * setting.horizon // config.horizon)
             chosen = config.changed({"samples": setting.samples, "horizon": setting.horizon, "knots": knots})
             if setting.physics not in (None, _suggested_physics(task)):
                 physics = {"physics": setting.physics}
@@ -238,11 +239,11 @@ def _worlds(
 
 
 _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
-"""Numbers of samples to choose from in real time, beside the task's own."""
+"""Numbers of samples to choose from in real time, besides the task's own number."""
 
 
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
-    """Choose the settings that the flags leave open, from measured planning times; None if they leave nothing open.
+    """Choose the settings that are not given as flags, from measured planning times; None if all are given.
 
     The deadline is a step of the plant, or if nothing meets it, a longer step of the planner.
     """
@@ -351,7 +352,7 @@ def _save(run: Run, done: list[Trajectory], options: Plan) -> None:
 
 
 def _summary(done: list[Trajectory], options: Plan) -> ControlReport:
-    """The report of some episodes. A plan has the time of the steps to the next one."""
+    """The report of some episodes. The deadline of a plan is the time until the next plan."""
     return control_report(done, rate=1 / (options.replan_every * done[0].period))
 
 

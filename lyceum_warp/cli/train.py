@@ -124,10 +124,10 @@ class Train:
     """Iterations between two videos of the mean policy, videos/000100.mp4 and so on in the run's folder; 0 for none."""
     camera: CameraWords = ()
     transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
-    """Whether to judge at the end whether the policy does the same on the other engine, and write transfer.json. By
-    default worlds on a GPU are compared with the C engine, and physics other than the task's own with those. With
-    --transfer the Warp engine also judges a policy trained on CPU cores, after minutes of compilation if its kernels
-    are cold, and each physics of the task is compared."""
+    """Whether to test at the end whether the policy performs equally on the other engine, and write transfer.json. By
+    default only cheap comparisons run: a GPU with the C engine, and the run's physics with the task's own. With
+    --transfer a policy trained on CPU cores is also tested on the Warp engine (compiling its kernels may take minutes),
+    and each physics of the task is compared."""
     trust: Trust = False
     take_over: bool = False
     """Continue a run that another process has locked, on this or another host. The other process ends at its next

@@ -20,11 +20,11 @@ Cell: TypeAlias = Callable[[dict[str, Any]], str]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Tune:
-    """Measure what each physics option of a task buys and what it changes, and print the fastest with equal returns.
+    """Measure the gain and the side effects of each physics option of a task, and print the fastest with equal returns.
 
-    Each setting is compared with the task as it is: steps per second, memory, faults, the divergence of trajectories,
+    Each setting is compared with the unchanged task: steps per second, memory, faults, the divergence of trajectories,
     and the returns of the same episodes under random actions and, with --run, under a policy. Every result is appended
-    to a file of JSON lines; the same command continues a search that was stopped. docs/physics.md explains the table.
+    to a JSON Lines file; the same command continues a stopped search. docs/physics.md explains the table.
 
     $ lyceum-warp tune hopper --short
     $ lyceum-warp tune humanoid --run runs/humanoid-20260101-120000
@@ -34,7 +34,7 @@ class Tune:
 
     task: TaskWord
     run_folder: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
-    """A run of this task, whose policy runs the same episodes. Its task parameters are the defaults."""
+    """A run of this task. Its policy also plays the episodes, and its task parameters are the defaults."""
     which: str = "last"
     """Which policy of --run: last, best, or the number of a saved iteration."""
     tolerance: Annotated[str, tyro.conf.arg(metavar="strict|loose|any")] = "strict"
@@ -43,18 +43,18 @@ class Tune:
     short: bool = False
     """Compare the first 100 steps of episodes, for a few seconds for each setting, instead of whole episodes."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Number of episodes of each setting; by default as many as the interval needs, within a minute (5 s with
+    """Number of episodes of each setting; by default chosen for the width of the interval, within a minute (5 s with
     --short)."""
     planning: bool = False
-    """Find physics for the task's planner: compare the time of a plan, and the ranks that the coarser physics and the
-    task as it is give to the same samples. --nworld is then the number of samples, and --episodes the number of states
+    """Find physics for the task's planner: compare planning times, and the rankings of the same samples under the
+    coarser physics and the unchanged task. --nworld is then the number of samples, and --episodes the number of states
     of each kind."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of worlds; by default 256, or 4096 on a GPU. With --planning the planner's samples, by default 64."""
     seed: int = 0
     """Seed of initial states and actions."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File of the results, by default tune/TASK.jsonl or tune/TASK-planning.jsonl. Results that it has are not measured
+    """File of the results, by default tune/TASK.jsonl or tune/TASK-planning.jsonl. Existing results are not measured
     again."""
     param: ParamWords = ()
     env: Annotated[Placement, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(

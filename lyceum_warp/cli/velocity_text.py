@@ -17,13 +17,14 @@ _STEP = 0.02
 """Seconds in a step."""
 
 _NEAR = 0.1
-"""Feet are the ends of legs whose lowest point is at most this share of the base's height above the lowest of all."""
+"""A leg ends in a foot if its lowest point is at most this fraction of the base's height above the lowest point of all
+legs."""
 
 _FLAT = 0.01
 """Spheres of a sole are at most this much higher than its lowest sphere, m."""
 
 _AT = 0.06
-"""A site of the robot is a foot if it is at most this far from the middle of the sole, m."""
+"""A site of the robot marks a foot if it is at most this far from the centre of the sole, m."""
 
 _Kind = mujoco.mjtObj
 
@@ -31,7 +32,7 @@ _Kind = mujoco.mjtObj
 @dataclasses.dataclass
 class _Foot:
     name: str
-    """Name of the foot's site, which the model has or the task adds."""
+    """Name of the foot's site, which exists in the model or is added by the task."""
     body: int
     element: str = ""
     """A body, joint or geom in the foot's body; empty if the model has the site."""
@@ -46,12 +47,12 @@ class Walker:
 
     Args:
         spec: The model.
-        feet: Names of sites, bodies or geoms that are feet; without them, the ends of the legs that reach lowest.
-        joints: Names of the joints that act; without them, those of the legs that have an actuator.
+        feet: Names of sites, bodies or geoms that are feet; by default the ends of the legs that reach lowest.
+        joints: Names of the actuated joints; by default the leg joints that have an actuator.
 
     Raises:
-        ValueError: The robot has no floating base, no feet or no joints, or an element that the file must name has no
-            name.
+        ValueError: The robot has no floating base, no feet or no joints, or an element that the task file refers to has
+            no name.
     """
 
     def __init__(self, spec: mujoco.MjSpec, feet: Sequence[str] = (), joints: Sequence[str] = ()) -> None:
@@ -116,7 +117,7 @@ class Walker:
         raise ValueError(f"the model has no site, geom or body {name!r}: --feet takes their names, separated by spaces")
 
     def _foot(self, body: int, name: str) -> _Foot:
-        """A foot at the middle of a body's sole: a site that is there, or a new one."""
+        """Find the site at the centre of a body's sole, or describe a new site there."""
         spheres = self._spheres(body)
         if not len(spheres):
             raise ValueError(f"the body {self._called(body)} of a foot has no geom that can touch the ground")
@@ -150,7 +151,7 @@ class Walker:
         return names
 
     def _moved(self) -> np.ndarray:
-        """Whether an actuator moves each joint, (njnt,), also through a tendon, which ``walkers.servos`` refuses."""
+        """Whether an actuator moves each joint, (njnt,), also through tendons, which ``walkers.servos`` refuses."""
         m, d = self.model, self.data
         mujoco.mj_forward(m, d)
         moment = np.zeros((m.nu, m.nv))
@@ -169,7 +170,7 @@ class _Joints:
 
 
 def velocity_text(file: str, class_name: str, source: str, title: str, walker: Walker) -> str:
-    """The text of the file of a robot; see ``task_text`` for the other arguments."""
+    """Generate the text of a robot's task file; see ``task_text`` for the other arguments."""
     biped = len(walker.feet) == 2
     model, new = walker.model, [foot for foot in walker.feet if foot.element]
     fastest = round(0.4 * float(np.sqrt(9.81 * walker.height)), 1)

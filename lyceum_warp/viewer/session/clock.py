@@ -69,7 +69,7 @@ class Session:
         now = time.perf_counter()
         self._next_frame = self._next_check = now
         self._next_step = now + self.stage.env.timestep / self.stage.speed
-        with contextlib.ExitStack() as ends:  # in reverse order
+        with contextlib.ExitStack() as ends:  # closed in reverse order
             ends.enter_context(self.stage.videos.finishing(print))
             ends.callback(self.stage.close)
             ends.callback(window.close)

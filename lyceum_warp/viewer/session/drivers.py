@@ -173,7 +173,7 @@ class ControlRun:
     def __init__(self, control: WorldControl, number: int) -> None:
         self._control, self._number = control, number
         self.__name__ = getattr(control.controller, "__name__", type(control.controller).__name__)
-        self.__wrapped__ = control.controller  # whose signature inspect.signature finds
+        self.__wrapped__ = control.controller  # inspect.signature finds the signature of __wrapped__
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._control.controller, name)
@@ -192,7 +192,7 @@ def plan_view(controller: Any, state: torch.Tensor) -> PlanView | None:
     samples, best = torch.empty(len(actions), 0, actions.shape[1]), None
     sampled, returns = getattr(controller, "sampled", None), getattr(controller, "returns", None)
     if isinstance(sampled, torch.Tensor) and isinstance(returns, torch.Tensor) and sampled.shape[1] == len(returns):
-        # samples are independent: the first samples stand for all
+        # samples are independent, so the first samples represent all of them
         shown = torch.arange(min(MOST_SAMPLES, len(returns)), device=returns.device)
         shown[0] = returns.argmax()
         samples = sampled.index_select(1, shown).to("cpu", torch.float32)

@@ -124,7 +124,7 @@ class FrameMaker:
         )  # fmt: skip
 
     def _report(self, rows: Rows, plant_of: int | None) -> None:
-        """Report an episode that ended, and faults; ``plant_of`` is the world that a plant is a copy of."""
+        """Report an episode that ended, and faults; ``plant_of`` is the world that the plant was copied from."""
         number, bits, returned, length = rows.end
         if number > self._seen_end:
             self.say(f"the episode ended after {length:.0f} steps ({reasons(int(bits))}), return {returned:.6g}")
@@ -166,7 +166,7 @@ class FrameMaker:
 
 
 def _following(index: int, number: int, count: int) -> list[int]:
-    """Indices of the other worlds or episodes that come after one, at most ``count``."""
+    """Indices of the worlds or episodes after the given one, at most ``count``."""
     return [(index + i) % number for i in range(1, min(count, number - 1) + 1)]
 
 

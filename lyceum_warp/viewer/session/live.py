@@ -110,7 +110,7 @@ class Live:
         """Whether rows are copied to the host asynchronously."""
         self.returns = torch.zeros(n, dtype=torch.float64, device=device)
         """Return of each world's episode so far, (nworld,)."""
-        self._clock = 0  # steps since the session began, minus those taken back
+        self._clock = 0  # steps since the session began, minus the steps taken back
         self._ends = torch.zeros(n, 4, dtype=torch.float64, device=device)
         self._fault = torch.zeros(4, dtype=torch.float64, device=device)
         self._ended, self._reward = torch.zeros(n, dtype=torch.bool, device=device), torch.zeros_like(env.reward)
@@ -243,7 +243,7 @@ class Live:
         if steps < 0:
             self._times.clear()
 
-    # changes from outside
+    # changes requested by the user
 
     def reset(self, *, random: bool) -> None:
         """Start a new episode of the shown world."""

@@ -105,7 +105,7 @@ class Playback:
         return (self.step + (-1 if self.backwards else 1)) % (self.episode.steps + 1)
 
     def choose(self, index: int) -> None:
-        """Show another episode, at the same step or its last one."""
+        """Show another episode, at the same step or at its last step if it is shorter."""
         self.index = index
         self.seek(self.step)
 

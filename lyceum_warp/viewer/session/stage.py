@@ -73,7 +73,7 @@ class Stage:
         self.steps = 0
         """Steps since the session began, for the measured speed."""
         self.progress: deque[tuple[float, int]] = deque(maxlen=64)
-        """Times of the last frames, with the number of steps by then."""
+        """Times of the last frames, each with the number of steps until then."""
         self.select(modes[0], next(iter(self.controllers), None))
 
     @property

@@ -111,7 +111,7 @@ class VideoTaker:
         A video that is incomplete after two minutes, or at a second Ctrl-C, is discarded.
 
         Args:
-            show: Called with a line about each.
+            show: Called with a line about each video.
         """
         try:
             yield
@@ -124,7 +124,7 @@ class VideoTaker:
                         video.wait(end - time.monotonic())
             finally:
                 for video in self._drawing:
-                    video.cancel()  # no effect on a complete one
+                    video.cancel()  # cancelling has no effect on a complete video
                     show(_completed(video))
 
 

@@ -54,7 +54,7 @@ class WindowEnd:
         while True:
             try:
                 if not self._connection.poll(1.0):
-                    if os.getppid() != self._parent:  # a fork of the session may hold the connection open
+                    if os.getppid() != self._parent:  # a forked child of the session may hold the connection open
                         return
                     continue
                 frame = self._connection.recv()

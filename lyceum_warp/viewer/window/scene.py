@@ -134,10 +134,10 @@ class ModelValues:
         self._nominal = nominal
         self._values: dict[str, np.ndarray] = {}
         self.model = copy.deepcopy(nominal)
-        """The model with the values."""
+        """The model with the current values."""
 
     def set(self, values: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
-        """Set a world's values; return whether any has changed, and whether one that changes the picture has."""
+        """Set a world's values; return whether any has changed, and whether a visible one has."""
         changed = [
             name for name in {*values, *self._values}
             if name not in values or name not in self._values or not np.array_equal(values[name], self._values[name])
