@@ -142,7 +142,7 @@ def test_a_policy_with_a_users_network_is_saved_and_loaded(tmp_path: Path) -> No
     ):
         lw.load(run)
     with pytest.raises(
-        ValueError, match=r"\('network.weight' is absent in the file, and \(2, 6\) in .*: give one like"
+        ValueError, match=r"\('network.weight' is absent in the file, and \(2, 6\) in .*: give one with the same"
     ):
         lw.load(run, policy=lw.GaussianPolicy(6, 2, network=nn.Linear(6, 2), normalize=True))
 
