@@ -57,8 +57,8 @@ def checked_state(env: Env, state: torch.Tensor, like: torch.Tensor) -> torch.Te
     if state.device.type != "cpu":
         return state
     values = state.numpy().ravel()
-    # a single call, because a plan may take only a millisecond; the slow check runs only if the dot product is not
-    # finite
+    # a single dot product is a fast check, because a plan may take only a millisecond; the slow check runs only if it
+    # fails
     if not math.isfinite(values.dot(values)) and not (finite := np.isfinite(values)).all():
         where = int(np.flatnonzero(~finite)[0])
         plant, column = divmod(where, env.state_space.size)

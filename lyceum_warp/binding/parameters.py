@@ -269,7 +269,7 @@ class Parameters:
 def _element_field(default: Any) -> str | None:
     """The field, such as "site_xpos", of the model elements in a table's default.
 
-    It is None if the default has plain numbers.
+    Returns None if the default has plain numbers.
     """
     while isinstance(default, list | tuple) and default:
         default = default[0]

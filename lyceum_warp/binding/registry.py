@@ -105,7 +105,7 @@ def _file(task: type[Task]) -> str | None:
 def spelled_task(task: type[Task]) -> str | None:
     """The name or ``file:Class`` that finds a task in another process (``find_task``).
 
-    It is None for a task without a file.
+    Returns None for a task without a file.
     """
     if task.__module__.startswith("lyceum_warp."):
         return task_name(task)

@@ -87,7 +87,7 @@ class FunctionSource:
     def condition(self, node: ast.expr) -> bool | None:
         """The value of a ``wp.static(...)`` condition, for which Warp compiles only one branch.
 
-        It is None for other conditions.
+        Returns None for other conditions.
         """
         found = self.value(node) if self.is_static(node) else None
         return None if found is None else bool(found)

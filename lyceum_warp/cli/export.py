@@ -48,7 +48,7 @@ class Export:
         return 0
 
     def _env(self, run: Run) -> Env | None:
-        """A world of the run's task, for the metadata; None, with a message, if it cannot be made."""
+        """Make a world of the run's task for the metadata. If this fails, print a message and return None."""
         try:
             saved = Configuration.of(run)
             options = saved.options.changed({"nworld": 1} | options_on_cores())

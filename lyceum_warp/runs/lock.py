@@ -126,7 +126,7 @@ def _named(owner: dict[str, Any]) -> str:
 def _started(pid: int) -> str:
     """The start time of a process, to distinguish it from later processes with the same pid.
 
-    "" if it does not exist.
+    Returns "" if the process does not exist.
     """
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

@@ -29,9 +29,10 @@ def push_history(history: Row[float], value: Row[float]):
 
 @wp.func
 def read_history(history: Row[float], width: int, age: int, i: int) -> float:
-    """Element i of the value that was appended ``age`` values before the last one.
+    """Get element i of a value in the history.
 
-    In a shorter history it is the first value, as if that had always been there; in an empty one it is 0.
+    ``age`` counts back from the last value. If the history is shorter, the first value is used; if it is empty, the
+    result is 0.
     """
     pushes = int(history[0])
     if pushes == 0:

@@ -17,7 +17,7 @@ from lyceum_warp.task import Row
 def symmetric_eigenvectors(matrix: wp.mat33) -> wp.mat33:
     """The eigenvectors of a symmetric matrix, the columns of a rotation, by Jacobi's method.
 
-    Golub and Van Loan, "Matrix computations", 8.5. A matrix that is nearly diagonal has nearly the identity.
+    Golub and Van Loan, "Matrix computations", 8.5. For a nearly diagonal matrix the result is close to the identity.
     """
     a = matrix
     vectors = wp.identity(n=3, dtype=float)

@@ -41,7 +41,7 @@ def test_a_learner_is_rebuilt_from_its_description(kind: str) -> None:
 @pytest.mark.parametrize(
     ("saved", "options"),
     [
-        (None, PhysicsOptions()),  # the run is older than this option
+        (None, PhysicsOptions()),  # the run was made before this option existed
         ({"integrator": None, "solver": {}, "deterministic": False, "unroll": False}, PhysicsOptions()),
         (
             {"integrator": "euler", "solver": {"iterations": 7}, "deterministic": True, "unroll": False},
