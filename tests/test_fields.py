@@ -139,7 +139,7 @@ def test_a_function_for_defaults_names_an_element(element: Element, place: int, 
         ("act", "turn", "the actuator 'turn' has no 'act'"),
     ],
 )
-def test_an_element_that_is_not_there_is_refused(name: str, element: str, message: str, model: mujoco.MjModel) -> None:
+def test_an_unknown_element_is_refused(name: str, element: str, message: str, model: mujoco.MjModel) -> None:
     with pytest.raises(ValueError, match=message):
         elements(model, name, element)
 

@@ -117,7 +117,7 @@ class TaskSource:
         return not hasattr(self.task, "obs")
 
     def _term(self, name: str) -> wp.Function | None:
-        """A Warp function of the task by any name, or None."""
+        """Find a Warp function of the task by its name; None if there is none."""
         for owner in self._owners:
             for names in (vars(owner), owner.scope, vars(sys.modules[owner.__module__])):
                 found = names.get(name)

@@ -53,7 +53,7 @@ def put_history(target: Row[float], history: Row[float], width: int):
 
 @wp.func
 def delayed_action(action: Row[float], history: Row[float], delay: Row[float], i: int) -> float:
-    """Element i of the action of ``delay`` steps ago, for ``control``; the first action of a younger episode.
+    """Get element i of the action ``delay`` steps ago, or of the episode's first action; for ``control``.
 
     ``advance`` appends every action: ``terms.push_history(s1.history, action)``.
     """

@@ -75,7 +75,7 @@ def test_planning_gives_settings_options_and_parameters_and_arguments_override_t
         (Planning(options={"nworld": 3}), "planning.options of the task 'planned': a planner takes no option nworld"),
     ],
 )  # fmt: skip
-def test_planning_that_is_not_valid_is_refused_by_task_and_part(planning: Any, message: str) -> None:
+def test_invalid_planning_raises_an_error_that_names_task_and_part(planning: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message) as raised:
         MPPI(type("Planned", (Picky,), {"planning": planning}))
     assert "\n" not in str(raised.value)
