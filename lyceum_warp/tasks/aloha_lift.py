@@ -28,7 +28,7 @@ class World:
 class Params:
     dt: float
     goal_height: float = 0.1
-    rest_height: float = 0.0658  # initial pose of the pot on the table
+    rest_height: float = 0.0658  # height of the pot at rest on the table, m
     place: wp.vec3 = wp.vec3(0.03, 0.03, 0.25)  # bounds of the pot's initial pose: x, y (m) and yaw (rad)
     pot: int = lw.body("partnet_100015/")
     left_grip: int = lw.site("lift/left_grip")
