@@ -137,7 +137,8 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def grouped(rows: Sequence[Row], part: str, *by: str) -> dict[tuple[Any, ...], list[Row]]:
-    """Group the rows of a part by entries of their cases, in the order of TASKS, then by size."""
+    """Group the rows of a part by the given entries of their cases; sort the groups in the order of TASKS, then by
+    size."""
     found: dict[tuple[Any, ...], list[Row]] = {}
     order = {task: place for place, task in enumerate(TASKS)}
     mine = [row for row in rows if row.case["part"] == part]

@@ -127,7 +127,7 @@ def test_arms_do_not_move_without_torque(shared_env: SharedEnv) -> None:
 
 
 def test_a_finger_moves_with_one_motor(shared_env: SharedEnv) -> None:
-    """The fingertip turns by 45 degrees per 140; both spread joints move together."""
+    """The fingertip turns by 45 degrees if the finger turns by 140 degrees; both spread joints move together."""
     env = shared_env("herb_reach", nworld=1, autoreset=False)
     env.reset()
     action = torch.zeros(1, 22)
