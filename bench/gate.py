@@ -1,4 +1,4 @@
-"""Judge whether a robot walks: a fixed battery of commands, with limits for tracking, falls and gait.
+"""Judge whether a robot walks: play fixed commands, with limits for tracking, falls and gait.
 
     lyceum-warp bench gate --policy runs/g1
     lyceum-warp bench gate --policy runs/go1-1 runs/go1-2
@@ -6,9 +6,9 @@
 The mean policy plays on the C engine under the task's exact physics. A Unitree G1 must pass nanoG1's gate
 (kingjulio8238/nanoG1, eval.py): six commands from four noisy starts each, for 20 s, and 2,000 steps at 0.5 m/s whose
 gait is measured, all without noise, pushes and differences between robots. nanoG1 clips actions to 1 and multiplies
-them by 0.25 rad; here the change of an action is the change of a servo's target divided by 0.25 rad. Other robots play
-100 episodes of 20 s with noise and differences between robots as in training: ten commands, from ten starts each, once
-without and once with pushes. After a fall an episode begins again.
+them by 0.25 rad; here the change of a servo's target, divided by 0.25 rad, counts as the change of the action. Other
+robots play 100 episodes of 20 s with noise and differences between robots as in training: ten commands, from ten starts
+each, once without and once with pushes. After a fall, a world returns to its start.
 """
 
 import dataclasses
@@ -28,14 +28,14 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.tasks.velocity.g1 import LEGS
 
 NEVER = 1e6
-"""Seconds until a push or a new command that does not come."""
+"""Seconds until the next push or command, longer than any episode."""
 NOISES = ("linear_velocity_noise", "angular_velocity_noise", "gravity_noise", "joint_position_noise",
           "joint_velocity_noise")  # fmt: skip
 STEPS = 1000
 BATTERY = ((0.8, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.3, 0.0, 1.0), (0.3, 0.0, -1.0), (0.0, 0.4, 0.0), (0.0, 0.0, 0.0))
 """nanoG1's commands: forward and lateral velocity, m/s, and yaw rate, rad/s."""
 GAIT = (0.5, 0.0, 0.0)
-"""The command of nanoG1's gait, for twice as many steps."""
+"""The command under which nanoG1's gate measures the gait, for twice as many steps."""
 COMMANDS = (
     (1.0, 0.0, 0.0), (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0),
     (0.5, 0.0, 0.5), (0.5, 0.0, -0.5), (0.5, 0.3, 0.0), (0.0, 0.0, 0.0),
@@ -64,12 +64,12 @@ BESIDE = {
     "pushed_falls": "falls with pushes", "pushed_velocity_error": "velocity error with pushes, m/s",
     "pushed_yaw_rate_error": "yaw rate error with pushes, rad/s",
 }  # fmt: skip
-"""Numbers without a limit."""
+"""Descriptions of the numbers that have no limit."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """A robot that walks, judged by a battery of commands with limits."""
+    """Judge whether a robot walks: fixed commands, with limits."""
 
     policy: tuple[Path, ...] = ()
     """Folders of runs on a velocity task, for example g1_velocity."""
@@ -150,14 +150,14 @@ def play(env: lw.Env, policy: Any, commands: Sequence[Sequence[float]], steps: i
 
 
 def worlds(folder: Path, nworld: int, options: Options, **params: Any) -> lw.Env:
-    """Make worlds of the run's task, with the run's parameters, that never end by time."""
+    """Make worlds of the run's task, with the run's parameters and without a time limit."""
     place = {"engine": "mujoco", "device": "cpu", "nthread": options.threads, "physics": "exact"}
     words = place | {"horizon": 0, "seed": 1000}
     return run_worlds(Run.open(folder), words, params, nworld=nworld, task=options.task, trust=False)
 
 
 def calm(env: lw.Env) -> dict[str, Any]:
-    """Parameters without noise, pushes and differences between robots, and with the model's own friction."""
+    """Return parameters without noise, pushes and differences between robots, with the model's own friction."""
     slide, spin, roll = env.model.geom_friction[env.task.params["foot_geoms"][0]].tolist()
     return dict.fromkeys(NOISES, 0.0) | {
         "encoder_bias": 0.0, "trunk_offset": [0.0, 0.0, 0.0], "push_seconds": [NEVER, NEVER],
@@ -166,7 +166,7 @@ def calm(env: lw.Env) -> dict[str, Any]:
 
 
 def home(env: lw.Env) -> torch.Tensor:
-    """The task's fixed initial state, without a push in its first step."""
+    """Return the task's fixed initial state, with the first push never due."""
     env.reset()
     state = env.get_state()
     env.state_space.split(state)["push_timer"][:] = NEVER
@@ -178,7 +178,7 @@ def rms(numbers: torch.Tensor) -> float:
 
 
 def nano_g1(case: Case, folder: Path, options: Options) -> dict[str, Any]:
-    """Play nanoG1's battery, and measure its gait."""
+    """Play the commands of nanoG1's gate, and measure the gait."""
     policy = lw.load(folder, which=options.which)
     quiet = calm(worlds(folder, 1, options))
     commands = [command for command in BATTERY for _ in range(case.starts)]
@@ -205,7 +205,7 @@ def nano_g1(case: Case, folder: Path, options: Options) -> dict[str, Any]:
 
 
 def walks(case: Case, folder: Path, options: Options) -> dict[str, Any]:
-    """Play a hundred episodes of the task with fixed commands, without pushes and with them."""
+    """Play 100 episodes of the task with fixed commands, once without and once with pushes."""
     policy = lw.load(folder, which=options.which)
     commands = [command for command in COMMANDS for _ in range(case.starts)]
     found: dict[str, Any] = {}
@@ -239,7 +239,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    """One table for each policy: every number beside its limit."""
+    """Make a table for each policy, with every number beside its limit."""
     made = []
     for row in rows:
         case, result = row.case, row.result

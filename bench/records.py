@@ -6,7 +6,7 @@
 The clock starts before the command does, so the seconds include imports, compilation and graph captures; it stops when
 the run's config.json says that the target is reached. With a cold cache all kernels are compiled; before a measurement
 with a warm cache, the same command trains for one iteration, off the clock. A run that lasts longer than --seconds is
-stopped: the same command of this program continues it, and the seconds add up, with every further start.
+stopped. The same command continues it; the seconds add up and include every further start.
 """
 
 import contextlib
@@ -29,9 +29,9 @@ from experiment import Experiment, Row, Skipped, Table, choose, median_and_range
 from lyceum_warp.runs.folder import Run
 
 WALKING = ("--algorithm", "ppo", "--mean-every", "0")
-"""The target is then the mean return of an iteration's episodes, with exploration noise."""
+"""Flags under which the target is the mean return of an iteration's episodes, with exploration noise."""
 NPG = ("--algorithm", "npg", "--mean-every", "5")
-"""The target is then the return of the mean policy in 16 episodes, whose evaluations count."""
+"""Flags under which the target is the mean policy's return in 16 episodes; the clock includes the evaluations."""
 LARGE = ("--samples", "65536")
 
 RECORDS: dict[str, tuple[float, dict[str, tuple[str, ...]]]] = {
@@ -46,7 +46,7 @@ RECORDS: dict[str, tuple[float, dict[str, tuple[str, ...]]]] = {
     "half_cheetah": (4000.0, {"cpu": NPG, "cuda": (*NPG, *LARGE)}),
     "humanoid": (4500.0, {"cuda": (*NPG, "--nworld", "8192", "--samples", "131072")}),
 }
-"""The threshold of each task, and flags of the command by kind of device."""
+"""Each task's threshold, and the flags of `lyceum-warp train` for each kind of device."""
 
 COMMON = ("--iterations", "1000000", "--no-video", "--no-plot", "--no-transfer")
 
