@@ -72,10 +72,7 @@ def shared_env() -> Iterator[SharedEnv]:
 
 @pytest.fixture(scope="session")
 def task_file(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> TaskFile:
-    """Write a task file with ``task_file("mine.py", source)``; its path is the same in every run of the tests.
-
-    Warp caches compiled kernels by the task's path, so later runs reuse them.
-    """
+    """Write a task file with ``task_file("mine.py", source)``; its path is the same in every run of the tests."""
     cache = getattr(pytestconfig, "cache", None)
     folder = cache.mkdir("tasks") if cache else tmp_path_factory.mktemp("tasks")
 

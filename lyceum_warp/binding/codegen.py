@@ -125,7 +125,7 @@ def kernels_of(
             found["terminated"] = scope["terms"].get("terminated", found["terminated"])
             functions = {name: function or scope.get(f"no_{name}") for name, function in found.items()}
             written = [name for name, function in found.items() if function is not None]
-            module = free_module_name(f"lyceum_warp.generated.{source.path}")
+            module = free_module_name(f"lyceum_warp.generated.{source.kernel_name}")
             given: dict[str, Any] = {"module": module, "functions": functions, "written": written}
             names = [field.name for field in dataclasses.fields(steps.TaskCode) if field.name not in given]
             _kernels[key] = steps.make_kernels(steps.TaskCode(**given, **{name: scope[name] for name in names}))

@@ -10,6 +10,7 @@ from typing import Any
 import warp as wp
 
 from lyceum_warp.binding.parts import parts_of
+from lyceum_warp.binding.registry import kernel_name
 from lyceum_warp.binding.sources import FunctionSource, is_struct
 from lyceum_warp.binding.task_terms import Terms
 from lyceum_warp.binding.variants import Variant, variant_of
@@ -31,6 +32,7 @@ class TaskSource:
     def __init__(self, task: type[Task], name: str) -> None:
         self.task, self.name = task, name
         self.path = f"{task.__module__}.{task.__qualname__}"
+        self.kernel_name = kernel_name(task)
         self._owners: Any = task.__mro__[: task.__mro__.index(Task)]
         self._variant: Variant | None = None
         self.world: Any = self._struct("World")

@@ -234,6 +234,14 @@ def _task_of_file(path: Path, attribute: str) -> type[Task]:
     return next(iter(found.values()))
 
 
+def kernel_name(task: type[Task]) -> str:
+    """The task's name in Warp's cache, by the contents of its file, not by its path, so copies share kernels."""
+    module = task.__module__
+    if module.startswith(_FILE) and task in _sources:
+        module = f"{module[:-8]}{zlib.crc32(b''.join(_sources[task].values())):08x}"
+    return f"{module}.{task.__qualname__}"
+
+
 def _module_of_file(path: Path) -> ModuleType:
     """The module of a task's file. The file is run if it is new, or if it or a module beside it has changed."""
     if not path.is_file():

@@ -49,7 +49,7 @@ class _Run:
         self.functions |= {observer_name(group): function for group, function in task.observers.items()}
         try:
             self.checked: CheckedFunctions = checked_functions(
-                task.source.path, self.functions, task.kernels.views, self.env.device
+                task.source.kernel_name, self.functions, task.kernels.views, self.env.device
             )
         except Unchecked as error:
             ctx.fail(f"the functions could not be checked: {error}")

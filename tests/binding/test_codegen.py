@@ -6,6 +6,7 @@ from typing import Any
 import tiny_task
 
 from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.registry import find_task
 
 EVALUATE = "def evaluate(s: World, p: Params) -> float:\n    return s.qpos[1]"
@@ -26,10 +27,12 @@ def test_a_different_function_makes_different_kernels(tmp_path: Path) -> None:
     assert kernels(f"{file}:Tiny") is not kernels(f"{file}:Other")
 
 
-def test_a_kernel_module_keeps_its_name_until_its_task_file_changes(tmp_path: Path) -> None:
+def test_a_kernel_module_has_the_same_name_for_a_copy_of_the_task_file_until_it_changes(tmp_path: Path) -> None:
     """Warp caches compiled kernels by the module's name."""
-    file = tiny_task.write(tmp_path, tiny_task.TINY)
-    first = kernels(file).judge.module.name
-    assert first == f"lyceum_warp.generated.{find_task(file).__module__}.Tiny"
+    (tmp_path / "copy").mkdir()
+    file, copy = (tiny_task.write(folder, tiny_task.TINY) for folder in (tmp_path, tmp_path / "copy"))
+    first = TaskSource(find_task(file), "tiny").kernel_name
+    assert TaskSource(find_task(copy), "tiny").kernel_name == first
+    assert kernels(file).judge.module.name.startswith(f"lyceum_warp.generated.{first}")
     tiny_task.write(tmp_path, tiny_task.with_function(EVALUATE))
-    assert kernels(file).judge.module.name == f"{first}_1"
+    assert TaskSource(find_task(file), "tiny").kernel_name != first
