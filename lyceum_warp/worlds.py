@@ -92,10 +92,10 @@ class Worlds(WorldArrays):
 
     # phases
 
-    def step_phases(self) -> list[Phase]:
-        """The phases of one step, in order."""
+    def step_phases(self, substeps: int | None = None) -> list[Phase]:
+        """The phases of one step, in order; by default with all the task's substeps."""
         return [
-            *self._transition_phases(),
+            *self._transition_phases(substeps),
             *self._restart_phases(self.restarting, randomly=True),
             *self._event_phases(),
             *self._moved_phases(),
@@ -131,11 +131,11 @@ class Worlds(WorldArrays):
 
         return Phase(every[0].name, partial(self.engine.run_for, mask, run), engine=True)
 
-    def _transition_phases(self) -> list[Phase]:
+    def _transition_phases(self, substeps: int | None = None) -> list[Phase]:
         """Advance to the next state, and judge the transition."""
         return [
             Phase("act", self.act, by_world=True),
-            *self.physics_phases(),
+            *self.physics_phases(substeps),
             Phase("judge", self._judge_step, by_world=True),
             *self._tally_phases(),
         ]
@@ -145,9 +145,9 @@ class Worlds(WorldArrays):
         kernel = self.task.kernels.tally_worlds if self.autoreset else None
         return [] if kernel is None else [Phase("tally", partial(self._tally, kernel))]
 
-    def physics_phases(self) -> list[Phase]:
-        """The substeps of a step."""
-        skip = self.task.frame_skip
+    def physics_phases(self, substeps: int | None = None) -> list[Phase]:
+        """The substeps of a step; by default all."""
+        skip = self.task.frame_skip if substeps is None else substeps
         if (kernel := self.task.kernels.substep_memory) is None:
             return self.engine.step_phases(skip)
         substep = [*self.engine.step_phases(1), Phase("substep", partial(self._substep, kernel), by_world=True)]
@@ -214,7 +214,9 @@ class Worlds(WorldArrays):
     def rehearsal(self) -> None:
         """Run every phase that consists of launches once, so that ``compile_ahead`` can list the kernels."""
         self.seed_streams(0)
-        phases = (*self.reset_phases(randomly=True), *self.step_phases(), *self.read_phases(), *self.restore_phases())
+        # only the first substep differs from the others, and the Warp engine needs a millisecond or more to list one
+        step = self.step_phases(min(self.task.frame_skip, 2))
+        phases = (*self.reset_phases(randomly=True), *step, *self.read_phases(), *self.restore_phases())
         for phase in phases:
             if self.engine.capturable or not phase.engine:
                 phase.run()

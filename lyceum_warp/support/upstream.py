@@ -4,6 +4,7 @@ No other module does this, so only this one depends on their versions.
 """
 
 import contextlib
+import functools
 import importlib
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -137,3 +138,36 @@ def replaced_in_this_thread(functions: Mapping[str, Callable[..., Any]]) -> Iter
             setattr(owner, name, call)
             restored.callback(setattr, owner, name, original)
         yield
+
+
+_REMADE = ("reset_data", "get_state", "set_state")
+"""Functions of MuJoCo Warp that make their kernels again in every call. The sources depend only on whether there is a
+mask, their only free variable."""
+
+
+def quicken_mujoco_warp() -> None:
+    """Spare MuJoCo Warp's host code repeated work: most of the time of a step or a reset that is not captured.
+
+    For each pair of types of geoms it calls a Warp function from Python, and each call resolves overloads. The
+    functions in ``_REMADE`` parse and hash their kernels in every call, and ``put_model`` parses packages' metadata.
+    """
+    convex: Any = importlib.import_module("mujoco_warp._src.collision_convex")
+    primitive: Any = importlib.import_module("mujoco_warp._src.collision_primitive")
+    for module in (convex, primitive):
+        module.upper_trid_index = module.upper_trid_index.func  # no kernel of these modules calls it
+    packages: Any = importlib.import_module("mujoco_warp._src.util_pkg")
+    packages.check_version = functools.cache(packages.check_version)
+    make, made = wp.kernel, {}
+
+    def kernel(f: Any = None, **options: Any) -> Any:
+        return make(f, **options) if f or options.get("module") != "unique" else lambda f: unique(f, options)
+
+    def unique(f: Any, options: Mapping[str, Any]) -> wp.Kernel:
+        if f.__qualname__.partition(".")[0] not in _REMADE or not f.__module__.startswith("mujoco_warp."):
+            return make(**options)(f)
+        key = f.__code__, f.__closure__[0].cell_contents is None
+        if key not in made:
+            made[key] = make(**options)(f)
+        return made[key]
+
+    wp.kernel = kernel

@@ -102,7 +102,7 @@ def unmarked(method: Function) -> Function:
 
 
 def once_a_step(method: Function) -> Function:
-    def phases(self: Worlds) -> list[Phase]:
+    def phases(self: Worlds, substeps: int | None = None) -> list[Phase]:
         return [Phase("physics", lambda: self.engine.step(self.task.frame_skip), engine=True), method(self)[-1]]
 
     return phases

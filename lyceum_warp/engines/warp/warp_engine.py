@@ -28,10 +28,12 @@ from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_columns, copy_rows, fill_rows, narrow, widen, zero_columns
 from lyceum_warp.model_fields import ModelField
 from lyceum_warp.support.arrays import alias, flat, launch_rows
-from lyceum_warp.support.upstream import has_sdf_functions
+from lyceum_warp.support.upstream import has_sdf_functions, quicken_mujoco_warp
 from lyceum_warp.support.validate import whole_number
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
+
+quicken_mujoco_warp()
 
 
 class WarpEngine(Engine):
