@@ -1,8 +1,8 @@
 """ArmHandPickup: pick up a ball with an arm and a hand, and hold it at a goal (Lyceum's ArmHandPickup).
 
-Arm and hand are Kinova's Jaco (extra "jaco"). Goal, reward and initial states are Lyceum's, except that Lyceum's code
-uses, by mistake, the distance from the ball to (ball - goal), which is constant; here it is the distance to the goal.
-Actions are joint velocities. Success: the ball has been within 5 cm of the goal for ten consecutive steps, 0.2 s.
+Arm and hand are Kinova's Jaco (extra "dm-control"). Goal, reward and initial states are Lyceum's, except that Lyceum's
+code uses, by mistake, the distance from the ball to (ball - goal), which is constant; here it is the distance to the
+goal. Actions are joint velocities. Success: the ball has been within 5 cm of the goal for ten consecutive steps, 0.2 s.
 """
 
 import mujoco
@@ -14,7 +14,7 @@ from lyceum_warp import Row
 
 def jaco(file: str) -> lw.ModelFile:
     file = f"third_party/kinova/{file}"
-    return lw.package_model("dm_control", file, install="lyceum-warp[jaco]", before_python="3.13")
+    return lw.package_model("dm_control", file, install="lyceum-warp[dm-control]", before_python="3.13")
 
 
 @wp.struct
