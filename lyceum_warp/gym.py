@@ -4,6 +4,7 @@ Importing this module registers each task under the name of its class, as ``lyce
 loaded when an environment is made. ``register`` adds a task of your own.
 """
 
+import re
 from pathlib import Path
 
 from lyceum_warp.adapters.gymnasium_single import GymnasiumEnv
@@ -29,7 +30,7 @@ def register(task: str | Path | type[Task]) -> str:
     """
     known = isinstance(task, str) and task in task_names()
     name = str(task) if known else task_name(find_task(task))
-    id = f"lyceum/{''.join(map(str.capitalize, name.split('_')))}-v0"
+    id = f"lyceum/{''.join(map(str.capitalize, re.split('[_/]', name)))}-v0"
     gymnasium.registry.pop(id, None)  # Gymnasium warns if an id is registered twice
     gymnasium.register(
         id,

@@ -114,8 +114,18 @@ def spelled_task(task: type[Task]) -> str | None:
 
 
 def task_name(task: type[Task]) -> str:
-    """The name under which a task is registered."""
-    return snake_case(task.__name__)
+    """The name under which a task is registered: the class's name in snake_case.
+
+    A family of the package may declare its names in a namespace: ``dm/walker_walk`` for WalkerWalk.
+    """
+    name = snake_case(task.__name__)
+    declared = (known for known, module in _package_modules().items() if module == task.__module__)
+    return next((known for known in declared if known.endswith(f"/{name}")), name)
+
+
+def file_name(name: str) -> str:
+    """The name of a task as part of a file's name: dm-walker_walk for dm/walker_walk."""
+    return name.replace("/", "-")
 
 
 def snake_case(name: str) -> str:

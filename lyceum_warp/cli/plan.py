@@ -17,7 +17,7 @@ from rich.markup import escape
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.mppi_config import MPPIConfig
 from lyceum_warp.algos.planner import MPPI
-from lyceum_warp.binding.registry import find_task, snake_case, spelled_task, task_name
+from lyceum_warp.binding.registry import file_name, find_task, snake_case, spelled_task, task_name
 from lyceum_warp.cli.arguments import (
     CameraWords,
     ParamWords,
@@ -154,9 +154,8 @@ class Plan:
             )
         if self.value is not None:
             _check_value_task(self.value, self.task)
-        out = self.out or Path(
-            "runs", f"plan-{task_name(find_task(self.task))}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-        )
+        name = file_name(task_name(find_task(self.task)))
+        out = self.out or Path("runs", f"plan-{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
         Run.check_free(out)
         # all options are checked before the folder is created
         camera = parsed_camera(self.camera)
@@ -207,7 +206,8 @@ def _check_value_task(run: Path, task: str) -> None:
 
 def _stem(task: str) -> str:
     """The name of a task, or its file's name without suffix."""
-    return Path(task.partition(":")[0]).stem
+    name = task.partition(":")[0]
+    return Path(name).stem if name.endswith(".py") else name
 
 
 def _worlds(

@@ -15,7 +15,7 @@ from lyceum_warp.algos.distributed import Team, join
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.learner import Learner
 from lyceum_warp.algos.networks import moved
-from lyceum_warp.binding.registry import find_task, task_name, task_names
+from lyceum_warp.binding.registry import file_name, find_task, task_name, task_names
 from lyceum_warp.cli.algorithms import Hyperparameters
 from lyceum_warp.cli.arguments import (
     CameraWords,
@@ -259,7 +259,7 @@ class Train:
                     )
         if source is not None and self.task is None and self.resume is None:
             note_changes(source, learner.env, note=says)
-        name = f"{learner.env.task.name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+        name = f"{file_name(learner.env.task.name)}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         return learner, self.resume or self.out or Path("runs", name), entries
 
     def _report(self, run: Run, learner: Learner, console: Console) -> int:

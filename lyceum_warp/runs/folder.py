@@ -84,8 +84,8 @@ class Run:
     @property
     def task_name(self) -> str:
         """Name of the run's task."""
-        task = self.config.get("kept", {}).get("name") or str(self.config.get("task"))
-        return Path(task.partition(":")[0]).stem
+        task = str(self.config.get("kept", {}).get("name") or self.config.get("task")).partition(":")[0]
+        return Path(task).stem if task.endswith(".py") else task
 
     @staticmethod
     def check_free(folder: str | Path) -> None:

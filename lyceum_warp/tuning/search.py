@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lyceum_warp.algos.policy import acting
-from lyceum_warp.binding.registry import find_task, task_name
+from lyceum_warp.binding.registry import file_name, find_task, task_name
 from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import check_sizes
@@ -125,7 +125,7 @@ def tune(
     else:
         trials = _trials(kind, run, which, words, effort=SHORT if short else FULL, seed=seed, episodes=episodes)
         measured["policy"] = None if run is None else _digest(run, which)
-    name = f"{task_name(kind)}{'-planning' * planning}.jsonl"
+    name = f"{file_name(task_name(kind))}{'-planning' * planning}.jsonl"
     rows = RowFile(Path("tune", name) if out is None else Path(out), identity(trials.reference, **measured))
     return _Search(trials, rows, tolerance, progress).run()
 

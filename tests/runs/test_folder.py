@@ -39,6 +39,15 @@ def test_read_returns_the_saved_state(run: Run) -> None:
     }
 
 
+@pytest.mark.parametrize(
+    ("config", "name"),
+    [({"task": "dm/walker_walk"}, "dm/walker_walk"), ({"task": "a/mine.py:Mine"}, "mine"),
+     ({"task": "a/mine.py:Mine", "kept": {"name": "other"}}, "other")],
+)  # fmt: skip
+def test_a_run_knows_the_name_of_its_task(tmp_path: Path, config: dict[str, object], name: str) -> None:
+    assert Run.create(tmp_path / "run", config).task_name == name
+
+
 def test_create_refuses_a_folder_with_content(run: Run, tmp_path: Path) -> None:
     before = {path: path.read_bytes() for path in run.folder.iterdir()}
     with pytest.raises(ValueError, match=r"holds a run: give another folder, or continue the run"):
