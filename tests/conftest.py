@@ -13,16 +13,19 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.support.warp_log import start_warp
+from lyceum_warp.tasks.dm import TASKS as SUITE
 
 # the tests' batches are too small to parallelise, and on a busy machine torch's threads wait for each other
 torch.set_num_threads(1)
 
 SAME_FUNCTIONS = (
     "g1_full_velocity", "g1_rough_velocity", "h1_velocity", "humanoid_walk", "spot_velocity", "t1_velocity",
+    *(name for name in SUITE if name not in ("dm/manipulator_bring_ball", "dm/cheetah_run")),
 )  # fmt: skip
 """Tasks that share their functions with ``go1_velocity``, ``g1_velocity``, ``go1_rough_velocity`` or
-``humanoid_stand``."""
+``humanoid_stand``; and those of dm_control's suite, whose functions are as simple as others."""
 SAME_MODELS = (
+    "dm/cheetah_run", "dm/manipulator_bring_ball",
     "adroit_door", "adroit_hammer", "adroit_relocate", "aloha_lift", "arm_hand_pickup", "herb_reach", "humanoid_get_up",
     "humanoid_standup", "inverted_double_pendulum", "pusher", "reacher", "swimmer", "walker2d",
 )  # fmt: skip

@@ -218,7 +218,10 @@ def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None
 def on_engines(task: str) -> list[object]:
     """Return a task's cases on both engines; on the Warp engine a few tasks cover most elements of a model."""
     few = task in ("hopper", "humanoid", "adroit_pen", "soft_ball", "reach")
-    return [pytest.param(task, "mujoco"), pytest.param(task, "warp", marks=[] if few else [pytest.mark.long])]
+    return [
+        pytest.param(task, "mujoco", marks=[pytest.mark.long] if task.startswith("dm/") else []),
+        pytest.param(task, "warp", marks=[] if few else [pytest.mark.long]),
+    ]
 
 
 @pytest.mark.parametrize("task, engine", [case for task in PACKAGE for case in on_engines(task)])

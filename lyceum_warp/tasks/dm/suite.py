@@ -1,0 +1,75 @@
+"""Load the models of dm_control's suite, and share what its domains have in common."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+
+def model(domain: str) -> Any:
+    """The model of a domain, which the package dm-control brings."""
+    file = f"suite/{domain}.xml"
+    return lw.package_model("dm_control", file, install="lyceum-warp[dm-control]", before_python="3.13")
+
+
+def free_target(spec: mujoco.MjSpec) -> None:
+    """Move the geom or the site "target" into a mocap body "target", so that each world has a target of its own."""
+    fixed = spec.geom("target") or spec.site("target")
+    target = spec.worldbody.add_body(name="target", mocap=True, pos=fixed.pos)
+    looks = {"name": "target", "type": fixed.type, "size": fixed.size.copy(), "material": fixed.material}
+    add = target.add_geom if isinstance(fixed, mujoco.MjsGeom) else target.add_site
+    spec.delete(fixed)
+    add(**looks)
+
+
+def count_contacts(spec: mujoco.MjSpec) -> None:
+    """Add a sensor "contacts", the number of contacts."""
+    found = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)
+    spec.add_sensor(name="contacts", type=mujoco.mjtSensor.mjSENS_CONTACT, intprm=[found, 0, 1])
+
+
+def random_joints(model: mujoco.MjModel, p: Any) -> Sequence[int]:
+    """The indices in ``qpos`` of the joints that an episode draws: those with limits, and hinges."""
+    drawn = model.jnt_limited.astype(bool) | (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
+    return model.jnt_qposadr[drawn]
+
+
+def random_range(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """The range of each drawn joint, (joints, 2); a hinge without limits is drawn from a whole turn."""
+    joints = np.searchsorted(model.jnt_qposadr, p.drawn_joints)
+    return np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.pi, np.pi])
+
+
+@wp.struct
+class RandomJoints:
+    """The parameters of ``draw_joints``."""
+
+    drawn_joints: wp.array[int] = lw.from_model(random_joints)
+    drawn_range: wp.array[wp.vec2] = lw.from_model(random_range)
+
+
+@wp.func
+def draw_joints(qpos: Row[float], drawn_joints: Row[int], drawn_range: Row[wp.vec2], rng: Row[wp.uint32]):
+    """Draw positions of joints, as dm_control's randomize_limited_and_rotational_joints."""
+    for j in range(drawn_joints.shape[0]):
+        qpos[drawn_joints[j]] = lw.uniform(rng, drawn_range[j][0], drawn_range[j][1])
+
+
+@wp.func
+def small_control(action: Row[float]) -> float:
+    """(4 + mean(max(0, 1 - a^2))) / 5."""
+    total = float(0.0)
+    for i in range(action.shape[0]):
+        total += lw.tolerance(action[i], wp.vec2(0.0), 1.0, lw.Sigmoid.QUADRATIC, 0.0)
+    return (4.0 + total / float(action.shape[0])) / 5.0
+
+
+@wp.func
+def log1p(x: float) -> float:
+    """log(1 + x), the scale of touch sensors."""
+    return wp.log(1.0 + x)

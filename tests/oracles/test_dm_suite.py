@@ -1,0 +1,206 @@
+"""Compare dm_control's suite with the package's tasks of the same names.
+
+dm_control 1.0.50 does not run on MuJoCo 4, so ``store_dm_control.py`` stored five episodes of each task with MuJoCo
+3.17. Observations and rewards are compared on equal states, where they differ only by rounding; a step from an equal
+state tells models and physics apart; and initial states must have the same distribution.
+"""
+
+import functools
+import importlib
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from conftest import SharedEnv
+
+import lyceum_warp as lw
+from lyceum_warp.tasks.dm import TASKS
+
+DATA = Path(__file__).parent.parent / "data" / "dm_control"
+LAST_SUBSTEP = ("touch", "imu", "force_torque")
+"""Parts of observations that the last substep leaves, so that they are not functions of the state."""
+RESETS = 512
+QUICK = ("dm/cartpole_swingup", "dm/finger_turn_hard", "dm/manipulator_bring_ball", "dm/walker_walk")
+EVERY = [pytest.param(task, marks=() if task in QUICK else pytest.mark.long) for task in TASKS]
+
+
+@functools.cache
+def stored(task: str) -> dict[str, np.ndarray]:
+    """Return what dm_control stored for a task; rows are (starts * segments, size)."""
+    domain = TASKS[task].removeprefix("dm_")
+    name = task.removeprefix(f"dm/{domain}_")
+    with np.load(DATA / f"{domain}.npz") as file:
+        return {key.removeprefix(f"{name}/"): file[key] for key in file.files if key.startswith(f"{name}/")}
+
+
+def rows(task: str, name: str) -> np.ndarray:
+    """Return the rows of all segments."""
+    values = stored(task)[name]
+    return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])
+
+
+def segments(shared_env: SharedEnv, task: str) -> lw.Env:
+    """Return an environment with one world in the first state of each segment."""
+    qpos = rows(task, "qpos")
+    env = shared_env(task, nworld=len(qpos), autoreset=False)
+    state = env.get_state()
+    parts = env.state_space.split(state)
+    parts["qacc_warmstart"].zero_()
+    for name in ("qpos", "qvel", "act"):
+        if name in parts:
+            parts[name].copy_(torch.from_numpy(rows(task, name)))
+    if env.model.nmocap:
+        target = torch.from_numpy(rows(task, "target"))
+        parts["mocap_pos"].copy_(target[:, :3])
+        if target.shape[1] == 7:
+            parts["mocap_quat"].copy_(target[:, 3:])
+    env.set_state(state)
+    env.action.copy_(torch.from_numpy(rows(task, "action")))
+    return env
+
+
+def current_columns(task: str) -> np.ndarray:
+    """Return the columns of observations that are functions of the state."""
+    values = stored(task)
+    return np.repeat([part not in LAST_SUBSTEP for part in values["parts"]], values["sizes"])
+
+
+ARGUMENTS: Mapping[str, tuple[object, ...]] = {
+    "dm/manipulator_bring_ball": (False, False),
+    "dm/quadruped_run": (100.0,),
+    "dm/quadruped_walk": (10.0,),
+    "dm/swimmer_swimmer15": (15,),
+    "dm/swimmer_swimmer6": (6,),
+}
+"""Arguments of dm_control's function that makes a model."""
+FIELDS = (
+    "body_mass body_inertia body_pos body_quat body_ipos body_iquat body_invweight0 "
+    "geom_type geom_size geom_pos geom_quat geom_friction geom_contype geom_conaffinity geom_condim geom_solref "
+    "geom_solimp geom_margin geom_fluid site_pos site_quat site_size site_type jnt_type jnt_axis jnt_pos jnt_range "
+    "jnt_limited jnt_stiffness jnt_solref jnt_solimp actuator_gear actuator_gainprm actuator_biasprm actuator_dynprm "
+    "actuator_ctrlrange tendon_stiffness tendon_range tendon_lengthspring eq_solref eq_solimp"
+).split()
+KINDS = {
+    "body": ("BODY", "nbody"), "geom": ("GEOM", "ngeom"), "site": ("SITE", "nsite"), "jnt": ("JOINT", "njnt"),
+    "actuator": ("ACTUATOR", "nactuator"), "tendon": ("TENDON", "ntendon"), "eq": ("EQUALITY", "neq"),
+}  # fmt: skip
+
+
+def dm_controls_model(task: str) -> mujoco.MjModel:
+    """Compile the XML that dm_control's Python makes, on this MuJoCo."""
+    module = importlib.import_module(f"dm_control.suite.{TASKS[task].removeprefix('dm_')}")
+    make = getattr(module, "make_model", None) or module.get_model_and_assets
+    made = make(*ARGUMENTS.get(task, ()))
+    xml = made[0] if isinstance(made, tuple) else made
+    assets = importlib.import_module("dm_control.suite.common").ASSETS
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # settotalmass of cheetah is deprecated
+        return mujoco.MjModel.from_xml_string(xml if isinstance(xml, str) else xml.decode(), assets)
+
+
+@pytest.mark.parametrize("task", EVERY)
+def test_the_model_is_the_one_that_dm_controls_python_makes(shared_env: SharedEnv, task: str) -> None:
+    ours, theirs = shared_env(task, nworld=len(rows(task, "qpos")), autoreset=False).model, dm_controls_model(task)
+    for field in FIELDS:
+        kind, count = KINDS[field.partition("_")[0]]
+        named = [
+            {mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind}"), i): row for i, row in enumerate(rows_)}
+            for model in (ours, theirs)
+            for rows_ in [getattr(model, field)]
+        ]
+        assert named[1].keys() <= named[0].keys() and getattr(theirs, count) == len(getattr(theirs, field))
+        for name in named[1].keys() - {"target"}:  # which episodes move
+            np.testing.assert_allclose(named[0][name], named[1][name], rtol=1e-9, atol=1e-12, err_msg=f"{field} {name}")
+    for field in ("dof_armature", "dof_frictionloss", "dof_M0", "qpos0", "qpos_spring", "key_qpos"):
+        np.testing.assert_allclose(getattr(ours, field), getattr(theirs, field), rtol=1e-9, atol=1e-12, err_msg=field)
+    damping = theirs.dof_damping.copy()
+    if task == "dm/finger_spin":  # dm_control sets it at each reset
+        damping[2] = 0.03
+    np.testing.assert_allclose(ours.dof_damping, damping)
+    for field in ("timestep", "integrator", "cone", "gravity", "density", "viscosity"):
+        assert np.array_equal(getattr(ours.opt, field), getattr(theirs.opt, field)), field
+    without_sensors = ours.opt.disableflags & ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # if the task reads none
+    assert without_sensors == theirs.opt.disableflags
+
+
+@pytest.mark.parametrize("task", EVERY)
+def test_a_task_has_dm_controls_sizes_and_times(shared_env: SharedEnv, task: str) -> None:
+    env, theirs = shared_env(task, nworld=len(rows(task, "qpos")), autoreset=False), stored(task)
+    sizes = {name: part.stop - part.start for name, part in env.obs_space.parts.items()}
+    assert list(sizes.items()) == list(zip(theirs["parts"].tolist(), theirs["sizes"].tolist(), strict=True))
+    assert env.timestep == pytest.approx(theirs["control_timestep"])
+    assert env.model.opt.timestep == pytest.approx(theirs["timestep"])
+    np.testing.assert_allclose(env.action_space.low, theirs["minimum"])
+    np.testing.assert_allclose(env.action_space.high, theirs["maximum"])
+    # every episode has a first step, the steps between and a last one, whose discount is 1: it ends, but not the task
+    assert (theirs["step_type"] == [0, *(env.task.task.horizon - 1) * [1], 2]).all() and (theirs["discount"] == 1).all()
+
+
+@pytest.mark.parametrize("task", EVERY)
+def test_observations_and_rewards_are_dm_controls_on_its_states(shared_env: SharedEnv, task: str) -> None:
+    env = segments(shared_env, task)
+    state, columns = env.get_state(), current_columns(task)
+    np.testing.assert_allclose(
+        env.get_obs(state)[:, columns], rows(task, "observation")[:, columns], rtol=1e-5, atol=2e-6
+    )
+    rewards = env.get_reward(state, env.action, state)
+    np.testing.assert_allclose(rewards, rows(task, "reward"), rtol=1e-5, atol=2e-6)
+
+
+@pytest.mark.parametrize("task", EVERY)
+def test_a_step_from_dm_controls_state_gives_its_next_state_observation_and_reward(
+    shared_env: SharedEnv, task: str
+) -> None:
+    env = segments(shared_env, task)
+    env.step()
+    check_positions(env, rows(task, "next_qpos"), "qpos")
+    check_positions(env, rows(task, "next_qvel"), "qvel")
+    columns, wanted = current_columns(task), rows(task, "next_observation")
+    np.testing.assert_allclose(env.obs[:, columns], wanted[:, columns], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(env.obs[:, ~columns], wanted[:, ~columns], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(env.reward, rows(task, "next_reward"), rtol=1e-5, atol=1e-5)
+
+
+def check_positions(env: lw.Env, wanted: np.ndarray, name: str) -> None:
+    """Compare a part of the state with numbers that were rounded to float32."""
+    found = env.state_space.split(env.get_state())[name].numpy()
+    error = np.abs(found - wanted).max(1)
+    print(f"{env.task.name} {name}: {np.quantile(error, [0.5, 0.95, 1.0])}")
+    np.testing.assert_allclose(found, wanted, rtol=2e-7, atol=1e-6)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("task", TASKS)
+def test_forty_steps_from_each_of_dm_controls_states_end_as_its_own(shared_env: SharedEnv, task: str) -> None:
+    """The segments are all steps of five episodes."""
+    env = segments(shared_env, task)
+    for _ in range(40):
+        env.step()
+    check_positions(env, rows(task, "end_qpos"), "qpos")
+
+
+@pytest.mark.parametrize("task", EVERY)
+def test_episodes_start_as_dm_controls(shared_env: SharedEnv, task: str) -> None:
+    """Each number of the initial state has the same distribution, by the two-sample test of Kolmogorov and Smirnov."""
+    theirs = stored(task)
+    env = lw.make(task, nworld=RESETS)
+    env.rand_reset(seed=1)
+    parts = env.state_space.split(env.get_state())
+    pairs = {name: (theirs[f"reset_{name}"], parts[name].numpy()) for name in ("qpos", "qvel", "act") if name in parts}
+    if env.model.nmocap:
+        target = theirs["reset_target"]
+        found = np.concatenate([parts["mocap_pos"].numpy(), parts["mocap_quat"].numpy()], 1)
+        pairs["target"] = target, found[:, : target.shape[1]]
+    for name, (wanted, found) in pairs.items():
+        for column in range(wanted.shape[1]):
+            a, b = np.sort(wanted[:, column]), np.sort(found[:, column])
+            if np.ptp(a) == 0:
+                np.testing.assert_allclose(b, a[0], atol=1e-6, err_msg=f"{name} {column}")
+                continue
+            both = np.concatenate([a, b])
+            gap = np.abs(np.searchsorted(a, both, "right") / len(a) - np.searchsorted(b, both, "right") / len(b)).max()
+            assert gap < 2.2 * np.sqrt(1 / len(a) + 1 / len(b)), f"{name} {column}"
