@@ -1,6 +1,8 @@
 """Reimplement dm_control's suite: a family of tasks with one domain in each module."""
 
 TASKS = {
+    "dm/acrobot_swingup": "dm_acrobot",
+    "dm/acrobot_swingup_sparse": "dm_acrobot",
     "dm/pendulum_swingup": "dm_pendulum",
 }
 """The modules of the tasks, by the tasks' names; the registry reads them without running this file."""
