@@ -3,6 +3,10 @@
 TASKS = {
     "dm/acrobot_swingup": "dm_acrobot",
     "dm/acrobot_swingup_sparse": "dm_acrobot",
+    "dm/cartpole_balance": "dm_cartpole",
+    "dm/cartpole_balance_sparse": "dm_cartpole",
+    "dm/cartpole_swingup": "dm_cartpole",
+    "dm/cartpole_swingup_sparse": "dm_cartpole",
     "dm/pendulum_swingup": "dm_pendulum",
 }
 """The modules of the tasks, by the tasks' names; the registry reads them without running this file."""
