@@ -8,5 +8,6 @@ TASKS = {
     "dm/cartpole_swingup": "dm_cartpole",
     "dm/cartpole_swingup_sparse": "dm_cartpole",
     "dm/pendulum_swingup": "dm_pendulum",
+    "dm/point_mass_easy": "dm_point_mass",
 }
 """The modules of the tasks, by the tasks' names; the registry reads them without running this file."""
