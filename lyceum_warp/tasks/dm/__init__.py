@@ -9,5 +9,7 @@ TASKS = {
     "dm/cartpole_swingup_sparse": "dm_cartpole",
     "dm/pendulum_swingup": "dm_pendulum",
     "dm/point_mass_easy": "dm_point_mass",
+    "dm/reacher_easy": "dm_reacher",
+    "dm/reacher_hard": "dm_reacher",
 }
 """The modules of the tasks, by the tasks' names; the registry reads them without running this file."""
