@@ -3,6 +3,7 @@
 TASKS = {
     "dm/acrobot_swingup": "dm_acrobot",
     "dm/acrobot_swingup_sparse": "dm_acrobot",
+    "dm/ball_in_cup_catch": "dm_ball_in_cup",
     "dm/cartpole_balance": "dm_cartpole",
     "dm/cartpole_balance_sparse": "dm_cartpole",
     "dm/cartpole_swingup": "dm_cartpole",
