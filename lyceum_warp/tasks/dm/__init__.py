@@ -12,5 +12,8 @@ TASKS = {
     "dm/point_mass_easy": "dm_point_mass",
     "dm/reacher_easy": "dm_reacher",
     "dm/reacher_hard": "dm_reacher",
+    "dm/walker_run": "dm_walker",
+    "dm/walker_stand": "dm_walker",
+    "dm/walker_walk": "dm_walker",
 }
 """The modules of the tasks, by the tasks' names; the registry reads them without running this file."""
