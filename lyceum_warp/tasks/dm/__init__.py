@@ -9,6 +9,8 @@ TASKS = {
     "dm/cartpole_swingup": "dm_cartpole",
     "dm/cartpole_swingup_sparse": "dm_cartpole",
     "dm/cheetah_run": "dm_cheetah",
+    "dm/hopper_hop": "dm_hopper",
+    "dm/hopper_stand": "dm_hopper",
     "dm/pendulum_swingup": "dm_pendulum",
     "dm/point_mass_easy": "dm_point_mass",
     "dm/reacher_easy": "dm_reacher",
