@@ -12,6 +12,8 @@ TASKS = {
     "dm/finger_spin": "dm_finger",
     "dm/finger_turn_easy": "dm_finger",
     "dm/finger_turn_hard": "dm_finger",
+    "dm/fish_swim": "dm_fish",
+    "dm/fish_upright": "dm_fish",
     "dm/hopper_hop": "dm_hopper",
     "dm/hopper_stand": "dm_hopper",
     "dm/humanoid_run": "dm_humanoid",
