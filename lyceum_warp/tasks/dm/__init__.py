@@ -23,6 +23,8 @@ TASKS = {
     "dm/point_mass_easy": "dm_point_mass",
     "dm/reacher_easy": "dm_reacher",
     "dm/reacher_hard": "dm_reacher",
+    "dm/swimmer_swimmer15": "dm_swimmer",
+    "dm/swimmer_swimmer6": "dm_swimmer",
     "dm/walker_run": "dm_walker",
     "dm/walker_stand": "dm_walker",
     "dm/walker_walk": "dm_walker",
