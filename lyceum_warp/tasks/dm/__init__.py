@@ -21,6 +21,8 @@ TASKS = {
     "dm/humanoid_walk": "dm_humanoid",
     "dm/pendulum_swingup": "dm_pendulum",
     "dm/point_mass_easy": "dm_point_mass",
+    "dm/quadruped_run": "dm_quadruped",
+    "dm/quadruped_walk": "dm_quadruped",
     "dm/reacher_easy": "dm_reacher",
     "dm/reacher_hard": "dm_reacher",
     "dm/swimmer_swimmer15": "dm_swimmer",
