@@ -19,6 +19,7 @@ TASKS = {
     "dm/humanoid_run": "dm_humanoid",
     "dm/humanoid_stand": "dm_humanoid",
     "dm/humanoid_walk": "dm_humanoid",
+    "dm/manipulator_bring_ball": "dm_manipulator",
     "dm/pendulum_swingup": "dm_pendulum",
     "dm/point_mass_easy": "dm_point_mass",
     "dm/quadruped_run": "dm_quadruped",
