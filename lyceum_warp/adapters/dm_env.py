@@ -1,0 +1,86 @@
+"""Adapt one world to dm_env's Environment, the interface of dm_control's suite."""
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of
+from lyceum_warp.adapters.libraries import check_library
+from lyceum_warp.adapters.step_results import HostArrays, Observations
+from lyceum_warp.env import Env
+from lyceum_warp.task import Task
+
+check_library("dm-env", low="1.5", below="2", install="dm-env>=1.5,<2")
+
+import dm_env  # noqa: E402
+from dm_env import specs  # noqa: E402
+
+
+class DmEnvironment(dm_env.Environment):  # type: ignore[misc]
+    """One world as a ``dm_env.Environment``, for code that expects the interface of dm_control's suite.
+
+    An observation is a dict with the parts of the observation group ``policy``, float32; a part of one number has the
+    shape (1,). The step after the last of an episode starts the next one, and ignores its action. The discount is 0
+    after a termination, and 1 if the time limit or a fault ends the episode.
+
+    Args:
+        task: A task, as in ``lw.make``, or an environment of one world, made with ``autoreset=False``.
+        flat_observation: Whether an observation is a dict with one array, "observations".
+        **words: Options and parameters for ``lw.make``; ``seed=0`` gives the same episodes in every run.
+
+    Raises:
+        ValueError: An argument is unknown or does not fit.
+        FileNotFoundError: The package with the task's model is not installed.
+    """
+
+    def __init__(self, task: str | type[Task] | Env, *, flat_observation: bool = False, **words: Any) -> None:
+        self.env = environment_of(task, 1, words, autoreset=False)
+        self._parts = {"observations": slice(None)} if flat_observation else self.env.obs_space.parts
+        self._observations = Observations(self.env, dict_obs=False)
+        self._host = HostArrays(self.env, one_world=True)
+        self._seeds = ResetSeeds(seeded=isinstance(task, Env) or "seed" in words)
+        self._ended = True
+
+    def reset(self) -> dm_env.TimeStep:
+        """Start a new random episode, and return its first time step, without reward and discount."""
+        self.env.rand_reset(self._seeds(None, lambda: np.random.SeedSequence().entropy))
+        self._ended = False
+        (obs,) = self._host.of(self.env.obs)
+        return dm_env.restart(self._split(obs[0]))
+
+    def step(self, action: np.ndarray) -> dm_env.TimeStep:
+        """Advance the world by one step, or start the next episode.
+
+        Args:
+            action: (nact,), float32 or float64.
+
+        Raises:
+            ValueError: The action has the wrong shape or type.
+        """
+        if self._ended:
+            return self.reset()
+        self._host.set_action(action)
+        env = self.env
+        env.step()
+        buffers: list[torch.Tensor] = [*self._observations.current, env.reward, env.terminated, env.truncated]
+        obs, reward, terminated, truncated = (array[0] for array in self._host.of(*buffers))
+        self._ended = bool(terminated or truncated)
+        if terminated:
+            return dm_env.termination(float(reward), self._split(obs))
+        if truncated:
+            return dm_env.truncation(float(reward), self._split(obs))
+        return dm_env.transition(float(reward), self._split(obs))
+
+    def observation_spec(self) -> dict[str, specs.Array]:
+        """The shapes of the parts of an observation."""
+        sizes = {name: len(range(*part.indices(self.env.obs_space.size))) for name, part in self._parts.items()}
+        return {name: specs.Array((size,), np.float32, name) for name, size in sizes.items()}
+
+    def action_spec(self) -> specs.BoundedArray:
+        """The shape and the bounds of an action."""
+        space = self.env.action_space
+        return specs.BoundedArray(space.shape, np.float32, space.low, space.high, "action")
+
+    def _split(self, obs: np.ndarray) -> dict[str, np.ndarray]:
+        return {name: obs[part] for name, part in self._parts.items()}
