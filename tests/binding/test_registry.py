@@ -9,7 +9,7 @@ import tiny_task
 
 import lyceum_warp as lw
 from lyceum_warp.binding import registry
-from lyceum_warp.binding.registry import find_task, task_name, task_names
+from lyceum_warp.binding.registry import file_name, find_task, task_name, task_names
 
 REGISTERED = tiny_task.changed(("class Tiny", "@lw.register\nclass Tiny"))
 
@@ -38,6 +38,13 @@ def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Load:
 def test_every_task_of_the_package_is_found_by_its_name() -> None:
     for name in task_names():
         assert task_name(find_task(name)) == name
+
+
+def test_a_name_in_a_namespace_belongs_to_its_own_class_and_is_one_part_of_a_path() -> None:
+    assert find_task("dm/humanoid_walk") is not find_task("humanoid_walk")
+    assert file_name("dm/humanoid_walk") == "dm-humanoid_walk" and file_name("hopper") == "hopper"
+    with pytest.raises(ValueError, match="no task 'dm/walker_wlk': did you mean dm/walker_walk"):
+        find_task("dm/walker_wlk")
 
 
 @pytest.mark.parametrize("name", ["hopper.xml", "foo.bar", "./t", ""])
