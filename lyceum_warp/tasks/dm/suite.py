@@ -1,6 +1,5 @@
 """Load the models of dm_control's suite, and share what its domains have in common."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -11,7 +10,7 @@ import lyceum_warp as lw
 from lyceum_warp import Row
 
 
-def model(domain: str) -> Any:
+def model(domain: str) -> lw.ModelFile:
     """The model of a domain, which the package dm-control brings."""
     file = f"suite/{domain}.xml"
     return lw.package_model("dm_control", file, install="lyceum-warp[dm-control]", before_python="3.13")
@@ -33,7 +32,7 @@ def count_contacts(spec: mujoco.MjSpec) -> None:
     spec.add_sensor(name="contacts", type=mujoco.mjtSensor.mjSENS_CONTACT, intprm=[found, 0, 1])
 
 
-def random_joints(model: mujoco.MjModel, p: Any) -> Sequence[int]:
+def random_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
     """The indices in ``qpos`` of the joints that an episode draws: those with limits, and hinges."""
     drawn = model.jnt_limited.astype(bool) | (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
     return model.jnt_qposadr[drawn]
