@@ -8,7 +8,7 @@ FastSAC (Seo et al. 2025, "Learning Sim-to-Real Humanoid Locomotion in 15 Minute
 import copy
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -30,6 +30,7 @@ from lyceum_warp.algos.rollout_statistics import (
 )
 from lyceum_warp.algos.sac_config import SACConfig
 from lyceum_warp.algos.squashed_policy import SquashedPolicy
+from lyceum_warp.algos.symmetry import PolicyMirror, Reflected, reflections
 from lyceum_warp.algos.timing import PhaseTimer
 from lyceum_warp.algos.twin_critic import TwinCritic
 from lyceum_warp.algos.value import value_group
@@ -143,6 +144,7 @@ class SAC(Learner):
         )  # fmt: skip
         _check_sizes(self.policy, self.value, env, low, high)
         trainable(self.policy.to(device)), trainable(self.value.to(device))
+        self._make_mirror(given)
         self.target = copy.deepcopy(self.value).requires_grad_(False)
         self.target.normalizer = self.value.normalizer
         self.log_temperature = torch.tensor(math.log(given.temperature), device=device, requires_grad=True)
@@ -158,7 +160,7 @@ class SAC(Learner):
         self.config = dataclasses.replace(
             given, replay=self.replay.steps * nworld, hidden=tuple(own["hidden"]), activation=own["activation"],
             normalize=own["normalize"], value_hidden=tuple(critics["hidden"]), value_activation=critics["activation"],
-            layer_norm=critics["layer_norm"],
+            layer_norm=critics["layer_norm"], symmetry="exact" if self.policy.mirror is not None else given.symmetry,
         )  # fmt: skip
         self.rollout = Rollout(env, given.num_steps)
         self.count = given.num_steps * nworld
@@ -179,6 +181,18 @@ class SAC(Learner):
         self._evaluate_mean = MeanPolicyEvaluation(env, given.mean_episodes, team)
         self.rollout.restart()
         self.rollout.stagger(self.generator, team)
+
+    def _make_mirror(self, config: SACConfig) -> None:
+        """Set the mirror images of observations and actions, if the policy is to be symmetric."""
+        self._mirror: PolicyMirror | None = None
+        if config.symmetry == "none" or self.policy.mirror is not None:  # of another run
+            return
+        found, device = reflections(self.env), self.env.obs.device
+        if config.symmetry == "exact":
+            self.policy.use_mirror(found)
+        else:
+            value = reflections(self.env, group=self.value.group)["obs"]
+            self._mirror, self._mirror_value = PolicyMirror(found).to(device), Reflected(value).to(device)
 
     @property
     def title(self) -> str:
@@ -294,6 +308,9 @@ class SAC(Learner):
         for i in range(config.updates):
             batch, weight = self.replay.at(self._index[i], n_step=config.n_step, gamma=config.gamma), self._weight[i]
             next_noise, noise = self._noise[i].split(nact, dim=-1)
+            if config.symmetry == "augment":
+                batch, weight = self._with_images(batch), torch.cat([weight, weight]) / 2.0
+                next_noise, noise = torch.cat([next_noise, noise]), torch.cat([noise, next_noise])
             with torch.autocast(weight.device.type, torch.bfloat16, enabled=config.bf16):
                 loss, *numbers = critic_loss(batch, weight, next_noise)
             self._sums[:2] += self.critic_step(loss, *numbers)
@@ -308,6 +325,23 @@ class SAC(Learner):
             with torch.no_grad():
                 for target, own in zip(self.target.parameters(), self.value.parameters(), strict=True):
                     target.lerp_(own, config.tau)
+
+    def _with_images(self, batch: Transitions) -> Transitions:
+        """Append the mirror images of transitions."""
+        assert self._mirror is not None
+        images = {"policy": self._mirror.obs, self.value.group: self._mirror_value}
+
+        def both(rows: torch.Tensor, image: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
+            return torch.cat([rows, image(rows)])
+
+        obs, next_obs = (
+            {name: both(groups[name], image) for name, image in images.items()}
+            for groups in (batch.obs, batch.next_obs)
+        )
+        return Transitions(
+            obs=obs, action=both(batch.action, self._mirror.action), reward=batch.reward.repeat(2),
+            discount=batch.discount.repeat(2), next_obs=next_obs,
+        )  # fmt: skip
 
     def critic_loss(
         self, batch: Transitions, weight: torch.Tensor, noise: torch.Tensor
@@ -341,6 +375,12 @@ class SAC(Learner):
         action, log_prob = self.policy.sample(batch.obs["policy"], noise)
         value = self._bound(self.value(batch.obs[self.value.group], action))
         loss = self.log_temperature.detach().exp() * log_prob - value
+        if self.config.symmetry == "loss":
+            assert self._mirror is not None
+            mean, image = (
+                torch.tanh(self.policy(obs)[0]) for obs in (batch.obs["policy"], self._mirror.obs(batch.obs["policy"]))
+            )
+            loss = loss + self.config.symmetry_coef * (mean - self._mirror.action(image)).square().mean(-1)
         return (weight * loss).sum(), -(weight * log_prob.detach()).sum()
 
     def _bound(self, values: torch.Tensor) -> torch.Tensor:

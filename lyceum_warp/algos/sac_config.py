@@ -10,7 +10,7 @@ from lyceum_warp.support.docstrings import document_attributes
 _BOUNDS: dict[str, float | tuple[float, float]] = {
     "num_steps": 1, "replay": 1, "warmup": 0, "updates": 1, "actor_every": 1, "batch": 1, "n_step": 1, "mean_every": 0,
     "mean_episodes": 1, "gamma": (0.0, 1.0), "tau": (0.0, 1.0), "learning_rate": 0.0, "temperature": 1e-6,
-    "target_entropy": LEAST, "action_limit": 1e-6,
+    "target_entropy": LEAST, "action_limit": 1e-6, "symmetry_coef": 0.0,
 }  # fmt: skip
 
 MANY_WORLDS = 256
@@ -88,6 +88,12 @@ class SACConfig:
     """Group of observations for the critics; by default "critic" if the task has this group, else "policy"."""
     layer_norm: bool = True
     """Whether to normalise the critics' hidden layers."""
+    symmetry: Literal["none", "exact", "loss", "augment"] = "none"
+    """How to use the mirror image that a task declares (``lw.Mirror``): "exact" averages the policy with its mirror
+    image; "loss" adds symmetry_coef times the squared difference between both; "augment" learns from the mirror images
+    of all samples, too."""
+    symmetry_coef: float = 1.0
+    """Coefficient of the loss of symmetry "loss"."""
     normalize: bool = True
     """Whether to normalise observations by their running mean and variance, updated in every step."""
     tf32: bool = True

@@ -1,12 +1,14 @@
 """Define SAC's policies, which draw bounded actions: the hyperbolic tangent of a Gaussian sample."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 
 from lyceum_warp.algos.networks import LIMIT, Activation, Normalized, check_memory, initialize_as_torch, mlp
+from lyceum_warp.algos.symmetry import PolicyMirror
+from lyceum_warp.mirror import Reflection
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import layer_sizes, whole_number
 
@@ -30,7 +32,11 @@ class SquashedPolicy(Normalized):
         activation: Activation of the hidden layers.
         normalize: Whether to normalise observations by their running mean and variance.
         limit: Normalised observations are clipped to [-limit, limit]; inf for no limit.
+        mirror: Reflections for ``use_mirror``.
         generator: Draws the initial weights.
+
+    Raises:
+        ValueError: The bounds are not those of their mirror image.
     """
 
     shape: dict[str, Any]
@@ -51,6 +57,7 @@ class SquashedPolicy(Normalized):
         activation: Activation = "relu",
         normalize: bool = False,
         limit: float = LIMIT,
+        mirror: Mapping[str, Reflection] | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
         nobs, nact = whole_number("nobs", nobs, low=1), whole_number("nact", nact, low=1)
@@ -66,11 +73,42 @@ class SquashedPolicy(Normalized):
         initialize_as_torch(self.network, generator)
         self.register_buffer("low", torch.tensor(self.shape["low"]))
         self.register_buffer("width", torch.tensor(self.shape["high"]) - torch.tensor(self.shape["low"]))
+        self.mirror: PolicyMirror | None = None
+        if mirror is not None:
+            self.use_mirror(mirror)
+
+    def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:
+        """Average the Gaussian with that of the mirror image from now on.
+
+        Args:
+            reflections: The reflections of ``obs`` and ``action`` (``algos.symmetry.reflections``).
+
+        Raises:
+            ValueError: The bounds of the actions are not those of their mirror image.
+        """
+        low, high = self.shape["low"], self.shape["high"]
+        bounds = list(zip(low, high, strict=True))
+        order, signs = reflections["action"]
+        images = [bounds[i] if sign > 0 else (-high[i], -low[i]) for i, sign in zip(order, signs, strict=True)]
+        if images != bounds:
+            raise ValueError(
+                f"the actions from {low} to {high} have other bounds than their mirror image: learn with "
+                'symmetry="none"'
+            )
+        self.mirror = PolicyMirror(reflections).to(self.low.device)
+        self.shape["mirror"] = self.mirror.reflections
 
     def forward(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Compute the Gaussian's means and the logarithms of its standard deviations, each (..., nact)."""
-        mean, spread = self.network(self.normalizer(obs)).float().chunk(2, dim=-1)  # float32 also under autocast
+        mean, spread = self._outputs(obs)
+        if self.mirror is not None:
+            image, image_spread = self._outputs(self.mirror.obs(obs))
+            mean = 0.5 * (mean + self.mirror.action(image))
+            spread = 0.5 * (spread + self.mirror.action.swapped(image_spread))
         return mean, _LOWEST + 0.5 * (_HIGHEST - _LOWEST) * (1.0 + torch.tanh(spread))
+
+    def _outputs(self, obs: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return self.network(self.normalizer(obs)).float().chunk(2, dim=-1)  # float32 also under autocast
 
     def act(self, obs: torch.Tensor) -> torch.Tensor:
         """Compute actions without noise, (..., nact)."""

@@ -1,6 +1,7 @@
 """Test policies that are exactly symmetric, or learn symmetry."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +26,10 @@ def learner(env: lw.Env, symmetry: str, **changes: Any) -> lw.PPO:
     return lw.PPO(env, config=dataclasses.replace(CONFIG, symmetry=symmetry, **changes), seed=1)
 
 
-def asymmetry(policy: lw.GaussianPolicy, env: lw.Env) -> float:
+def asymmetry(policy: Callable[[torch.Tensor], torch.Tensor], env: lw.Env) -> float:
     """Return the mean difference between actions and mirrored actions of mirrored observations."""
     mirror = PolicyMirror(reflections(env))
-    obs = torch.randn(500, policy.nobs, generator=torch.Generator().manual_seed(0))
+    obs = torch.randn(500, env.obs_space.size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         return (policy(mirror.obs(obs)) - mirror.action(policy(obs))).abs().mean().item()
 
@@ -113,3 +114,25 @@ def test_mirrored_samples_have_the_gradient_of_the_mirrored_task(env: lw.Env) ->
 def test_a_task_without_a_mirror_image_is_refused(shared_env: SharedEnv) -> None:
     with pytest.raises(ValueError, match="the task 'hopper' declares no mirror image: give it mirror = lw.Mirror"):
         lw.PPO(shared_env("hopper"), config=dataclasses.replace(CONFIG, symmetry="exact"))
+
+
+@pytest.mark.parametrize("symmetry", ["exact", "loss", "augment"])
+def test_sac_learns_symmetric_policies_and_keeps_them(symmetry: str, env: lw.Env, tmp_path: Path) -> None:
+    config = lw.SACConfig(
+        hidden=(16,), value_hidden=(16,), batch=64, warmup=64, num_steps=40, mean_every=0, symmetry=symmetry
+    )
+    env.rand_reset(1)
+    sac = lw.SAC(env, config=config, seed=1)
+    before = asymmetry(sac.policy.act, env)
+    policy = lw.load(lw.train(sac, tmp_path / "run", iterations=2))
+    assert asymmetry(policy.act, env) == asymmetry(sac.policy.act, env)
+    if symmetry == "exact":
+        assert max(before, asymmetry(policy.act, env)) < 1e-6  # bounds are added to unit actions, which rounds
+        assert lw.SAC(env, lw.load(tmp_path / "run"), config=lw.SACConfig(batch=64)).config.symmetry == "exact"
+    else:
+        assert asymmetry(policy.act, env) < before
+
+
+def test_bounds_that_are_not_symmetric_are_refused() -> None:
+    with pytest.raises(ValueError, match="have other bounds than their mirror image"):
+        lw.SquashedPolicy(1, 1, (4,), low=[-1.0], high=[2.0], mirror={"obs": ([0], [-1.0]), "action": ([0], [-1.0])})
