@@ -8,7 +8,8 @@ plan from given states.
 
 The Python planner (python_mppi.py) sends one message per plan to each process. All planners control the same plant, and
 take turns in blocks of episodes. The contestants "a set at a time" run last: one planner controls the plants of all
-episodes of a set. With --jobs, blocks run at the same time, each in a subprocess on separate cores.
+episodes of a set. With --jobs, blocks run at the same time, each in a subprocess on separate cores. ``mppi_fast`` plans
+with the physics that a task names "fast"; the plant keeps the task's own.
 """
 
 import dataclasses
@@ -27,6 +28,7 @@ import torch
 from experiment import Row, Table, choose, installed, median_and_range
 
 import lyceum_warp as lw
+from lyceum_warp.binding.registry import find_task
 from lyceum_warp.controllers.control_report import wilson
 
 EPISODES = {"reach": 75, "adroit_pen": 75, "herb_reach": 150, "panda_lift": 150, "aloha_lift": 150,
@@ -38,12 +40,13 @@ TASKS = ("reach", "half_cheetah", "adroit_pen", "herb_reach", "panda_lift", "alo
 
 CONTESTANTS = {
     "mppi": "lyceum_warp, C engine",
+    "mppi_fast": "lyceum_warp, C engine, fast physics",
     "mppi_warp": "lyceum_warp, Warp engine",
     "mppi_together": "lyceum_warp, C engine, a set at a time",
     "mppi_warp_together": "lyceum_warp, Warp engine, a set at a time",
     "python": "Python, a message a plan",
 }
-OURS, TOGETHER = ("mppi", "mppi_warp"), ("mppi_together", "mppi_warp_together")
+OURS, TOGETHER = ("mppi", "mppi_fast", "mppi_warp"), ("mppi_together", "mppi_warp_together")
 ON_WARP = ("mppi_warp", "mppi_warp_together")
 
 
@@ -110,7 +113,7 @@ def cases(options: Options) -> list[Case]:
         found += [Case("episodes", task, name, number, 1000 * number + first, size, 10 if short else EPISODES[task],
                        0.0, threads)
                   for number in sets for first, size, names in blocks for task in chosen for name in names]  # fmt: skip
-    return found
+    return [case for case in found if case.contestant != "mppi_fast" or "fast" in find_task(case.task).physics]
 
 
 def estimate(case: Case) -> float:
@@ -128,7 +131,8 @@ def planner(task: str, contestant: str, threads: int, device: str, plants: int =
     """Make one of our planners."""
     if contestant in ON_WARP:
         return lw.MPPI(task, engine="warp", device=device, plants=plants)
-    return lw.MPPI(task, engine="mujoco", nthread=threads, plants=plants)
+    physics = "fast" if contestant == "mppi_fast" else "exact"
+    return lw.MPPI(task, engine="mujoco", nthread=threads, plants=plants, physics=physics)
 
 
 @functools.cache
