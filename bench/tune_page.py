@@ -1,0 +1,88 @@
+"""Write results/tune.md, tables of the rows that `lyceum-warp tune --out results/tune-MACHINE.jsonl` appended."""
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from experiment import RESULTS, Table
+
+from lyceum_warp.support.files import replaced
+from lyceum_warp.tuning.judgement import Difference, verdict
+
+TEXT = "# tune\n\nFaster physics at equal returns. Written by `lyceum-warp bench tune_page` from {}."
+
+
+def searches(name: str) -> list[list[dict[str, Any]]]:
+    """Return the rows of each search in a file, the fastest setting first, with their verdicts."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for line in (RESULTS / name).read_text().splitlines():
+        row = json.loads(line)
+        found.setdefault(json.dumps(row["identity"]), []).append(row)
+    for rows in found.values():
+        for row in rows:
+            row["verdict"] = verdict(row, "strict") if row["physics"] else "reference"
+        rows.sort(key=lambda row: -row.get("speedup", 0.0))
+    return sorted(found.values(), key=lambda rows: (rows[0]["identity"]["task"], not rows[0]["identity"]["short"]))
+
+
+def fastest(rows: Sequence[dict[str, Any]], *verdicts: str) -> dict[str, Any] | None:
+    return next((row for row in rows if row["verdict"] in verdicts), None)
+
+
+def changes(row: dict[str, Any]) -> str:
+    return "; ".join(f"{source} {Difference(**found)}" for source, found in row["returns"].items())
+
+
+def worlds_table(machine: str, found: Sequence[Sequence[dict[str, Any]]]) -> Table:
+    lines = []
+    for rows in found:
+        who = rows[0]["identity"]
+        exact, same = fastest(rows, "reference"), fastest(rows, "same")
+        faster = [row for row in rows if row["verdict"] in ("different", "not shown", "faults")
+                  and row["speedup"] > (same["speedup"] if same else 1.0)]  # fmt: skip
+        lines.append([
+            who["task"], "first 100 steps" if who["short"] else "whole episodes",
+            f"{exact['steps_per_second']:,.0f}" if exact else "",
+            *((same["name"], f"{same['speedup']:.2f}", changes(same)) if same else ("as it is", "1", "")),
+            "; ".join(f"{row['name']}: {row['speedup']:.2f}, {row['verdict']}, {changes(row)}" for row in faster[:2]),
+        ])  # fmt: skip
+    title = (
+        f"{machine}, {found[0][0]['identity']['nworld']} worlds: the fastest setting with the same returns (strict: "
+        "within 2 %), under random actions and, where it is named, under a policy. Speed: relative to the task as it "
+        "is. Intervals: difference of returns, %."
+    )
+    header = ["task", "episodes", "steps/s as it is", "setting", "speed", "returns", "faster, but"]
+    return Table(title, header, lines)
+
+
+def planning_table(machine: str, found: Sequence[Sequence[dict[str, Any]]]) -> Table:
+    lines = []
+    for rows in found:
+        for row in rows:
+            if row["verdict"] in ("same", "not shown", "ranks badly") and row["speedup"] > 1.2:
+                ranks = [f"{value['mean']:.2f} ({value['low']:.2f})" for value in row["ranks"].values()]
+                lines.append([row["identity"]["task"], row["name"], f"{row['speedup']:.2f}", *ranks, row["verdict"]])
+    title = (
+        f"{machine}, a planner's physics that plan at least 1.2 times as fast: rank correlation of the samples' "
+        "returns with the task's own physics, mean (lower bound)."
+    )
+    return Table(title, ["task", "setting", "speed of a plan", "standing", "moving", "fallen", "verdict"], lines)
+
+
+def main() -> None:
+    names = sorted(path.name for path in RESULTS.glob("tune-*.jsonl"))
+    parts = [TEXT.format(", ".join(f"`{name}`" for name in names))]
+    for name in names:
+        found = searches(name)
+        machine = found[0][0]["identity"]["device"]
+        planning = [rows for rows in found if "planner" in rows[0]["identity"]]
+        worlds = [rows for rows in found if rows not in planning]
+        tables = [make(machine, kind) for make, kind in ((worlds_table, worlds), (planning_table, planning)) if kind]
+        parts += [table.markdown() for table in tables]
+    with replaced(RESULTS / "tune.md") as temporary:
+        temporary.write_text("\n\n".join(parts) + "\n")
+    print(RESULTS / "tune.md")
+
+
+if __name__ == "__main__":
+    main()
