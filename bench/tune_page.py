@@ -42,14 +42,15 @@ def worlds_table(machine: str, found: Sequence[Sequence[dict[str, Any]]]) -> Tab
                   and row["speedup"] > (same["speedup"] if same else 1.0)]  # fmt: skip
         lines.append([
             who["task"], "first 100 steps" if who["short"] else "whole episodes",
-            f"{exact['steps_per_second']:,.0f}" if exact else "",
+            f"{exact['steps_per_second']:,.0f} ({exact['speedup']:.2f})" if exact else "",
             *((same["name"], f"{same['speedup']:.2f}", changes(same)) if same else ("as it is", "1", "")),
             "; ".join(f"{row['name']}: {row['speedup']:.2f}, {row['verdict']}, {changes(row)}" for row in faster[:2]),
         ])  # fmt: skip
     title = (
         f"{machine}, {found[0][0]['identity']['nworld']} worlds: the fastest setting with the same returns (strict: "
         "within 2 %), under random actions and, where it is named, under a policy. Speed: relative to the task as it "
-        "is. Intervals: difference of returns, %."
+        "is; the number after steps/s is the task as it is against itself, which shows the noise. Intervals: difference"
+        " of returns, %."
     )
     header = ["task", "episodes", "steps/s as it is", "setting", "speed", "returns", "faster, but"]
     return Table(title, header, lines)

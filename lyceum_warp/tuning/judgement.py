@@ -13,7 +13,8 @@ TOLERANCES = {"strict": 0.02, "loose": 0.05, "any": math.inf}
 """Largest accepted difference of returns, relative to the mean absolute return of the unchanged task."""
 
 RANK_CORRELATIONS = {"strict": 0.9, "loose": 0.8, "any": -1.0}
-"""Smallest accepted rank correlation between a planner's physics and the plant's, by name of the tolerance."""
+"""Smallest accepted rank correlation between a planner's physics and the plant's, by name of the tolerance.
+bench/rank_loss.py compares it with the loss of planned return."""
 
 LEAST_GAIN = 1.03
 """A setting must be faster by at least this factor, or take less memory, to be judged further."""
