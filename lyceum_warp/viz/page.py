@@ -1,0 +1,226 @@
+"""Write a recording as one HTML file: a scene that plays and turns in any browser, without a server or a network.
+
+The file holds triangles of the visible geoms, in the axes of their bodies, and the bodies' poses in each frame; the
+script in ``page.html`` draws them with WebGL. Textures are left out, except for the floor's squares.
+"""
+
+import base64
+import html
+import json
+import zlib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+
+from lyceum_warp.env import Env
+from lyceum_warp.support.files import replaced
+from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
+
+_GROUPS = 3  # groups of geoms that MuJoCo shows by default
+_AROUND, _ALONG = 24, 12  # parts of a circle, and of a half circle
+_RATE = 60  # most frames per second
+_FLOOR = 200.0  # half the side of an endless floor, m
+Surface = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Vertices and normals, both (n, 3), and triangles (m, 3)."""
+
+
+def write_page(env: Env, states: torch.Tensor, out: str | Path, *, camera: CameraChoice = None) -> Path:
+    """Write states as a page that plays them in a browser; the file contains all that it needs.
+
+    Args:
+        env: Environment of the states.
+        states: States of one world, one row per step, (steps, state_space.size).
+        out: The file. It is replaced when the page is complete.
+        camera: The first camera, as in ``write_video``. The page can turn it.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        ValueError: The states do not have the environment's shape, or the model has no such camera.
+    """
+    if states.ndim != 2 or states.shape[1] != env.state_space.size or not len(states):
+        raise ValueError(f"states must have the shape (steps, {env.state_space.size}), not {tuple(states.shape)}")
+    stride = max(1, round(1 / (_RATE * env.timestep)))
+    none, parts, rows = slice(0), env.state_space.parts, states[::stride].double().cpu().numpy()
+    poses = [
+        (row[parts["qpos"]], *(row[parts.get(name, none)] for name in ("mocap_pos", "mocap_quat"))) for row in rows
+    ]
+    view = camera_values(find_camera(env.model, camera))
+    return write_poses(env.model, poses, out, dt=stride * env.timestep, title=env.task.name, camera=view)
+
+
+def write_poses(
+    model: mujoco.MjModel,
+    poses: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    out: str | Path,
+    *,
+    dt: float,
+    title: str,
+    camera: Sequence[float],
+) -> Path:
+    """Write poses of a model as a page; see ``write_page``.
+
+    Args:
+        model: The model.
+        poses: qpos, mocap_pos and mocap_quat of each frame.
+        out: The file.
+        dt: Seconds between frames.
+        title: Title of the page.
+        camera: The camera's values, as ``cameras.camera_values`` returns them.
+    """
+    data, frames = mujoco.MjData(model), []
+    for qpos, place, turn in poses:
+        data.qpos[:] = qpos
+        if model.nmocap:
+            data.mocap_pos[:], data.mocap_quat[:] = np.reshape(place, (-1, 3)), np.reshape(turn, (-1, 4))
+        mujoco.mj_kinematics(model, data)
+        frames.append(np.concatenate([data.xpos, data.xquat], axis=1))
+    vertices, indices, ranges = _triangles(model)
+    _, fixed, tracked = (int(value) for value in camera[:3])
+    if fixed >= 0:  # a camera of the model
+        tracked, view = int(model.cam_bodyid[fixed]), model.stat.extent * 1.5
+        camera = (0, -1, tracked, *model.stat.center, view, 120.0, -20.0)
+    moving = np.flatnonzero(model.body_dofnum)
+    content = {
+        "dt": dt, "ranges": ranges, "fovy": float(model.vis.global_.fovy), "reach": 30 * float(model.stat.extent),
+        "followed": tracked if tracked > 0 else int(moving[0]) if len(moving) else 0,
+        "camera": dict(
+            lookat=list(map(float, camera[3:6])), distance=float(camera[6]), azimuth=float(camera[7]),
+            elevation=float(camera[8]),
+        ),
+        "poses": _packed(np.array(frames, dtype=np.float32)), "vertices": _packed(vertices),
+        "indices": _packed(indices),
+    }  # fmt: skip
+    text = Path(__file__).with_name("page.html").read_text().replace("TITLE", html.escape(title), 1)
+    with replaced(Path(out)) as temporary:
+        Path(temporary).write_text(text.replace("DATA", json.dumps(content), 1))
+    return Path(out)
+
+
+def _packed(array: np.ndarray) -> str:
+    return base64.b64encode(zlib.compress(array.tobytes(), 9)).decode()
+
+
+def _triangles(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[tuple[int, int]]]:
+    """Triangles of the visible geoms: packed vertices, indices, and each body's first index with their number."""
+    kind = np.dtype([("at", np.float32, 3), ("normal", np.int8, 4), ("colour", np.uint8, 4)])
+    vertices: list[np.ndarray] = []
+    indices: list[np.ndarray] = []
+    ranges, count, used = [], 0, 0
+    for body in range(model.nbody):
+        first = used
+        for geom in np.flatnonzero((model.geom_bodyid == body) & (model.geom_group < _GROUPS)):
+            rgba = _colour(model, geom)
+            surface = _surface(model, geom)
+            if surface is None or rgba[3] == 0:
+                continue
+            if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
+                rgba[3] = 0.0  # marks a floor
+            points, normals, faces = surface
+            axes = np.empty(9)
+            mujoco.mju_quat2Mat(axes, model.geom_quat[geom])
+            rows = np.empty(len(points), dtype=kind)
+            rows["at"] = points @ axes.reshape(3, 3).T + model.geom_pos[geom]
+            rows["normal"][:, :3] = np.round(127 * normals @ axes.reshape(3, 3).T)
+            rows["normal"][:, 3], rows["colour"] = 0, np.round(255 * rgba)
+            vertices.append(rows)
+            indices.append(faces.ravel().astype(np.uint32) + count)
+            count, used = count + len(points), used + faces.size
+        ranges.append((first, used - first))
+    return np.concatenate([*vertices, np.empty(0, kind)]), np.concatenate([*indices, np.empty(0, np.uint32)]), ranges
+
+
+def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """Red, green, blue and opacity of a geom; a material's, unless the geom has its own."""
+    own, material = model.geom_rgba[geom].astype(float), model.geom_matid[geom]
+    if material < 0 or not np.allclose(own, (0.5, 0.5, 0.5, 1.0)):
+        return own
+    return np.array(model.mat_rgba[material], dtype=float)
+
+
+def _surface(model: mujoco.MjModel, geom: int) -> Surface | None:
+    """Vertices, normals and triangles of a geom, in its axes; None for a kind that is not drawn."""
+    types = mujoco.mjtGeom
+    kind, size = types(int(model.geom_type[geom])), model.geom_size[geom]
+    if kind == types.mjGEOM_PLANE:
+        x, y = np.where(size[:2] > 0, size[:2], _FLOOR) if model.geom_bodyid[geom] else (_FLOOR, _FLOOR)
+        corners = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0.0]])
+        return corners, np.tile([0.0, 0.0, 1.0], (4, 1)), np.array([[0, 1, 2], [0, 2, 3]])
+    if kind == types.mjGEOM_BOX:
+        return _flat(*_box(size))
+    if kind in (types.mjGEOM_SPHERE, types.mjGEOM_ELLIPSOID, types.mjGEOM_CAPSULE, types.mjGEOM_CYLINDER):
+        return _round(kind, size)
+    if kind == types.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        points = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
+        return _flat(points, model.mesh_face[model.mesh_faceadr[mesh] :][: model.mesh_facenum[mesh]])
+    if kind == types.mjGEOM_HFIELD:
+        return _flat(*_ground(model, model.geom_dataid[geom]))
+    return None
+
+
+def _box(size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return corners, np.array([face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))])
+
+
+def _ground(model: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of a height field."""
+    rows, columns = model.hfield_nrow[field], model.hfield_ncol[field]
+    x, y, top, _ = model.hfield_size[field]
+    heights = model.hfield_data[model.hfield_adr[field] :][: rows * columns].reshape(rows, columns)
+    across, along = np.meshgrid(np.linspace(-x, x, columns), np.linspace(-y, y, rows))
+    number = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+    faces = np.concatenate([np.stack(each, -1).reshape(-1, 3) for each in ((a, b, c), (a, c, d))])
+    return np.stack([across, along, top * heights], -1).reshape(-1, 3), faces
+
+
+def _flat(points: np.ndarray, faces: np.ndarray) -> Surface:
+    """A surface of flat triangles; neighbours within 30 degrees share a normal, so that curved meshes look smooth."""
+    corners = points[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    mean = np.zeros_like(points, dtype=float)
+    for corner in range(3):
+        np.add.at(mean, faces[:, corner], normals)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-30)
+    own = np.repeat(normals / area, 3, axis=0)
+    shared = mean[faces.ravel()]
+    smooth = (own * shared).sum(1, keepdims=True) > np.cos(np.radians(30))
+    return corners.reshape(-1, 3), np.where(smooth, shared, own), np.arange(faces.size).reshape(-1, 3)
+
+
+def _round(kind: mujoco.mjtGeom, size: np.ndarray) -> Surface:
+    """A sphere, an ellipsoid, a capsule or a cylinder, along z."""
+    types = mujoco.mjtGeom
+    if kind == types.mjGEOM_CYLINDER:  # rings: a cap's centre and edge, the side, the other cap's edge and centre
+        height, radius = np.array([-1, -1, -1, 1, 1, 1.0]), np.array([0, 1, 1, 1, 1, 0.0])
+        rise, out = np.array([-1, -1, 0, 0, 1, 1.0]), np.array([0, 0, 1, 1, 0, 0.0])
+        place = np.stack([radius * size[0], height * size[1]])
+    else:
+        angle = np.linspace(-np.pi / 2, np.pi / 2, _ALONG + 1)
+        if kind == types.mjGEOM_CAPSULE:  # its middle is doubled
+            angle = np.concatenate([np.linspace(-np.pi / 2, 0, _ALONG // 2), np.linspace(0, np.pi / 2, _ALONG // 2)])
+        out, rise = np.cos(angle), np.sin(angle)
+        lift = np.sign(np.arange(len(angle)) - len(angle) / 2 + 0.5) * size[1] if kind == types.mjGEOM_CAPSULE else 0.0
+        place = np.stack([out * size[0], rise * size[0] + lift])
+    around = np.linspace(0, 2 * np.pi, _AROUND + 1)
+    circle = np.stack([np.cos(around), np.sin(around)], 1)
+    points = np.concatenate([np.column_stack([r * circle, np.full(len(circle), z)]) for r, z in place.T])
+    normals = np.concatenate(
+        [np.column_stack([r * circle, np.full(len(circle), z)]) for r, z in zip(out, rise, strict=True)]
+    )
+    if kind == types.mjGEOM_ELLIPSOID:
+        points = normals * size
+        normals = normals / size
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    ring, step = np.meshgrid(np.arange(len(out) - 1), np.arange(_AROUND), indexing="ij")
+    a = (ring * (_AROUND + 1) + step).ravel()
+    b, c, d = a + 1, a + _AROUND + 2, a + _AROUND + 1
+    return points, normals, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
