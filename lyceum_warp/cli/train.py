@@ -134,6 +134,8 @@ class Train:
     write."""
     view: bool = False
     """Whether to show the newest policy during training, like lyceum-warp view FOLDER --follow in another shell."""
+    port: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Port of the page of --view; by default the first free port from 8080 on."""
     plot: bool = True
     """Whether to plot the learning curve at the end."""
     require_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
@@ -159,6 +161,8 @@ class Train:
             raise ValueError("--trust has no effect without --resume or --from: omit it")
         if self.take_over and self.resume is None:
             raise ValueError("--take-over has no effect without --resume: omit it")
+        if self.port is not None and not self.view:
+            raise ValueError(f"--port {self.port} has no effect without --view: omit it")
         source = None if folder is None else Run.open(folder)
         saved = {} if source is None else source.config
         settings = {}
@@ -173,7 +177,7 @@ class Train:
                 learner, folder, entries = self._learner(source, team)
             console, leads, total = make_console(), learner.team.leads, settings["iterations"]
             try:
-                with RunViewer(folder) if self.view and leads else contextlib.nullcontext():
+                with RunViewer(folder, port=self.port) if self.view and leads else contextlib.nullcontext():
                     run = train(
                         learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
                         take_over=self.take_over, minutes=self.minutes, transfer=self.transfer, entries=entries,

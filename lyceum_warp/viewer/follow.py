@@ -9,6 +9,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -110,12 +111,19 @@ class RunViewer:
         # multiprocessing would import the caller's program again
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-c", "from lyceum_warp.cli.view import attached; attached()"],
-            stdin=subprocess.PIPE, text=True, process_group=0,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, process_group=0,
         )  # fmt: skip
+        threading.Thread(target=self._print, daemon=True).start()
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):  # a process that ended at once has printed the reason
             self._process.stdin.write(job + "\n")
             self._process.stdin.flush()
+
+    def _print(self) -> None:
+        """Print the lines of the process above a live display, which redirects only what this process prints."""
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            print(line, end="", flush=True)
 
     @property
     def is_open(self) -> bool:

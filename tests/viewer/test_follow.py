@@ -67,7 +67,7 @@ def trained(folder: Path, callback: Callable[[lw.Iteration], object] | None = No
     return [list(map(str, row.items())) for row in rows], list(lw.load(run).state_dict().values())
 
 
-def test_a_viewer_does_not_change_a_runs_numbers(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_viewer_does_not_change_a_runs_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     alone = trained(tmp_path / "alone")
     begun, printed = time.monotonic(), ""
     with lw.RunViewer(tmp_path / "shown", nworld=2) as viewer:
@@ -77,7 +77,7 @@ def test_a_viewer_does_not_change_a_runs_numbers(tmp_path: Path, capfd: pytest.C
             while not re.search(r"http://127\.0\.0\.1:\d+/", printed):  # the first iteration waits for the viewer
                 assert viewer.is_open and time.monotonic() < begun + 60, printed
                 time.sleep(0.1)
-                printed += capfd.readouterr().out
+                printed += capsys.readouterr().out  # by this process, above a live line
 
         shown = trained(tmp_path / "shown", callback)
         assert viewer.is_open
@@ -121,11 +121,13 @@ def test_a_viewer_ends_with_its_program_also_while_it_waits_for_the_run(kill: bo
 
 
 def test_train_shows_its_run_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folders: list[Path] = []
+    made: list[Any] = []
     training = importlib.import_module("lyceum_warp.cli.train")  # the package also has a function of this name
-    monkeypatch.setattr(training, "RunViewer", lambda folder: folders.append(folder) or contextlib.nullcontext())
-    assert train(tmp_path / "run", "--iterations", "1", "--view") == 0
-    assert folders == [tmp_path / "run"]
+    monkeypatch.setattr(
+        training, "RunViewer", lambda *given, **words: made.append((given, words)) or contextlib.nullcontext()
+    )
+    assert train(tmp_path / "run", "--iterations", "1", "--view", "--port", "8123") == 0
+    assert made == [((tmp_path / "run",), {"port": 8123})]
 
 
 def test_a_viewer_of_a_task_that_is_not_found_ends_with_one_line(
