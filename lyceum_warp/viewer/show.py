@@ -1,5 +1,8 @@
 """Show worlds, controllers and episodes in a viewer: ``lw.view``."""
 
+import html
+import sys
+import threading
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,7 +22,8 @@ def view(
     host: str = "127.0.0.1",
     port: int | None = None,
     watchers: Sequence[Watcher] = (),
-) -> None:
+    block: bool | None = None,
+) -> "BackgroundView | None":
     """Show worlds, controllers and episodes on a page in a browser, until the user quits.
 
     ``lw.view(env)`` shows passive worlds; ``lw.view(env, controllers={"policy": policy, "mppi": plan})`` adds
@@ -43,6 +47,11 @@ def view(
         host: Address to serve the page on. The default is the loopback address, which other machines cannot reach.
         port: Port of the page; by default the first free port from 8080.
         watchers: Functions that are called about twice a second and return new messages, a sequence of strings.
+        block: Whether to return only when the user quits. False steps the worlds in a thread: leave them to it until
+            the view is closed. The default is False in a notebook, which then shows a link to the page.
+
+    Returns:
+        The running view, if the call does not block.
 
     Raises:
         ValueError: An argument is invalid, or the port is in use.
@@ -52,11 +61,50 @@ def view(
     session = Session(env, controllers, episodes=episodes, seed=seed, paused=paused, watchers=watchers)
     try:
         window = opened(session.stage.scene, host=host, port=port)
+        if block is False or (block is None and in_notebook()):
+            return BackgroundView(session, window)
         session.run(window)
-    finally:
+    except BaseException:
         session.stage.close()
+        raise
     if window.error is not None:
         raise NoWindowError(f"the viewer's window ended: {window.error}")
+    return None
+
+
+class BackgroundView:
+    """A view whose worlds are stepped in a thread; ``lw.view`` returns it if it does not block.
+
+    A notebook shows it as a link. It cannot show the page itself, which needs memory shared between threads: browsers
+    allow that only in pages of their own.
+    """
+
+    def __init__(self, session: Session, window: Window) -> None:
+        self.address = window.address
+        """The page's address with its token."""
+        self._title, self._window = session.stage.scene.title, window
+        self._thread = threading.Thread(target=session.run, args=(window,), name="lyceum_warp view", daemon=True)
+        self._thread.start()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it runs."""
+        return self._thread.is_alive()
+
+    def close(self) -> None:
+        """End it, and leave the worlds in their last state. A second call does nothing."""
+        self._window.close()
+        self._thread.join()
+
+    def _repr_html_(self) -> str:
+        state = "" if self.is_open else " (closed)"
+        return f'<a href="{html.escape(self.address)}" target="_blank">viewer of {html.escape(self._title)}</a>{state}'
+
+
+def in_notebook() -> bool:
+    """Whether this program is the kernel of a notebook."""
+    shell = sys.modules.get("IPython")
+    return shell is not None and getattr(shell.get_ipython(), "kernel", None) is not None
 
 
 def opened(scene: Scene, **place: Any) -> Window:
