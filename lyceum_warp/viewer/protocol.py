@@ -45,6 +45,8 @@ class Scene:
     """Names of the saved episodes."""
     curves: tuple[str, ...]
     """Names of the live curves: "reward", "eval" and the task's metrics."""
+    speeds: tuple[float, float, float] | None = None
+    """Largest forward and lateral velocity, m/s, and yaw rate, rad/s, of a robot that can be driven."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,11 +63,23 @@ class Pose:
 
 @dataclasses.dataclass(frozen=True)
 class Ghost:
-    """A pose that is drawn translucently."""
+    """A further pose that is drawn."""
 
     pose: Pose
+    colour: tuple[float, float, float, float] | None
+    """Red, green, blue and opacity, each from 0 to 1; None for the model's own colours."""
+    shift: tuple[float, float] = (0.0, 0.0)
+    """Where it is drawn, relative to its position, metres."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Arrow:
+    """An arrow in the scene."""
+
+    start: np.ndarray
+    """(3,), metres."""
+    end: np.ndarray
     colour: tuple[float, float, float, float]
-    """Red, green, blue and opacity, each from 0 to 1."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +88,8 @@ class SetGhosts:
 
     worlds: int = 0
     """Number of worlds to draw as ghosts, at most ``MOST_GHOSTS``, beginning after the shown world."""
+    grid: bool = False
+    """Whether these worlds are drawn beside each other, in their own colours."""
     episodes: int = 0
     """Number of episodes to draw as ghosts, at the same step, beginning after the shown episode."""
     burst: int = 0
@@ -110,6 +126,14 @@ class Status:
     """Name of the current video; None without one."""
     ghosts: SetGhosts = SetGhosts()
     """The ghosts that are drawn."""
+    command: tuple[float, float, float] | None = None
+    """Commanded forward and lateral velocity, m/s, and yaw rate, rad/s, of a walking robot."""
+    driven: bool = False
+    """Whether the command is the user's."""
+    planner: tuple[tuple[str, float], ...] = ()
+    """Names and values of the planner's settings that can be changed."""
+    params: tuple[tuple[str, float], ...] = ()
+    """Names and values of the task's parameters that can be changed."""
     seekable: tuple[int, int] = (0, 0)
     """First and last step of the slider."""
     text: tuple[tuple[str, str], ...] = ()
@@ -131,21 +155,25 @@ class Frame:
     """Paths of the planner's samples, (samples, points, 3), metres."""
     best: int | None = None
     """Index of the best sample."""
+    arrows: tuple[Arrow, ...] = ()
     samples: np.ndarray | None = None
-    """New points of the curves, (points, 1 + curves): simulated seconds, then a value per curve."""
+    """New points of the curves, (points, 2 + curves): simulated seconds, 1 if the episode ended, a value per curve."""
     messages: tuple[str, ...] = ()
     """New messages: ends of episodes, faults, refused commands."""
+    files: tuple[str, ...] = ()
+    """New recordings and pictures, as absolute paths, which the page offers for download."""
 
 
 def latest(older: Frame | None, newer: Frame) -> Frame:
-    """Merge the curve points and messages of a skipped frame into the newer frame."""
-    if older is None or (older.samples is None and not older.messages):
+    """Merge the curve points, messages and files of a skipped frame into the newer frame."""
+    if older is None or (older.samples is None and not older.messages and not older.files):
         return newer
     samples = [part for part in (older.samples, newer.samples) if part is not None]
     return dataclasses.replace(
         newer,
         samples=np.concatenate(samples)[-MAX_POINTS:] if samples else None,
         messages=(older.messages + newer.messages)[-MAX_MESSAGES:],
+        files=older.files + newer.files,
     )
 
 
@@ -231,6 +259,23 @@ class Perturb:
 
 
 @dataclasses.dataclass(frozen=True)
+class Drive:
+    """Command a walking robot."""
+
+    command: tuple[float, float, float] | None
+    """Forward and lateral velocity, m/s, and yaw rate, rad/s; None lets the task draw commands again."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SetNumber:
+    """Change a setting of the planner or a parameter of the task."""
+
+    of: Literal["planner", "task"]
+    name: str
+    value: float
+
+
+@dataclasses.dataclass(frozen=True)
 class SetVideo:
     """Start a video, or end it."""
 
@@ -239,13 +284,21 @@ class SetVideo:
 
 
 @dataclasses.dataclass(frozen=True)
+class TakePicture:
+    """Write a picture of the scene."""
+
+    camera: dict[str, Any]
+    """Attributes of the ``mujoco.MjvCamera``."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Close:
     """End the session. Closing a page does not end it, because the page can be opened again."""
 
 
 Command: TypeAlias = (
-    SetMode | SetWorld | SetPaused | SetSpeed | StepBy | Seek | SetBackwards | Reset | SetGhosts | Perturb | SetVideo
-    | Close
+    SetMode | SetWorld | SetPaused | SetSpeed | StepBy | Seek | SetBackwards | Reset | SetGhosts | Perturb | Drive
+    | SetNumber | SetVideo | TakePicture | Close
 )  # fmt: skip
 
 

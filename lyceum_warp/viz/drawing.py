@@ -20,7 +20,7 @@ from lyceum_warp.support.files import replaced
 from lyceum_warp.support.validate import positive_number
 from lyceum_warp.viz import EXTRA, NoVideoError
 from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
-from lyceum_warp.viz.render import CANNOT_DRAW, VIDEO, Shot
+from lyceum_warp.viz.render import CANNOT_DRAW, PICTURE, VIDEO, Shot
 
 _PATIENCE = 10.0  # seconds until the process is killed
 
@@ -106,6 +106,11 @@ class DrawingProcess:
         """
         if not self._send(shot) or self._answer() != "frame":
             raise NoVideoError(f"{self.product} could not be written ({self._ended()[1]})")
+
+    def picture(self) -> np.ndarray:
+        """The last picture, (height, width, 3) uint8."""
+        pixels = np.fromfile(Path(self._folder, PICTURE), dtype=np.uint8)
+        return pixels.reshape(self.size[1], self.size[0], 3)
 
     def abandon(self) -> None:
         """Kill the process and do not start another. Other threads may call this; it does not wait.

@@ -1,13 +1,10 @@
 """Render an environment's worlds to arrays."""
 
-from pathlib import Path
-
 import numpy as np
 
 from lyceum_warp.env import Env
 from lyceum_warp.viz.cameras import CameraChoice
 from lyceum_warp.viz.drawing import DrawingProcess
-from lyceum_warp.viz.render import PICTURE
 from lyceum_warp.viz.video import shots
 
 
@@ -40,8 +37,7 @@ class WorldPictures(DrawingProcess):
         pictures = []
         for shot in shots(self.env, self.env.get_state().cpu()):
             self.draw(shot)
-            pixels = np.fromfile(Path(self._folder, PICTURE), dtype=np.uint8)
-            pictures.append(pixels.reshape(self.size[1], self.size[0], 3))
+            pictures.append(self.picture())
         return pictures
 
     def close(self) -> None:

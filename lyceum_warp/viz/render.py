@@ -36,8 +36,8 @@ class Shot(TypedDict):
     """qpos, mocap_pos and mocap_quat."""
     model_fields: dict[str, np.ndarray]
     """Values of model fields by name. Other fields have the model's values."""
-    ghosts: list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[float, ...]]]
-    """Additional poses of the model, each with a colour."""
+    ghosts: list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[float, ...] | None, tuple[float, float]]]
+    """Additional poses of the model, each with a colour, or None for the model's own, and a shift in x and y."""
     lines: list[tuple[np.ndarray, tuple[float, ...], float]]
     """Points of lines, (points, 3), each with a colour and a width in pixels."""
     frames: int
@@ -74,15 +74,17 @@ class Painter:
         self._place(self.data, shot["pose"])
         self.renderer.update_scene(self.data, self.view, self.option)
         scene = self.renderer.scene
-        for pose, colour in shot["ghosts"]:
+        for pose, colour, shift in shot["ghosts"]:
             self._place(self.ghost, pose)
             first = scene.ngeom
             moving = int(self.mujoco.mjtCatBit.mjCAT_DYNAMIC)
             self.mujoco.mjv_addGeoms(self.model, self.ghost, self.option, self.perturb, moving, scene)
             for geom in scene.geoms[first : scene.ngeom]:
-                geom.rgba[:], geom.matid, geom.transparent = colour, -1, 1
-        for points, colour, width in shot["lines"]:
-            self._add_line(scene, points, colour, width)
+                geom.pos[:2] += shift
+                if colour is not None:
+                    geom.rgba[:], geom.matid, geom.transparent = colour, -1, 1
+        for points, paint, width in shot["lines"]:
+            self._add_line(scene, points, paint, width)
         image: np.ndarray = self.renderer.render()
         return image
 

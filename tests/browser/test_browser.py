@@ -29,6 +29,7 @@ from lyceum_warp import Row
 from lyceum_warp.viewer.protocol import Command, Frame, Perturb, Reset, Seek, SetBackwards, SetMode, SetPaused, Status
 from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viewer.session.window_process import Window
+from lyceum_warp.viz.page import write_page
 
 pytestmark = pytest.mark.browser
 
@@ -201,11 +202,15 @@ class Tab:
     def place(self) -> float:
         """Return the horizontal centre of the red block, from 0 to 1."""
         self.frames(3)
-        picture = np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")).astype(int)
-        red, green, blue = picture.transpose(2, 0, 1)
-        seen = (red > 60) & (red > 2 * green) & (red > 2 * blue)
-        assert 0.01 < seen.mean() < 0.2
-        return float(np.nonzero(seen)[1].mean() / seen.shape[1])
+        return red_place(self.page)
+
+
+def red_place(page: Page) -> float:
+    picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
+    red, green, blue = picture.transpose(2, 0, 1)
+    seen = (red > 60) & (red > 2 * green) & (red > 2 * blue)
+    assert 0.01 < seen.mean() < 0.2
+    return float(np.nonzero(seen)[1].mean() / seen.shape[1])
 
 
 def push(action: float) -> Callable[[torch.Tensor], torch.Tensor]:
@@ -324,6 +329,37 @@ def test_an_episode_is_scrubbed_and_played(tab: Tab) -> None:
     assert start < half < tab.place()
     tab.press("Control+r", lambda: viewer.status.backwards)
     tab.press("Space", lambda: viewer.status.step < STEPS / 2)
+
+
+def test_the_page_has_a_title_and_links_to_new_files(tab: Tab, tmp_path: Path) -> None:
+    assert tab.page.title() == "Block"
+    file = tmp_path / "recorded.html"
+    file.write_text("<p>recorded")
+    tab.viewer.session.stage.videos.files.append(file)
+    with tab.page.expect_download() as download:
+        tab.page.get_by_text("recorded.html").click(timeout=SECONDS * 1000)
+    assert Path(download.value.path()).read_text() == "<p>recorded"
+    assert tab.page.evaluate("fetch('/saved/other.html').then((answer) => answer.status)") == 404
+
+
+def test_a_recorded_page_plays_without_a_server(browser: Browser, tmp_path: Path) -> None:
+    env = lw.make(Block, autoreset=False)
+    episode = lw.control(env, lambda state, obs: torch.ones(1), steps=STEPS, seed=0)
+    file = write_page(env, episode.states, tmp_path / "block.html", camera=lw.FreeCamera(azimuth=90, elevation=-20))
+    page = browser.new_page(viewport=VIEW, device_scale_factor=0.25)  # type: ignore[arg-type]
+    errors: list[Any] = []
+    page.on("pageerror", errors.append)
+    page.goto(f"file://{file}")
+    page.get_by_text("pause").click()
+    assert page.get_by_text("play").is_visible()
+    page.get_by_text("follow").click()
+    places = []
+    for frame in (0, STEPS):
+        page.get_by_label("frame").fill(str(frame))
+        page.wait_for_timeout(200)
+        places.append(red_place(page))
+    assert places[0] < places[1] - 0.02 and not errors
+    page.close()
 
 
 @pytest.mark.long

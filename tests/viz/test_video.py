@@ -155,7 +155,7 @@ def test_shots_are_drawn_one_by_one_with_their_model_ghosts_and_lines(model: muj
         mp4 = video_of(model, tmp_path / "video.mp4", fps=25)
         for each in (
             shot(0.0), shot(0.0, model_fields=small), shot(0.0), shot(0.5),
-            shot(0.0, ghosts=[(shot(1.5)["pose"], red)]),
+            shot(0.0, ghosts=[(shot(1.5)["pose"], red, (0.0, 0.0))]),
             shot(0.0, lines=[(np.array([[-1.5, 0, -1], [1.5, 0, -1]]), red, 2.0)]),
         ):  # fmt: skip
             mp4.add(each)

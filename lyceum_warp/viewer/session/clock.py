@@ -12,7 +12,17 @@ import torch
 
 from lyceum_warp.controllers.episode_collector import ControlProgress
 from lyceum_warp.env import Env
-from lyceum_warp.viewer.protocol import Close, Command, Perturb, SetGhosts, SetMode, SetVideo
+from lyceum_warp.viewer.protocol import (
+    Close,
+    Command,
+    Drive,
+    Perturb,
+    SetGhosts,
+    SetMode,
+    SetNumber,
+    SetVideo,
+    TakePicture,
+)
 from lyceum_warp.viewer.session.commands import obey
 from lyceum_warp.viewer.session.drivers import ControllerError, WorldControl
 from lyceum_warp.viewer.session.plant import POLL, InterruptedByCommand, run_plant
@@ -129,7 +139,7 @@ class Session:
         if now < self._next_frame or not (videos.due or self._window.wants_frame):
             return
         self._next_frame = max(self._next_frame + 1 / _FPS, now)
-        changed = stage.changed or bool(stage.frames.messages) or videos.due
+        changed = stage.changed or bool(stage.frames.messages or videos.files) or videos.due
         if stage.paused and not changed and now - self._last_frame < _IDLE:
             return
         frame = stage.frame()
@@ -182,15 +192,15 @@ class Session:
 
         While a plant runs in real time, a command that needs its state interrupts the run.
         """
-        push = isinstance(command, Perturb) and command.qpos is None
-        if self._in_run and not push and not isinstance(command, SetVideo | SetGhosts):
+        push = isinstance(command, Drive) or (isinstance(command, Perturb) and command.qpos is None)
+        if self._in_run and not push and not isinstance(command, SetVideo | TakePicture | SetGhosts):
             self._waiting.appendleft(command)
             raise InterruptedByCommand
         stage = self.stage
         stage.changed = True
         if isinstance(command, Close):
             self._closed = True
-        if isinstance(command, SetMode) and not self._calls_have_ended():
+        if isinstance(command, SetMode | SetNumber) and not self._calls_have_ended():
             return
         try:
             obey(stage, command)

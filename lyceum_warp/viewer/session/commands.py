@@ -56,6 +56,15 @@ def obey(stage: Stage, command: protocol.Command) -> None:
             stage.frames.ghosts = command
         case protocol.Perturb():
             _perturb(stage, command)
+        case protocol.Drive(command):
+            if stage.driving.limits is None or stage.mode == "playback":
+                raise ValueError("only a walking robot whose task draws commands can be driven, and not in a playback")
+            stage.driving.wanted = command
+            stage.driving.apply(stage.live)
+        case protocol.SetNumber(of, name, value):
+            stage.set_number(of, name, value)
+        case protocol.TakePicture(camera):
+            stage.videos.picture(camera, stage.frame())
         case protocol.SetVideo(camera):
             stage.videos.end() if camera is None else stage.videos.begin(camera)
 

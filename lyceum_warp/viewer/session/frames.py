@@ -1,5 +1,7 @@
 """Make the frames and messages of worlds and playbacks."""
 
+import functools
+import itertools
 import math
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -9,6 +11,7 @@ import numpy as np
 
 from lyceum_warp.env import Env
 from lyceum_warp.viewer.protocol import Frame, Ghost, SetGhosts, Status
+from lyceum_warp.viewer.session.driving import Driving
 from lyceum_warp.viewer.session.live import Live, Rows, pose
 from lyceum_warp.viewer.session.playback import Playback, reasons
 from lyceum_warp.viewer.session.traces import Traces
@@ -27,14 +30,15 @@ class FrameMaker:
     Args:
         env: The worlds.
         curves: Number of curves.
+        driving: The command of a walking robot.
     """
 
-    def __init__(self, env: Env, curves: int) -> None:
+    def __init__(self, env: Env, curves: int, driving: Driving) -> None:
         self.ghosts = SetGhosts()
         """The ghosts that are drawn."""
         self.messages: list[str] = []
         """Messages of the next frame."""
-        self._env, self._curves = env, curves
+        self._env, self._curves, self._driving = env, curves, driving
         self._points: list[list[float]] = []
         self._seen_end = self._seen_fault = 0.0
 
@@ -51,7 +55,7 @@ class FrameMaker:
         episode, step = playback.episode, playback.step
         values = [episode.rewards[step - 1], episode.evals[step - 1]] if step else [math.nan, math.nan]
         unknown = [math.nan] * (self._curves - 2)
-        self._points.append([step * self._env.timestep, *values, *unknown])
+        self._points.append([step * self._env.timestep, 0.0, *values, *unknown])
 
     def of_worlds(
         self, live: Live, main: Live, traces: Traces | None, status: Callable[..., Status], *, paused: bool
@@ -81,21 +85,24 @@ class FrameMaker:
             live.request(*wanted)
         state, parts = rows.states[0], live.env.state_space.parts
         self._report(rows, main.world if live is not main else None)
-        others = rows.states[1:]
+        others, grid = rows.states[1:], self.ghosts.grid
         if live is not main and shown:  # other worlds wait
             main.request(shown)
             waiting = main.take()
             others = others if waiting is None else waiting.states[1:]
         ghosts = [] if traces is None else [Ghost(traces.final, (*_PLAN, _OPACITY))]
-        ghosts += [*self._coloured(others), *self._burst(rows.back, _PAST)]
+        ghosts += self._beside(others) if grid else self._coloured(others)
+        ghosts += self._burst(rows.back, _PAST)
         step, past = int(state[parts["step"]][0]), live.past
         complete = status(
             world=main.world, step=step, steps=live.env.horizon, time=float(state[parts["time"]][0]),
-            text=(("return", f"{rows.episode_return:.6g}"),), seekable=(max(0, step - past.behind), step + past.ahead),
+            text=(("return", f"{rows.episode_return:.6g}"),), command=self._driving.command(state),
+            seekable=(max(0, step - past.behind), step + past.ahead),
         )  # fmt: skip
         return Frame(
             self._pose(state), self._physics(state), self._model_fields(state), complete, tuple(ghosts),
             None if traces is None else traces.paths, None if traces is None else traces.best,
+            self._driving.arrows(state),
             np.concatenate(points), self._take_messages(),
         )  # fmt: skip
 
@@ -109,8 +116,8 @@ class FrameMaker:
         ghosts += self._burst((episode.states[s] for s in reversed(around) if s < playback.step), _PAST)
         ghosts += self._burst((episode.states[s] for s in around if s > playback.step), _FUTURE)
         text = [("episode", episode.name)]
-        if episode.done_reason:
-            text.append(("end", reasons(episode.done_reason)))
+        if episode.end:
+            text.append(("end", episode.end))
         if np.isfinite(episode.rewards).all() and episode.steps:
             text.append(("return", f"{episode.rewards[: playback.step].sum():.6g} of {episode.rewards.sum():.6g}"))
         complete = status(
@@ -120,14 +127,16 @@ class FrameMaker:
         points, self._points = self._points, []
         return Frame(
             self._pose(state), self._physics(state), self._model_fields(state), complete, tuple(ghosts),
-            samples=np.array(points, dtype=float).reshape(-1, 1 + self._curves), messages=self._take_messages(),
+            arrows=self._driving.arrows(state),
+            samples=np.array(points, dtype=float).reshape(-1, 2 + self._curves), messages=self._take_messages(),
         )  # fmt: skip
 
     def _report(self, rows: Rows, plant_of: int | None) -> None:
         """Report an episode that ended, and faults; ``plant_of`` is the world that the plant was copied from."""
-        number, bits, returned, length = rows.end
+        number, bits, returned, length, success = rows.end
         if number > self._seen_end:
-            self.say(f"the episode ended after {length:.0f} steps ({reasons(int(bits))}), return {returned:.6g}")
+            why = "success" if success else reasons(int(bits))
+            self.say(f"the episode ended after {length:.0f} steps ({why}), return {returned:.6g}")
         if rows.fault[0] > self._seen_fault:
             _, bits, world, count = rows.fault
             where = int(world) if plant_of is None else plant_of
@@ -138,6 +147,22 @@ class FrameMaker:
     def _coloured(self, states: Iterable[np.ndarray]) -> list[Ghost]:
         """Ghosts of other worlds or episodes."""
         return [Ghost(self._pose(row), (*_COLOURS[i % len(_COLOURS)], _OPACITY)) for i, row in enumerate(states)]
+
+    def _beside(self, states: Iterable[np.ndarray]) -> list[Ghost]:
+        """Other worlds in a grid around the shown one."""
+        cells = sorted(itertools.product(range(-3, 4), repeat=2), key=lambda cell: (max(map(abs, cell)), cell))[1:]
+        step = self._grid_step
+        return [Ghost(self._pose(row), None, (step * x, step * y)) for row, (x, y) in zip(states, cells, strict=False)]
+
+    @functools.cached_property
+    def _grid_step(self) -> float:
+        """Distance between the worlds of a grid, m: a bit more than the robot's size."""
+        model = self._env.task.model
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        moving = model.body_weldid[model.geom_bodyid] > 0
+        far = np.linalg.norm(data.geom_xpos - data.subtree_com[0], axis=1) + model.geom_rbound
+        return 2.2 * float(far[moving].max(initial=0.1))
 
     def _burst(self, states: Iterable[np.ndarray], colour: tuple[float, float, float]) -> list[Ghost]:
         """Ghosts along a trajectory, the nearest to the present first."""

@@ -83,11 +83,11 @@ class Rows:
     episode_return: float
     """Return of the shown world's episode so far."""
     end: tuple[float, ...]
-    """Last end of an episode of the shown world: number of the step, bits of ``Done``, return, length."""
+    """Last end of an episode of the shown world: number of the step, bits of ``Done``, return, length, success."""
     fault: tuple[float, ...]
     """Last fault in any world: number of the step, bits of ``Done``, world, number of faults so far."""
     points: np.ndarray
-    """New points of the curves, (points, 1 + curves) float64."""
+    """New points of the curves, (points, 2 + curves) float64."""
 
 
 class Live:
@@ -111,10 +111,10 @@ class Live:
         self.returns = torch.zeros(n, dtype=torch.float64, device=device)
         """Return of each world's episode so far, (nworld,)."""
         self._clock = 0  # steps since the session began, minus the steps taken back
-        self._ends = torch.zeros(n, 4, dtype=torch.float64, device=device)
+        self._ends = torch.zeros(n, 5, dtype=torch.float64, device=device)
         self._fault = torch.zeros(4, dtype=torch.float64, device=device)
         self._ended, self._reward = torch.zeros(n, dtype=torch.bool, device=device), torch.zeros_like(env.reward)
-        self._curves = torch.zeros(_CURVE_ROWS, 2 + len(env.metrics), dtype=torch.float64, device=device)
+        self._curves = torch.zeros(_CURVE_ROWS, 3 + len(env.metrics), dtype=torch.float64, device=device)
         self._times: list[float] = []
         self._state = env.get_state()
         self._reading: tuple[tuple[int, ...], list[float], list[torch.Tensor]] | None = None  # worlds, times, rows
@@ -189,6 +189,7 @@ class Live:
         if self.asynchronous or ended.any():
             self._note_ends(ended)
         values = [
+            ended[self.world].to(env.reward.dtype),
             env.reward[self.world],
             env.eval[self.world],
             *(metric[self.world] for metric in env.metrics.values()),
@@ -200,7 +201,7 @@ class Live:
         """Save ends of episodes and faults, without waiting for the device."""
         env, reason = self.env, self.env.done_reason
         made = torch.full_like(self.returns, self.made)
-        end = torch.stack([made, reason.double(), self.returns, self._length + 1.0], dim=1)
+        end = torch.stack([made, reason.double(), self.returns, self._length + 1.0, env.success.double()], dim=1)
         torch.where(ended[:, None], end, self._ends, out=self._ends)
         if env.autoreset:
             self.returns.masked_fill_(ended, 0.0)

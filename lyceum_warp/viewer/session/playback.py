@@ -26,8 +26,8 @@ class Episode:
     """(steps,), NaN if unknown."""
     evals: np.ndarray
     """(steps,), NaN if unknown."""
-    done_reason: int = 0
-    """Bits of ``Done``; 0 if the episode did not end, or if this is unknown."""
+    end: str = ""
+    """Why the episode ended; empty if it did not end, or if this is unknown."""
 
     @property
     def steps(self) -> int:
@@ -79,7 +79,8 @@ def _episode(name: str | None, given: Any, env: Env, number: int = 0) -> Episode
 def _of_trajectory(name: str, trajectory: Trajectory, env: Env) -> Episode:
     check_episode(env, trajectory, name)
     rewards, evals = (values.double().numpy() for values in (trajectory.rewards, trajectory.evals))
-    return Episode(name, trajectory.states.numpy(), rewards, evals, trajectory.done_reason)
+    end = "success" if trajectory.steps and trajectory.succeeded else reasons(trajectory.done_reason)
+    return Episode(name, trajectory.states.numpy(), rewards, evals, end)
 
 
 class Playback:

@@ -1,20 +1,25 @@
 """Hold the state of a session: mode, controller, worlds and episode."""
 
+import dataclasses
 import math
 import time
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 
+from lyceum_warp.algos.planner import Planner
 from lyceum_warp.controllers.loop import control
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import check_kind, whole_number
 from lyceum_warp.viewer.protocol import Frame, Mode, Scene, Status
 from lyceum_warp.viewer.session.drivers import Control, ControllerError, PolicyControl, WorldControl, controls
+from lyceum_warp.viewer.session.driving import Driving
 from lyceum_warp.viewer.session.frames import FrameMaker, model_bytes
 from lyceum_warp.viewer.session.live import Live
+from lyceum_warp.viewer.session.live_settings import planner_numbers, rebuilt_planner, task_numbers
 from lyceum_warp.viewer.session.plant import make_plant
 from lyceum_warp.viewer.session.playback import Playback, episodes_of
 from lyceum_warp.viewer.session.traces import TraceRollouts, Traces, TraceThread
@@ -59,6 +64,7 @@ class Stage:
         """Whether the user is pushing a body."""
         self.changed = False
         """Whether anything has changed since the last frame."""
+        self.driving = Driving(env)
         modes: list[Mode] = ["playback"] if self.playback.episodes else []
         modes += ["controller"] if self.controllers else []
         modes.append("passive")
@@ -66,10 +72,10 @@ class Stage:
             title=env.task.name, model=model_bytes(env.task.model), nworld=env.nworld,
             modes=tuple(modes), controllers=tuple(self.controllers),
             episodes=tuple(episode.name for episode in self.playback.episodes),
-            curves=("reward", "eval", *env.metrics),
+            curves=("reward", "eval", *env.metrics), speeds=self.driving.limits,
         )  # fmt: skip
         self.videos = VideoTaker(env.task.model, self.scene.title)
-        self.frames = FrameMaker(env, len(self.scene.curves))
+        self.frames = FrameMaker(env, len(self.scene.curves), self.driving)
         self.steps = 0
         """Steps since the session began, for the measured speed."""
         self.progress: deque[tuple[float, int]] = deque(maxlen=64)
@@ -182,9 +188,33 @@ class Stage:
             self.reset_controller()
             self.progress.clear()
         self.frames.forget_seen(self.live)
+        self._trace()
+
+    def _trace(self) -> None:
+        """Start to draw the plans of the controller in use."""
         current = self.control
         if isinstance(current, WorldControl) and current.plans and current.name not in self._threads:
             self._threads[current.name] = TraceThread(TraceRollouts(current.controller, self.live.env))
+
+    def set_number(self, of: str, name: str, value: float) -> None:
+        """Change a setting of the planner in use, which is rebuilt, or a parameter of the task in all worlds.
+
+        Raises:
+            ValueError: The value is not valid.
+        """
+        planners = [each for each in self.controllers.values() if isinstance(each, WorldControl)]
+        if of == "planner":
+            assert isinstance(self.control, WorldControl)
+            planners = [self.control]
+            self.control.controller = rebuilt_planner(self.control.controller, name, value)
+        else:
+            plans = [each.controller.env for each in planners if isinstance(each.controller, Planner)]
+            for env in {id(env): env for env in (self.env, self.live.env, *plans)}.values():
+                env.set_params(**{name: value})
+        for planner in planners:
+            if (thread := self._threads.pop(planner.name, None)) is not None:
+                thread.close()
+        self._trace()
 
     def show_world(self, world: int) -> None:
         """Show another world, and end a push."""
@@ -216,9 +246,18 @@ class Stage:
 
     def frame(self) -> Frame:
         """Make a frame of the present state."""
+        files, self.videos.files = self.videos.files, []
+        return dataclasses.replace(self._frame(), files=tuple(str(file.absolute()) for file in files))
+
+    def _frame(self) -> Frame:
         if self.mode == "playback":
             return self.frames.of_playback(self.playback, self._status)
-        return self.frames.of_worlds(self.live, self.main, self._traces(), self._status, paused=self.paused)
+        frame = self.frames.of_worlds(self.live, self.main, self._traces(), self._status, paused=self.paused)
+        wanted, live = self.driving.wanted, self.live
+        if wanted is not None and not live.past.ahead and not np.allclose(frame.status.command, wanted, atol=1e-6):
+            self.driving.apply(live)  # a new episode, or another world
+            live.expect_steps()
+        return frame
 
     def _traces(self) -> Traces | None:
         """The newest traces, if they are shown; requests new ones."""
@@ -244,5 +283,7 @@ class Stage:
             mode=self.mode, controller=self.controller if self.mode == "controller" else None,
             episode=self.playback.index if self.mode == "playback" else None, paused=self.paused, speed=self.speed,
             measured_speed=measured, backwards=self.playback.backwards, video=self.videos.name,
-            ghosts=self.frames.ghosts, plan_ms=1000 * self.control.seconds if self.control else math.nan, **rest,
+            ghosts=self.frames.ghosts, driven=self.driving.wanted is not None,
+            planner=planner_numbers(getattr(self.control, "controller", None)), params=task_numbers(self.env),
+            plan_ms=1000 * self.control.seconds if self.control else math.nan, **rest,
         )  # fmt: skip

@@ -1,8 +1,9 @@
-"""Make videos of the viewer in subprocesses."""
+"""Record the viewer: videos and pictures, drawn in subprocesses, and pages that play in a browser."""
 
 import contextlib
 import datetime
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,10 +15,14 @@ import numpy as np
 from lyceum_warp.support.interrupts import obeyed
 from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Frame, Pose
 from lyceum_warp.viz import NoVideoError
+from lyceum_warp.viz.cameras import camera_values
+from lyceum_warp.viz.drawing import DrawingProcess, check_video
+from lyceum_warp.viz.page import write_poses
 from lyceum_warp.viz.render import Shot
 from lyceum_warp.viz.video import Recorder
 
 FPS = 30
+_PICTURE_SIZE = (1280, 960)
 _WIDTH = 2.0  # of lines, pixels
 _MOST_WAITING = 4 * FPS  # poses that wait for the drawing process, which starts slowly
 _PATIENCE = 120.0  # seconds to finish drawing when the viewer ends; a signal discards the videos
@@ -37,6 +42,12 @@ class VideoTaker:
         self._running: Recorder | None = None
         self._drawing: list[Recorder] = []
         self._start = 0.0
+        self._poses: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        self._camera = mujoco.MjvCamera()
+        self._pictures: list[threading.Thread] = []
+        self._done: list[str] = []  # messages of pictures and pages
+        self.files: list[Path] = []
+        """Complete files, for the next frame."""
 
     @property
     def name(self) -> str | None:
@@ -58,13 +69,40 @@ class VideoTaker:
             NoVideoError: A package for videos is not installed.
         """
         self.end()
-        title = re.sub(r"[^\w.-]+", "-", self._title)  # the title may be a path
-        file = self._folder / f"{title}-{datetime.datetime.now():%Y%m%d-%H%M%S-%f}.mp4"
-        chosen = mujoco.MjvCamera()
-        for name, value in camera.items():
-            setattr(chosen, name, value)
-        self._running = Recorder(self._model, file, camera=chosen, fps=FPS, most_waiting=_MOST_WAITING)
+        self._camera, self._poses = _camera(camera), []
+        self._running = Recorder(
+            self._model, self._file(".mp4"), camera=self._camera, fps=FPS, most_waiting=_MOST_WAITING
+        )
         self._start = time.perf_counter()
+
+    def picture(self, camera: dict[str, Any], frame: Frame) -> None:
+        """Write a picture of a frame, in a thread.
+
+        Raises:
+            NoVideoError: A package for pictures is not installed.
+        """
+        check_video()
+        import imageio.v2 as imageio
+
+        drawing = DrawingProcess(self._model, camera=_camera(camera), size=_PICTURE_SIZE, fps=None, background=True)
+        shot, file = _shot(frame, 1), self._file(".png")
+
+        def draw() -> None:
+            try:
+                with drawing:
+                    drawing.draw(shot)
+                    imageio.imwrite(file, drawing.picture())
+                self._done.append(f"picture: {file}")
+                self.files.append(file)
+            except (NoVideoError, OSError) as error:
+                self._done.append(f"no picture: {error}")
+
+        self._pictures.append(threading.Thread(target=draw, name="lyceum-warp picture", daemon=True))
+        self._pictures[-1].start()
+
+    def _file(self, ending: str) -> Path:
+        title = re.sub(r"[^\w.-]+", "-", self._title, flags=re.ASCII)  # the title may be a path
+        return self._folder / f"{title}-{datetime.datetime.now():%Y%m%d-%H%M%S-%f}{ending}"
 
     def add(self, frame: Frame) -> None:
         """Add a frame, which lasts until now.
@@ -75,20 +113,22 @@ class VideoTaker:
         video = self._running
         if video is None or (count := int((time.perf_counter() - self._start) * FPS) + 1 - video.added) <= 0:
             return
-        paths = () if frame.traces is None else frame.traces
-        lines = [(path, BEST_COLOUR if i == frame.best else TRACE_COLOUR, _WIDTH) for i, path in enumerate(paths)]
-        ghosts = [(_numbers(ghost.pose), ghost.colour) for ghost in frame.ghosts]
-        video.add(
-            Shot(
-                pose=_numbers(frame.pose), model_fields=frame.model_fields, ghosts=list(ghosts), lines=list(lines),
-                frames=count,
-            )
-        )  # fmt: skip
+        self._poses += [_numbers(frame.pose)] * count
+        video.add(_shot(frame, count))
 
     def end(self) -> None:
-        """End the video. It is completed in the background."""
+        """End the video, which is completed in the background, and write the page beside it."""
         if self._running is not None:
             self._running.end()
+            page = self._running.out.with_suffix(".html")
+            view = camera_values(self._camera)
+            if self._poses:
+                try:
+                    write_poses(self._model, self._poses, page, dt=1 / FPS, title=self._title, camera=view)
+                    self._done.append(f"page: {page}")
+                    self.files.append(page)
+                except OSError as error:
+                    self._done.append(f"no page: {error}")
             self._drawing.append(self._running)
             self._running = None
 
@@ -96,7 +136,9 @@ class VideoTaker:
         """Messages about videos that are complete or have failed."""
         done = [video for video in self._drawing if video.finished]
         self._drawing = [video for video in self._drawing if video not in done]
-        return [_completed(video) for video in done]
+        lines, self._done = [*self._done, *map(_completed, done)], []
+        self.files += [video.out for video in done if video.out.exists()]
+        return lines
 
     def give_up(self) -> None:
         """Discard the current video."""
@@ -122,14 +164,36 @@ class VideoTaker:
                 with obeyed():
                     for video in self._drawing:
                         video.wait(end - time.monotonic())
+                    for thread in self._pictures:
+                        thread.join(end - time.monotonic())
             finally:
                 for video in self._drawing:
                     video.cancel()  # cancelling has no effect on a complete video
-                    show(_completed(video))
+                for line in self.completed():
+                    show(line)
 
 
 def _numbers(pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return pose.qpos, pose.mocap_pos, pose.mocap_quat
+
+
+def _shot(frame: Frame, count: int) -> Shot:
+    """The content of ``count`` frames of a video."""
+    paths = () if frame.traces is None else frame.traces
+    lines = [(path, BEST_COLOUR if i == frame.best else TRACE_COLOUR, _WIDTH) for i, path in enumerate(paths)]
+    lines += [(np.stack([arrow.start, arrow.end]), arrow.colour, 2 * _WIDTH) for arrow in frame.arrows]
+    ghosts = [(_numbers(ghost.pose), ghost.colour, ghost.shift) for ghost in frame.ghosts]
+    return Shot(
+        pose=_numbers(frame.pose), model_fields=frame.model_fields, ghosts=list(ghosts), lines=list(lines),
+        frames=count,
+    )  # fmt: skip
+
+
+def _camera(values: dict[str, Any]) -> mujoco.MjvCamera:
+    chosen = mujoco.MjvCamera()
+    for name, value in values.items():
+        setattr(chosen, name, value)
+    return chosen
 
 
 def _completed(video: Recorder) -> str:

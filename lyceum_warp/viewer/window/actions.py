@@ -17,6 +17,8 @@ SPEEDS = tuple(2.0**power for power in range(-4, 5))
 MANY_STEPS = 50
 """Steps of the arrow keys with Shift."""
 
+_DRIVING = tuple(getattr(imgui.Key, name) for name in "WSADQE")  # ahead, back, left, right, turn left, turn right
+
 KEY_NAMES = {"Right": "RightArrow", "Left": "LeftArrow", "Up": "UpArrow", "Down": "DownArrow"}
 """Studio's names of keys that have others here."""
 
@@ -43,6 +45,7 @@ class Actions:
         self.scroll_down = False
         """Whether there is a message that has not been drawn yet."""
         self._keys = key_table()
+        self._steering = (0.0, 0.0, 0.0)  # the last command by keys
 
     @property
     def status(self) -> Status:
@@ -64,11 +67,29 @@ class Actions:
             if key.ctrl == io.KeyCtrl and key.shift == io.KeyShift and imgui.IsKeyPressed(key.code, key.repeat):
                 key.action(self)
                 return
+        if self.status.driven and any(map(imgui.IsKeyDown, _DRIVING)):
+            return
         viewer, flying = self.viewer, self.cameras.state.camera_index == ux.FREE_CAMERA_IDX
         if not io.KeyCtrl:
             inputs.handle_vis_options_keyboard_events(viewer.vis_options, flying)
         if flying and viewer.client_camera is None:
             _, viewer.cam_speed = ux.move_camera_with_keys(viewer.model, viewer.camera, viewer.cam_speed)
+
+    def drive_by_keys(self) -> None:
+        """Command a walking robot while driving keys are pressed, and stop it when they are released."""
+        if self.scene.speeds is None or not self.status.driven or imgui.GetIO().WantCaptureKeyboard:
+            return
+        ahead, back, left, right, anticlockwise, clockwise = (bool(imgui.IsKeyDown(key)) for key in _DRIVING)
+        forward, lateral, turn = self.scene.speeds
+        command = (ahead - back) * forward, (left - right) * lateral, (anticlockwise - clockwise) * turn
+        if command != self._steering:
+            self._steering = command
+            self.do(protocol.Drive(command))
+
+    def toggle_driving(self) -> None:
+        """Begin to drive, from a standstill, or let the task draw commands again."""
+        if self.scene.speeds is not None:
+            self.do(protocol.Drive(None if self.status.driven else (0.0, 0.0, 0.0)))
 
     def change_mode(self, by: int) -> None:
         """Change to the next or the previous mode."""
@@ -102,6 +123,10 @@ class Actions:
     def toggle_video(self) -> None:
         """Start a video from the view's camera, or end it."""
         self.do(protocol.SetVideo(self.cameras.view() if self.status.video is None else None))
+
+    def take_picture(self) -> None:
+        """Write a picture from the view's camera."""
+        self.do(protocol.TakePicture(self.cameras.view()))
 
     def toggle_window(self, title: str) -> None:
         """Open or close a window of the panel."""
@@ -159,7 +184,9 @@ def key_table() -> list[Key]:
         Key("Ctrl+R", "reverse the playback", lambda p: p.do(protocol.SetBackwards(not p.status.backwards))),
         Key("Ctrl+B", "burst: many states at once",
             lambda p: p.set_ghosts(burst=0 if p.status.ghosts.burst else MOST_BURST // 2)),
-        Key("Ctrl+V", "start or end a video", lambda p: p.toggle_video()),
+        Key("Enter", "drive a walking robot: W A S D move it, Q E turn it", lambda p: p.toggle_driving()),
+        Key("Ctrl+V", "start or end a video and a page that plays it", lambda p: p.toggle_video()),
+        Key("Ctrl+P", "take a picture", lambda p: p.take_picture()),
         Key("Ctrl+A", "look at everything", lambda p: p.cameras.reset()),
         Key("Escape", "free camera", lambda p: p.cameras.choose(ux.TUMBLE_CAMERA_IDX)),
     ]  # fmt: skip

@@ -87,14 +87,15 @@ def run(opening: Opening, end: WindowEnd) -> None:
     """Run studio with the panel."""
     with contextlib.ExitStack() as ends:
         try:
-            proxy = ends.enter_context(Proxy(host=opening.host, port=opening.port))
+            proxy = ends.enter_context(Proxy(host=opening.host, port=opening.port, title=opening.scene.title))
         except ValueError as error:
             return end.send(Failed(str(error), refused=True))
         sock = private_socket()
         model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": opening.scene.model})
+        model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] = 0.0  # drawn as endless as they are
         screen = studio.Screen()
         opened = Opened(proxy.address, tuple(proxy.instructions))
-        panel = Panel(opening.scene, model, end.send, end.take, screen, opened)
+        panel = Panel(opening.scene, model, end.send, end.take, screen, opened, proxy.offer)
 
         def follow() -> None:
             end.receive()

@@ -28,6 +28,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         newest: Returns the latest frame that was not shown yet.
         screen: The viewer that runs the plugin.
         opened: Sent to the session when the window is open.
+        offer: Offers a file for download.
         limit: Maximum number of geoms of ghosts and traces.
     """
 
@@ -39,6 +40,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         newest: Callable[[], Frame | None],
         screen: studio.Screen,
         opened: Opened,
+        offer: Callable[[str], object] = lambda file: None,
         limit: int = studio.MAX_GEOMS,
     ) -> None:
         self.actions = Actions(scene, send)
@@ -46,6 +48,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         self.values = ModelValues(model)
         self.windows = Windows(self.actions)
         self._send, self._newest, self._screen, self._opened, self._limit = send, newest, screen, opened, limit
+        self._offer = offer
         self._geoms = ExtraGeoms(model, limit)
         self._swapped = -SWAP_TIME
         self._model_due = False
@@ -73,6 +76,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
             viewer.model, viewer.data, viewer.camera, viewer.vis_options, viewer.perturb, self.actions.cameras.state,
             move_camera=viewer.client_camera is None,
         )  # fmt: skip
+        self.actions.drive_by_keys()
         self.actions.press_keys()
         self.mouse.drag(self.viewer, paused=self.actions.status.paused)
 
@@ -89,6 +93,8 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         model, data = self.viewer.model, self.viewer.data
         if frame.samples is not None:
             self.windows.curves.add(frame.samples)
+        for file in frame.files:
+            self._offer(file)
         if frame.messages:
             self.actions.say(*frame.messages)
         # the session reports other states as faults; the last good pose stays
@@ -96,7 +102,9 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
             mujoco.mj_setState(model, data, frame.state, mujoco.mjtState.mjSTATE_INTEGRATION)
             mujoco.mj_forward(model, data)
         groups = np.array(self.viewer.vis_options.geomgroup)
-        self.viewer.extra_geoms[:] = self._geoms.draw(frame.pose, frame.ghosts, frame.traces, frame.best, groups)
+        self.viewer.extra_geoms[:] = self._geoms.draw(
+            frame.pose, frame.ghosts, frame.traces, frame.best, frame.arrows, groups
+        )
 
     def _show_model(self, frame: Frame) -> None:
         """Set the world's values in the drawn model."""

@@ -19,6 +19,7 @@ import asyncio
 import contextlib
 import getpass
 import hmac
+import html
 import ipaddress
 import logging
 import os
@@ -67,14 +68,45 @@ SCRIPT = """<script>
   };
   const original = window.fetch;
   window.fetch = (what, options) => original(what instanceof Request ? what : below(what), options);
+  let state = null;  // the WebSocket of studio's session
+  const say = (what) => state?.readyState === WebSocket.OPEN && state.send(what);
   window.WebSocket = class extends WebSocket {
     constructor(address, protocols = []) {
       super(below(address), protocols);
+      if (!new URL(this.url).pathname.endsWith("/state")) return;
+      state = this;
+      this.addEventListener("open", () => take());
+      this.addEventListener("message", (event) => {
+        if (typeof event.data !== "string") return;
+        if (event.data.includes("role=spectator;queue_pos=0")) say("request_control");
+        if (event.data.startsWith("saved=")) {
+          event.stopImmediatePropagation();
+          offer(event.data.slice(6));
+        }
+      });
     }
   };
+  const offer = (name) => {
+    const box = document.getElementById("saved") ?? document.body.appendChild(document.createElement("div"));
+    box.id = "saved";
+    box.style = "position:fixed;right:12px;bottom:44px;padding:8px;background:#fffd;font:14px sans-serif";
+    const link = document.createElement("a");
+    Object.assign(link, {href: below("/saved/" + name), download: name, textContent: "\u2b07 " + name});
+    link.style = "display:block;color:#06c";
+    box.append(link);
+    while (box.children.length > 4) box.firstChild.remove();
+  };
+  const take = () => document.visibilityState === "visible" && say("force_control");
+  document.addEventListener("visibilitychange", take);
+  window.addEventListener("focus", take);
+  try {
+    const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+    localStorage.mjwv_theme ??= dark ? "dark" : "light";
+  } catch {}
 })();
 </script>"""
-"""Prefixes the addresses that the page requests with its secret path."""
+"""Completes studio's page: it prefixes the addresses that the page requests with its secret path; the visible tab takes
+control, and another one waits for it; the first theme is the browser's; links to new files appear."""
 
 _PATH = re.compile(r"(/[A-Za-z0-9_~!$&'()*+,;=:@\[\]-][A-Za-z0-9._~!$&'()*+,;=:@\[\]-]*)+|/")
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?")
@@ -93,12 +125,14 @@ class Proxy:
     Args:
         host: Address or name to listen on; see ``lw.view``.
         port: Port to listen on; by default the first free port from 8080.
+        title: Title of the browser's tab.
 
     Raises:
         ValueError: The port is out of range or in use, or the address is not an address of this machine.
     """
 
-    def __init__(self, *, host: str = "127.0.0.1", port: int | None = None) -> None:
+    def __init__(self, *, host: str = "127.0.0.1", port: int | None = None, title: str = "lyceum_warp") -> None:
+        self._title = html.escape(title)
         self._sockets = public_sockets(host, port)
         addresses = [ipaddress.ip_address(each.getsockname()[0].partition("%")[0]) for each in self._sockets]
         self.port: int = self._sockets[0].getsockname()[1]
@@ -118,6 +152,8 @@ class Proxy:
         self._stop: asyncio.Event
         self._server: _Server
         self._client: aiohttp.ClientSession
+        self._files: dict[str, str] = {}  # paths of files for download, by name
+        self._pages: set[web.WebSocketResponse] = set()
         self._silence: asyncio.TimerHandle | None = None
 
     @property
@@ -159,6 +195,10 @@ class Proxy:
         self._thread.start()
         ready.wait()
 
+    def offer(self, file: str) -> None:
+        """Offer a file for download to the open pages. Any thread may call this."""
+        self._loop.call_soon_threadsafe(lambda: self._loop.create_task(self._tell(file)))
+
     def close(self) -> None:
         """Close the port and all connections. A second call does nothing."""
         if self._thread is not None and self._thread.is_alive():
@@ -188,6 +228,13 @@ class Proxy:
             ready.set()
             await self._stop.wait()
             await runner.cleanup()
+
+    async def _tell(self, file: str) -> None:
+        name = os.path.basename(file)
+        self._files[name] = file
+        for page in [*self._pages]:
+            with contextlib.suppress(ConnectionError):
+                await page.send_str(f"saved={name}")
 
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
         try:
@@ -262,7 +309,11 @@ class Proxy:
         return f"/{below}{question}{query}"
 
     async def _fetch(self, request: web.BaseRequest, target: str) -> web.StreamResponse:
-        """Forward studio's response: type, length, caching and body."""
+        """Forward studio's response: type, length, caching and body; or send a file for download."""
+        if target.startswith("/saved/"):
+            if (file := self._files.get(target.removeprefix("/saved/"))) is None or not os.path.isfile(file):
+                raise web.HTTPNotFound(text="no such file\n")
+            return web.FileResponse(file, headers={**PROTECTION, "Content-Disposition": "attachment"})
         try:
             found = await self._client.get(URL(self._upstream + target, encoded=True), allow_redirects=False)
         except (aiohttp.ClientError, TimeoutError):
@@ -274,6 +325,7 @@ class Proxy:
                 begin, tag, rest = (await found.text()).partition("<head>")
                 if not tag:
                     raise web.HTTPBadGateway(text="an unexpected page\n")
+                rest = re.sub("<title>.*?</title>", lambda _: f"<title>{self._title}</title>", rest, count=1)
                 body = (begin + tag + SCRIPT + rest).encode()
                 return web.Response(status=found.status, body=body, headers=headers)
             answer = web.StreamResponse(status=found.status, headers=headers)
@@ -301,7 +353,12 @@ class Proxy:
             return browser
         async with studio:
             controls = target.partition("?")[0] == "/ui"
-            await asyncio.gather(_relay(studio, browser), _relay(browser, studio, self._hear if controls else None))
+            if not controls:
+                self._pages.add(browser)
+            try:
+                await asyncio.gather(_relay(studio, browser), _relay(browser, studio, self._hear if controls else None))
+            finally:
+                self._pages.discard(browser)
         return browser
 
     def _hear(self) -> None:

@@ -8,10 +8,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Ghost, Pose
+from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Arrow, Ghost, Pose
 from lyceum_warp.viewer.window.studio import ux
 
 LINE_WIDTH = 3.0  # pixels
+ARROW_WIDTH, SHORTEST_ARROW = 0.015, 0.01  # m
 MAX_LINES = 160
 """Maximum number of lines of all traces. All geoms are sent to the browser 60 times a second, about 600 bytes each."""
 FEWEST_SEGMENTS = 4
@@ -48,6 +49,7 @@ class ExtraGeoms:
         ghosts: Sequence[Ghost] = (),
         traces: np.ndarray | None = None,
         best: int | None = None,
+        arrows: Sequence[Arrow] = (),
         groups: np.ndarray | None = None,
     ) -> list[mujoco.MjvGeom]:
         """Make the geoms of a frame, which are valid until the next frame.
@@ -57,6 +59,7 @@ class ExtraGeoms:
             ghosts: Further poses.
             traces: (samples, points, 3), metres.
             best: Index of the best sample.
+            arrows: Arrows.
             groups: (6,) which groups of geoms are visible; by default as before.
         """
         if groups is not None:
@@ -64,6 +67,7 @@ class ExtraGeoms:
         paths = [] if traces is None else list(traces)
         first = [] if best is None else [paths.pop(best)]
         lines = _lines(first, BEST_COLOUR, min(self.limit, MAX_LINES))
+        lines += _arrows(arrows)
         bodies = self._ghosts(pose, ghosts, self.limit - len(lines))
         left = min(self.limit - len(bodies), MAX_LINES) - len(lines)
         return [*bodies, *lines, *_lines(paths, TRACE_COLOUR, left)]
@@ -80,14 +84,17 @@ class ExtraGeoms:
             mujoco.mjv_addGeoms(self.model, data, self._options, self._perturb, mujoco.mjtCatBit.mjCAT_DYNAMIC, scene)
             if scene.ngeom > limit:
                 break
+            own, beside = ghost.colour is None, ghost.shift != (0.0, 0.0)
             near, turned = np.abs(data.geom_xpos - positions), np.abs(data.geom_xmat - axes)
             same = (near.max(1, initial=0.0) < 1e-3) & (turned.max(1, initial=0.0) < 1e-2)
             for geom in scene.geoms[begin : scene.ngeom]:
-                if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and same[geom.objid]:
+                if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and same[geom.objid] and not beside:
                     continue  # two coincident surfaces flicker
-                geom.rgba = ghost.colour
-                geom.matid = -1  # no material
-                geom.transparent = ghost.colour[3] < 1
+                geom.pos[:2] += ghost.shift
+                if not own:
+                    geom.rgba = ghost.colour
+                    geom.matid = -1  # no material
+                    geom.transparent = ghost.colour[3] < 1
                 geom.category = mujoco.mjtCatBit.mjCAT_DECOR  # cannot be selected
                 geoms.append(geom)
         return geoms
@@ -118,6 +125,19 @@ def _lines(paths: Sequence[np.ndarray], colour: Sequence[float], limit: int) -> 
             mujoco.mjv_connector(line, kind, LINE_WIDTH, start, end)
             lines.append(line)
     return lines
+
+
+def _arrows(arrows: Sequence[Arrow]) -> list[mujoco.MjvGeom]:
+    """Draw arrows, except those without length."""
+    geoms, kind = [], mujoco.mjtGeom.mjGEOM_ARROW
+    for arrow in arrows:
+        if np.linalg.norm(arrow.end - arrow.start) > SHORTEST_ARROW:
+            geom = mujoco.MjvGeom()
+            rgba = np.array(arrow.colour, dtype=np.float32)
+            mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), rgba)
+            mujoco.mjv_connector(geom, kind, ARROW_WIDTH, arrow.start, arrow.end)
+            geoms.append(geom)
+    return geoms
 
 
 # the model of the shown world

@@ -1,7 +1,7 @@
 """Draw the windows of the panel with ImGui."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -10,8 +10,8 @@ from lyceum_warp.viewer.protocol import MAX_POINTS, MOST_BURST, MOST_GHOSTS
 from lyceum_warp.viewer.window.actions import MANY_STEPS, OTHER_KEYS, SPEEDS, Actions, key_table
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
-PLOT_POINTS = 200
-"""Maximum number of points of a plotted curve. Each frame sends all of them to the browser."""
+PLOT_POINTS, PLOT_SECONDS = 200, 20.0
+"""Maximum number of points of a plotted curve, all of which each frame sends to the browser, and its length."""
 WINDOWS = ("messages", "curves", "view", "keys")
 
 
@@ -25,6 +25,8 @@ class Windows:
     def __init__(self, actions: Actions) -> None:
         self.curves = Curves(len(actions.scene.curves))
         self._actions, self._scene = actions, actions.scene
+        self._edited: dict[tuple[str, str], float] = {}
+        self._plotted = set(self._scene.curves[:2])
         self._size = (0.0, 0.0)
 
     def draw(self) -> None:
@@ -34,7 +36,7 @@ class Windows:
         # the windows may be moved until the browser's window changes its size
         self._size, resized = (width, height), (width, height) != self._size
         cond = int(imgui.Cond.Always if resized else imgui.Cond.FirstUseEver)
-        tall = min(len(self._scene.curves) * 128 + 40, height - 50)
+        tall = min(len(self._plotted) * 138 + 60, height - 50)
         self._window(self._scene.title, (10, 10, 320, height - 20), cond, self._session)
         self._window("messages", (340, height - 110, width - 710, 100), cond, self._messages)
         self._window("curves", (width - 360, 40, 350, tall), cond, self._curves)
@@ -73,6 +75,9 @@ class Windows:
         self._worlds()
         self._time()
         self._status()
+        self._drive()
+        self._push()
+        self._numbers()
         self._ghosts()
         self._camera()
         self._buttons()
@@ -166,10 +171,56 @@ class Windows:
                 imgui.TextWrapped(value)
             imgui.EndTable()
 
+    def _drive(self) -> None:
+        """Show a walking robot's command, and let the user replace it."""
+        status, speeds = self._actions.status, self._scene.speeds
+        if speeds is None or status.command is None:
+            return
+        imgui.SeparatorText("drive")
+        if imgui.Checkbox("by W A S D, Q E (Enter)", status.driven)[0]:
+            self._actions.toggle_driving()
+        for i, (name, most) in enumerate(zip(("forward", "left", "turn left"), speeds, strict=True)):
+            changed, value = imgui.SliderFloat(name, status.command[i], -2 * most, 2 * most, "%.2f")
+            if changed:
+                command = [*status.command]
+                command[i] = value
+                self._actions.do(protocol.Drive((command[0], command[1], command[2])))
+
+    def _numbers(self) -> None:
+        """Change the planner's settings and the task's parameters; a value is sent when its field is left."""
+        status = self._actions.status
+        parts: tuple[tuple[Literal["planner", "task"], Any], ...] = ("planner", status.planner), ("task", status.params)
+        for of, numbers in parts:
+            if not numbers or not imgui.CollapsingHeader(f"{of} settings"):
+                continue
+            imgui.PushItemWidth(110)
+            for name, now in numbers:
+                value = self._edited.get((of, name), now)
+                if isinstance(now, int):
+                    changed, value = imgui.DragInt(name, int(value), max(0.01 * now, 0.1), 1, 100_000)
+                else:
+                    changed, value = imgui.DragFloat(name, value, max(abs(now) / 100, 1e-3), 0, 0, "%.4g")
+                if changed:
+                    self._edited[of, name] = value
+                if imgui.IsItemDeactivatedAfterEdit():
+                    self._actions.do(protocol.SetNumber(of, name, self._edited.pop((of, name), value)))
+            imgui.PopItemWidth()
+
+    def _push(self) -> None:
+        """Explain how to push a body."""
+        viewer, paused = self._actions.viewer, self._actions.status.paused
+        body = viewer.perturb.select
+        name = viewer.model.body(body).name if body > 0 else ""
+        imgui.SeparatorText(f"push {name or 'a body'}")
+        act = "place or turn" if paused else "push or twist"
+        imgui.TextWrapped(
+            f"Ctrl + drag right or left: {act} it" if body > 0 else "double-click it, then Ctrl + drag right"
+        )
+
     def _last_values(self) -> list[tuple[str, float]]:
         """The last value of each curve."""
         rows = self.curves.rows
-        return list(zip(self._scene.curves, rows[-1, 1:].tolist(), strict=True)) if len(rows) else []
+        return list(zip(self._scene.curves, rows[-1, 2:].tolist(), strict=True)) if len(rows) else []
 
     def _ghosts(self) -> None:
         if not imgui.CollapsingHeader("ghosts"):
@@ -186,6 +237,10 @@ class Windows:
                 if changed:  # a typed number may be beyond the ends of the slider
                     self._actions.set_ghosts(**{name: min(max(count, 0), most)})
                 imgui.SetItemTooltip(what)
+        if self._scene.nworld > 1:
+            changed, grid = imgui.Checkbox("grid: worlds beside each other", ghosts.grid)
+            if changed:  # as many as a browser draws
+                self._actions.set_ghosts(grid=grid, worlds=ghosts.worlds or min(self._scene.nworld - 1, MOST_GHOSTS))
         changed, plan = imgui.Checkbox("plan", ghosts.plan)
         if changed:
             self._actions.set_ghosts(plan=plan)
@@ -207,6 +262,9 @@ class Windows:
         if highlighted_button("\uf03d  end the video" if making else "\uf03d  video", making):
             self._actions.toggle_video()
         imgui.SameLine()
+        if imgui.Button("\uf030  picture"):
+            self._actions.take_picture()
+        imgui.SameLine()
         if imgui.Button("quit"):
             self._actions.do(protocol.Close())
         for i, title in enumerate(WINDOWS):
@@ -225,14 +283,28 @@ class Windows:
             self._actions.scroll_down = False
 
     def _curves(self) -> None:
-        rows = self.curves.thinned(PLOT_POINTS)
+        names = self._scene.curves
+        if len(names) > 2 and imgui.CollapsingHeader("choose"):
+            for name in names:
+                if imgui.Checkbox(name, name in self._plotted)[0]:
+                    self._plotted ^= {name}
+        low, mean, high = self.curves.thinned(PLOT_POINTS, PLOT_SECONDS)
+        times, ends = mean[:, 0], high[high[:, 1] > 0, 0]
         flags = int(implot.Flags.NoLegend) | int(implot.Flags.NoMenus) | int(implot.Flags.NoBoxSelect)
-        fit = int(implot.AxisFlags.AutoFit)
-        for i, name in enumerate(self._scene.curves):
-            if implot.BeginPlot(name, imgui.Vec2(-1, 120), flags):
-                implot.SetupAxes("", "", fit, fit)
-                implot.PlotLine(name, rows[:, 0], rows[:, i + 1], int(implot.LineFlags.SkipNaN))
+        flags |= int(implot.Flags.NoTitle)
+        fit, skip = int(implot.AxisFlags.AutoFit), int(implot.LineFlags.SkipNaN)
+        for i, name in enumerate(names, 2):
+            if name in self._plotted and implot.BeginPlot(name, imgui.Vec2(-1, 130), flags):
+                implot.SetupAxes("simulated seconds", name, fit, fit)
+                bounds = np.array([low[:, i], high[:, i]])
+                if np.isfinite(bounds).any():
+                    bottom, top = np.nanmin(bounds), np.nanmax(bounds)
+                    for end in ends:  # each with its own name has the same colour
+                        implot.PlotLine("end", [end, end], [bottom, top])
+                implot.PlotShaded("range", times, *bounds)
+                implot.PlotLine(name, times, mean[:, i], skip)
                 implot.EndPlot()
+        imgui.TextDisabled("vertical lines: ends of episodes")
 
     def _view(self) -> None:
         viewer = self._actions.viewer
@@ -244,6 +316,25 @@ class Windows:
             ux.groups_gui(viewer.model, viewer.vis_options)
         if imgui.CollapsingHeader("sensors"):
             ux.sensor_gui(viewer.model, viewer.data)
+        if imgui.CollapsingHeader("joints"):
+            self._joints()
+        if imgui.CollapsingHeader("controls"):
+            imgui.BeginDisabled()  # a controller determines them
+            ux.controls_gui(viewer.model, viewer.data, viewer.vis_options)
+            imgui.EndDisabled()
+        if imgui.CollapsingHeader("watch"):
+            ux.watch_gui(viewer.model, viewer.data, self._actions.cameras.state)
+
+    def _joints(self) -> None:
+        """Show the joints; while paused, move them."""
+        viewer, frame = self._actions.viewer, self._actions.frame
+        paused = frame is not None and frame.status.paused
+        imgui.TextDisabled("drag a joint to move it" if paused else "pause to move joints")
+        before = viewer.data.qpos.copy()
+        ux.joints_gui(viewer.model, viewer.data, viewer.vis_options)
+        if paused and (viewer.data.qpos != before).any():
+            forces = np.zeros_like(viewer.data.xfrc_applied)
+            self._actions.do(protocol.Perturb(forces=forces, qpos=viewer.data.qpos.copy()))
 
     def _help(self) -> None:
         if imgui.BeginTable("##keys", 2):
@@ -287,8 +378,8 @@ class Curves:
     """
 
     def __init__(self, number: int) -> None:
-        self.rows = np.empty((0, 1 + number))
-        """(points, 1 + number): times in seconds, then a value per curve."""
+        self.rows = np.empty((0, 2 + number))
+        """(points, 2 + number): times in seconds, whether an episode ended, then a value per curve."""
 
     def add(self, rows: np.ndarray) -> None:
         """Append points. If time goes back, as after steps back, later points are dropped."""
@@ -297,14 +388,12 @@ class Curves:
                 kept = self.rows[: np.searchsorted(self.rows[:, 0], part[0, 0])]
                 self.rows = np.concatenate([kept, part])[-MAX_POINTS:]
 
-    def thinned(self, points: int) -> np.ndarray:
-        """Thin the curves to about ``points`` rows: the minimum and the maximum of each of ``points / 2`` parts."""
-        rows = self.rows
+    def thinned(self, points: int, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Thin the last ``seconds`` to at most ``points`` rows: minimum, mean and maximum of successive rows."""
+        rows = self.rows[np.searchsorted(self.rows[:, 0], self.rows[-1:, 0].sum() - seconds) :]
         if len(rows) <= points:
-            return rows
-        edges = np.linspace(0, len(rows), points // 2 + 1).astype(int)
-        low = np.minimum.reduceat(rows, edges[:-1])
-        high = np.maximum.reduceat(rows, edges[:-1])
-        thin = np.empty((2 * len(low), rows.shape[1]))
-        thin[0::2], thin[1::2] = low, high
-        return thin
+            return rows, rows, rows
+        edges = np.linspace(0, len(rows), points + 1).astype(int)
+        count = np.diff(edges)[:, None]
+        low, total, high = (each.reduceat(rows, edges[:-1]) for each in (np.minimum, np.add, np.maximum))
+        return low, total / count, high

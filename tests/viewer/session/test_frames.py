@@ -25,6 +25,9 @@ def test_other_worlds_and_past_states_are_shown_as_ghosts(shared_env: SharedEnv)
     past = ghosts[2:]
     assert len(past) == 5 and past[0].colour[3] > past[1].colour[3] and past[0].colour[0] > past[0].colour[2]
     np.testing.assert_array_equal(past[-1].pose.qpos, session.stage.live.past.states[0, 2, qpos].numpy())
+    session.obey(protocol.SetGhosts(worlds=3, grid=True))
+    shifts = {ghost.shift for ghost in session.stage.frame().ghosts}
+    assert len(shifts) == 3 and (0.0, 0.0) not in shifts and all(g.colour is None for g in session.stage.frame().ghosts)
     session.obey(protocol.SetGhosts(worlds=9))
     assert len(session.stage.frame().ghosts) == 3
 
@@ -58,8 +61,8 @@ def test_frames_hold_every_point_of_the_curves(shared_env: SharedEnv) -> None:
         session.stage.advance()
         rewards.append(env.reward[0].item())
     points = session.stage.frame().samples
-    assert points.shape == (20, 1 + len(session.stage.scene.curves))
-    np.testing.assert_array_equal(points[:, 1], rewards)
+    assert points.shape == (20, 2 + len(session.stage.scene.curves))
+    np.testing.assert_array_equal(points[:, 2], rewards)
     np.testing.assert_allclose(points[:, 0], env.timestep * np.arange(1, 21))
     session.obey(protocol.StepBy(-5))
     session.obey(protocol.StepBy(6))  # one step after five restored ones

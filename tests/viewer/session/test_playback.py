@@ -43,7 +43,7 @@ def test_a_playback_is_sought_reversed_and_looped(shared_env: SharedEnv, traject
     session.stage.frame()
     session.stage.advance(3)
     points = session.stage.frame().samples
-    np.testing.assert_allclose(points[:, 1], trajectories[1].rewards[:3])
+    np.testing.assert_allclose(points[:, 2], trajectories[1].rewards[:3])
     session.obey(protocol.SetGhosts(episodes=2, burst=4))
     ghosts = session.stage.frame().ghosts
     np.testing.assert_array_equal(ghosts[0].pose.qpos, trajectories[0].states[3, qpos])
@@ -67,7 +67,7 @@ def test_states_are_played_back_without_rewards(shared_env: SharedEnv) -> None:
     session = Session(env, episodes=states)
     session.stage.advance()
     frame = session.stage.frame()
-    assert frame.status.steps == 3 and np.isnan(frame.samples[:, 1]).all()
+    assert frame.status.steps == 3 and np.isnan(frame.samples[:, 2:]).all()
 
 
 def test_an_episode_that_does_not_fit_is_refused(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:

@@ -35,14 +35,20 @@ def test_a_video_of_the_session_is_written_and_reported(
 
     def after(frame: Frame, number: int) -> list[Command] | None:
         assert (frame.status.video is not None) == (0 < number <= 15)
-        return {0: [protocol.SetVideo(CAMERA)], 15: [protocol.SetVideo(None)], 16: None}.get(number, [])
+        return {
+            0: [protocol.SetVideo(CAMERA), protocol.TakePicture(CAMERA)],
+            15: [protocol.SetVideo(None)],
+            16: None,
+        }.get(number, [])
 
     Session(shared_env("hopper")).run(MemoryWindow(after))  # type: ignore[arg-type]
     printed = capsys.readouterr().out
     if "this machine cannot draw" in printed:
         pytest.skip(printed)
-    (video,) = tmp_path.glob("hopper-*.mp4")
-    assert f"video: {video.name}" in printed and video.read_bytes()[4:8] == b"ftyp"
+    heads = {"mp4": b"ftyp", "png": b"\r\n\x1a\n", "html": b"ctyp"}
+    for kind, ending in (("video", "mp4"), ("picture", "png"), ("page", "html")):
+        (file,) = tmp_path.glob(f"hopper-*.{ending}")
+        assert f"{kind}: {file.name}" in printed and file.read_bytes()[4:8] == heads[ending]
 
 
 @pytest.fixture

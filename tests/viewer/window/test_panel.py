@@ -8,6 +8,7 @@ from headless_screen import Bench, frame_of, pose_of, robot, scene_of, status_of
 from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import Ghost, Opened, SetVideo
 from lyceum_warp.viewer.window.actions import key_table
+from lyceum_warp.viewer.window.studio import imgui
 from lyceum_warp.viewer.window.windows import WINDOWS
 
 KEYS = {key.name: key for key in key_table()}
@@ -30,11 +31,17 @@ def pressed(bench: Bench, key: str, **status: object) -> list[object]:
 
 
 @pytest.mark.parametrize("mode", ["passive", "controller", "playback"])
-def test_panel_draws_every_mode_with_all_windows_open(bench: Bench, mode: str) -> None:
+def test_panel_draws_every_mode_with_all_windows_open(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imgui, "CollapsingHeader", lambda title: True)
+    model = robot()
+    bench = Bench(model, scene_of(model, speeds=(1.0, 1.0, 0.5)))
     bench.panel.actions.windows |= set(WINDOWS)
     frame = frame_of(
-        bench.model, bench.data, status_of(mode=mode, episode=1, video="video.mp4", seekable=(0, 20)),
-        samples=np.array([[0.0, 1.0, np.nan], [0.1, 2.0, 3.0]]), messages=("world 3: terminated",),
+        bench.model, bench.data, status_of(
+            mode=mode, episode=1, video="video.mp4", seekable=(0, 20), command=(0.5, 0.0, 0.1), driven=True,
+            planner=(("noise", 0.5), ("samples", 8)), params=(("weight", 0.1),), paused=True,
+        ),
+        samples=np.array([[0.0, 0.0, 1.0, np.nan], [0.1, 1.0, 2.0, 3.0]]), messages=("world 3: terminated",),
     )  # fmt: skip
     assert bench.sent == [Opened("http://here")]
     assert bench.draw() == bench.draw(frame) == bench.draw() == []  # draw before, with and after the first frame

@@ -12,6 +12,7 @@ import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from websockets.exceptions import ConnectionClosed
@@ -269,6 +270,18 @@ def test_pages_are_forwarded_without_the_clients_headers(proxy: Proxy, upstream:
         (received,) = upstream.received
         assert received.startswith(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:".encode())
         assert b"Cookie" not in received and b"X-Forwarded-For" not in received
+
+
+def test_only_offered_files_are_sent_and_only_to_those_with_the_secret(proxy: Proxy, tmp_path: Path) -> None:
+    (tmp_path / "video.mp4").write_bytes(b"offered")
+    (tmp_path / "secret.txt").write_bytes(b"not offered")
+    proxy.offer(str(tmp_path / "video.mp4"))
+    answer = get(proxy, "/PATH/saved/video.mp4")
+    assert status(answer) == 200 and answer.endswith(b"\r\n\r\noffered")
+    assert b"Content-Disposition: attachment" in answer and b"nosniff" in answer
+    assert status(get(proxy, "/PATH/saved/video.mp4", cookie="")) == status(get(proxy, "/saved/video.mp4")) == 403
+    for name in ("secret.txt", "../secret.txt", "%2e%2e/secret.txt", "video.mp4/../secret.txt", str(tmp_path)):
+        assert status(get(proxy, f"/PATH/saved/{name}")) == 404
 
 
 def test_an_endless_head_is_refused_without_being_buffered(proxy: Proxy) -> None:

@@ -5,7 +5,7 @@ from lyceum_warp.viewer.window.windows import Curves
 
 def ramp(begin: int, end: int) -> np.ndarray:
     times = np.arange(begin, end, dtype=float)
-    return np.stack([times, 2 * times], axis=1)
+    return np.stack([times, 0 * times, 2 * times], axis=1)
 
 
 def test_curves_keep_the_newest_points_in_order() -> None:
@@ -24,15 +24,15 @@ def test_a_time_that_decreases_drops_later_points() -> None:
     np.testing.assert_array_equal(curves.rows, ramp(0, 2))
 
 
-def test_thinned_curve_keeps_its_extremes() -> None:
+def test_thinned_curve_keeps_its_extremes_and_ends_of_episodes() -> None:
     curves = Curves(1)
     rows = ramp(0, 1000)
-    rows[:, 1] = 0
-    rows[333, 1], rows[777, 1] = 5, -7
+    rows[:, 2] = 0
+    rows[333, 2], rows[777, 2], rows[500, 1] = 5, -7, 1
     curves.add(rows[:50])
-    np.testing.assert_array_equal(curves.thinned(50), rows[:50])
+    np.testing.assert_array_equal(curves.thinned(50, 1e3), 3 * [rows[:50]])
     curves.add(rows[50:])
-    thin = curves.thinned(50)
-    assert len(thin) == 50
-    assert (thin[:, 1].min(), thin[:, 1].max()) == (-7, 5)
-    assert (np.diff(thin[:, 0]) >= 0).all()
+    low, mean, high = curves.thinned(50, 1e3)
+    assert len(mean) == 50 and (low[:, 2].min(), high[:, 2].max()) == (-7, 5)
+    assert (low <= mean).all() and (mean <= high).all() and high[:, 1].sum() == 1
+    assert curves.thinned(50, 10.0)[0][0, 0] == 989

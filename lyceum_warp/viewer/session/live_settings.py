@@ -1,0 +1,42 @@
+"""Read and change numbers while a session runs: a planner's settings and a task's parameters."""
+
+import dataclasses
+from typing import Any
+
+from lyceum_warp.algos.planner import Planner
+from lyceum_warp.env import Env
+
+_SETTINGS = ("noise", "temperature", "horizon", "samples")
+_OF_THE_PLANNER = ("nworld", "autoreset", "horizon", "seed", "first_world")  # options that it chooses for its worlds
+
+Numbers = tuple[tuple[str, float], ...]
+"""Names and values."""
+
+
+def planner_numbers(controller: Any) -> Numbers:
+    """The settings of a planner that can be changed; none for other controllers."""
+    if not isinstance(controller, Planner):
+        return ()
+    found = ((name, getattr(controller.config, name)) for name in _SETTINGS)
+    return tuple((name, value) for name, value in found if isinstance(value, int | float))
+
+
+def task_numbers(env: Env) -> Numbers:
+    """The parameters of a task that are floats, including the weights of its reward."""
+    known = env.task.params
+    return tuple((n, v) for n, v in known.items() if isinstance(v, float) and n not in ("dt", "substep_dt"))
+
+
+def rebuilt_planner(planner: Planner, name: str, value: float) -> Planner:
+    """A new planner with another setting, because sizes and settings are part of a planner's graphs.
+
+    Raises:
+        ValueError: The value is not valid.
+    """
+    kind = type(getattr(planner.config, name))
+    env = planner.env
+    options = {key: given for key, given in env.options.given().items() if key not in _OF_THE_PLANNER}
+    return type(planner)(
+        env.task.task, dataclasses.replace(planner.config, **{name: kind(value)}), value=planner.value,
+        seed=planner.seeds[0], params=env.given_params, **(options | {"model": env.task.spec}),
+    )  # fmt: skip
