@@ -151,6 +151,11 @@ class Tab:
         self.frames(3)
         return self
 
+    def loaded_again(self) -> None:
+        """Wait until the page, which is open, has drawn the panel."""
+        self.logs("First remote draw frame applied")
+        self.frames(3)
+
     def frames(self, number: int) -> None:
         """Wait until the browser has drawn some frames."""
         self.page.evaluate(
@@ -332,7 +337,7 @@ def test_an_episode_is_scrubbed_and_played(tab: Tab) -> None:
 
 
 def test_the_page_has_a_title_and_links_to_new_files(tab: Tab, tmp_path: Path) -> None:
-    assert tab.page.title() == "Block"
+    assert tab.page.title() == "block"
     file = tmp_path / "recorded.html"
     file.write_text("<p>recorded")
     tab.viewer.session.stage.videos.files.append(file)
@@ -382,6 +387,43 @@ def test_another_browser_controls_after_one_is_closed_or_killed(
         address = tab.page.url  # the cookie remains
         tab.page.close()
     assert viewer.window.is_open()
+
+
+@pytest.mark.long
+def test_the_tab_in_front_controls_and_another_takes_over(viewer: Viewer, context: BrowserContext) -> None:
+    def controls(tab: Tab) -> None:
+        paused = viewer.status.paused
+        tab.press("Space", lambda: viewer.status.paused != paused)
+
+    first = Tab(context.new_page(), viewer).loaded()
+    controls(first)
+    second = Tab(context.new_page(), viewer, first.page.url).loaded()
+    controls(second)
+    first.log.clear()
+    first.page.evaluate("window.dispatchEvent(new Event('focus'))")
+    first.loaded_again()
+    controls(first)
+    second.log.clear()
+    first.page.close()
+    second.loaded_again()
+    controls(second)
+
+
+@pytest.mark.long
+def test_a_walking_robot_is_driven_by_keys(context: BrowserContext) -> None:
+    viewer = Viewer(Session(lw.make("go1_velocity"), seed=0))
+    tab = Tab(context.new_page(), viewer).loaded()
+    tab.press("Enter", lambda: viewer.status.driven)
+    tab.page.keyboard.down("w")
+    tab.wait(lambda: viewer.status.command == (1.0, 0.0, 0.0))
+    tab.page.keyboard.down("q")
+    tab.wait(lambda: viewer.status.command == (1.0, 0.0, 0.5))
+    tab.page.keyboard.up("w")
+    tab.page.keyboard.up("q")
+    tab.wait(lambda: viewer.status.command == (0.0, 0.0, 0.0))
+    tab.press("Enter", lambda: not viewer.status.driven)
+    viewer.window.close()
+    viewer.thread.join(30)
 
 
 def test_pages_of_other_sites_cannot_reach_the_viewer(viewer: Viewer, context: BrowserContext) -> None:

@@ -297,12 +297,11 @@ class Windows:
             if name in self._plotted and implot.BeginPlot(name, imgui.Vec2(-1, 130), flags):
                 implot.SetupAxes("simulated seconds", name, fit, fit)
                 bounds = np.array([low[:, i], high[:, i]])
-                if np.isfinite(bounds).any():
-                    bottom, top = np.nanmin(bounds), np.nanmax(bounds)
-                    for end in ends:  # each with its own name has the same colour
-                        implot.PlotLine("end", [end, end], [bottom, top])
-                implot.PlotShaded("range", times, *bounds)
-                implot.PlotLine(name, times, mean[:, i], skip)
+                if np.isfinite(bounds).any():  # the order determines the colours
+                    implot.PlotShaded("range", times, *bounds)
+                    implot.PlotLine("mean", times, mean[:, i], skip)
+                    for end in ends:
+                        implot.PlotLine("end", [end, end], [np.nanmin(bounds), np.nanmax(bounds)])
                 implot.EndPlot()
         imgui.TextDisabled("vertical lines: ends of episodes")
 
