@@ -113,7 +113,7 @@ def _triangles(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[tupl
     ranges, count, used = [], 0, 0
     for body in range(model.nbody):
         first = used
-        for geom in np.flatnonzero((model.geom_bodyid == body) & (model.geom_group < _GROUPS)):
+        for geom in np.flatnonzero((model.geom_bodyid == body) & (model.geom_group < _GROUPS)).tolist():
             rgba = _colour(model, geom)
             surface = _surface(model, geom)
             if surface is None or rgba[3] == 0:

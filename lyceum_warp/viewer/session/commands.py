@@ -56,10 +56,10 @@ def obey(stage: Stage, command: protocol.Command) -> None:
             stage.frames.ghosts = command
         case protocol.Perturb():
             _perturb(stage, command)
-        case protocol.Drive(command):
+        case protocol.Drive(velocity):
             if stage.driving.limits is None or stage.mode == "playback":
                 raise ValueError("only a walking robot whose task draws commands can be driven, and not in a playback")
-            stage.driving.wanted = command
+            stage.driving.wanted = velocity
             stage.driving.apply(stage.live)
         case protocol.SetNumber(of, name, value):
             stage.set_number(of, name, value)

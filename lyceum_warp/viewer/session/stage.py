@@ -253,8 +253,8 @@ class Stage:
         if self.mode == "playback":
             return self.frames.of_playback(self.playback, self._status)
         frame = self.frames.of_worlds(self.live, self.main, self._traces(), self._status, paused=self.paused)
-        wanted, live = self.driving.wanted, self.live
-        if wanted is not None and not live.past.ahead and not np.allclose(frame.status.command, wanted, atol=1e-6):
+        wanted, command, live = self.driving.wanted, frame.status.command, self.live
+        if wanted and command and not live.past.ahead and not np.allclose(command, wanted, atol=1e-6):
             self.driving.apply(live)  # a new episode, or another world
             live.expect_steps()
         return frame

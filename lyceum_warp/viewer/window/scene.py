@@ -84,17 +84,17 @@ class ExtraGeoms:
             mujoco.mjv_addGeoms(self.model, data, self._options, self._perturb, mujoco.mjtCatBit.mjCAT_DYNAMIC, scene)
             if scene.ngeom > limit:
                 break
-            own, beside = ghost.colour is None, ghost.shift != (0.0, 0.0)
+            colour, beside = ghost.colour, ghost.shift != (0.0, 0.0)
             near, turned = np.abs(data.geom_xpos - positions), np.abs(data.geom_xmat - axes)
             same = (near.max(1, initial=0.0) < 1e-3) & (turned.max(1, initial=0.0) < 1e-2)
             for geom in scene.geoms[begin : scene.ngeom]:
                 if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and same[geom.objid] and not beside:
                     continue  # two coincident surfaces flicker
                 geom.pos[:2] += ghost.shift
-                if not own:
-                    geom.rgba = ghost.colour
+                if colour is not None:
+                    geom.rgba = colour
                     geom.matid = -1  # no material
-                    geom.transparent = ghost.colour[3] < 1
+                    geom.transparent = colour[3] < 1
                 geom.category = mujoco.mjtCatBit.mjCAT_DECOR  # cannot be selected
                 geoms.append(geom)
         return geoms
