@@ -96,6 +96,7 @@ SCRIPT = """<script>
     box.append(link);
     while (box.children.length > 4) box.firstChild.remove();
   };
+  Object.defineProperty(document, "title", {get: () => document.querySelector("title").text, set: () => {}});
   const take = () => document.visibilityState === "visible" && say("force_control");
   document.addEventListener("visibilitychange", take);
   window.addEventListener("focus", take);
@@ -106,7 +107,7 @@ SCRIPT = """<script>
 })();
 </script>"""
 """Completes studio's page: it prefixes the addresses that the page requests with its secret path; the visible tab takes
-control, and another one waits for it; the first theme is the browser's; links to new files appear."""
+control, and another one waits for it; the first theme is the browser's; links to new files appear; the title stays."""
 
 _PATH = re.compile(r"(/[A-Za-z0-9_~!$&'()*+,;=:@\[\]-][A-Za-z0-9._~!$&'()*+,;=:@\[\]-]*)+|/")
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?")
