@@ -64,7 +64,7 @@ def obey(stage: Stage, command: protocol.Command) -> None:
         case protocol.SetNumber(of, name, value):
             stage.set_number(of, name, value)
         case protocol.TakePicture(camera):
-            stage.videos.picture(camera, stage.frame())
+            stage.videos.picture(camera, stage.shown or stage.frame())
         case protocol.SetVideo(camera):
             stage.videos.end() if camera is None else stage.videos.begin(camera)
 

@@ -76,6 +76,8 @@ class Stage:
         )  # fmt: skip
         self.videos = VideoTaker(env.task.model, self.scene.title)
         self.frames = FrameMaker(env, len(self.scene.curves), self.driving)
+        self.shown: Frame | None = None
+        """The last frame."""
         self.steps = 0
         """Steps since the session began, for the measured speed."""
         self.progress: deque[tuple[float, int]] = deque(maxlen=64)
@@ -204,7 +206,8 @@ class Stage:
         """
         planners = [each for each in self.controllers.values() if isinstance(each, WorldControl)]
         if of == "planner":
-            assert isinstance(self.control, WorldControl)
+            if not isinstance(self.control, WorldControl):  # the mode has changed meanwhile
+                raise ValueError(f"{name} was not changed: no planner is in use")
             planners = [self.control]
             self.control.controller = rebuilt_planner(self.control.controller, name, value)
         else:
@@ -217,9 +220,12 @@ class Stage:
         self._trace()
 
     def show_world(self, world: int) -> None:
-        """Show another world, and end a push."""
+        """Show another world, and end a push and the driving of the one before."""
         before = self.live
         before.end_push()
+        if self.driving.wanted is not None:
+            self.driving.wanted = None
+            self.driving.apply(before)
         self.dragging = False
         if before is not self.main:
             self._transfer(before, self.main)
@@ -247,7 +253,8 @@ class Stage:
     def frame(self) -> Frame:
         """Make a frame of the present state."""
         files, self.videos.files = self.videos.files, []
-        return dataclasses.replace(self._frame(), files=tuple(str(file.absolute()) for file in files))
+        self.shown = dataclasses.replace(self._frame(), files=tuple(str(file.absolute()) for file in files))
+        return self.shown
 
     def _frame(self) -> Frame:
         if self.mode == "playback":

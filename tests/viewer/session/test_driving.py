@@ -23,10 +23,12 @@ def test_a_user_command_is_observed_until_it_is_given_back(shared_env: SharedEnv
         np.testing.assert_allclose(env.obs[0, 45:], command)
         session.obey(protocol.Reset(random=True))  # the task draws a command, which the next frame replaces
         stage.frame()
-    session.obey(protocol.Drive(None))
-    stage.advance(2)
-    assert not stage.frame().status.driven
-    assert not torch.allclose(env.obs[0, 45:], torch.tensor(command))
+    for end in (protocol.Drive(None), protocol.SetWorld(1)):
+        session.obey(protocol.Drive(command))
+        session.obey(end)
+        stage.advance(2)
+        assert not stage.frame().status.driven
+        assert not torch.allclose(env.obs[0, 45:], torch.tensor(command))
 
 
 def test_arrows_show_the_commanded_and_the_measured_velocity(shared_env: SharedEnv) -> None:
