@@ -161,7 +161,7 @@ class Frame:
     messages: tuple[str, ...] = ()
     """New messages: ends of episodes, faults, refused commands."""
     files: tuple[str, ...] = ()
-    """New recordings and pictures, as absolute paths, which the page offers for download."""
+    """New videos, pages and pictures, as absolute paths, which the page offers for download."""
 
 
 def latest(older: Frame | None, newer: Frame) -> Frame:

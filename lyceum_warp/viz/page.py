@@ -1,4 +1,4 @@
-"""Write a recording as one HTML file: a scene that plays and turns in any browser, without a server or a network.
+"""Write an episode as one HTML file: a scene that plays and turns in any browser, without a server or a network.
 
 The file holds triangles of the visible geoms, in the axes of their bodies, and the bodies' poses in each frame; the
 script in ``page.html`` draws them with WebGL. Textures are left out, except for the floor's squares.

@@ -1,4 +1,4 @@
-"""Write recordings as pages."""
+"""Write episodes as pages."""
 
 import base64
 import json
