@@ -7,8 +7,9 @@
 ``session/``       the process with torch, Warp and the worlds. ``clock.py`` has the main loop; ``commands.py`` carries
                    out commands; ``stage.py`` holds the mode, controller and worlds; ``live.py`` steps worlds and
                    keeps their history; ``plant.py`` runs a planner in real time; ``drivers.py`` calls controllers;
-                   ``playback.py``, ``frames.py``, ``traces.py``, ``driving.py``, ``live_settings.py`` and
-                   ``videos.py``; ``window_process.py`` starts the other process
+                   ``playback.py`` plays back episodes; ``frames.py``, ``traces.py`` and ``videos.py`` make frames,
+                   traces and videos; ``driving.py`` and ``live_settings.py`` change commands and numbers;
+                   ``window_process.py`` starts the other process
 ``window/``        the process with mujoco, NumPy and studio. ``main.py`` is its entry point; ``panel.py`` connects
                    studio with the session; ``windows.py`` draws the ImGui windows; ``actions.py`` has the keys;
                    ``mouse.py`` pushes bodies; ``scene.py`` draws ghosts and traces; ``studio.py`` wraps mujoco.studio;
