@@ -29,6 +29,7 @@ from lyceum_warp import Row
 from lyceum_warp.viewer.protocol import Command, Frame, Perturb, Reset, Seek, SetBackwards, SetMode, SetPaused, Status
 from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viewer.session.window_process import Window
+from lyceum_warp.viz.cameras import FreeCamera
 from lyceum_warp.viz.page import write_page
 
 pytestmark = pytest.mark.browser
@@ -350,10 +351,10 @@ def test_the_page_has_a_title_and_links_to_new_files(tab: Tab, tmp_path: Path) -
 def test_a_recorded_page_plays_without_a_server(browser: Browser, tmp_path: Path) -> None:
     env = lw.make(Block, autoreset=False)
     episode = lw.control(env, lambda state, obs: torch.ones(1), steps=STEPS, seed=0)
-    file = write_page(env, episode.states, tmp_path / "block.html", camera=lw.FreeCamera(azimuth=90, elevation=-20))
+    file = write_page(env, episode.states, tmp_path / "block.html", camera=FreeCamera(azimuth=90, elevation=-20))
     page = browser.new_page(viewport=VIEW, device_scale_factor=0.25)  # type: ignore[arg-type]
     errors: list[Any] = []
-    page.on("pageerror", errors.append)
+    page.on("pageerror", lambda error: errors.append(error))
     page.goto(f"file://{file}")
     page.get_by_text("pause").click()
     assert page.get_by_text("play").is_visible()
@@ -399,13 +400,9 @@ def test_the_tab_in_front_controls_and_another_takes_over(viewer: Viewer, contex
     controls(first)
     second = Tab(context.new_page(), viewer, first.page.url).loaded()
     controls(second)
-    first.log.clear()
     first.page.evaluate("window.dispatchEvent(new Event('focus'))")
-    first.loaded_again()
     controls(first)
-    second.log.clear()
     first.page.close()
-    second.loaded_again()
     controls(second)
 
 
