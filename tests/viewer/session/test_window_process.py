@@ -144,7 +144,7 @@ def test_close_ends_the_process_and_leaves_nothing_open(capfd: pytest.CaptureFix
         window.close()
         assert window._process.returncode != -signal.SIGKILL and not is_alive(pid) and not window.is_open()
         window.show(frame_of(MODEL, DATA))  # has no effect
-        assert threading.active_count() == threads
+        assert threading.active_count() <= threads
         before, descriptors = descriptors, len(os.listdir("/proc/self/fd"))
         assert before in (None, descriptors)
     assert capfd.readouterr() == ("", "")  # studio prints nothing
