@@ -97,7 +97,7 @@ def test_a_missing_file_is_named() -> None:
 
 def test_one_of_several_tasks_of_a_file_must_be_named(tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, f"{tiny_task.TINY}\nclass Other(Tiny):\n    pass\n")
-    with pytest.raises(ValueError, match=r"has 2 tasks \(Tiny, Other\): name one, as in .*tiny.py:Name"):
+    with pytest.raises(ValueError, match=r"has 2 tasks \(Tiny, Other\): name one of them, as .*tiny.py:Name"):
         find_task(file)
     with pytest.raises(ValueError, match=r"tiny.py has no task 'Arm'; it has Tiny, Other"):
         find_task(f"{file}:Arm")
