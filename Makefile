@@ -1,6 +1,6 @@
 # make demo: install, train Hopper and show the result         make test: install and run the tests
 # make lint: ruff and mypy                                     make test-all: the same with the longest lists
-# make clean: remove what these made
+# make docs: build the site in build/site                      make clean: remove what these made
 #
 # Another Python: make demo PYTHON=python3.12
 
@@ -9,7 +9,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-all test-room lint clean
+.PHONY: demo docs test test-all test-room lint clean
 
 demo: $(VENV)/installed-viz
 	$(BIN)/lyceum-warp train hopper --iterations 80 --out runs/demo-$$(date +%Y%m%d-%H%M%S) --require-return 1000
@@ -31,6 +31,12 @@ lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# Everything anew, because pages depend on the package; the notebooks take most of the time
+docs: $(VENV)/installed-docs
+	MUJOCO_GL=$${MUJOCO_GL:-egl} $(BIN)/python -m sphinx --fresh-env --fail-on-warning --keep-going --quiet \
+		--conf-dir docs --doctree-dir build/doctrees . build/site
+	@echo "the site: build/site/index.html"
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache

@@ -1,6 +1,7 @@
 """Run the commands and the Python of pages, and check links and file names in documents."""
 
 import dataclasses
+import json
 import re
 import runpy
 import shlex
@@ -14,13 +15,14 @@ from training_runs import TINY
 
 import lyceum_warp as lw
 from lyceum_warp import cli
+from lyceum_warp.binding.registry import package_task_names
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.tuning import search
 from lyceum_warp.viewer import show as views
 from lyceum_warp.viz.video import NoVideoError, check_video
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted((ROOT / "docs").glob("*.md"))
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
 WALKTHROUGHS = [page for page in PAGES if "\n```sh\n" in page.read_text()]
 """Pages with commands. Their blocks run in order in one folder; a block with a title is written to a file of that
 name."""
@@ -28,7 +30,7 @@ DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 
 
 def name_of(path: Path) -> str:
-    return path.name
+    return path.relative_to(ROOT / "docs").as_posix() if path in PAGES else path.name
 
 
 def python_of(page: Path) -> str:
@@ -43,14 +45,16 @@ def python_of(page: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-@pytest.mark.parametrize("page", sorted({*PAGES} - {*WALKTHROUGHS}), ids=name_of)
+PROGRAMS = [page for page in PAGES if page not in WALKTHROUGHS and python_of(page).strip()]
+"""Pages with Python and without commands."""
+
+
+@pytest.mark.parametrize("page", PROGRAMS, ids=name_of)
 def test_python_of_a_page_runs_in_order(page: Path, task_file: TaskFile) -> None:
     if page.stem == "dm_suite":
         pytest.importorskip("dm_control", reason="dm_control brings the models")
-    source = python_of(page)
-    assert source.strip(), f"{page.name} has no Python"
     # Warp compiles functions only from a source file
-    runpy.run_path(str(task_file(f"page_{page.stem}.py", source)), run_name=f"page_{page.stem}")
+    runpy.run_path(str(task_file(f"page_{page.stem}.py", python_of(page))), run_name=f"page_{page.stem}")
 
 
 WRONG = re.compile(r"^```py\n(.*?)^```\n\n```\n(.*?)\n```$", re.MULTILINE | re.DOTALL)
@@ -174,8 +178,18 @@ def test_tasks_in_own_task_md_pass_check_task(empty_folder: Path, monkeypatch: p
         assert (empty_folder / "runs" / video).stat().st_size > 10_000
 
 
+def generated(folder: str, kind: str) -> list[str]:
+    """Return the words of the comments that docs/conf.py replaces by generated sections, in the pages of a folder."""
+    pages = sorted((ROOT / "docs" / folder).glob("*.md"))
+    return [word for page in pages for word in words_of(page, kind)]
+
+
+def words_of(page: Path, kind: str) -> list[str]:
+    return " ".join(re.findall(rf"<!-- {kind}: (.*?)-->", page.read_text(), re.DOTALL)).split()
+
+
 def anchors(document: Path) -> set[str]:
-    headings = re.findall(r"^#+ (.+)$", document.read_text(), re.MULTILINE)
+    headings = re.findall(r"^#+ (.+)$", document.read_text(), re.MULTILINE) + words_of(document, "tasks")
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
@@ -195,6 +209,29 @@ def test_files_that_a_document_names_exist(document: Path) -> None:
     named = set(re.findall(r"`([\w./-]+(?:\.py|\.md|/))`", document.read_text())) - {"path/to/file.py"}
     places = (ROOT, ROOT / "lyceum_warp")
     assert not sorted(name for name in named if not any((place / name).exists() for place in places))
+
+
+def test_the_reference_has_every_public_name_once() -> None:
+    assert sorted(generated("reference", "names")) == sorted(lw.__all__)
+
+
+def test_the_pages_of_tasks_have_every_task_of_the_package_once() -> None:
+    assert sorted(generated("tasks", "tasks")) == sorted(package_task_names())
+
+
+def test_notebooks_are_stored_without_output() -> None:
+    for path in sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
+        cells = [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
+        assert cells and not any(cell["outputs"] or cell["execution_count"] for cell in cells), path.name
+
+
+def test_the_gallery_is_current_and_its_pictures_are_small() -> None:
+    """``python docs/gallery.py`` draws the pictures and writes the page."""
+    page, folder = ROOT / "docs" / "gallery.md", ROOT / "docs" / "images" / "gallery"
+    results = json.loads((folder / "results.json").read_text())
+    assert runpy.run_path(str(ROOT / "docs" / "gallery.py"))["page"](results) == page.read_text()
+    sizes = {path.stem: path.stat().st_size for path in folder.glob("*.webp")}
+    assert set(sizes) == set(results) and max(sizes.values()) < 100_000 and sum(sizes.values()) < 4_000_000
 
 
 def test_the_map_of_the_rooms_is_current() -> None:

@@ -83,7 +83,7 @@ FILES = [
         for path in sorted((ROOT / folder).rglob("*.py"))
     ),
     *(ROOT / name for name in (*DOCUMENTS, *OTHERS)),
-    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted(path for suffix in ("md", "py", "ipynb") for path in (ROOT / "docs").rglob(f"*.{suffix}")),
     *sorted(path for path in (ROOT / ".github").rglob("*") if path.is_file()),
 ]
 NAMES = [str(path.relative_to(ROOT)) for path in FILES if path.exists() and path != Path(__file__)]

@@ -1,0 +1,104 @@
+"""Configure the site that ``make docs`` builds from the pages in docs/, CONTRIBUTING.md, CHANGELOG.md and bench/.
+
+The sources lie in the root of the repository, so relative links lead to the same file there and on the site. A comment
+``<!-- KIND: words -->`` in a page is replaced by generated text; ``PLACES`` lists the kinds.
+"""
+
+import logging
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from sphinx.addnodes import pending_xref
+
+sys.path.insert(0, str(Path(__file__).parent))
+import reference
+
+import lyceum_warp as lw
+
+logging.getLogger("lyceum_warp").setLevel(logging.WARNING)
+sys.modules["lw"] = lw  # so that names are documented as they are written: lw.make
+
+project, version, author = "lyceum_warp", lw.__version__, "The lyceum_warp authors"
+extensions = ["myst_nb", "sphinx.ext.autodoc"]
+root_doc = "docs/index"
+include_patterns = ["docs/**", "CONTRIBUTING.md", "CHANGELOG.md", "bench/README.md", "bench/results/*.md"]
+exclude_patterns = [".*", "build", "runs", "**/__pycache__"]
+
+html_theme, html_title = "furo", "lyceum_warp"
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+html_theme_options = {"sidebar_hide_name": False, "navigation_with_keys": True}
+html_show_copyright = html_show_sourcelink = False
+
+highlight_language = "none"  # blocks without a language are output and formulas
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 4
+nb_execution_mode, nb_execution_timeout, nb_execution_raise_on_error = "force", 300, True
+nb_merge_streams = True
+
+add_module_names, python_use_unqualified_type_names, python_maximum_signature_line_length = True, True, 100
+autodoc_member_order, autodoc_typehints = "bysource", "none"
+
+CONTENTS = {
+    "Guide": "own_task warp_for_python task_form terms",
+    "Tasks": "gallery tasks/gymnasium tasks/adroit tasks/control tasks/arms tasks/balance tasks/velocity velocity "
+    "terrain",
+    "Learning": "runs ppo sac policies learners deployment adapters",
+    "Planning": "planning",
+    "Viewer": "viewer",
+    "Internals": "architecture physics /bench/README /CONTRIBUTING /CHANGELOG",
+    "Reference": "reference/environments reference/tasks reference/functions reference/models reference/learning "
+    "reference/planning reference/runs",
+}
+"""The pages of each section, in order, relative to docs/."""
+
+
+def contents(_: str) -> str:
+    """The tables of contents in the margin."""
+    return "\n".join(
+        "\n".join(["```{toctree}", ":hidden:", f":caption: {caption}", *pages.split(), "```", ""])
+        for caption, pages in CONTENTS.items()
+    )
+
+
+PLACES = {"contents": contents, "names": reference.names, "modules": reference.modules, "tasks": reference.tasks}
+
+
+def fill(app: Any, docname: str, source: list[str]) -> None:
+    """Replace the comments in a page by generated text."""
+    if docname == "bench/README":
+        source[0] += "\n```{toctree}\n:hidden:\n:glob:\nresults/*\n```\n"
+    if docname.startswith("docs/") and not docname.startswith("docs/notebooks/"):
+        kinds = "|".join(PLACES)
+        source[0] = re.sub(
+            rf"<!-- ({kinds}):? ?(.*?)-->", lambda found: PLACES[found[1]](found[2]), source[0], flags=re.DOTALL
+        )
+
+
+def link_names(app: Any, doctree: nodes.document) -> None:
+    """Let inline code such as ``lw.make`` lead to the reference."""
+    for literal in list(doctree.findall(nodes.literal)):
+        found = re.fullmatch(r"(lw\.\w+)(\(.*\))?", literal.astext())
+        if found and not isinstance(literal.parent, nodes.reference | pending_xref):
+            link = pending_xref(
+                "", refdomain="py", reftype="obj", reftarget=found[1], refdoc=app.env.docname, refwarn=False
+            )
+            literal.replace_self(link)
+            link += literal
+
+
+def redirect(app: Any, error: Exception | None) -> None:
+    """Lead from the site's address to its first page."""
+    Path(app.outdir, "index.html").write_text('<meta http-equiv="refresh" content="0; url=docs/index.html">\n')
+
+
+def setup(app: Any) -> None:
+    """Connect the functions above to the build."""
+    app.connect("source-read", fill)
+    app.connect("autodoc-process-docstring", reference.convert)
+    app.connect("autodoc-process-signature", reference.short_signature)
+    app.connect("doctree-read", link_names)
+    app.connect("build-finished", redirect)

@@ -1,0 +1,201 @@
+"""Draw the gallery: MUJOCO_GL=egl python docs/gallery.py [--runs FOLDER] [TASK ...].
+
+Each task is shown by the policy in FOLDER/TASK, a run, if there is one, and otherwise by MPPI. The program writes a
+moving picture of each task, its command and its result into docs/images/gallery/, and the page gallery.md from these
+files. Without tasks it draws all.
+"""
+
+import argparse
+import dataclasses
+import io
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import torch
+from PIL import Image
+
+import lyceum_warp as lw
+from lyceum_warp.viz.cameras import CameraChoice, FreeCamera, camera_values, find_camera
+from lyceum_warp.viz.render import Painter
+from lyceum_warp.viz.video import shots
+
+DOCS = Path(__file__).resolve().parent
+FOLDER = DOCS / "images" / "gallery"
+RESULTS = FOLDER / "results.json"
+
+SIZE, SCALE = (208, 156), 2  # pixels; drawn larger and reduced, for smooth edges
+RATE = 12.5  # frames per second
+LARGEST = 80_000  # bytes of a picture
+
+
+@dataclasses.dataclass(frozen=True)
+class Show:
+    """How a task is shown."""
+
+    settings: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Settings of MPPI and options of its worlds that differ from the task's."""
+    seconds: float = 4.0
+    """Simulated seconds of the picture; shorter if the episode ends earlier."""
+    start: float = 0.0
+    """Simulated seconds before the picture begins."""
+    seed: int = 0
+    algorithm: str = "npg"
+    """The algorithm of the policy, if there is one."""
+    flags: str = ""
+    """Further words of the command that trains it."""
+    camera: CameraChoice = None
+
+
+PPO = {"algorithm": "ppo", "flags": "--device cuda", "start": 1.0, "seconds": 3.2}
+SHOWS = {
+    "ant": Show({"samples": 96, "noise": 0.6}, start=1.0),
+    "adroit_door": Show(seconds=2.0),
+    "adroit_hammer": Show(seconds=2.0),
+    "adroit_pen": Show(seconds=2.0),
+    "adroit_relocate": Show(seconds=2.0),
+    "humanoid_standup": Show({"samples": 96, "noise": 0.3, "physics": "fast"}, seconds=3.0),
+    "half_cheetah": Show(start=0.5, seconds=3.0),
+    "hopper": Show(start=1.0, seconds=3.0),
+    "walker2d": Show(start=1.0, seconds=3.0),
+    "swimmer": Show(start=1.0, seconds=4.0),
+    "inverted_pendulum": Show({"noise": 1.0}, seconds=2.5),
+    "inverted_double_pendulum": Show(seconds=2.5),
+    "point_mass": Show(seconds=3.0),
+    "humanoid": Show({"samples": 96, "noise": 0.2}, seconds=3.0),
+    "soft_ball": Show({"samples": 64, "noise": 0.5}, seconds=4.0),
+    **{f"{robot}_velocity": Show(**PPO, camera=FreeCamera(track=1, distance=distance, azimuth=135.0, elevation=-15.0))
+       for robot, distance in (("go1", 1.7), ("go1_rough", 2.2), ("spot", 2.6), ("g1", 2.8), ("g1_full", 2.8),
+                               ("g1_rough", 3.2), ("h1", 3.6), ("t1", 2.8))},
+}  # fmt: skip
+"""Tasks that are not shown as the defaults of Show say."""
+
+
+def draw(name: str, runs: Path | None) -> dict[str, str]:
+    """Draw a task, and return its command and its result."""
+    show = SHOWS.get(name, Show())
+    env = lw.make(name, autoreset=False)
+    steps = min(env.horizon or 10**9, round((show.start + show.seconds) / env.timestep))
+    run = runs / name if runs is not None and (runs / name).is_dir() else None
+    if run is None:
+        states, result = planned(env, show, steps)
+        words = " ".join(f"--{key} {value}" for key, value in show.settings.items())
+        command = f"lyceum-warp plan {name} {words}".rstrip()
+    else:
+        policy = lw.load(run)
+        states = acted(env, policy, show, steps)
+        episodes = lw.evaluate(lw.make(name, nworld=16), policy, 16, seed=0)
+        result = f"{show.algorithm.upper()}: return {number(episodes.returns.mean().item())}"
+        if env.task.functions["success"] is not None:
+            result += f", success {episodes.success.mean().item():.0%}"
+        algorithm = "" if show.algorithm == "npg" else f"--algorithm {show.algorithm}"
+        command = " ".join(f"lyceum-warp train {name} {algorithm} {show.flags}".split())
+    save(pictures(env, states[round(show.start / env.timestep) :], show), FOLDER / f"{name}.webp")
+    return {"command": command, "result": result}
+
+
+def planned(env: lw.Env, show: Show, steps: int) -> tuple[torch.Tensor, str]:
+    """The states of an episode under MPPI, and its result."""
+    plan = lw.MPPI(env.task.name, seed=show.seed, **show.settings)
+    trajectory = lw.control(env, plan, steps=steps, seed=show.seed)
+    seconds = trajectory.steps * env.timestep
+    if trajectory.succeeded:
+        return trajectory.states, f"MPPI: success after {seconds:.2g} s"
+    return trajectory.states, f"MPPI: return {number(trajectory.rewards.sum().item())} in {seconds:.2g} s"
+
+
+@torch.no_grad()
+def acted(env: lw.Env, policy: Any, show: Show, steps: int) -> torch.Tensor:
+    """The states of an episode under a policy. A robot that follows commands walks straight ahead, without pushes."""
+    env.rand_reset(seed=show.seed)
+    state = env.get_state()
+    parts = env.state_space.split(state)
+    if "drawn_velocity" in parts:
+        parts["drawn_velocity"][:] = torch.tensor([0.8, 0.0, 0.0])
+        parts["heading_controlled"][:], parts["standing"][:] = 0.0, 0.0
+        parts["command_timer"][:], parts["push_timer"][:] = 1e6, 1e6
+        env.set_state(state)
+    states = []
+    for _ in range(steps):
+        states.append(env.get_state()[0])
+        env.action.copy_(policy.act(env.obs))
+        env.step()
+        if env.done.item():
+            break
+    return torch.stack(states)
+
+
+def pictures(env: lw.Env, states: torch.Tensor, show: Show) -> list[Image.Image]:
+    """The pictures of states, at the rate of the gallery."""
+    model = env.model
+    size = (SCALE * SIZE[0], SCALE * SIZE[1])
+    painter = Painter(mujoco, model, size, camera_values(find_camera(model, show.camera)))
+    chosen = [round(i / RATE / env.timestep) for i in range(int(len(states) * env.timestep * RATE) or 1)]
+    drawn = [painter.draw(shot) for shot in shots(env, states[chosen])]
+    return [Image.fromarray(picture).resize(SIZE, Image.Resampling.LANCZOS) for picture in drawn]
+
+
+def save(images: list[Image.Image], path: Path) -> None:
+    """Write a moving picture, as finely as its size allows."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for quality in (80, 65, 50, 35, 20):
+        file = io.BytesIO()
+        images[0].save(file, "WEBP", save_all=True, append_images=images[1:], duration=round(1000 / RATE), loop=0,
+                       quality=quality, method=6)  # fmt: skip
+        if file.tell() <= LARGEST:
+            break
+    path.write_bytes(file.getvalue())
+    print(f"{path.name}: {len(images)} pictures, {file.tell() / 1000:.0f} kB, quality {quality}", flush=True)
+
+
+def number(value: float) -> str:
+    """A number with three digits, and thousands with a comma."""
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def families() -> dict[str, tuple[str, list[str]]]:
+    """The titles of the pages of tasks and the names of their tasks, by page."""
+    found = {}
+    for path in sorted((DOCS / "tasks").glob("*.md")):
+        text = path.read_text()
+        names = " ".join(re.findall(r"<!-- tasks: (.*?)-->", text, re.DOTALL)).split()
+        found[path.stem] = (text.partition("\n")[0].removeprefix("# "), names)
+    return found
+
+
+def page(results: dict[str, dict[str, str]]) -> str:
+    """The page of the gallery."""
+    lines = ["# Gallery", "", "Every task of the package, with the command that does the same and what it reached. "
+             "`python docs/gallery.py` draws", "the pictures, on two CPU cores in about an hour.", ""]  # fmt: skip
+    for stem, (title, names) in families().items():
+        cells = []
+        for name in names:
+            own = results.get(name)
+            if own:
+                picture = f"![{name}](images/gallery/{name}.webp)"
+                link = f"[{name}](tasks/{stem}.md#{name})"
+                cells.append(f"{picture}<br>{link}<br>{own['result']}<br>`{own['command']}`")
+        lines += [f"## {title}", "", "| | | |", "|---|---|---|"]
+        cells += [""] * (-len(cells) % 3)
+        lines += [f"| {' | '.join(cells[i : i + 3])} |" for i in range(0, len(cells), 3)]
+        lines.append("")
+    return "\n".join(lines[:-1]) + "\n"
+
+
+def main() -> None:
+    """Draw tasks, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("tasks", nargs="*", metavar="TASK")
+    parser.add_argument("--runs", type=Path, metavar="FOLDER")
+    words = parser.parse_args()
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    for name in words.tasks or [name for _, names in families().values() for name in names]:
+        results[name] = draw(name, words.runs)
+        RESULTS.write_text(json.dumps(results, indent=1, sort_keys=True) + "\n")
+    (DOCS / "gallery.md").write_text(page(results))
+
+
+if __name__ == "__main__":
+    main()

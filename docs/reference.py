@@ -1,0 +1,317 @@
+"""Write the reference of the site from the package: public names, and tables of tasks.
+
+``names`` and ``tasks`` return MyST Markdown for conf.py. Every public name and every task must be on one page, which
+tests/test_docs.py checks.
+"""
+
+import ast
+import dataclasses
+import importlib
+import inspect
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from sphinx.ext.napoleon import Config, GoogleDocstring
+
+import lyceum_warp as lw
+from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.spaces import action_space
+from lyceum_warp.support.docstrings import attribute_docs
+from lyceum_warp.task import Element, FromModel
+
+DOCS = Path(__file__).parent
+
+ALIASES = {
+    "Row": ("class", "One world's values of a field; inside a kernel, a one-dimensional Warp array."),
+    "quat": ("class", "A quaternion in MuJoCo's order w, x, y, z: ``wp.vec4``."),
+    "vec10": ("class", "The ten numbers of a contact's or a geom's row that Warp has no name for."),
+}
+"""Names whose objects belong to Warp, with their kinds and meanings."""
+
+SECTIONS = Config(napoleon_custom_sections=["Functions"], napoleon_use_rtype=False)
+
+
+# public names
+
+
+def names(words: str) -> str:
+    """The documentation of public names of the package.
+
+    Args:
+        words: The names, between spaces.
+    """
+    return "\n".join(["```{eval-rst}", *(line for name in words.split() for line in entry(lw, name)), "```"])
+
+
+def modules(words: str) -> str:
+    """The documentation of modules whose functions have no names in the package itself, such as ``lw.walkers``."""
+    lines = ["```{eval-rst}"]
+    for word in words.split():
+        module = importlib.import_module(f"lyceum_warp.{word}")
+        sys.modules[f"lw.{word}"] = module
+        found = [
+            name for name, value in vars(module).items()
+            if not name.startswith("_") and inspect.isfunction(value) and value.__module__ == module.__name__
+        ]  # fmt: skip
+        lines += [line for name in found for line in entry(module, name, f"lw.{word}")]
+    return "\n".join([*lines, "```"])
+
+
+def entry(module: Any, name: str, prefix: str = "lw") -> list[str]:
+    """The lines of a name in reStructuredText."""
+    value = getattr(module, name)
+    if name in ALIASES:
+        kind, text = ALIASES[name]
+        return [f".. py:{kind}:: {prefix}.{name}", "", f"   {text}", ""]
+    if isinstance(value, wp.Function):
+        return warp_function(value, f"{prefix}.{name}")
+    if not isinstance(value, type):
+        return [f".. autofunction:: {prefix}.{name}", ""]
+    found = members(value)
+    return [f".. autoclass:: {prefix}.{name}", *([f"   :members: {', '.join(found)}"] if found else []), ""]
+
+
+def members(cls: type) -> list[str]:
+    """The public members of a class that have a docstring, including those of base classes of the package."""
+    found: dict[str, None] = {}
+    for base in reversed(cls.__mro__):
+        if base.__module__.startswith("lyceum_warp."):
+            own = {name: value for name, value in vars(base).items() if not name.startswith("_")}
+            found |= dict.fromkeys(attribute_docs(base))
+            found |= dict.fromkeys(
+                name for name, value in own.items()
+                if isinstance(value, property | classmethod | staticmethod) or inspect.isfunction(value)
+            )  # fmt: skip
+    return list(found)
+
+
+def convert(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Convert a docstring to reStructuredText, without the list of attributes, which follow as members."""
+    if what == "class" and "Attributes:" in lines:
+        del lines[lines.index("Attributes:") :]
+    lines[:] = converted("\n".join(lines))
+
+
+def converted(text: str) -> list[str]:
+    """The lines of a docstring in reStructuredText; bars outside of code are no substitutions."""
+    text = re.sub(r"``.*?``|\|", lambda found: "\\|" if found[0] == "|" else found[0], text, flags=re.DOTALL)
+    return str(GoogleDocstring(text, SECTIONS)).splitlines()
+
+
+def short_signature(app: Any, what: str, name: str, obj: Any, options: Any, signature: str, result: str) -> Any:
+    """Leave out a dataclass's fields, which follow as members, and the fields of default values."""
+    if what == "class" and dataclasses.is_dataclass(obj):
+        return "", result
+    return signature and re.sub(r"(PhysicsOptions)\(.*?\)", r"\1()", signature), result
+
+
+def warp_function(function: Any, name: str) -> list[str]:
+    """The lines of a Warp function: its signatures, the types of all overloads together, and its docstring."""
+    found: dict[tuple[str, ...], dict[str, dict[str, None]]] = {}
+    for overload in dict.fromkeys(each.func for each in (*function.user_overloads.values(),
+                                                         *function.user_templates.values())):  # fmt: skip
+        signature = inspect.signature(overload)
+        types = found.setdefault(tuple(signature.parameters), {})
+        for argument in signature.parameters.values():
+            types.setdefault(argument.name, {})[type_name(argument.annotation)] = None
+        types.setdefault("return", {})[type_name(signature.return_annotation)] = None
+    heads = []
+    for arguments, types in found.items():
+        spelled = {each: "Any" if "Any" in kinds else " | ".join(kinds) for each, kinds in types.items()}
+        result = f" -> {spelled['return']}" if spelled["return"] else ""
+        heads.append(f"{name}({', '.join(f'{each}: {spelled[each]}' for each in arguments)}){result}")
+    text = inspect.getdoc(function) or ""
+    if text.startswith(f"{function.key}("):  # one line for each overload
+        text = text.partition("\n\n")[2]
+    lines = [f".. py:function:: {heads[0]}", *(f"                 {head}" for head in heads[1:]), ""]
+    return [*lines, *(f"   {line}" for line in converted(text)), ""]
+
+
+def type_name(annotation: Any) -> str:
+    """A type as a task's file spells it; "" without one."""
+    if annotation is inspect.Signature.empty or annotation is None:
+        return ""
+    text = str(annotation) if not isinstance(annotation, type) else annotation.__name__
+    if found := re.fullmatch(r"wp\.array(2d|3d)?\[(?:wp\.)?(.*?)\]", repr(annotation) if "array" in text else text):
+        inner = type_name_of_word(found[2])
+        return f"Row[{inner}]" if found[1] is None else f"wp.array{found[1]}[{inner}]"
+    return type_name_of_word(text.rpartition(".")[2])
+
+
+def type_name_of_word(word: str) -> str:
+    """The public spelling of one of Warp's types."""
+    word = word.rpartition(".")[2]
+    known = {
+        "float32": "float",
+        "int32": "int",
+        "vec4f": "lw.quat",
+        "Any": "Any",
+        "spatial_vectorf": "wp.spatial_vector",
+    }
+    if word in known or word in ("float", "int", "bool"):
+        return known.get(word, word)
+    return "wp." + re.sub(r"^(vec|mat)([0-9]+)f$", r"\1\2", word)
+
+
+# tasks
+
+
+def tasks(words: str) -> str:
+    """A section for each task: what it does, its observations, actions, parameters and metrics.
+
+    Args:
+        words: The names of the tasks, between spaces.
+    """
+    return "\n\n".join(map(task_section, words.split()))
+
+
+def task_section(name: str) -> str:
+    """The section of a task."""
+    task = BoundTask(find_task(name))
+    cls = task.task
+    text = vars(cls).get("__doc__") or inspect.getdoc(sys.modules[cls.__module__]) or ""
+    head, _, body = text.partition("\n\n")
+    about = sentence(head.partition(": ")[2] or head)
+    lines = [f"## {name}", ""]
+    if (DOCS / "images" / "gallery" / f"{name}.webp").exists():
+        lines += [f"![{name}](../images/gallery/{name}.webp)", ""]
+    lines += [about, "", markdown(body), "", *facts(task), ""]
+    for group, layout in task.obs_layouts.items():
+        title = "observation" if group == "policy" else f"`{group}` observation"
+        lines += table((f"{title}, {sum(layout.values())} numbers", "size"),
+                       [(f"`{part}`", size) for part, size in layout.items()])  # fmt: skip
+    lines += actions(task)
+    lines += metrics(task)
+    rows = parameters(task)
+    if rows:
+        known = any(row[2] for row in rows)
+        shown = table(("parameter", "default", "meaning"), rows) if known else table(
+            ("parameter", "default"), [row[:2] for row in rows])  # fmt: skip
+        lines += shown if len(rows) <= 12 else folded(f"{len(rows)} parameters", shown)
+    source = Path(sys.modules[cls.__module__].__file__ or "")
+    place = source.relative_to(DOCS.parent).as_posix()
+    code = [f"```{{literalinclude}} /{place}", ":language: python", "```", ""]
+    return "\n".join([*lines, *folded(f"The file <code>{place}</code>", code)])
+
+
+def facts(task: BoundTask) -> list[str]:
+    """A table of lengths, physics and settings of a planner."""
+    cls, seconds = task.task, task.timestep
+    rows = [
+        ("step", f"{seconds:g} s, {task.frame_skip} substeps of {1000 * task.model.opt.timestep:g} ms"),
+        ("episode", f"{cls.horizon} steps, {cls.horizon * seconds:g} s" if cls.horizon else "no limit"),
+    ]
+    if cls.gymnasium:
+        rows.append(("the same as", f"Gymnasium's `{cls.gymnasium}`"))
+    if cls.physics:
+        rows.append(("further physics", ", ".join(f'`physics="{name}"`' for name in cls.physics)))
+    if task.functions["success"] is not None:
+        rows.append(("success", "yes" if cls.success_steps == 1 else f"after {cls.success_steps} steps in a row"))
+    if cls.planning.settings:
+        words = ", ".join(f"{name} {shortened(value)}" for name, value in cls.planning.settings.items())
+        rows.append(("MPPI's settings", words))
+    return table(("", ""), rows)
+
+
+def shortened(value: Any) -> str:
+    """A setting; a long list by its length."""
+    return f"({len(value)} numbers)" if isinstance(value, list | tuple) and len(value) > 3 else f"{value}"
+
+
+def actions(task: BoundTask) -> list[str]:
+    """A table of the actions and their bounds; neighbours with the same bounds share a row."""
+    space = action_space(task.model, task.task.action_range, task.actions)
+    assert space.low is not None and space.high is not None
+    rows: list[tuple[list[str], int, str]] = []
+    for part, columns in space.parts.items():
+        bounds = dict.fromkeys(zip(space.low[columns].tolist(), space.high[columns].tolist(), strict=True))
+        text = ", ".join("none" if np.isinf(high) else f"{low:.3g} to {high:.3g}" for low, high in bounds)
+        if rows and rows[-1][2] == text:
+            rows[-1] = ([*rows[-1][0], part], rows[-1][1] + columns.stop - columns.start, text)
+        else:
+            rows.append(([part], columns.stop - columns.start, text))
+    shown = [(", ".join(f"`{part}`" for part in parts), size, text) for parts, size, text in rows]
+    return table((f"action, {space.size} numbers", "size", "bounds"), shown)
+
+
+def metrics(task: BoundTask) -> list[str]:
+    """The metrics, with the weights of those that are terms of the reward."""
+    weights, ends = task.task.rewards, task.task.terminations
+    if not weights and not ends:
+        return [f"Metrics: {', '.join(f'`{name}`' for name in task.metrics)}.", ""] if task.metrics else []
+    rows = [(f"`{name}`", f"{weights[name]:g}" if name in weights else "ends the episode" if name in ends else "")
+            for name in task.metrics]  # fmt: skip
+    return table(("metric", "weight in the reward"), rows)
+
+
+def parameters(task: BoundTask) -> list[tuple[Any, ...]]:
+    """The parameters, their defaults and the comments on them in the task's files."""
+    meanings = comments(task.task)
+    rows = []
+    for name in task.source.params.vars:
+        if name in ("dt", "substep_dt"):
+            continue
+        default = getattr(task.source.defaults, name)
+        rows.append((f"`{name}`", spelled(default, task.parameters.values[name]), meanings.get(name, "")))
+    return rows
+
+
+def spelled(default: Any, value: Any) -> str:
+    """A default as in a table."""
+    elements = default if isinstance(default, list) else [default]
+    if isinstance(default, FromModel):
+        return "from the model"
+    if elements and all(isinstance(each, Element) for each in elements):
+        given = ", ".join(each.name for each in elements)
+        return f"{given if len(given) < 40 else given[:40] + ' …'}"
+    numbers = np.asarray(value)
+    if numbers.dtype.kind not in "fiub" or numbers.size > 12:
+        return f"table, {' x '.join(map(str, numbers.shape))}"
+    if numbers.ndim == 0:
+        return str(value) if numbers.dtype.kind == "b" else f"{value:.6g}"
+    return ", ".join(f"{number:.6g}" for number in numbers.ravel().tolist())
+
+
+def comments(task: type) -> dict[str, str]:
+    """The comments behind the fields of ``Params``, in the files of a task and of its base classes."""
+    found: dict[str, str] = {}
+    for cls in reversed(task.__mro__[:-1]):
+        lines = inspect.getsource(sys.modules[cls.__module__]).splitlines()
+        for node in ast.parse("\n".join(lines)).body:
+            if isinstance(node, ast.ClassDef) and node.name.endswith("Params"):
+                for field in node.body:
+                    if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+                        _, mark, text = lines[(field.end_lineno or 0) - 1].partition("  # ")
+                        if mark and not text.startswith(("fmt:", "noqa", "type:")):
+                            found[field.target.id] = text.replace("|", "\\|").replace("*", "\\*")
+    return found
+
+
+# Markdown
+
+
+def table(headings: tuple[str, ...], rows: list[tuple[Any, ...]]) -> list[str]:
+    """A table in Markdown, and a blank line."""
+    cells = [headings, ("---",) * len(headings), *rows]
+    return [*(f"| {' | '.join(map(str, row))} |" for row in cells), ""]
+
+
+def folded(title: str, lines: list[str]) -> list[str]:
+    """Lines that a reader unfolds."""
+    return [f"<details><summary>{title}</summary>", "", *lines, "", "</details>", ""]
+
+
+def markdown(text: str) -> str:
+    """A docstring as Markdown."""
+    return re.sub(r"``(.+?)``", r"`\1`", text)
+
+
+def sentence(text: str) -> str:
+    """A description that begins with a capital and ends with a full stop."""
+    text = " ".join(text.split())
+    return f"{text[0].upper()}{text[1:].rstrip('.')}."
