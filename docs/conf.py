@@ -37,17 +37,17 @@ highlight_language = "none"  # blocks without a language are output and formulas
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 nb_execution_mode, nb_execution_timeout, nb_execution_raise_on_error = "force", 300, True
-nb_merge_streams = True
+nb_merge_streams = nb_execution_in_temp = True
 
 add_module_names, python_use_unqualified_type_names, python_maximum_signature_line_length = True, True, 100
 autodoc_member_order, autodoc_typehints = "bysource", "none"
 
 CONTENTS = {
-    "Guide": "own_task warp_for_python task_form terms",
+    "Guide": "notebooks/first_task own_task warp_for_python task_form terms",
     "Tasks": "gallery tasks/gymnasium tasks/adroit tasks/control tasks/arms tasks/balance tasks/velocity velocity "
     "terrain",
-    "Learning": "runs ppo sac policies learners deployment adapters",
-    "Planning": "planning",
+    "Learning": "runs ppo sac policies learners deployment adapters notebooks/own_robot notebooks/deploy",
+    "Planning": "planning notebooks/live_planner",
     "Viewer": "viewer",
     "Internals": "architecture physics /bench/README /CONTRIBUTING /CHANGELOG",
     "Reference": "reference/environments reference/tasks reference/functions reference/models reference/learning "

@@ -1,6 +1,6 @@
 """Draw the gallery: MUJOCO_GL=egl python docs/gallery.py [--runs FOLDER] [TASK ...].
 
-Each task is shown by the policy in FOLDER/TASK, a run, if there is one, and otherwise by MPPI. The program writes a
+Each task is shown by the policy of its run in FOLDER, if there is one, and otherwise by MPPI. The program writes a
 moving picture of each task, its command and its result into docs/images/gallery/, and the page gallery.md from these
 files. Without tasks it draws all.
 """
@@ -37,61 +37,66 @@ class Show:
 
     settings: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Settings of MPPI and options of its worlds that differ from the task's."""
+    replan_every: int = 1
+    """Steps of MPPI from one plan to the next."""
     seconds: float = 4.0
     """Simulated seconds of the picture; shorter if the episode ends earlier."""
     start: float = 0.0
     """Simulated seconds before the picture begins."""
     seed: int = 0
-    algorithm: str = "npg"
-    """The algorithm of the policy, if there is one."""
-    flags: str = ""
-    """Further words of the command that trains it."""
     camera: CameraChoice = None
 
 
-PPO = {"algorithm": "ppo", "flags": "--device cuda", "start": 1.0, "seconds": 3.2}
 SHOWS = {
-    "ant": Show({"samples": 96, "noise": 0.6}, start=1.0),
-    "adroit_door": Show(seconds=2.0),
-    "adroit_hammer": Show(seconds=2.0),
-    "adroit_pen": Show(seconds=2.0),
-    "adroit_relocate": Show(seconds=2.0),
-    "humanoid_standup": Show({"samples": 96, "noise": 0.3, "physics": "fast"}, seconds=3.0),
+    "adroit_door": Show(seconds=2.0, replan_every=2),
+    "adroit_hammer": Show(seconds=2.0, replan_every=2),
+    "adroit_pen": Show(seconds=1.5, replan_every=2),
+    "adroit_relocate": Show(seconds=2.0, replan_every=2),
+    "aloha_lift": Show(replan_every=2),
+    "ant": Show({"noise": 0.6}, start=1.0, seconds=3.0),
+    "arm_hand_pickup": Show(replan_every=2),
     "half_cheetah": Show(start=0.5, seconds=3.0),
-    "hopper": Show(start=1.0, seconds=3.0),
-    "walker2d": Show(start=1.0, seconds=3.0),
-    "swimmer": Show(start=1.0, seconds=4.0),
+    "hopper": Show(start=1.0, seconds=2.5, replan_every=4),
+    "humanoid": Show({"noise": 0.2}, seconds=2.0, replan_every=2),
+    "humanoid_get_up": Show(seconds=3.0),
+    "humanoid_stand": Show(seconds=3.0),
+    "humanoid_standup": Show({"noise": 0.3}, seconds=2.0, replan_every=2),
+    "humanoid_walk": Show(seconds=3.0),
     "inverted_pendulum": Show({"noise": 1.0}, seconds=2.5),
     "inverted_double_pendulum": Show(seconds=2.5),
+    "panda_lift": Show(replan_every=2),
     "point_mass": Show(seconds=3.0),
-    "humanoid": Show({"samples": 96, "noise": 0.2}, seconds=3.0),
-    "soft_ball": Show({"samples": 64, "noise": 0.5}, seconds=4.0),
-    **{f"{robot}_velocity": Show(**PPO, camera=FreeCamera(track=1, distance=distance, azimuth=135.0, elevation=-15.0))
+    "soft_ball": Show({"samples": 32}, seconds=3.0, replan_every=4),
+    "swimmer": Show({"horizon": 48}, start=1.0, seconds=3.0),
+    "walker2d": Show(start=1.0, seconds=2.5),
+    **{f"{robot}_velocity": Show(start=1.0, seconds=3.2, camera=FreeCamera(track=1, distance=distance, azimuth=135.0,
+                                                                           elevation=-15.0))
        for robot, distance in (("go1", 1.7), ("go1_rough", 2.2), ("spot", 2.6), ("g1", 2.8), ("g1_full", 2.8),
                                ("g1_rough", 3.2), ("h1", 3.6), ("t1", 2.8))},
 }  # fmt: skip
 """Tasks that are not shown as the defaults of Show say."""
 
 
-def draw(name: str, runs: Path | None) -> dict[str, str]:
+def draw(name: str, run: Path | None) -> dict[str, str]:
     """Draw a task, and return its command and its result."""
     show = SHOWS.get(name, Show())
     env = lw.make(name, autoreset=False)
     steps = min(env.horizon or 10**9, round((show.start + show.seconds) / env.timestep))
-    run = runs / name if runs is not None and (runs / name).is_dir() else None
     if run is None:
         states, result = planned(env, show, steps)
-        words = " ".join(f"--{key} {value}" for key, value in show.settings.items())
+        flags = show.settings | ({"replan-every": show.replan_every} if show.replan_every > 1 else {})
+        words = " ".join(f"--{flag} {value}" for flag, value in flags.items())
         command = f"lyceum-warp plan {name} {words}".rstrip()
     else:
         policy = lw.load(run)
         states = acted(env, policy, show, steps)
         episodes = lw.evaluate(lw.make(name, nworld=16), policy, 16, seed=0)
-        result = f"{show.algorithm.upper()}: return {number(episodes.returns.mean().item())}"
+        config = json.loads((run / "config.json").read_text())
+        result = f"{config['algorithm'].upper()}: return {number(episodes.returns.mean().item())}"
         if env.task.functions["success"] is not None:
             result += f", success {episodes.success.mean().item():.0%}"
-        algorithm = "" if show.algorithm == "npg" else f"--algorithm {show.algorithm}"
-        command = " ".join(f"lyceum-warp train {name} {algorithm} {show.flags}".split())
+        device = " --device cuda" if config["device"] != "cpu" else ""
+        command = f"lyceum-warp train {name} --algorithm {config['algorithm']}{device}"
     save(pictures(env, states[round(show.start / env.timestep) :], show), FOLDER / f"{name}.webp")
     return {"command": command, "result": result}
 
@@ -99,7 +104,7 @@ def draw(name: str, runs: Path | None) -> dict[str, str]:
 def planned(env: lw.Env, show: Show, steps: int) -> tuple[torch.Tensor, str]:
     """The states of an episode under MPPI, and its result."""
     plan = lw.MPPI(env.task.name, seed=show.seed, **show.settings)
-    trajectory = lw.control(env, plan, steps=steps, seed=show.seed)
+    trajectory = lw.control(env, plan, steps=steps, seed=show.seed, replan_every=show.replan_every)
     seconds = trajectory.steps * env.timestep
     if trajectory.succeeded:
         return trajectory.states, f"MPPI: success after {seconds:.2g} s"
@@ -190,11 +195,14 @@ def main() -> None:
     parser.add_argument("tasks", nargs="*", metavar="TASK")
     parser.add_argument("--runs", type=Path, metavar="FOLDER")
     words = parser.parse_args()
+    runs = {} if words.runs is None else {
+        json.loads(path.read_text())["task"]: path.parent for path in sorted(words.runs.glob("*/config.json"))
+    }  # fmt: skip
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     for name in words.tasks or [name for _, names in families().values() for name in names]:
-        results[name] = draw(name, words.runs)
+        results[name] = draw(name, runs.get(name))
         RESULTS.write_text(json.dumps(results, indent=1, sort_keys=True) + "\n")
-    (DOCS / "gallery.md").write_text(page(results))
+        (DOCS / "gallery.md").write_text(page(results))
 
 
 if __name__ == "__main__":
