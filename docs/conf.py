@@ -49,7 +49,7 @@ CONTENTS = {
     "Learning": "runs ppo sac policies learners deployment adapters notebooks/own_robot notebooks/deploy",
     "Planning": "planning notebooks/live_planner",
     "Viewer": "viewer",
-    "Internals": "architecture physics /bench/README /CONTRIBUTING /CHANGELOG",
+    "Internals": "architecture physics Measurements</bench/README> /CONTRIBUTING /CHANGELOG",
     "Reference": "reference/environments reference/tasks reference/functions reference/models reference/learning "
     "reference/planning reference/runs",
 }

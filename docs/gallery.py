@@ -107,7 +107,7 @@ def planned(env: lw.Env, show: Show, steps: int) -> tuple[torch.Tensor, str]:
     trajectory = lw.control(env, plan, steps=steps, seed=show.seed, replan_every=show.replan_every)
     seconds = trajectory.steps * env.timestep
     if trajectory.succeeded:
-        return trajectory.states, f"MPPI: success after {seconds:.2g} s"
+        return trajectory.states, f"MPPI: success within {seconds:.2g} s"
     return trajectory.states, f"MPPI: return {number(trajectory.rewards.sum().item())} in {seconds:.2g} s"
 
 
@@ -172,16 +172,19 @@ def families() -> dict[str, tuple[str, list[str]]]:
 
 def page(results: dict[str, dict[str, str]]) -> str:
     """The page of the gallery."""
-    lines = ["# Gallery", "", "Every task of the package, with the command that does the same and what it reached. "
-             "`python docs/gallery.py` draws", "the pictures, on two CPU cores in about an hour.", ""]  # fmt: skip
+    lines = ["# Gallery", "", "Tasks of the package under a policy or a planner, with the return or the success "
+             "of this episode (policies: the mean of", "16 episodes), and a command that does the same. A name leads "
+             "to the task's observations, actions and parameters.", ""]  # fmt: skip
     for stem, (title, names) in families().items():
         cells = []
         for name in names:
             own = results.get(name)
             if own:
                 picture = f"![{name}](images/gallery/{name}.webp)"
-                link = f"[{name}](tasks/{stem}.md#{name})"
+                link = f"[{name}](tasks/{stem}.md#{name.replace('/', '')})"
                 cells.append(f"{picture}<br>{link}<br>{own['result']}<br>`{own['command']}`")
+        if not cells:
+            continue
         lines += [f"## {title}", "", "| | | |", "|---|---|---|"]
         cells += [""] * (-len(cells) % 3)
         lines += [f"| {' | '.join(cells[i : i + 3])} |" for i in range(0, len(cells), 3)]
@@ -198,9 +201,10 @@ def main() -> None:
     runs = {} if words.runs is None else {
         json.loads(path.read_text())["task"]: path.parent for path in sorted(words.runs.glob("*/config.json"))
     }  # fmt: skip
-    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     for name in words.tasks or [name for _, names in families().values() for name in names]:
-        results[name] = draw(name, runs.get(name))
+        result = draw(name, runs.get(name))
+        results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}  # another process may draw other tasks
+        results[name] = result
         RESULTS.write_text(json.dumps(results, indent=1, sort_keys=True) + "\n")
         (DOCS / "gallery.md").write_text(page(results))
 

@@ -72,15 +72,23 @@ def entry(module: Any, name: str, prefix: str = "lw") -> list[str]:
         return warp_function(value, f"{prefix}.{name}")
     if not isinstance(value, type):
         return [f".. autofunction:: {prefix}.{name}", ""]
-    found = members(value)
-    return [f".. autoclass:: {prefix}.{name}", *([f"   :members: {', '.join(found)}"] if found else []), ""]
+    lines = [f".. autoclass:: {prefix}.{name}"]
+    if found := members(value):
+        lines.append(f"   :members: {', '.join(found)}")
+    bases = [f"``lw.{base.__name__}``" for base in value.__mro__[1:] if is_public(base)]
+    return [*lines, "", *([f"   Members as in {' and '.join(bases)}.", ""] if bases else [])]
+
+
+def is_public(cls: type) -> bool:
+    """Whether a class is one of the package's public names."""
+    return cls.__module__.startswith("lyceum_warp.") and cls.__name__ in lw.__all__
 
 
 def members(cls: type) -> list[str]:
-    """The public members of a class that have a docstring, including those of base classes of the package."""
+    """The public members of a class that have a docstring, with those of base classes without a public name."""
     found: dict[str, None] = {}
     for base in reversed(cls.__mro__):
-        if base.__module__.startswith("lyceum_warp."):
+        if base is cls or (base.__module__.startswith("lyceum_warp.") and not is_public(base)):
             own = {name: value for name, value in vars(base).items() if not name.startswith("_")}
             found |= dict.fromkeys(attribute_docs(base))
             found |= dict.fromkeys(

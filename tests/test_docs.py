@@ -230,7 +230,9 @@ def test_the_gallery_is_current_and_its_pictures_are_small() -> None:
     page, folder = ROOT / "docs" / "gallery.md", ROOT / "docs" / "images" / "gallery"
     results = json.loads((folder / "results.json").read_text())
     assert runpy.run_path(str(ROOT / "docs" / "gallery.py"))["page"](results) == page.read_text()
-    sizes = {path.stem: path.stat().st_size for path in folder.glob("*.webp")}
+    sizes = {
+        path.relative_to(folder).with_suffix("").as_posix(): path.stat().st_size for path in folder.rglob("*.webp")
+    }
     assert set(sizes) == set(results) and max(sizes.values()) < 100_000 and sum(sizes.values()) < 4_000_000
 
 
