@@ -10,6 +10,7 @@ import importlib
 import inspect
 import re
 import sys
+import types
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,12 @@ ALIASES = {
     "vec10": ("class", "The ten numbers of a contact's or a geom's row that Warp has no name for."),
 }
 """Names whose objects belong to Warp, with their kinds and meanings."""
+
+TYPES = {"float32": "float", "int32": "int", "vec2f": "wp.vec2", "vec3f": "wp.vec3", "vec4f": "lw.quat",
+         "mat33f": "wp.mat33", "spatial_vectorf": "wp.spatial_vector", "Any": "Any"}  # fmt: skip
+"""Warp's types as a task's file spells them."""
+
+METHODS = (types.FunctionType, property, classmethod, staticmethod)
 
 SECTIONS = Config(napoleon_custom_sections=["Functions"], napoleon_use_rtype=False)
 
@@ -89,13 +96,9 @@ def members(cls: type) -> list[str]:
     found: dict[str, None] = {}
     for base in reversed(cls.__mro__):
         if base is cls or (base.__module__.startswith("lyceum_warp.") and not is_public(base)):
-            own = {name: value for name, value in vars(base).items() if not name.startswith("_")}
             found |= dict.fromkeys(attribute_docs(base))
-            found |= dict.fromkeys(
-                name for name, value in own.items()
-                if isinstance(value, property | classmethod | staticmethod) or inspect.isfunction(value)
-            )  # fmt: skip
-    return list(found)
+            found |= {name: None for name, value in vars(base).items() if isinstance(value, METHODS) and value.__doc__}
+    return [name for name in found if not name.startswith("_")]
 
 
 def convert(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
@@ -124,13 +127,13 @@ def warp_function(function: Any, name: str) -> list[str]:
     for overload in dict.fromkeys(each.func for each in (*function.user_overloads.values(),
                                                          *function.user_templates.values())):  # fmt: skip
         signature = inspect.signature(overload)
-        types = found.setdefault(tuple(signature.parameters), {})
+        kinds = found.setdefault(tuple(signature.parameters), {})
         for argument in signature.parameters.values():
-            types.setdefault(argument.name, {})[type_name(argument.annotation)] = None
-        types.setdefault("return", {})[type_name(signature.return_annotation)] = None
+            kinds.setdefault(argument.name, {})[type_name(argument.annotation)] = None
+        kinds.setdefault("return", {})[type_name(signature.return_annotation)] = None
     heads = []
-    for arguments, types in found.items():
-        spelled = {each: "Any" if "Any" in kinds else " | ".join(kinds) for each, kinds in types.items()}
+    for arguments, kinds in found.items():
+        spelled = {each: "Any" if "Any" in names else " | ".join(names) for each, names in kinds.items()}
         result = f" -> {spelled['return']}" if spelled["return"] else ""
         heads.append(f"{name}({', '.join(f'{each}: {spelled[each]}' for each in arguments)}){result}")
     text = inspect.getdoc(function) or ""
@@ -144,26 +147,9 @@ def type_name(annotation: Any) -> str:
     """A type as a task's file spells it; "" without one."""
     if annotation is inspect.Signature.empty or annotation is None:
         return ""
-    text = str(annotation) if not isinstance(annotation, type) else annotation.__name__
-    if found := re.fullmatch(r"wp\.array(2d|3d)?\[(?:wp\.)?(.*?)\]", repr(annotation) if "array" in text else text):
-        inner = type_name_of_word(found[2])
-        return f"Row[{inner}]" if found[1] is None else f"wp.array{found[1]}[{inner}]"
-    return type_name_of_word(text.rpartition(".")[2])
-
-
-def type_name_of_word(word: str) -> str:
-    """The public spelling of one of Warp's types."""
-    word = word.rpartition(".")[2]
-    known = {
-        "float32": "float",
-        "int32": "int",
-        "vec4f": "lw.quat",
-        "Any": "Any",
-        "spatial_vectorf": "wp.spatial_vector",
-    }
-    if word in known or word in ("float", "int", "bool"):
-        return known.get(word, word)
-    return "wp." + re.sub(r"^(vec|mat)([0-9]+)f$", r"\1\2", word)
+    text = annotation.__name__ if isinstance(annotation, type) else repr(annotation)
+    text = re.sub(r"[\w.]+", lambda word: TYPES.get(word[0].rpartition(".")[2], word[0]), text)
+    return re.sub(r"^wp\.array\[", "Row[", text)
 
 
 # tasks
