@@ -1,8 +1,8 @@
 """Draw the gallery: MUJOCO_GL=egl python docs/gallery.py [--runs FOLDER] [TASK ...].
 
-Each task is shown by the policy of its run in FOLDER, if there is one, and otherwise by MPPI. The program writes a
-moving picture of each task, its command and its result into docs/images/gallery/, and the page gallery.md from these
-files. Without tasks it draws all.
+Each task is shown by the policy of its run in FOLDER, if there is one, and otherwise by MPPI; by default FOLDER holds
+the pretrained policies. The program writes a moving picture of each task, its command and its result into
+docs/images/gallery/, and the page gallery.md from these files. Without tasks it draws all.
 """
 
 import argparse
@@ -25,6 +25,7 @@ from lyceum_warp.viz.video import shots
 DOCS = Path(__file__).resolve().parent
 FOLDER = DOCS / "images" / "gallery"
 RESULTS = FOLDER / "results.json"
+PRETRAINED = Path(lw.__file__).parent / "pretrained"
 
 SIZE, SCALE = (208, 156), 2  # pixels; drawn larger and reduced, for smooth edges
 RATE = 12.5  # frames per second
@@ -90,13 +91,15 @@ def draw(name: str, run: Path | None) -> dict[str, str]:
     else:
         policy = lw.load(run)
         states = acted(env, policy, show, steps)
-        episodes = lw.evaluate(lw.make(name, nworld=16), policy, 16, seed=0)
         config = json.loads((run / "config.json").read_text())
-        result = f"{config['algorithm'].upper()}: return {number(episodes.returns.mean().item())}"
-        if env.task.functions["success"] is not None:
-            result += f", success {episodes.success.mean().item():.0%}"
-        device = " --device cuda" if config["device"] != "cpu" else ""
-        command = f"lyceum-warp train {name} --algorithm {config['algorithm']}{device}"
+        if "evaluated" in config:
+            mean = config["evaluated"]["return"]
+        else:
+            mean = lw.evaluate(lw.make(name, nworld=16), policy, 16, seed=0).returns.mean().item()
+        result = f"{config['algorithm'].upper()}: return {number(mean)}"
+        command = f"lyceum-warp train {name} --algorithm {config['algorithm']}"
+        if run.parent == PRETRAINED:
+            command = f"lyceum-warp view {name} --pretrained"
     save(pictures(env, states[round(show.start / env.timestep) :], show), FOLDER / f"{name}.webp")
     return {"command": command, "result": result}
 
@@ -196,11 +199,9 @@ def main() -> None:
     """Draw tasks, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("tasks", nargs="*", metavar="TASK")
-    parser.add_argument("--runs", type=Path, metavar="FOLDER")
+    parser.add_argument("--runs", type=Path, metavar="FOLDER", default=PRETRAINED)
     words = parser.parse_args()
-    runs = {} if words.runs is None else {
-        json.loads(path.read_text())["task"]: path.parent for path in sorted(words.runs.glob("*/config.json"))
-    }  # fmt: skip
+    runs = {json.loads(path.read_text())["task"]: path.parent for path in sorted(words.runs.glob("*/config.json"))}
     for name in words.tasks or [name for _, names in families().values() for name in names]:
         result = draw(name, runs.get(name))
         results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}  # another process may draw other tasks
