@@ -32,7 +32,7 @@ lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Everything anew, because pages depend on the package; the notebooks take most of the time
+# Every page is built again, because pages depend on the package; the notebooks take most of the time
 docs: $(VENV)/installed-docs
 	MUJOCO_GL=$${MUJOCO_GL:-egl} $(BIN)/python -m sphinx --fresh-env --fail-on-warning --keep-going --quiet \
 		--conf-dir docs --doctree-dir build/doctrees . build/site
