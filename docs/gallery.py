@@ -6,6 +6,7 @@ docs/images/gallery/, and the page gallery.md from these files. Without tasks it
 """
 
 import argparse
+import copy
 import dataclasses
 import io
 import json
@@ -64,7 +65,9 @@ SHOWS = {
     "humanoid_standup": Show({"noise": 0.3}, seconds=2.0, replan_every=2),
     "humanoid_walk": Show(seconds=3.0),
     "inverted_pendulum": Show({"noise": 1.0}, seconds=2.5),
-    "inverted_double_pendulum": Show(seconds=2.5),
+    "inverted_double_pendulum": Show(
+        seconds=2.5, camera=FreeCamera(lookat=(0.0, 0.0, 0.5), distance=3.0, azimuth=90.0, elevation=-10.0)
+    ),
     "panda_lift": Show(replan_every=2),
     "point_mass": Show(seconds=3.0),
     "soft_ball": Show({"samples": 32}, seconds=3.0, replan_every=4),
@@ -137,7 +140,7 @@ def acted(env: lw.Env, policy: Any, show: Show, steps: int) -> torch.Tensor:
 
 def pictures(env: lw.Env, states: torch.Tensor, show: Show) -> list[Image.Image]:
     """The pictures of states, at the rate of the gallery."""
-    model = env.model
+    model = copy.copy(env.model)  # the painter sets each world's model fields
     size = (SCALE * SIZE[0], SCALE * SIZE[1])
     painter = Painter(mujoco, model, size, camera_values(find_camera(model, show.camera)))
     chosen = [round(i / RATE / env.timestep) for i in range(int(len(states) * env.timestep * RATE) or 1)]
