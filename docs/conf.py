@@ -18,7 +18,8 @@ import reference
 
 import lyceum_warp as lw
 
-logging.getLogger("lyceum_warp").setLevel(logging.WARNING)
+for each in ("lyceum_warp", "traitlets"):
+    logging.getLogger(each).setLevel(logging.WARNING)
 sys.modules["lw"] = lw  # so that names are documented as they are written: lw.make
 
 project, version, author = "lyceum_warp", lw.__version__, "The lyceum_warp authors"
