@@ -19,6 +19,7 @@ import torch
 from PIL import Image
 
 import lyceum_warp as lw
+from lyceum_warp.binding.registry import file_name
 from lyceum_warp.viz.cameras import CameraChoice, FreeCamera, camera_values, find_camera
 from lyceum_warp.viz.render import Painter
 from lyceum_warp.viz.video import shots
@@ -103,7 +104,7 @@ def draw(name: str, run: Path | None) -> dict[str, str]:
         command = f"lyceum-warp train {name} --algorithm {config['algorithm']}"
         if run.parent == PRETRAINED:
             command = f"lyceum-warp view {name} --pretrained"
-    save(pictures(env, states[round(show.start / env.timestep) :], show), FOLDER / f"{name}.webp")
+    save(pictures(env, states[round(show.start / env.timestep) :], show), FOLDER / f"{file_name(name)}.webp")
     return {"command": command, "result": result}
 
 
@@ -178,15 +179,15 @@ def families() -> dict[str, tuple[str, list[str]]]:
 
 def page(results: dict[str, dict[str, str]]) -> str:
     """The page of the gallery."""
-    lines = ["# Gallery", "", "Tasks of the package under a policy or a planner, with the return or the success "
-             "of this episode (policies: the mean of", "16 episodes), and a command that does the same. A name leads "
-             "to the task's observations, actions and parameters.", ""]  # fmt: skip
+    lines = ["# Gallery", "", "Tasks of the package under a policy or a planner, with the result and a command that "
+             "shows or trains it. A policy's", "return is the mean of whole episodes, a planner's is that of the "
+             "seconds shown. A name leads to the task's details.", ""]  # fmt: skip
     for stem, (title, names) in families().items():
         cells = []
         for name in names:
             own = results.get(name)
             if own:
-                picture = f"![{name}](images/gallery/{name}.webp)"
+                picture = f"![{name}](images/gallery/{file_name(name)}.webp)"
                 link = f"[{name}](tasks/{stem}.md#{name.replace('/', '')})"
                 cells.append(f"{picture}<br>{link}<br>{own['result']}<br>`{own['command']}`")
         if not cells:

@@ -20,7 +20,7 @@ from sphinx.ext.napoleon import Config, GoogleDocstring
 
 import lyceum_warp as lw
 from lyceum_warp.binding.bound_task import BoundTask
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding.registry import file_name, find_task
 from lyceum_warp.spaces import action_space
 from lyceum_warp.support.docstrings import attribute_docs
 from lyceum_warp.task import Element, FromModel
@@ -172,8 +172,9 @@ def task_section(name: str) -> str:
     head, _, body = text.partition("\n\n")
     about = sentence(head.partition(": ")[2] or head)
     lines = [f"## {name}", ""]
-    if (DOCS / "images" / "gallery" / f"{name}.webp").exists():
-        lines += [f"![{name}](../images/gallery/{name}.webp)", ""]
+    picture = f"images/gallery/{file_name(name)}.webp"
+    if (DOCS / picture).exists():
+        lines += [f"![{name}](../{picture})", ""]
     lines += [about, "", markdown(body), "", *facts(task), ""]
     for group, layout in task.obs_layouts.items():
         title = "observation" if group == "policy" else f"`{group}` observation"
