@@ -5,7 +5,7 @@
 The area under a learning curve is the mean return of the episodes sampled over a run. Two one-sided t tests (TOST, at
 5 %) decide whether the areas of 20 seeds on each engine are equivalent: whether the 90 % interval of the difference of
 their means (Welch) lies within the margin. The margin is one standard deviation between seeds, pooled over both
-engines. It was fixed, with the tasks and the seeds, before the first run.
+engines. The margin, the tasks and the seeds were chosen before the first run.
 """
 
 import dataclasses

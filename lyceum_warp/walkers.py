@@ -334,7 +334,7 @@ def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[
 
 
 def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.ndarray:
-    """Enlarge spheres of a geom by the margin of its contacts with the ground, minus their gap."""
+    """Add a geom's contact margin minus its gap, for contacts with the ground, to the radii of its spheres."""
     ground = np.flatnonzero(model.geom_bodyid == 0)
     margin = model.geom_margin[geom] + model.geom_margin[ground].max()
     gap = model.geom_gap[geom] + model.geom_gap[ground].max()

@@ -62,7 +62,7 @@ class WorldArrays:
         self.state_view = torch_view(self.state)
 
     def _allocate_fields(self) -> None:
-        """Allocate the fields after and before a step, and the task's memory."""
+        """Allocate the fields of the states before and after a step, and the task's memory."""
         n, model, task, kernels = self.nworld, self.task.model, self.task.task, self.task.kernels
         self.memory, self.lasting_memory, self._lasting_before = (
             wp.zeros((n, sum(sizes(self.task.memory[name]).values())), dtype=float)

@@ -351,7 +351,7 @@ class Worlds(WorldArrays):
             launch_lanes(kernels.replace_observations, self.nworld, args, self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
-        """Observe and judge the states of the masked worlds, without a transition."""
+        """Compute observations, evaluations and terminations of the masked worlds' states, without a transition."""
         # a state set without a check may be a fault; its world keeps the last valid observation
         self.engine.find_faults(self.mask)
         keep_reason = keep_reason and not self.autoreset

@@ -1,4 +1,4 @@
-"""A task with a table among its parameters: a ball on a rail that follows a motion."""
+"""A task that reads a motion from a table in its parameters: a ball on a rail follows it."""
 
 import warp as wp
 from rail_task import rail

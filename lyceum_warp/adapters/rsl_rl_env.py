@@ -86,8 +86,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         if env.horizon == 0:
             raise ValueError(
                 f"episodes of {env.task.name!r} have no time limit, so they cannot begin at a random step: call "
-                f"learn with "
-                "init_at_random_ep_len=False, or give make() a horizon"
+                "learn with init_at_random_ep_len=False, or give make() a horizon"
             )
         if ((steps < 0) | (steps >= env.horizon)).any():
             raise ValueError(

@@ -134,7 +134,7 @@ ENDLESS_STEPS = 1000
 
 
 def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
-    """Make a few worlds of the same task for whole episodes. Tasks without a horizon get one of 1,000 steps.
+    """Make a few worlds of the same task that play whole episodes. Tasks without a horizon get one of 1,000 steps.
 
     Args:
         env: The environment.

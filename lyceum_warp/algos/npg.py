@@ -220,7 +220,7 @@ class NPG(OnPolicyLearner):
     def advantages(self) -> tuple[torch.Tensor, torch.Tensor, ValueSums, torch.Tensor]:
         """Compute generalised advantages and discounted returns of the rollout.
 
-        Returns bootstrap from the value function at time limits and at the end of the rollout. Terminal states have
+        The returns bootstrap from the value function at time limits and at the end of the rollout. Terminal states have
         value 0 (as in mjrl; Lyceum also bootstraps there). The returns determine the value function's scale, and
         advantages are clipped to ten times this scale, so that a single extreme reward dominates neither the gradient
         nor the fit.

@@ -26,7 +26,7 @@ class OnPolicyLearner(Learner):
 
     Raises:
         ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy
-            cannot be learned (``lyceum_warp.algos.policy_check``).
+            is not trainable (``lyceum_warp.algos.policy_check``).
     """
 
     config_type: ClassVar[type]

@@ -14,7 +14,7 @@ from lyceum_warp.task import Part
 
 @dataclasses.dataclass(frozen=True)
 class Slice:
-    """The position of a part in its row of floats."""
+    """The slice of a row of floats that holds a part."""
 
     start: int
     """Index of the first float."""

@@ -115,7 +115,7 @@ class Display(training.Display):
 
 
 _COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skipped update"}
-"""Columns that count problems, with their names in messages. Not every algorithm has all columns."""
+"""Columns that count problems, each with its label in messages. Not every algorithm has all columns."""
 
 _BAR_WIDTH = 36
 """Width of the bar with the iteration number and the times, in characters."""

@@ -58,7 +58,7 @@ class Settings:
     termination: Annotated[str | None, tyro.conf.arg(metavar="stop|ignore")] = None
     update: Annotated[str | None, tyro.conf.arg(metavar="mppi|cem|predictive_sampling")] = None
     min_noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
-    include_plan: Annotated[bool | None, tyro.conf.arg(metavar="True|False")] = None
+    include_plan: bool | None = None
     spline: Annotated[str | None, tyro.conf.arg(metavar="zero|linear|cubic")] = None
     between: Annotated[str | None, tyro.conf.arg(metavar="hold|linear")] = None
     risk: Annotated[str | None, tyro.conf.arg(metavar="mean|worst")] = None

@@ -222,7 +222,7 @@ def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor
         if name in source and not isinstance(source[name], kind):
             raise ValueError(f"source has {source[name]!r} as its {name}")
     if missing := [name for name in source.get("params", ()) if name not in scalars["params"]]:
-        raise ValueError(f"source names the parameter {missing[0]!r}, which params lacks")
+        raise ValueError(f"source names the parameter {missing[0]!r}, but params has no such key")
 
 
 def provenance(env: Env) -> dict[str, Any]:

@@ -126,7 +126,7 @@ def test_bad_environments_and_actions_are_refused(env: lw.Env, shared_env: Share
         RslRlVecEnv(env).step(torch.zeros(4, 2))
     endless = RslRlVecEnv(shared_env(Metered, nworld=2, horizon=0))
     assert endless.max_episode_length == 2**31 - 1
-    with pytest.raises(ValueError, match="'metered' have no time limit .* init_at_random_ep_len=False"):
+    with pytest.raises(ValueError, match="'metered' have no time limit, .* init_at_random_ep_len=False"):
         endless.episode_length_buf = torch.zeros(2, dtype=torch.long)
 
 

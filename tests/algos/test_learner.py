@@ -74,7 +74,7 @@ def test_a_minimal_learner_resumes_bit_for_bit(env: lw.Env) -> None:
 def test_a_policy_that_is_not_gaussian_is_saved_and_exported(env: lw.Env, tmp_path: Path) -> None:
     drift, shown = Drift(env), []
     run = lw.train(drift, tmp_path / "run", iterations=2, callback=shown.append, display=Display(make_console()))
-    assert len(shown) == 2 and len(list(curve_table(run.rows()).columns)) == 2
+    assert len(shown) == 2 and len(list(curve_table(run.rows(), make_console()).columns)) == 2
     assert run.config["drift"] == {"size": 0.1} and Run.open(run.folder).best_score() is None
     again = lw.train(Drift(env), run.folder, iterations=4, resume=True)
     assert [row["iteration"] for row in again.rows()] == [1, 2, 3, 4]

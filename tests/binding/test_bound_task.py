@@ -53,7 +53,7 @@ DECLARED_OTHERWISE = {
 
 
 @pytest.mark.parametrize(("fields", "message"), DECLARED_OTHERWISE.values(), ids=DECLARED_OTHERWISE)
-def test_a_field_of_another_type_is_refused_with_the_type_to_write(fields: str, message: str, tmp_path: Path) -> None:
+def test_a_field_of_a_wrong_type_is_refused_by_naming_the_type(fields: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         lw.make(tiny_task.write(tmp_path, tiny_task.changed(("qpos: Row[float]", fields))))
 
@@ -127,7 +127,7 @@ def test_a_function_that_warp_cannot_compile_is_explained_in_one_line(
 def test_actions_are_scaled_only_to_controls_with_ranges(tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, f"{tiny_task.TINY}    action_range = (-1.0, 1.0)\n")
     spec = mujoco.MjSpec.from_file(str(DATA / "unlimited.xml"))
-    with pytest.raises(ValueError, match=r"gives none to the controls \[0\]: set their ctrlrange"):
+    with pytest.raises(ValueError, match=r"the controls \[0\] have no range in the model: set their ctrlrange"):
         lw.make(file, model=spec)
 
 

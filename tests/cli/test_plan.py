@@ -211,7 +211,7 @@ def test_physics_options_change_only_the_planner(
 
 
 def test_every_update_is_saved_and_printed_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    flags = ["--knots", "4", "--spline", "linear", "--include-plan", "True", "--replan-every", "3", "--steps", "9"]
+    flags = ["--knots", "4", "--spline", "linear", "--include-plan", "--replan-every", "3", "--steps", "9"]
     shown = {
         ("cem", "--elites", "3", "--min-noise", "0.02"): "CEM, 8 samples",
         ("predictive_sampling",): "predictive sampling, 8 samples",

@@ -324,7 +324,7 @@ def test_train_refuses_to_overwrite_a_run(trained: Path, capsys: pytest.CaptureF
 @pytest.mark.parametrize(
     "task, options, words",
     [
-        ("point_mas", [], ["no task 'point_mas'", "did you mean point_mass?"]),
+        ("point_mas", [], ["no task 'point_mas'", "did you mean point_mass"]),
         ("nowhere.py", [], ["no task file 'nowhere.py'"]),
         ("point_mass", ["--engine", "bullet"], ["no engine 'bullet'", "'mujoco'"]),
         ("point_mass", ["--device", "cuda:77"], ["no device 'cuda:77'"]),

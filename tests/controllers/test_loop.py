@@ -101,7 +101,7 @@ def test_an_mppi_plan_is_played_until_the_next_one() -> None:
 def test_replanning_after_the_end_of_the_plan_is_refused(env: lw.Env) -> None:
     for every, controller, message in (
         (0, StepPlanner(env), "replan_every must be a whole number from 1"),
-        (9, StepPlanner(env), "needs a plan of 9 actions, and the controller has a plan of 8 actions: plan more often"),
+        (9, StepPlanner(env), "needs a plan of 9 actions, but the controller has a plan of 8 actions: plan more often"),
         (2, towards, "replan_every=2 needs a plan of 2 actions, and the controller has no plan"),
     ):
         with pytest.raises(ValueError, match=message):

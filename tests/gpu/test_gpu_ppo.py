@@ -1,4 +1,4 @@
-"""Test PPO on a GPU: captured epochs equal direct ones, nothing synchronizes, and resumption is exact."""
+"""Test PPO on a GPU: captured epochs equal eager ones, no call waits for the device, and resuming is exact."""
 
 from pathlib import Path
 from typing import Any

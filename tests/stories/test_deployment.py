@@ -26,7 +26,7 @@ CALM = {
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Run the page's program, and return its names."""
+    """Run the page's program, and return its global variables."""
     pytest.importorskip("onnxruntime")
     (program,) = re.findall(r"^```python title=robot_loop.py\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
     assert "lyceum_warp" not in program

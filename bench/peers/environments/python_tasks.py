@@ -112,7 +112,7 @@ POSITIONS = {
     "humanoid": lambda env: mass_center(env.model, env.data)[0],
     "ant": lambda env: env.data.body("torso").xpos[0],
 }
-"""The position whose change a task rewards; by default the first coordinate."""
+"""The coordinate whose change is rewarded; by default the first."""
 
 
 def dm_control_env(task: str, seed: int) -> Any:

@@ -211,7 +211,7 @@ class PartialForward:
     """Computes the masked worlds' fields in a small group of scratch worlds, and copies them back.
 
     A forward pass of all worlds costs as much as a substep, but few worlds restart in a step. So the masked worlds'
-    states are copied into the group, in as many turns as necessary.
+    states are copied into the group, in as many batches as necessary.
 
     Args:
         rows: MuJoCo Warp's model for the group.

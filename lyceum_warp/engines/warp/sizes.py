@@ -174,9 +174,9 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 _TEMPORARIES = 1.25
-"""A world's memory relative to MuJoCo Warp's Data. A step's temporary arrays take 1 to 9 % (measured); the rest is for
-graphs and for the group of a partial forward pass. CPU graphs keep all temporary arrays alive and take up to three
-times as much."""
+"""A world's memory divided by the memory of MuJoCo Warp's Data. A step's temporary arrays take 1 to 9 % (measured); the
+rest is for graphs and for the group of a partial forward pass. CPU graphs keep all temporary arrays alive and take up
+to three times as much."""
 
 _TEMPORARIES_CONVEX = 3.5
 """The same factor with convex collisions or the noslip solver: on adroit_pen the temporary arrays take 1.5 to 2.4 times

@@ -204,7 +204,7 @@ Control = PolicyControl | WorldControl
 
 
 def controls(given: Mapping[str, Any], env: Env) -> dict[str, Control]:
-    """Distinguish policies from controllers of one world by their number of arguments, and check them.
+    """Check controllers: those with one argument are policies, and those with two control a single world.
 
     Args:
         given: Controllers by name; see ``lw.view``.

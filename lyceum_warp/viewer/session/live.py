@@ -221,7 +221,7 @@ class Live:
             Number of steps that were taken back, at most ``past.behind``.
         """
         past = self.past
-        if not past.ahead and past.behind:  # the present state has no place yet
+        if not past.ahead and past.behind:  # the current state is not in the history yet
             past.put(self.env.get_state(out=self._state), self.returns, self.pushed)
         steps = min(steps, past.behind)
         if steps > 0:

@@ -275,7 +275,7 @@ class Proxy:
             raise web.HTTPBadRequest(text="a request with a body\n")
 
     def _enter(self, request: web.BaseRequest) -> web.Response:
-        """Exchange the token for the cookie and its path."""
+        """Accept the token, and set the cookie for the secret path."""
         tokens = request.query.getall("token")
         if len(tokens) > 1 or not _same(tokens[0], self._token):
             raise web.HTTPForbidden(text=f"This token is not the one of this viewer. {_WHERE}\n")

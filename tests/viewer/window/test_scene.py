@@ -44,7 +44,7 @@ def test_traces_get_fewer_points_before_some_are_dropped(limit: int, number: int
     traces = np.random.default_rng(0).normal(size=(number, 33, 3))
     scene = ExtraGeoms(MODEL, limit)
     geoms = scene.draw(pose(0), traces=traces, best=best)
-    assert len(geoms) <= min(limit, 160)  # ghosts get most geoms
+    assert len(geoms) <= min(limit, 160)  # most geoms are left for the ghosts
     assert (len(geoms) >= 4 * number) == (limit >= 100 and number == 10)  # a trace has at least 4 lines
     assert len(scene.draw(pose(0), [ghost(i) for i in range(20)], traces, best)) <= limit
 
