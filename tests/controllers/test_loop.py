@@ -102,7 +102,7 @@ def test_replanning_after_the_end_of_the_plan_is_refused(env: lw.Env) -> None:
     for every, controller, message in (
         (0, StepPlanner(env), "replan_every must be a whole number from 1"),
         (9, StepPlanner(env), "needs a plan of 9 actions, but the controller has a plan of 8 actions: plan more often"),
-        (2, towards, "replan_every=2 needs a plan of 2 actions, and the controller has no plan"),
+        (2, towards, "replan_every=2 needs a plan of 2 actions, but the controller has no plan"),
     ):
         with pytest.raises(ValueError, match=message):
             control(env, controller, steps=20, replan_every=every)
