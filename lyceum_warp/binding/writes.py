@@ -163,7 +163,7 @@ class _Reader:
                 self._read(statement)
 
     def _note(self, place: _Place, node: ast.AST, *, replaced: bool = False, follows: bool = True) -> None:
-        """Note a write; with ``follows=False``, note a use that the analysis cannot follow."""
+        """Record a write; with ``follows=False``, record a use that the analysis cannot follow."""
         use = None if follows else ast.unparse(node).splitlines()[0]
         target = ".".join(filter(None, (self.arguments[place.position], place.field)))
         where = self.source.place(node)

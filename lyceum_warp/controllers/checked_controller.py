@@ -113,7 +113,9 @@ class CheckedController:
             ValueError: The plan is shorter.
         """
         if (needed := self.steps(steps - 1) + 1) > horizon:
-            plan = f"a plan of {horizon} actions" if hasattr(self._controller, "actions") else "no plan, only one action"
+            plan = (
+                f"a plan of {horizon} actions" if hasattr(self._controller, "actions") else "no plan, only one action"
+            )
             raise ValueError(
                 f"replan_every={steps} needs a plan of {needed} actions, but the controller has {plan}: plan more "
                 "often, or give it a longer horizon"

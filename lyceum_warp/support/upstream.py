@@ -159,6 +159,7 @@ def quicken_mujoco_warp() -> None:
     packages.check_version = functools.cache(packages.check_version)
     make, made = wp.kernel, {}
 
+    @functools.wraps(make)
     def kernel(f: Any = None, **options: Any) -> Any:
         return make(f, **options) if f or options.get("module") != "unique" else lambda f: unique(f, options)
 

@@ -161,7 +161,7 @@ class Recorder:
             self._changed.notify_all()
 
     def end(self) -> None:
-        """Stop accepting shots, and finish the video in the background."""
+        """Stop accepting frames, and finish the video in the background."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()

@@ -15,7 +15,7 @@ FAULTS = ("--short", "--parts", "faults", "--threads", "1", "--nworld", "16")
 
 @pytest.fixture
 def work(request: pytest.FixtureRequest, pytestconfig: pytest.Config, tmp_path: Path) -> Path:
-    """Return the test's folder, without states; its path is the same in every run, so kernels are compiled once."""
+    """Return the test's folder, without states; its path is the same in every run."""
     cache = getattr(pytestconfig, "cache", None)
     folder: Path = cache.mkdir(request.node.name) if cache else tmp_path / "work"
     for file in folder.glob("*.pt"):

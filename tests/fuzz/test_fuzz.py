@@ -46,7 +46,7 @@ def cases(counts: Mapping[str, int], first: int) -> list[str]:
 def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Return ``outcomes(program, many)``, which runs the many cases of a program, or the few and the minimal ones.
 
-    The folder has the same path in every run of the tests, because Warp caches compiled kernels by a task's path.
+    The folder has the same path in every run of the tests.
     """
     cache = getattr(pytestconfig, "cache", None)
     parent = cache.mkdir("fuzz") if cache else tmp_path_factory.mktemp("fuzz")

@@ -27,9 +27,3 @@ class Params(walking.Params):
 @lw.register
 class Go1Velocity(walking.Velocity):
     model = "go1.xml"
-    # 2.6 times as fast on a core; with impratio 10, so few iterations make the robot explode
-    physics = {
-        "fast": lw.PhysicsOptions(
-            cone="pyramidal", impratio=1.0, timestep=0.01, frame_skip=2, solver={"iterations": 4, "ls_iterations": 8}
-        )
-    }

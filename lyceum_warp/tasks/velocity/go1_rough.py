@@ -14,8 +14,6 @@ class Params(rough.Params, go1.Params):
 
 @lw.register
 class Go1RoughVelocity(rough.Rough, go1.Go1Velocity):
-    physics = {}  # those of the plane are not tried here
-
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Replace the floor by the terrain."""
