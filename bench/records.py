@@ -26,6 +26,7 @@ from typing import Any, Literal
 import experiment
 from experiment import Experiment, Row, Skipped, Table, choose, median_and_range
 
+from lyceum_warp.binding.registry import file_name, package_task_names
 from lyceum_warp.runs.folder import Run
 
 WALKING = ("--algorithm", "ppo", "--mean-every", "0")
@@ -33,6 +34,8 @@ WALKING = ("--algorithm", "ppo", "--mean-every", "0")
 NPG = ("--algorithm", "npg", "--mean-every", "5")
 """Flags under which the target is the mean policy's return in 16 episodes; the clock includes the evaluations."""
 LARGE = ("--samples", "65536")
+SUITE = (*WALKING, "--num-steps", "32", "--gamma", "0.995", "--entropy-coef", "0.001", "--no-clip-value-loss")
+"""One setting for all tasks of dm_control's suite."""
 
 RECORDS: dict[str, tuple[float, dict[str, tuple[str, ...]]]] = {
     "go1_velocity": (80.0, {"cuda": WALKING}),
@@ -45,6 +48,7 @@ RECORDS: dict[str, tuple[float, dict[str, tuple[str, ...]]]] = {
     "walker2d": (3000.0, {"cpu": NPG, "cuda": (*NPG, *LARGE)}),
     "half_cheetah": (4000.0, {"cpu": NPG, "cuda": (*NPG, *LARGE)}),
     "humanoid": (4500.0, {"cuda": (*NPG, "--nworld", "8192", "--samples", "131072")}),
+    **{name: (900.0, {"cuda": SUITE}) for name in package_task_names() if name.startswith("dm/")},
 }
 """Each task's threshold, and the flags of `lyceum-warp train` for each kind of device."""
 
@@ -101,7 +105,7 @@ def command(case: Case, folder: Path, device: str) -> list[str]:
 
 def measure(case: Case, options: Options) -> dict[str, Any]:
     """Train until the target is reached, or raise Skipped once the seconds of this call are over."""
-    name = f"{case.task}-{case.device}-{case.cache}-{case.seed}"
+    name = f"{file_name(case.task)}-{case.device}-{case.cache}-{case.seed}"
     folder, notes = options.runs / name, options.runs / f"{name}.json"
     earlier = json.loads(notes.read_text()) if notes.exists() and (folder / "checkpoint.pt").exists() else [0.0, 0]
     if not earlier[1]:

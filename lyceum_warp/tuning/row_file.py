@@ -8,6 +8,7 @@ from typing import Any
 
 from lyceum_warp.env import Env
 from lyceum_warp.runs.task_copy import json_value, task_copy
+from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.support.versions import versions
 
 _BEGIN = b'{"name": '
@@ -27,7 +28,7 @@ def identity(env: Env, **more: Any) -> dict[str, Any]:
     known = versions(env.device.alias)
     return {
         "task": env.task.name, "digest": hashlib.sha256(json.dumps(task, sort_keys=True).encode()).hexdigest()[:16],
-        "engine": env.engine.name, "device": known.get("gpu") or f"{known['cpu']}, {known['cores']} cores",
+        "engine": env.engine.name, "device": known.get("gpu") or f"{known['cpu']}, {cpu_cores()} cores",
         "nthread": env.options.nthread, "nworld": env.nworld, **{name: known[name] for name in _VERSIONS}, **more,
     }  # fmt: skip
 
