@@ -171,14 +171,15 @@ class Rollout:
         """Set the worlds' step counters to random values, so that time limits are spread over time.
 
         Otherwise worlds that start together and never terminate would all reach their time limits in the same rollout.
-        The returns of these shortened episodes are not counted.
+        The returns of these shortened episodes are not counted. On the Warp engine, worlds whose initial states settle
+        (``lw.Task.settle``) keep starting together: all worlds wait while any of them settles.
 
         Args:
             generator: Draws the values, identically in every process.
             team: The processes.
         """
         env, team = self.env, team or Team()
-        if env.horizon == 0:
+        if env.horizon == 0 or (env.task.task.settle and env.engine.capturable):
             return
         state = env.get_state()
         steps = torch.randint(env.horizon, (team.size * env.nworld,), generator=generator, device=state.device)

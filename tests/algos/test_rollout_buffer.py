@@ -66,3 +66,19 @@ def test_faults_within_a_rollout_are_counted() -> None:
     noise.zero_()
     rollout.collect(policy, noise)
     assert rollout.faults.tolist() == [0, 0, 0]
+
+
+class Settling(Metered):
+    settle = 2
+
+
+@pytest.mark.parametrize(("task", "engine", "spread"), [
+    (Metered, "warp", True), (Settling, "mujoco", True), (Settling, "warp", False),
+])  # fmt: skip
+def test_episodes_are_staggered_unless_all_worlds_wait_for_one_that_settles(
+    task: type[lw.Task], engine: str, spread: bool
+) -> None:
+    rollout = lw.Rollout(lw.make(task, nworld=4, horizon=50, engine=engine), 1)
+    rollout.restart()
+    rollout.stagger(torch.Generator().manual_seed(0))
+    assert bool((rollout.env.episode_step > 0).any()) == spread
