@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from docutils import nodes
+from jupyter_client.manager import KernelManager
 from sphinx.addnodes import pending_xref
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -39,6 +40,7 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 nb_execution_mode, nb_execution_timeout, nb_execution_raise_on_error = "force", 300, True
 nb_merge_streams = nb_execution_in_temp = True
+KernelManager.transport_encryption.default_value = "auto"  # without it, kernels warn
 
 add_module_names, python_use_unqualified_type_names, python_maximum_signature_line_length = True, True, 100
 autodoc_member_order, autodoc_typehints = "bysource", "none"
