@@ -12,6 +12,8 @@ from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS, PLOT_SECONDS = 200, 20.0
 """Maximum number of points of a plotted curve, all of which each frame sends to the browser, and its length."""
+FEW_CURVES = 2
+"""Curves that are shown first: the reward and the evaluation."""
 WINDOWS = ("messages", "curves", "view", "keys")
 
 
@@ -26,7 +28,8 @@ class Windows:
         self.curves = Curves(len(actions.scene.curves))
         self._actions, self._scene = actions, actions.scene
         self._edited: dict[tuple[str, str], float] = {}
-        self._plotted = set(self._scene.curves[:2])
+        self._plotted = set(self._scene.curves[:FEW_CURVES])
+        self._folded = False
         self._size = (0.0, 0.0)
 
     def draw(self) -> None:
@@ -46,7 +49,7 @@ class Windows:
     def _window(
         self, title: str, place: tuple[float, float, float, float], cond: int, content: Callable[[], None]
     ) -> None:
-        """Draw a window, unless it is closed. The main window can only be folded.
+        """Draw a window, unless it is closed. The main window folds instead.
 
         Args:
             title: Its title.
@@ -58,11 +61,17 @@ class Windows:
         first = title == self._scene.title
         if not first and title not in self._actions.windows:
             return
+        if first:
+            title = f"{title}{': double-click to unfold' if self._folded else ''}###panel"
         imgui.SetNextWindowPos(imgui.Vec2(max(left, 0), max(top, 0)), cond)
         imgui.SetNextWindowSize(imgui.Vec2(max(width, 200), max(height, 80)), cond)
-        unfolded, still_open = imgui.Begin(title, None if first else True)
+        unfolded, still_open = imgui.Begin(title, True)
         if unfolded:
             content()
+        if first:
+            self._folded = not unfolded
+            if not still_open:  # studio draws a cross in every window
+                imgui.SetWindowCollapsed(True)
         imgui.End()
         if not first and not still_open:
             self._actions.windows.discard(title)
@@ -77,10 +86,11 @@ class Windows:
         self._status()
         self._drive()
         self._push()
+        self._buttons()
+        self._metrics()
         self._numbers()
         self._ghosts()
         self._camera()
-        self._buttons()
 
     def _modes(self) -> None:
         status = self._actions.status
@@ -161,15 +171,7 @@ class Windows:
             rows.append(("speed", f"{status.measured_speed:.2f} of {speed_name(status.speed)}"))
         if np.isfinite(status.plan_ms):
             rows.append(("control", f"{status.plan_ms:.1f} ms"))
-        rows += [(name, f"{value:.4g}") for name, value in self._last_values()]
-        rows += status.text
-        if imgui.BeginTable("##status", 2):
-            for name, value in rows:
-                imgui.TableNextColumn()
-                imgui.TextDisabled(name)
-                imgui.TableNextColumn()
-                imgui.TextWrapped(value)
-            imgui.EndTable()
+        two_columns("##status", [*rows, *self._last_values()[:FEW_CURVES], *status.text])
 
     def _drive(self) -> None:
         """Show a walking robot's command, and let the user replace it."""
@@ -217,10 +219,16 @@ class Windows:
             f"Ctrl + drag right or left: {act} it" if body > 0 else "double-click it, then Ctrl + drag right"
         )
 
-    def _last_values(self) -> list[tuple[str, float]]:
+    def _metrics(self) -> None:
+        """Show the last values of the curves that are not part of the status."""
+        if (values := self._last_values()[FEW_CURVES:]) and imgui.CollapsingHeader("metrics"):
+            two_columns("##metrics", values)
+
+    def _last_values(self) -> list[tuple[str, str]]:
         """The last value of each curve."""
         rows = self.curves.rows
-        return list(zip(self._scene.curves, rows[-1, 2:].tolist(), strict=True)) if len(rows) else []
+        values = rows[-1, 2:].tolist() if len(rows) else []
+        return [(name, f"{value:.4g}") for name, value in zip(self._scene.curves, values, strict=False)]
 
     def _ghosts(self) -> None:
         if not imgui.CollapsingHeader("ghosts"):
@@ -257,7 +265,7 @@ class Windows:
             self._actions.cameras.reset()
 
     def _buttons(self) -> None:
-        imgui.Separator()
+        imgui.SeparatorText("more")
         making = self._actions.status.video is not None
         if highlighted_button("\uf03d  end the video" if making else "\uf03d  video", making):
             self._actions.toggle_video()
@@ -356,6 +364,17 @@ def highlighted_button(label: str, on: bool) -> bool:
     if on:
         imgui.PopStyleColor()
     return bool(pressed)
+
+
+def two_columns(label: str, rows: list[tuple[str, str]]) -> None:
+    """Draw names and values."""
+    if imgui.BeginTable(label, 2):
+        for name, value in rows:
+            imgui.TableNextColumn()
+            imgui.TextDisabled(name)
+            imgui.TableNextColumn()
+            imgui.TextWrapped(value)
+        imgui.EndTable()
 
 
 def combo(label: str, names: Any, now: int) -> int | None:
