@@ -1,6 +1,7 @@
 """Show worlds, controllers and episodes in a viewer: ``lw.view``."""
 
 import html
+import secrets
 import sys
 import threading
 from collections.abc import Mapping, Sequence
@@ -48,7 +49,7 @@ def view(
         port: Port of the page; by default the first free port from 8080.
         watchers: Functions that are called about twice a second and return new messages, a sequence of strings.
         block: Whether to return only when the user quits. False steps the worlds in a thread: leave them to it until
-            the view is closed. The default is False in a notebook, which then shows a link to the page.
+            the view is closed. The default is False in a notebook, which then shows the page and a link to it.
 
     Returns:
         The running view, if the call does not block.
@@ -72,11 +73,23 @@ def view(
     return None
 
 
+FRAME = """<a id="{name}" href="{address}" target="_blank">viewer of {title}</a><script>
+if (navigator.userAgentData && ["localhost", "127.0.0.1"].includes(location.hostname)) {{
+  const frame = document.createElement("iframe"), link = document.getElementById("{name}"), page = new URL(link.href);
+  page.hostname = location.hostname;
+  Object.assign(frame, {{src: page.href, style: "display: block; width: 100%; height: 560px; border: 0"}});
+  link.before(frame);
+}}
+</script>"""
+"""The page in a notebook, and a link to it. Only browsers of Chromium's family give a frame of another page the memory
+that the page needs, and they send the viewer's cookie only below the notebook's own host name."""
+
+
 class BackgroundView:
     """A view whose worlds are stepped in a thread; ``lw.view`` returns it if it does not block.
 
-    A notebook shows it as a link. It cannot show the page itself, which needs memory shared between threads: browsers
-    allow that only in pages of their own.
+    A notebook shows the page as the output of the cell, and a link that opens it in a tab of its own. If the notebook
+    is served by another machine, or the browser is Firefox or Safari, it shows only the link.
     """
 
     def __init__(self, session: Session, window: Window) -> None:
@@ -97,8 +110,10 @@ class BackgroundView:
         self._thread.join()
 
     def _repr_html_(self) -> str:
-        state = "" if self.is_open else " (closed)"
-        return f'<a href="{html.escape(self.address)}" target="_blank">viewer of {html.escape(self._title)}</a>{state}'
+        title = html.escape(self._title)
+        if not self.is_open:
+            return f"viewer of {title} (closed)"
+        return FRAME.format(name=f"viewer-{secrets.token_hex(4)}", address=html.escape(self.address), title=title)
 
 
 def in_notebook() -> bool:

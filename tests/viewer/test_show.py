@@ -11,7 +11,9 @@ from conftest import SharedEnv
 import lyceum_warp as lw
 
 
-def test_a_notebook_shows_a_link_while_the_worlds_run(shared_env: SharedEnv, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notebook_shows_the_page_and_a_link_while_the_worlds_run(
+    shared_env: SharedEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shell = SimpleNamespace(kernel=object())
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
     env = shared_env("point_mass", nworld=2)
@@ -21,10 +23,11 @@ def test_a_notebook_shows_a_link_while_the_worlds_run(shared_env: SharedEnv, mon
     while env.episode_step[0] == 0 and time.monotonic() < end:
         time.sleep(0.01)
     assert shown.is_open and env.episode_step[0] > 0
-    assert re.search(r'<a href="http://127\.0\.0\.1:\d+/\?token=[\w-]{43}" target="_blank">', shown._repr_html_())
+    link = r'<a id="([\w-]+)" href="http://127\.0\.0\.1:\d+/\?token=[\w-]{43}" target="_blank">.*getElementById\("\1"\)'
+    assert re.search(link, shown._repr_html_(), re.DOTALL) and 'createElement("iframe")' in shown._repr_html_()
     shown.close()
     shown.close()
-    assert not shown.is_open and "(closed)" in shown._repr_html_()
+    assert not shown.is_open and shown._repr_html_() == "viewer of point_mass (closed)"
     before = env.episode_step.clone()
     env.step()
     assert (env.episode_step == before + 1).all()

@@ -49,13 +49,14 @@ QUIET_SECONDS = 2.0
 PROTECTION = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
-    "X-Frame-Options": "DENY",
-    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Content-Security-Policy": "frame-ancestors http://localhost:* http://127.0.0.1:*",  # notebooks
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Embedder-Policy": "require-corp",  # needed for memory shared between threads
+    "Document-Isolation-Policy": "isolate-and-require-corp",  # the same within a notebook; Chromium's family only
 }
-"""Headers of every response: other sites can neither read nor embed it, and never get its address."""
+"""Headers of every response: other sites can neither read nor embed it, and never get its address. Pages of this
+machine may embed it if they know the token, as a notebook does."""
 SCRIPT = """<script>
 (() => {
   const path = location.pathname.slice(0, location.pathname.indexOf("/", 1));
@@ -265,9 +266,10 @@ class Proxy:
                 raise web.HTTPMisdirectedRequest(text=text) from None
         own = (f"http://{host}", f"https://{host}")
         foreign = any(origin.lower() not in own for origin in request.headers.getall("Origin", []))
-        # links on other pages are allowed; they need the token
-        modes = request.headers.get("Sec-Fetch-Mode"), request.headers.get("Sec-Fetch-Dest")
-        if foreign or (_is_cross_site(request) and modes != ("navigate", "document")):
+        # links on other pages, and frames on pages of this host name, are allowed; they need the token
+        site, mode, use = (request.headers.get(f"Sec-Fetch-{name}") for name in ("Site", "Mode", "Dest"))
+        linked = mode == "navigate" and (use == "document" or (site == "same-site" and use == "iframe"))
+        if foreign or (_is_cross_site(request) and not linked):
             raise web.HTTPForbidden(text="a request of another site's page\n")
         if request.method != "GET":
             raise web.HTTPMethodNotAllowed(request.method, ["GET"], text="only GET is allowed\n")

@@ -227,11 +227,18 @@ def test_an_attack_is_refused(
 def test_other_sites_cannot_read_or_embed_the_page_and_studio_sets_no_cookies(proxy: Proxy) -> None:
     for answer in (get(proxy, "/PATH/model"), get(proxy, cookie=""), get(proxy, host="x")):
         head = answer.partition(b"\r\n\r\n")[0].decode().lower()
-        for line in ("x-frame-options: deny", "cross-origin-resource-policy: same-origin",
-                     "referrer-policy: no-referrer"):  # fmt: skip
+        for line in ("content-security-policy: frame-ancestors http://localhost:* http://127.0.0.1:*\r\n",
+                     "cross-origin-resource-policy: same-origin", "referrer-policy: no-referrer"):  # fmt: skip
             assert head.count(f"\r\n{line}") == 1
         assert "access-control-" not in head and "set-cookie" not in head
     assert b"\r\nCache-Control: no-cache\r\n" in get(proxy, "/PATH/model")
+
+
+def test_a_page_of_this_host_embeds_the_viewer_by_its_token(proxy: Proxy, upstream: Upstream) -> None:
+    frame = ("Sec-Fetch-Site: same-site", "Sec-Fetch-Mode: navigate", "Sec-Fetch-Dest: iframe")
+    assert re.search(rb'<meta http-equiv="refresh" content="0; url=/[\w-]{43}/">', get(proxy, "/?token=TOKEN", *frame))
+    assert status(get(proxy, "/?token=WRONG", *frame)) == status(get(proxy, "/PATH/", *frame, cookie="")) == 403
+    assert not upstream.received
 
 
 @pytest.mark.parametrize("answer", [
