@@ -178,7 +178,7 @@ def task_section(name: str) -> str:
     lines += [about, "", markdown(body), "", *facts(task), ""]
     for group, layout in task.obs_layouts.items():
         title = "observation" if group == "policy" else f"`{group}` observation"
-        lines += table((f"{title}, {sum(layout.values())} numbers", "size"),
+        lines += table((f"{title}, {count(sum(layout.values()), 'number')}", "size"),
                        [(f"`{part}`", size) for part, size in layout.items()])  # fmt: skip
     lines += actions(task)
     lines += metrics(task)
@@ -198,7 +198,7 @@ def facts(task: BoundTask) -> list[str]:
     """A table of lengths, physics and settings of a planner."""
     cls, seconds = task.task, task.timestep
     rows = [
-        ("step", f"{seconds:g} s, {task.frame_skip} substeps of {1000 * task.model.opt.timestep:g} ms"),
+        ("step", f"{seconds:g} s, {count(task.frame_skip, 'substep')} of {1000 * task.model.opt.timestep:g} ms"),
         ("episode", f"{cls.horizon} steps, {cls.horizon * seconds:g} s" if cls.horizon else "no limit"),
     ]
     if cls.gymnasium:
@@ -231,7 +231,7 @@ def actions(task: BoundTask) -> list[str]:
         else:
             rows.append(([part], columns.stop - columns.start, text))
     shown = [(", ".join(f"`{part}`" for part in parts), size, text) for parts, size, text in rows]
-    return table((f"action, {space.size} numbers", "size", "bounds"), shown)
+    return table((f"action, {count(space.size, 'number')}", "size", "bounds"), shown)
 
 
 def metrics(task: BoundTask) -> list[str]:
@@ -294,6 +294,11 @@ def table(headings: tuple[str, ...], rows: list[tuple[Any, ...]]) -> list[str]:
     """A table in Markdown, and a blank line."""
     cells = [headings, ("---",) * len(headings), *rows]
     return [*(f"| {' | '.join(map(str, row))} |" for row in cells), ""]
+
+
+def count(number: int, noun: str) -> str:
+    """A number of things."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def folded(title: str, lines: list[str]) -> list[str]:
