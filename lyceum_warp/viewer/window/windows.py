@@ -12,6 +12,8 @@ from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS, PLOT_SECONDS = 200, 20.0
 """Maximum number of points of a plotted curve, all of which each frame sends to the browser, and its length."""
+NARROW = 1100
+"""Width, in pixels, below which the first windows would cover the robot, as in a notebook."""
 FEW_CURVES = 2
 """Curves that are shown first: the reward and the evaluation."""
 WINDOWS = ("messages", "curves", "view", "keys")
@@ -39,6 +41,8 @@ class Windows:
         # the windows may be moved until the browser's window changes its size
         self._size, resized = (width, height), (width, height) != self._size
         cond = int(imgui.Cond.Always if resized else imgui.Cond.FirstUseEver)
+        if resized and width < NARROW:
+            self._actions.windows -= {"messages", "curves"}
         tall = min(len(self._plotted) * 138 + 60, height - 50)
         self._window(self._scene.title, (10, 10, 320, height - 20), cond, self._session)
         self._window("messages", (340, height - 110, width - 710, 100), cond, self._messages)
