@@ -12,6 +12,7 @@ from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Arrow, Ghost,
 from lyceum_warp.viewer.window.studio import ux
 
 LINE_WIDTH = 3.0  # pixels
+SHRUNK = 0.98
 ARROW_WIDTH, SHORTEST_ARROW = 0.015, 0.01  # m
 MAX_LINES = 160
 """Maximum number of lines of all traces. All geoms are sent to the browser 60 times a second, about 600 bytes each."""
@@ -90,6 +91,7 @@ class ExtraGeoms:
             for geom in scene.geoms[begin : scene.ngeom]:
                 if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and same[geom.objid] and not beside:
                     continue  # two coincident surfaces flicker
+                geom.size *= SHRUNK  # the same for a geom that has only turned about its own axis
                 geom.pos[:2] += ghost.shift
                 if colour is not None:
                     geom.rgba = colour
