@@ -12,6 +12,7 @@ import torch
 
 import lyceum_warp as lw
 from lyceum_warp.algos.evaluation import ENDLESS_STEPS, evaluate
+from lyceum_warp.binding.registry import file_name
 from lyceum_warp.cli.evaluate import run_worlds
 from lyceum_warp.runs.checkpoints import read_checkpoint, write_content
 from lyceum_warp.runs.folder import Run
@@ -26,7 +27,7 @@ def store(folder: Path, which: str) -> Path:
     """Store the policy of a run, and return the folder."""
     run = Run.open(folder)
     algorithm = run.config["algorithm"]
-    out = FOLDER / run.task_name
+    out = FOLDER / file_name(run.task_name)
     content = read_checkpoint(run.policy_file(which), parts=("iteration", "policy"))
     saved = content["policy"]
     state = {name: part.half() if name.startswith("network.") else part for name, part in saved["state"].items()}

@@ -11,7 +11,7 @@ from rich.console import Console
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.algos.transfer import Transfer, transfer
-from lyceum_warp.binding.registry import find_task, task_name
+from lyceum_warp.binding.registry import file_name, find_task, task_name
 from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, Trust, given, parameters
 from lyceum_warp.cli.display import fitting_table, make_console, note, policy_video, tried
 from lyceum_warp.controllers.policy_episodes import policy_episodes
@@ -136,7 +136,7 @@ class Eval:
             paths = _save_episodes(env, policy, self, run, origin)
             console.print(f"episodes: {paths}", soft_wrap=True, markup=False)
         if self.video:
-            path = Path(f"{env.task.name}.mp4") if self.pretrained else run.folder / "eval.mp4"
+            path = Path(f"{file_name(env.task.name)}.mp4") if self.pretrained else run.folder / "eval.mp4"
             video = tried(policy_video, env, policy, path, evaluation_seed(self.seed), camera=camera)
             console.print(f"video: {video}", soft_wrap=True, markup=False)
         return 0

@@ -3,6 +3,7 @@
 import difflib
 from pathlib import Path
 
+from lyceum_warp.binding.registry import file_name
 from lyceum_warp.runs.folder import Run
 
 _FOLDER = Path(__file__).resolve().parents[1] / "pretrained"
@@ -10,7 +11,7 @@ _FOLDER = Path(__file__).resolve().parents[1] / "pretrained"
 
 def pretrained_tasks() -> list[str]:
     """Names of the tasks that have a pretrained policy."""
-    return sorted(path.parent.name for path in _FOLDER.glob("*/config.json"))
+    return sorted(path.parent.name.replace("-", "/") for path in _FOLDER.glob("*/config.json"))
 
 
 def pretrained_run(task: str) -> Path:
@@ -32,7 +33,7 @@ def pretrained_run(task: str) -> Path:
         close = difflib.get_close_matches(task, tasks, 1)
         hint = f"did you mean {close[0]}? " if close else ""
         raise ValueError(f"there is no pretrained policy of {task!r}: {hint}there are {', '.join(tasks)}")
-    return _FOLDER / task
+    return _FOLDER / file_name(task)
 
 
 def pretrained_text(run: Run) -> str:
