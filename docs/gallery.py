@@ -11,6 +11,7 @@ import dataclasses
 import io
 import json
 import re
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,21 @@ SHOWS = {
     "aloha_lift": Show(replan_every=2),
     "ant": Show({"noise": 0.6}, start=1.0, seconds=3.0),
     "arm_hand_pickup": Show(replan_every=2),
+    "dm/acrobot_swingup": Show({"horizon": 150, "noise": 1.0}, start=2.0, replan_every=2),
+    "dm/ball_in_cup_catch": Show(seconds=2.5),
+    "dm/cartpole_balance": Show(seconds=2.5),
+    "dm/cheetah_run": Show({"horizon": 40}, start=1.0, seconds=2.5, replan_every=2),
+    "dm/fish_upright": Show(seconds=3.0),
+    "dm/hopper_hop": Show({"horizon": 50}, start=1.0, seconds=3.0, replan_every=2),
+    "dm/hopper_stand": Show({"horizon": 50}, seconds=3.0, replan_every=2),
+    "dm/humanoid_stand": Show(seconds=3.0, replan_every=2),
+    "dm/pendulum_swingup": Show({"horizon": 60}),
+    "dm/point_mass_easy": Show(seconds=3.0),
+    "dm/reacher_easy": Show(seconds=2.0, camera=FreeCamera(lookat=(0.0, 0.0, 0.0), distance=0.8, elevation=-90.0)),
+    "dm/reacher_hard": Show(seconds=2.0, camera=FreeCamera(lookat=(0.0, 0.0, 0.0), distance=0.8, elevation=-90.0)),
+    "dm/walker_run": Show(start=2.0, seconds=3.0),
+    "dm/walker_stand": Show(seconds=3.0),
+    "dm/walker_walk": Show(start=1.0, seconds=3.0),
     "half_cheetah": Show(start=0.5, seconds=3.0),
     "hopper": Show(start=1.0, seconds=2.5, replan_every=4),
     "humanoid": Show({"noise": 0.2}, seconds=2.0, replan_every=2),
@@ -102,6 +118,7 @@ def draw(name: str, run: Path | None) -> dict[str, str]:
             mean = lw.evaluate(lw.make(name, nworld=16), policy, 16, seed=0).returns.mean().item()
         result = f"{config['algorithm'].upper()}: return {number(mean)}"
         command = f"lyceum-warp train {name} --algorithm {config['algorithm']}"
+        command += " --device cuda" if config["device"].startswith("cuda") else ""
         if run.parent == PRETRAINED:
             command = f"lyceum-warp view {name} --pretrained"
     save(pictures(env, states[round(show.start / env.timestep) :], show), FOLDER / f"{file_name(name)}.webp")
@@ -196,7 +213,12 @@ def page(results: dict[str, dict[str, str]]) -> str:
         cells += [""] * (-len(cells) % 3)
         lines += [f"| {' | '.join(cells[i : i + 3])} |" for i in range(0, len(cells), 3)]
         lines.append("")
-    return "\n".join(lines[:-1]) + "\n"
+    missing = " ".join(
+        f"[{name}](tasks/{stem}.md#{name.replace('/', '')})," for stem, (_, names) in families().items()
+        for name in names if name not in results
+    )  # fmt: skip
+    lines += textwrap.wrap(f"Without a picture: {missing.rstrip(',')}.", 120, break_long_words=False) if missing else []
+    return "\n".join(lines).rstrip("\n") + "\n"
 
 
 def main() -> None:
