@@ -38,7 +38,8 @@ html_show_copyright = html_show_sourcelink = False
 highlight_language = "none"  # blocks without a language are output and formulas
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
-nb_execution_mode, nb_execution_timeout, nb_execution_raise_on_error = "force", 300, True
+nb_execution_mode, nb_execution_raise_on_error = "force", True
+nb_execution_timeout = 900  # seconds of a cell, which may compile kernels for minutes
 nb_merge_streams = nb_execution_in_temp = True
 KernelManager.transport_encryption.default_value = "auto"  # without it, kernels warn
 
