@@ -23,7 +23,7 @@ from lyceum_warp.runs.replay_files import read_replay
 from lyceum_warp.runs.saving import Saver
 from lyceum_warp.runs.task_copy import note_changes, run_params, task_copy
 from lyceum_warp.support.files import replaced
-from lyceum_warp.support.interrupts import Interrupted, ending, postponed
+from lyceum_warp.support.interrupts import Interrupted, postponed
 from lyceum_warp.support.validate import check_flag, check_function, check_kind, positive_number, whole_number
 from lyceum_warp.support.versions import versions
 from lyceum_warp.viz.cameras import CameraChoice, find_camera
@@ -216,7 +216,7 @@ def _learn(
     """Iterate for at most about ``limit`` seconds. All ranks save and end at the same iterations."""
     team, run, deadline = learner.team, saver.run, time.monotonic() + limit
     ended = False
-    with ending(), postponed(insist=team.size == 1) as noted:
+    with postponed(insist=team.size == 1) as noted:
         if saver.saved != learner.iteration:
             saver.save()
         while learner.iteration < iterations and not ended:
