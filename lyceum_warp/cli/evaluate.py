@@ -95,7 +95,7 @@ class Eval:
         run = Run.open(pretrained_run(str(self.folder)) if self.pretrained else self.folder)
         nworld = min(self.nworld, self.episodes)
         path = run.policy_file(self.which)
-        words, params = given(self.env) | self.physics.given(), parameters(self.param, self)
+        words, params = given(self.env) | given(self.physics), parameters(self.param, self)
         env = run_worlds(run, words, params, nworld=nworld, task=self.task, trust=self.trust)
         find_camera(env.model, camera)
         origin = _source(env, run)

@@ -221,7 +221,7 @@ def _worlds(
     task = plant.task.task
     value = None if options.value is None else load_value(options.value)
     config = options.mppi.on_top_of(task_config(task, value))
-    words = vars(options.planner) | options.planner_physics.given()
+    words = vars(options.planner) | given(options.planner_physics)
     if options.planner_model is not None:
         words["model"] = _model(options.planner_model)
 
@@ -256,7 +256,7 @@ def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) 
     if config.horizon > 1 and not {"horizon", "knots"} & flags.keys():
         horizons.append(config.horizon // 2)
     physics = [options.planner_physics.physics]
-    if not options.planner_physics.given():
+    if not given(options.planner_physics):
         physics = list(dict.fromkeys((_suggested_physics(task), *task.physics)))
     if len(samples) == len(horizons) == len(physics) == 1:
         return None

@@ -208,7 +208,7 @@ class Train:
 
     def configuration(self, source: Run | None, team: Team) -> Configuration:
         """The configuration of the source run, or the defaults, overridden by the given flags."""
-        words = given(self.env) | self.physics.given()
+        words = given(self.env) | given(self.physics)
         for name, value in (("nworld", self.nworld), ("seed", self.seed)):
             if value is not None:
                 words[name] = value

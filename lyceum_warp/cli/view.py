@@ -202,7 +202,7 @@ def _planner(options: View, env: Env) -> MPPI:
 
 def _words(options: View) -> dict[str, Any]:
     """The options of the worlds, or with --mppi of the planner's worlds."""
-    return given(options.place) | options.physics.given()
+    return given(options.place) | given(options.physics)
 
 
 def _run(options: View, seconds: float) -> Run:
