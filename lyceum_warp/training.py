@@ -162,8 +162,8 @@ def train(
             if resume:
                 _load_checkpoint(run, learner, settings, display.note if leads else log.debug)
         saver = Saver(
-            run if leads else None, learner, keep_every=keep_every, save_every=save_every,
-            saved=learner.iteration if resume else -1, lock=lock, note=display.note,
+            run if leads else None, lock, learner, keep_every=keep_every, save_every=save_every,
+            saved=learner.iteration if resume else -1, note=display.note,
         )  # fmt: skip
         callbacks: list[Callback] = []
         if leads:
