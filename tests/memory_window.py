@@ -1,4 +1,4 @@
-"""Replace the window process by an object that collects frames and sends a test's commands."""
+"""Replace the window process by an object that collects frames and sends the commands of a test."""
 
 import time
 from collections import deque

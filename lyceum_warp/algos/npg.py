@@ -37,7 +37,7 @@ from lyceum_warp.support.docstrings import document_attributes
 log = logging.getLogger(__name__)
 
 _SHORTER = 4
-"""Maximum number of times that a step, or a change of the normaliser, is shortened."""
+"""Maximum number of times that NPG shortens a step or a change of the normaliser."""
 
 _LARGEST = 1e30
 """Bound on rewards, so that float32 can represent the sum of an episode's rewards."""
@@ -283,7 +283,7 @@ class NPG(OnPolicyLearner):
                 square = (old_mean - mean(obs)).square()
                 kl = 0.5 * (square * torch.exp(-2 * self.policy.log_std)).sum(-1).mean()
                 kl = self.team.sum(kl) / self.team.size
-                if self._reads_numbers and kl <= limit:  # more rounds would change nothing
+                if self._reads_numbers and kl <= limit:  # further rounds would not change it
                     break
                 part = torch.where(kl <= limit, part, part * (limit / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5))
             normalizer.interpolate(before, after, part)
@@ -312,7 +312,7 @@ class NPG(OnPolicyLearner):
     def move(
         self, step: torch.Tensor, obs: torch.Tensor, old_mean: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Add a step, or a fraction of it, to the policy's parameters, within the limit of the KL divergence.
+        """Add a step to the policy's parameters, or a fraction of the step that obeys the limit of the KL divergence.
 
         The Fisher information approximates the KL divergence only to second order and on a subset of the samples. If
         the measured divergence exceeds its limit, the step is shortened by the second-order estimate, at least by half,
@@ -350,7 +350,7 @@ class NPG(OnPolicyLearner):
         fraction = finite.float()
         for _ in range(_SHORTER):
             kl = measured(fraction)
-            if self._reads_numbers and kl <= limit:  # more rounds would change nothing
+            if self._reads_numbers and kl <= limit:  # further rounds would not change it
                 break
             factor = (wanted / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5)
             fraction = torch.where(kl <= limit, fraction, fraction * factor)

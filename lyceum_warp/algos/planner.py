@@ -58,7 +58,7 @@ _BUFFERS = (
     "actions", "nominal", "knot_actions", "standard_noise", "adapted_noise", "sampled", "model_returns", "returns",
     "weights", "model_fields",
 )  # fmt: skip
-_MODELS = 0x6D6F64656C73  # "models" in ASCII: derives different seeds from the planner's
+_MODELS = 0x6D6F64656C73  # "models" in ASCII; with the planner's seed, it gives the seeds of the models
 _DRAWING = ("startup", "initialize", "randomize")
 """The task functions that can randomize a planner's model fields."""
 
@@ -135,7 +135,7 @@ class Planner:
     weights: torch.Tensor
     """The samples' weights, (samples,)."""
 
-    _only_update: str | None = None  # the only update of a subclass
+    _only_update: str | None = None  # the update of a subclass that has only one
 
     def __init__(
         self,
@@ -165,7 +165,7 @@ class Planner:
         self.env.reset()
         self.timestep, self.between = self.env.timestep, self.config.between
         self._initial = self.env.get_state()[0]
-        for name, row in self.env.engine.nominal.items():  # a robot has the nominal model, not one drawn by startup
+        for name, row in self.env.engine.nominal.items():  # for a robot, not what startup drew
             self._initial[self.env.state_space.parts[name]] = torch_view(flat(row))[0].double()
         if "lasting_memory" in self.env.task.writes.get("startup", ()):
             self._initial[memory_columns(self.env.task, self.env.state_space)["lasting_memory"]] = 0.0

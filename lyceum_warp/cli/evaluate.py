@@ -62,7 +62,7 @@ class Eval:
     episodes: int = 32
     """Number of episodes."""
     seed: int = 1
-    """Seed of the initial states, which differ from those of training with this seed."""
+    """Seed of the initial states; training with the same seed draws different ones."""
     nworld: int = 32
     """Maximum number of worlds; never more than episodes."""
     video: bool = False

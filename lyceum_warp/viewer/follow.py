@@ -1,4 +1,4 @@
-"""Follow a training run: show its newest policy in worlds of the viewer's own.
+"""Follow a training run: show its newest policy in separate worlds.
 
 The viewer only reads the run's files. So the run has the same numbers with and without it, also on another machine that
 shares the folder.
@@ -61,7 +61,7 @@ class Follower:
         return read_checkpoint(self.run.policy_file(), self.device, parts=("iteration", "policy"))
 
     def _stamp(self) -> tuple[int, int, int] | None:
-        """Numbers that change when the file is replaced."""
+        """Attributes of the file that change when it is replaced."""
         try:
             found = os.stat(self.run.policy_file())
         except OSError:
@@ -120,7 +120,7 @@ class RunViewer:
             self._process.stdin.flush()
 
     def _print(self) -> None:
-        """Print the lines of the process above a live display, which redirects only what this process prints."""
+        """Print the viewer's output through this process, so that a live display stays below it."""
         assert self._process.stdout is not None
         for line in self._process.stdout:
             print(line, end="", flush=True)

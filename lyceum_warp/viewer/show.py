@@ -47,7 +47,7 @@ def view(
         host: Address to serve the page on. The default is the loopback address, which other machines cannot reach.
         port: Port of the page; by default the first free port from 8080.
         watchers: Functions that are called about twice a second and return new messages, a sequence of strings.
-        block: Whether to return only when the user quits. False steps the worlds in a thread: leave them to it until
+        block: Whether to return only when the user quits. False steps the worlds in a thread: do not use them before
             the view is closed. The default is False in a notebook, which then shows a link to the page.
 
     Returns:
@@ -75,8 +75,8 @@ def view(
 class BackgroundView:
     """A view whose worlds are stepped in a thread; ``lw.view`` returns it if it does not block.
 
-    A notebook shows it as a link. It cannot show the page itself, which needs memory shared between threads: browsers
-    allow that only in pages of their own.
+    A notebook shows it as a link. A notebook cannot embed the page: its threads share memory, which browsers do not
+    allow in embedded pages.
     """
 
     def __init__(self, session: Session, window: Window) -> None:

@@ -70,7 +70,7 @@ def heavy_arm() -> mujoco.MjSpec:
     return spec
 
 
-# override the reward weights that the task's planning sets
+# undo the reward weights that the task's planning sets
 HOPPER = dict(task="hopper", horizon=12, samples=24, temperature=0.5, noise=0.8, healthy_reward=1.0,
               forward_reward_weight=1.0, integrator="euler")  # fmt: skip
 POINT = dict(task="point_mass", horizon=9, samples=40, temperature=0.3)
@@ -154,7 +154,7 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
         assert summary["mean_return"] == pytest.approx(plain.returns.mean(), rel=1e-4)
         assert summary["effective_samples"] == pytest.approx(1 / (plain.weights**2).sum(), rel=1e-2)
         assert summary["failed_samples"] == 0
-        plain.knots = plan.knot_actions.double().numpy()  # at low temperatures differences would grow
+        plain.knots = plan.knot_actions.double().numpy()  # a low temperature would amplify rounding differences
         if plan.adapted_noise is not None:
             plain.deviation = plan.adapted_noise.double().numpy()
         plant.step(action[None])
@@ -326,7 +326,7 @@ def test_actions_stay_within_the_control_ranges() -> None:
         assert (plan.actions >= low).all() and (plan.actions <= high).all()
         at_bounds = (plan.sampled == low) | (plan.sampled == high)
         assert at_bounds.float().mean() > 0.5
-    free = MPPI(Picky, noise=10.0, horizon=4, limit=1e9)  # its controls are unlimited
+    free = MPPI(Picky, noise=10.0, horizon=4, limit=1e9)  # Picky's controls are unlimited
     free(free.state_of())
     assert free.sampled.abs().max() > 10
 
@@ -488,7 +488,7 @@ def test_half_cheetah_runs() -> None:
 
 @pytest.mark.long
 def test_hopper_hops_without_falling() -> None:
-    """With other tasks' settings, it falls after about 100 steps."""
+    """With the settings of other tasks, the robot falls after about 100 steps."""
     plant, rewards, evals = drive("hopper", 130, 1)
     assert len(evals) == 130 and not plant.terminated.item()
     assert evals[-1] > 0.3 and rewards.sum() > 165, (evals[-1], rewards.sum())
@@ -497,8 +497,8 @@ def test_hopper_hops_without_falling() -> None:
 def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
     """Return the mean return over runs of 100 steps, and the standard deviation of this mean if coins are unknown.
 
-    Plant and planner have equal seeds. If no action depends on its coin, the variance of a return, the sum of action
-    times coin, is the sum of the squared actions.
+    Plant and planner have equal seeds. A return is the sum of action times coin. If no action depends on its coin, its
+    variance is the sum of the squared actions.
     """
     plan = MPPI(task, engine="mujoco", horizon=4, noise=2.0, smoothing=(1, 0, 0))
     plant = lw.make(task, autoreset=False)

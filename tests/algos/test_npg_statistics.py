@@ -95,7 +95,7 @@ def test_metric_means_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
     for processes in ([numbers(slice(None))], parts):
         assert summary(processes, 10, list(expected))["metrics"] == pytest.approx(expected, rel=1e-5)
     steps = {name: values.mean().item() for name, values in rollout.metrics.items()}
-    for count in (rollout.env.nworld, 1):  # one process, and one process per world
+    for count in (rollout.env.nworld, 1):  # one process for all worlds, and one process per world
         shares = [numbers(slice(k, k + count)) for k in range(0, rollout.env.nworld, count)]
         assert summary(shares, 10, list(steps))["step_metrics"] == pytest.approx(steps, rel=1e-5)
     none = [part._replace(episodes=EpisodeSums(*[0.0] * 9), metrics=(0.0,) * 4) for part in parts]

@@ -60,7 +60,7 @@ def test_plans_for_several_plants_equal_single_planners(update: str) -> None:
             plan(states[i])
             torch.testing.assert_close(together.standard_noise[:, i], plan.standard_noise)
             torch.testing.assert_close(together.returns[i], plan.returns, rtol=1e-3, atol=1e-3)
-            # rounding differences may change the elites, so compare plans computed from identical returns
+            # rounding may change the elites, so both plans are computed from the same returns
             if torch.equal(together.returns[i], plan.returns):
                 torch.testing.assert_close(actions[i].to(CUDA), plan.actions[0])
             plan.actions.copy_(together.actions[:, i])

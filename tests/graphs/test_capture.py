@@ -181,7 +181,7 @@ def test_forget_captures_changed_launches_again() -> None:
     calls = made.sequence([Phase("digit", lambda: wp.launch(append, 1, [digit[0], digits.number], device="cpu"))])
     assert [digits.after(calls) for _ in range(3)] == [1] * 3
     digit[0] = 2
-    assert digits.after(calls) == 1  # the graph holds the argument
+    assert digits.after(calls) == 1  # the graph keeps the argument alive
     made.forget()
     assert [digits.after(calls) for _ in range(3)] == [2] * 3
 

@@ -23,7 +23,7 @@ from lyceum_warp.tasks.dm import TASKS
 
 DATA = Path(__file__).parent.parent / "data" / "dm_control"
 LAST_SUBSTEP = ("touch", "imu", "force_torque")
-"""Parts of observations that the last substep leaves, so that they are not functions of the state."""
+"""Parts of observations that the last substep computed, and that therefore are not functions of the state."""
 RESETS = 512
 QUICK = ("dm/cartpole_swingup", "dm/finger_turn_hard", "dm/manipulator_bring_ball", "dm/walker_walk")
 EVERY = [pytest.param(task, marks=() if task in QUICK else pytest.mark.long) for task in TASKS]
@@ -137,7 +137,7 @@ def test_a_task_has_dm_controls_sizes_and_times(shared_env: SharedEnv, task: str
     assert env.model.opt.timestep == pytest.approx(theirs["timestep"])
     np.testing.assert_allclose(env.action_space.low, theirs["minimum"])
     np.testing.assert_allclose(env.action_space.high, theirs["maximum"])
-    # every episode has a first step, the steps between and a last one, whose discount is 1: it ends, but not the task
+    # an episode has a first step, middle steps and a last step; a discount of 1 shows that the time limit ended it
     assert (theirs["step_type"] == [0, *(env.task.task.horizon - 1) * [1], 2]).all() and (theirs["discount"] == 1).all()
 
 

@@ -459,8 +459,8 @@ class Numbers:
     steps: list[tuple[float, float, bool]]
 
     def changed(self, default: "Numbers") -> float:
-        """Return the fraction of terminal steps if terminations differ from the default's; otherwise of changed
-        steps."""
+        """Return the fraction of terminal steps if the terminations differ from the default; otherwise the fraction of
+        changed steps."""
         ends, default_ends = ([step[2] for step in numbers.steps] for numbers in (self, default))
         if ends != default_ends:
             return float(np.mean(ends))

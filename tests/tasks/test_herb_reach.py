@@ -42,7 +42,7 @@ ARM = {  # range in rad (Barrett D1001, tables 5 and 6; HERB turns the first joi
 }
 FINGERS = {"j00": 180, "j10": 180, "j01": 140, "j11": 140, "j21": 140, "j02": 48, "j12": 48, "j22": 48}  # degrees
 
-# inertias (xx, yy, zz, xy, xz, yz) of the WAM's links in Barrett's frames, whose z axis is that of the next joint
+# inertias (xx, yy, zz, xy, xz, yz) of the WAM's links in Barrett's frames, whose z axes are the axes of the next joints
 INERTIAS = {
     "wam1": (0.13488033, 0.11328369, 0.09046330, -0.00213041, -0.00012485, 0.00068555),
     "wam2": (0.02140958, 0.01377875, 0.01558906, 0.00027172, 0.00002461, -0.00181920),

@@ -181,7 +181,7 @@ class Live:
         self._clock += 1
         self.made += 1
         ended, reward = self._ended.copy_(env.done), self._reward.copy_(env.reward)
-        if not env.autoreset:  # done stays set, and the return stays the episode's
+        if not env.autoreset:  # done stays set, and the return keeps its value
             ended.logical_and_(~self._over)
             reward.masked_fill_(self._over, 0.0)
         self.returns.add_(reward)

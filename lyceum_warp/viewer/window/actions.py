@@ -20,7 +20,7 @@ MANY_STEPS = 50
 _DRIVING = tuple(getattr(imgui.Key, name) for name in "WSADQE")  # ahead, back, left, right, turn left, turn right
 
 KEY_NAMES = {"Right": "RightArrow", "Left": "LeftArrow", "Up": "UpArrow", "Down": "DownArrow"}
-"""Studio's names of keys that have others here."""
+"""Studio's names of keys that the panel names differently."""
 
 
 class Actions:

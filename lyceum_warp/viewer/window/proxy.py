@@ -289,8 +289,8 @@ class Proxy:
         }
         if not _is_cross_site(request):
             return web.Response(status=303, headers={**headers, "Location": target})
-        # After a link on another site, browsers send the cookie (SameSite=Strict) neither at once nor after a redirect,
-        # but when a page of this site leads on.
+        # If the user follows a link on another site, browsers do not send a SameSite=Strict cookie, not even after a
+        # redirect. They send it after this page, which belongs to the proxy's site.
         page = f'<!doctype html><meta http-equiv="refresh" content="0; url={target}">'
         return web.Response(text=page, content_type="text/html", headers=headers)
 

@@ -40,7 +40,7 @@ class ExtraGeoms:
         self.model, self.limit = model, limit
         self._data = mujoco.MjData(model)
         self._options, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
-        # with room for one ghost beyond the limit
+        # beyond the limit, there is room for one more ghost
         self._scene = mujoco.MjvScene(model, limit + 2 * (model.ngeom + model.nsite) + 10)
 
     def draw(

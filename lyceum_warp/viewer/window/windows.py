@@ -11,7 +11,8 @@ from lyceum_warp.viewer.window.actions import MANY_STEPS, OTHER_KEYS, SPEEDS, Ac
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS, PLOT_SECONDS = 200, 20.0
-"""Maximum number of points of a plotted curve, all of which each frame sends to the browser, and its length."""
+"""Maximum number of points of a plotted curve, and its length in seconds. Every frame sends all points to the
+browser."""
 WINDOWS = ("messages", "curves", "view", "keys")
 
 
@@ -381,7 +382,7 @@ class Curves:
         """(points, 2 + number): times in seconds, whether an episode ended, then a value per curve."""
 
     def add(self, rows: np.ndarray) -> None:
-        """Append points. If time goes back, as after steps back, later points are dropped."""
+        """Append points. If time decreases, as after steps back, points of later times are dropped."""
         for part in np.split(rows, np.flatnonzero(np.diff(rows[:, 0]) < 0) + 1):
             if len(part):
                 kept = self.rows[: np.searchsorted(self.rows[:, 0], part[0, 0])]
