@@ -240,7 +240,7 @@ class Side:
 
     def start(self) -> None:
         path = os.pathsep.join([str(self.root), *filter(None, [os.environ.get("PYTHONPATH")])])
-        # a killed process leaves temporary files of Warp's compiler
+        # if the process is killed, Warp's compiler leaves temporary files
         own = {"PYTHONPATH": path, "TMPDIR": str(self.folder), "CUBLAS_WORKSPACE_CONFIG": ":4096:8"}
         with self._log.open("w") as log:
             # -P omits bench/ from the path, because its modules could shadow others; a new session can be killed as a

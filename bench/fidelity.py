@@ -46,7 +46,7 @@ class Options(experiment.Options):
     """Options of the comparison of engines."""
 
     steps: int = 1000
-    """Number of compared steps, at most an episode's."""
+    """Number of compared steps; at most the length of an episode."""
     nworld: int = 128
     """Number of worlds."""
 

@@ -1,4 +1,4 @@
-"""Compare the cost of an environment's step with the bare engine's, on the same states.
+"""Compare the time of an environment's step with the bare engine's time, on the same states.
 
 Environment and bare engine alternate every ten steps. The states before the environment's steps are copied to the bare
 engine, outside the clock, so that both step the same states, resets included, under the same machine load. The bare

@@ -174,7 +174,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    """Plot the returns of go1_velocity over seconds, together with mjlab's."""
+    """Plot the returns of go1_velocity over seconds, together with mjlab's returns."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         if (row.case["task"], row.case["algorithm"]) == ("go1_velocity", "ppo"):

@@ -56,7 +56,7 @@ def names(words: str) -> str:
 
 
 def modules(words: str) -> str:
-    """The documentation of modules whose functions have no names in the package itself, such as ``lw.walkers``."""
+    """The documentation of modules that are public names themselves, such as ``lw.walkers``."""
     lines = ["```{eval-rst}"]
     for word in words.split():
         module = importlib.import_module(f"lyceum_warp.{word}")
@@ -92,7 +92,7 @@ def is_public(cls: type) -> bool:
 
 
 def members(cls: type) -> list[str]:
-    """The public members of a class that have a docstring, with those of base classes without a public name."""
+    """The public members of a class that have a docstring, including members of base classes without a public name."""
     found: dict[str, None] = {}
     for base in reversed(cls.__mro__):
         if base is cls or (base.__module__.startswith("lyceum_warp.") and not is_public(base)):

@@ -102,7 +102,7 @@ class Env:
     metrics: dict[str, torch.Tensor]
     """The task's metrics of the last step by name, each (nworld,), float32."""
     episode_metrics: dict[str, torch.Tensor]
-    """The sums of the metrics over the episode of the last step, each (nworld,), float32."""
+    """The task's metrics summed over the episode up to the last step, each (nworld,), float32."""
     episode_metric_sums: torch.Tensor
     """``episode_metrics`` as one tensor, (nworld, number of metrics), in the order of ``metrics``."""
     shared: dict[str, torch.Tensor]
@@ -192,7 +192,7 @@ class Env:
             probe = Probe(self.task, worlds.after, worlds.params, self.device)
             probe.check_bounds()  # check writes before any function of the task writes into an array
             self.rand_reset(options.seed)
-            if self.task.dynamics and not _replica:  # a bad draw in a later reset is a fault of its world
+            if self.task.dynamics and not _replica:  # at later resets, invalid values are a fault of the world
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
             probe.check_observations()
             if not _replica:

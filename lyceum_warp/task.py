@@ -137,7 +137,7 @@ RESULTS = ("obs", "ctrl", "metrics", "rng", "sums", "shared")
 """Arguments that are rows for results, which a function may write."""
 
 MEMORIES = ("memory", "lasting_memory")
-"""The rows of floats that hold the parts of memory in World, one row of each kind per world."""
+"""The kinds of memory. Each world has one row of floats for each kind, which holds the parts of this kind in World."""
 
 GROUP_PREFIX = "observe_"
 """``observe_critic`` writes the group ``critic`` of the observations."""
@@ -449,9 +449,8 @@ class Task:
     lagged: ClassVar[tuple[str, ...]] = ()
     """Fields that keep the values left by ``mj_step``, one substep behind the state, as in some Gymnasium tasks."""
     cleared: ClassVar[tuple[str, ...]] = ()
-    """Fields left by the last substep, such as contact forces, to zero at the start of an episode. Other such fields
-    are computed at that time, which takes a forward pass of the worlds that restart. A reset clears them before
-    ``initialize``."""
+    """Fields left by the last substep, such as contact forces, to zero at the start of an episode. Without this entry,
+    a forward pass of the worlds that restart computes these fields. A reset clears them before ``initialize``."""
     actions: ClassVar[Mapping[str, int | str] | None] = None
     """The parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls;
     ``control`` then turns them into inputs. A size may be the name of a table in Params: one number for each of its
@@ -462,7 +461,7 @@ class Task:
     keyframe: ClassVar[str | None] = None
     """Name of the model's keyframe at which ``reset`` starts, before ``initialize``; None for the model's ``qpos0``."""
     draws: ClassVar[int] = 10
-    """The most random initial states that a reset draws while ``reject`` returns True; the last is kept."""
+    """Maximum number of initial states that a reset draws while ``reject`` returns True; the last one is kept."""
     settle: ClassVar[int] = 0
     """Substeps in which an initial state settles before the first observation of its episode, under its own controls
     and without ``substep``. The time then starts from 0."""
@@ -490,7 +489,7 @@ class Task:
 
     @staticmethod
     def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
-        """Return what a robot needs to run a policy, for the metadata of ONNX files: JSON values by name.
+        """Return metadata for ONNX files, such as gains, that a robot needs to run a policy: JSON values by name.
 
         The default is empty.
 
@@ -502,7 +501,7 @@ class Task:
         super().__init_subclass__(**keywords)
         if "gymnasium" not in vars(cls):
             cls.gymnasium = None
-        # copied now, because a later cell of a notebook may define another task with the same names
+        # a copy, because a later cell of a notebook may define another task with the same names
         module = vars(sys.modules[cls.__module__])
         cls.scope = {
             name: value

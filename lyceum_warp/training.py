@@ -78,8 +78,8 @@ def train(
     """Train, and write metrics, policies and checkpoints into a run folder, as ``lyceum-warp train`` does.
 
     ``lw.load(folder)`` returns the last policy, and ``lw.load(folder, which="best")`` the policy with the best return.
-    The return is ``mean_return`` if the learner evaluates the mean policy. Otherwise it is ``return_mean`` over the
-    iteration's sampled episodes, which the policy before the update generated.
+    The return is ``mean_return`` if the learner evaluates the mean policy. Otherwise the return is ``return_mean`` over
+    the iteration's episodes, which the policy sampled before the update.
 
     The policy and the complete state are saved at the start, at the end, and every 30 s, or more often if saving takes
     at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run resumes from the last save and produces the
@@ -213,7 +213,8 @@ def _learn(
     learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None,
     limit: float,
 ) -> None:  # fmt: skip
-    """Iterate for at most about ``limit`` seconds. All ranks save and end at the same iterations."""
+    """Iterate until the target, the last iteration or the time limit is reached; ``limit`` is in seconds. All ranks
+    save and end at the same iterations."""
     team, run, deadline = learner.team, saver.run, time.monotonic() + limit
     ended = False
     with postponed(insist=team.size == 1) as noted:
@@ -270,7 +271,7 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
         text = " ".join(str(error).split())
         raise ValueError(f"{run.checkpoint} does not fit the configuration beside it: {text}") from error
     if learner.team.leads:
-        cut_rows(run.metrics, done)  # a killed run may have rows for unsaved iterations
+        cut_rows(run.metrics, done)  # a killed run may have written rows of iterations that were not saved
         if changed := run.changed(versions(run.config["device"])):
             text = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
             note(f"versions have changed, so numbers may differ from an uninterrupted run's: {text}")

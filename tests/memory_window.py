@@ -11,7 +11,7 @@ from lyceum_warp.viewer.session.clock import Session
 
 
 class MemoryWindow:
-    """A window that shows nothing.
+    """A window that collects frames without showing them.
 
     Args:
         script: Called after each frame with the frame and its number; returns commands, or None to close the window.

@@ -134,8 +134,8 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     def _log(self) -> dict[str, torch.Tensor]:
         """Means of the metrics over recent episodes, computed on the device.
 
-        rsl_rl averages the log over the steps of an iteration. With means over only the last step, a step in which one
-        episode ended would weigh as much as a step in which a thousand ended.
+        rsl_rl averages the log over the steps of an iteration. If each log held only the last step, a step with one
+        finished episode would weigh as much as a step with a thousand.
         """
         env = self.env
         if not env.metrics:

@@ -174,7 +174,7 @@ def _generated(
         scope[f"observe_{number}"] = function
         noisy = draws_noise(function)
         observe.append(f"if group == {number}:")
-        if noisy:  # a stream for each group, so that no group's draws depend on another group
+        if noisy:  # a separate stream for each group, so that its draws do not depend on other groups
             observe.append(f"    rng[0] = substream(base, {number})")
         row = f"out.{group}[w]"
         if group in structs:

@@ -55,7 +55,7 @@ def layout(struct: Any, kind: str, params: Mapping[str, Any], owner: str) -> Lay
     """Lay out a struct's parts of one kind; ``params`` has the tables that determine sizes.
 
     Raises:
-        ValueError: A size is not a positive number, or names no table of Params.
+        ValueError: A size is neither a positive number nor the name of a table of Params.
     """
     slices, start = dict[str, Slice](), 0
     for name, part in parts_of(struct, owner).items():

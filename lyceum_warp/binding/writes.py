@@ -84,7 +84,7 @@ def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mappin
 
 
 def _advice(write: Write, name: str, rights: Mapping[str, Rights]) -> str:
-    """List the fields that the function may write, and the functions that may write this field."""
+    """Say which fields the function may write, and which functions may write this field."""
     may = [field for fields in rights[name].values() for field in fields or ()]
     results = [argument for argument, fields in rights[name].items() if fields is None and argument != "rng"]
     own = f"{name} may write {', '.join(dict.fromkeys([*results, *may])) or 'nothing'}"
@@ -155,7 +155,7 @@ class _Reader:
     ) -> None:
         self.arguments, self.writes, self.seen = arguments, writes, seen
         self.source = FunctionSource(function)
-        # by name, and "name.field" for a row in a local struct
+        # keys: a name, or "name.field" for a row in a local struct
         self.places: dict[str, _Place | None] = dict(zip(function.input_types, places, strict=True))
         # a loop may use a local struct in its first iteration, before a later line puts a row into it
         for _ in range(2):

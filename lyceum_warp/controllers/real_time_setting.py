@@ -70,8 +70,7 @@ def choose_setting(
 ) -> RealTimeChoice:
     """Choose the largest number of samples whose plans meet a deadline.
 
-    Shorter horizons, and after them other physics, are tried only if the smallest number of samples misses the
-    deadline.
+    If the smallest number of samples misses the deadline, shorter horizons are tried, and then other physics.
 
     Args:
         samples: Numbers of samples, in ascending order.

@@ -157,9 +157,9 @@ def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, 
     """The initial policy and value function for a learner, and their iteration.
 
     Args:
-        run: The run of the networks.
+        run: The run that saved the networks.
         which: Which policy of the run; None to resume the run. The networks are then None if the hyperparameters
-            describe them completely, which they do not if the run started from another run's networks or uses
+            describe them completely. They do not if the run started from the networks of another run, or if it uses
             ``limit``.
 
     Raises:

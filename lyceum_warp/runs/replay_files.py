@@ -30,7 +30,7 @@ def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, lo
     oldest = replay.stored - replay.count
     for start, end in _parts(replay, max(since, oldest), replay.stored):
         first = max(start, oldest)
-        rows = {  # the axis of the worlds comes first while they are gathered
+        rows = {  # gather concatenates along the first axis, so the axis of the worlds comes first
             name: team.gather(part.transpose(0, 1).contiguous()).transpose(0, 1).cpu().contiguous()
             for name, part in replay.rows(first, end).items()
         }
@@ -64,7 +64,7 @@ def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
     """
     oldest = max(0, stored - replay.steps)
     for start, end in _parts(replay, oldest, stored):
-        # a longer part, from a save whose checkpoint is lost, begins with the same steps
+        # the part may have grown in a later save whose checkpoint is lost; it begins with the same steps
         longer = sorted(path for path in folder.glob(f"{start:012d}-*.pt") if path.name >= _name(start, end))
         if not longer:
             raise ValueError(f"{folder} lacks steps {start} to {end} of the replay buffer")

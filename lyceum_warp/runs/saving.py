@@ -18,10 +18,10 @@ SAVE_SECONDS = 30.0
 """Maximum number of seconds between saves."""
 
 SHARE = 100
-"""A run is saved earlier once it has trained for this multiple of the last save's duration."""
+"""A run is saved earlier once it has trained this many times as long as the last save took."""
 
 LONG = 20
-"""A run is saved later if a save takes long: once it has trained for this multiple of the last save's duration."""
+"""After a long save, a run is saved only once it has trained this many times as long as the save took."""
 
 
 class Saver:

@@ -90,7 +90,7 @@ def check_success_steps(ctx: Context) -> None:
 
     The count belongs to the state; a reset clears it.
 
-    To see whether a state meets the goal, the check sets it with a full count and reads ``success``.
+    To find whether a state meets the goal, the check sets the state with a full count and reads ``success``.
     """
     a, b, needed = ctx.a, ctx.b, int(ctx.a.task.task.success_steps)
     if needed == 1:

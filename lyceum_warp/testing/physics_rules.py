@@ -16,7 +16,7 @@ from lyceum_warp.testing.context import SHORT, Context
 from lyceum_warp.world_arrays import memory_columns
 
 _SMALLEST = 1e-4
-"""Coordinates are compared only if inputs or model fields move at least one of them by this much."""
+"""If inputs and model fields move every coordinate by less than this, coordinates are not compared."""
 
 
 def predicted(

@@ -21,7 +21,7 @@ from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.tasks.velocity import TASKS as VELOCITY
 
 NWORLD = 32
-TASKS = [name for name in package_task_names() if not name.startswith("dm/")]  # their models add no new kind
+TASKS = [name for name in package_task_names() if not name.startswith("dm/")]  # dm_control's models add no feature
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 FORCE_PARTS = ("contact_force",)

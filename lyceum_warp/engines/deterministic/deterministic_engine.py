@@ -19,8 +19,8 @@ from lyceum_warp.graphs.capture import capturing
 from lyceum_warp.model_fields import ModelField
 
 _TIMES_THE_MEMORY = 5
-"""A world's memory relative to the estimate for the plain Warp engine: 4.9 on humanoid, 6.1 on half_cheetah and 6.3 on
-hopper (measured). ``prepare_capture`` measures it for the actual model."""
+"""Memory of a world, divided by the estimate for the plain Warp engine. Measured: 4.9 on humanoid, 6.1 on half_cheetah
+and 6.3 on hopper. ``prepare_capture`` measures it for the actual model."""
 
 _FEW = 256
 """Below this number of worlds, scratch memory fits on any device and is allocated on demand."""
@@ -33,7 +33,7 @@ class DeterministicEngine(WarpEngine):
     this between all launches. It takes the arguments of ``WarpEngine``.
     """
 
-    __signature__ = inspect.signature(WarpEngine)  # placement reads the option names from it
+    __signature__ = inspect.signature(WarpEngine)  # placement reads the names of the options from this signature
 
     partial_refresh = False
 
@@ -56,7 +56,7 @@ class DeterministicEngine(WarpEngine):
         """
         model, data = super().bare()
         with wp.ScopedDevice(self.device):
-            CanonicalOrder(model, data)  # the model's callbacks keep it alive
+            CanonicalOrder(model, data)  # the model's callbacks keep the sorter alive
         return model, data
 
     def prepare_capture(self) -> None:

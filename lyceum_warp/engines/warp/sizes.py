@@ -163,7 +163,7 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
     for _ in range(_HOLDS):
         batch.ctrl[:] = rng.uniform(low, high, size=(_WORLDS, model.nu))
         for _ in range(_SUBSTEPS):
-            # the counts are valid even if the memory is too small
+            # if the memory is too small, the counts are still correct
             with contextlib.suppress(SimulationError):
                 batch.step()
             contacts, constraints = max(contacts, int(ncon.max())), max(constraints, int(nefc.max()))

@@ -22,7 +22,7 @@ VISIBLE = (
     "body_quat", "jnt_pos", "jnt_axis", "qpos0", "mat_", "tendon_rgba", "tendon_width", "cam_", "light_", "hfield_",
     "mesh_", "skin_", "flex_",
 )  # fmt: skip
-"""Prefixes of fields that change the picture."""
+"""Prefixes of the model fields that change the drawing."""
 
 
 # ghosts and traces
