@@ -213,8 +213,7 @@ def _learn(
     learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None,
     limit: float,
 ) -> None:  # fmt: skip
-    """Iterate until the target, the last iteration or the time limit is reached; ``limit`` is in seconds. All ranks
-    save and end at the same iterations."""
+    """Iterate until the target, the last iteration or the time limit, in seconds; all ranks save and end together."""
     team, run, deadline = learner.team, saver.run, time.monotonic() + limit
     ended = False
     with postponed(insist=team.size == 1) as noted:
