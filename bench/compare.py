@@ -225,7 +225,7 @@ def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
 
 
 class Side:
-    """The subprocess of a checkout. It starts with the first request, and restarts if it has died.
+    """The subprocess of a checkout. The process starts with the first request, and restarts if it has died.
 
     Args:
         name: "old" or "new".

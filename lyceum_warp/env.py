@@ -291,7 +291,7 @@ class Env:
     def get_state(self, out: torch.Tensor | None = None, mask: torch.Tensor | None = None) -> torch.Tensor:
         """The complete state of every world, (nworld, state_space.size), float64; it determines the world's future.
 
-        It holds the engine's integration state, fields left by the last substep, model fields that differ between
+        A state holds the engine's integration state, fields left by the last substep, model fields that differ between
         worlds, the step and episode counters, the random stream, the task's memory, the metric sums, and the count for
         ``success_steps``. ``state_space.parts`` names their columns.
 

@@ -171,7 +171,7 @@ class Part:
 def memory(size: int | str = 1) -> Any:
     """Declare task memory, as a default in World: a row that ``advance`` or ``substep`` writes and a reset clears.
 
-    It belongs to the state. Its type is ``Row[float]``, ``Row[wp.vec3]`` or another row of numbers.
+    Task memory belongs to the state. The field's type is ``Row[float]``, ``Row[wp.vec3]`` or another row of numbers.
 
     Args:
         size: Number of elements, or the name of a table in Params: one element for each of its rows.
@@ -182,7 +182,8 @@ def memory(size: int | str = 1) -> Any:
 def lasting_memory(size: int | str = 1) -> Any:
     """Declare memory that outlives episodes, as a default in World: for instance the level of a curriculum.
 
-    It is cleared only when a world's random stream starts (``rand_reset(seed=...)``); ``startup`` may then write it.
+    Lasting memory is cleared only when a world's random stream starts (``rand_reset(seed=...)``); ``startup`` may then
+    write it.
 
     Args:
         size: Number of elements, or the name of a table in Params: one element for each of its rows.
@@ -332,8 +333,8 @@ class FromModel:
 def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
     """Declare a value that is computed from the compiled model and other parameters, as a default in Params.
 
-    ``mass: float = lw.from_model(lambda model, p: model.body_subtreemass[p.trunk])`` is the mass of the robot. It is
-        recomputed if another parameter changes, unless its own value was given.
+    ``mass: float = lw.from_model(lambda model, p: model.body_subtreemass[p.trunk])`` is the mass of the robot. The
+        value is recomputed if another parameter changes, unless it was given explicitly.
 
     Args:
         function: A function of the MjModel and of an object with parameters as attributes: the parameters with ordinary
@@ -356,8 +357,8 @@ class Planning:
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Options of the planner's worlds, by the names of ``lw.make``, such as ``{"physics": "fast"}``."""
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Parameters of the planner's worlds, by the names of the task's ``Params``. They are ignored if MPPI has a value
-    function, because it was fitted to the rewards of the unchanged task."""
+    """Parameters of the planner's worlds, by the names of the task's ``Params``. If MPPI has a value function, these
+    parameters are ignored, because the function was fitted to the rewards of the unchanged task."""
 
     def __post_init__(self) -> None:
         """Check the type of every part."""
@@ -436,8 +437,9 @@ class Task:
     World. The reward is dt times the sum of weight times term. ``lw.make(task, upright=2.0)`` and ``set_params`` change
     weights, and each term is a metric, with its weight and dt. ``env.task.reward_text`` shows the generated source."""
     terminations: ClassVar[tuple[str, ...]] = ()
-    """Names of functions that end the episode if one returns True, in place of ``terminated``. They may take ``s``,
-    ``p`` and the named arguments of terms. Each is a metric: 1 if it returns True after the step, otherwise 0."""
+    """Names of functions that end the episode if one returns True, in place of ``terminated``. The functions may take
+    ``s``, ``p`` and the named arguments of terms. Each function is also a metric: 1 if it returns True after the step,
+    otherwise 0."""
     metrics: ClassVar[tuple[str, ...]] = ()
     """Names of the metrics that ``measure`` writes. Without ``measure``, they are functions with the arguments of terms
     that return a float or a bool."""

@@ -23,8 +23,9 @@ RECENT = 100
 class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     """An environment for rsl_rl's runners: ``OnPolicyRunner(RslRlVecEnv("hopper", 4096, device="cuda"), config)``.
 
-    ``step`` never waits for the device. It returns copies of the observations, because rsl_rl stores observations only
-    after the next step. All other results are buffers that the next step overwrites; rsl_rl copies them before that.
+    ``step`` never waits for the device. ``step`` returns copies of the observations, because rsl_rl stores observations
+    only after the next step. All other results are buffers that the next step overwrites; rsl_rl copies them before
+    that.
 
     Args:
         task: A task, as in ``lw.make``, or an environment with automatic resets.

@@ -69,12 +69,12 @@ Value: TypeAlias = ValueFunction | wp.Function | Callable[[torch.Tensor], torch.
 class Planner:
     """A controller that replans at every step: ``action = plan(state)``.
 
-    The planner simulates in its own worlds, one per sample. It controls a plant: an environment, with
-    ``plan(env.get_state()[0])``, or a robot, with ``plan(plan.state_of(qpos=..., qvel=..., time=...))``. The plant's
-    model, physics, time step and parameters may differ from the planner's. If the planner's time step is a multiple of
-    the plant's, ``lw.control`` and ``lw.control_async`` apply the plan as ``between`` says. Random streams are
-    counter-based: a plan depends on the seed, on the number of plans before it, and on the plan it starts from. In each
-    sample, the task's functions draw from a separate stream seeded by the planner, so a plan cannot anticipate the
+    The planner simulates in its own worlds, one per sample. The controlled world is called the plant: an environment,
+    with ``plan(env.get_state()[0])``, or a robot, with ``plan(plan.state_of(qpos=..., qvel=..., time=...))``. The
+    plant's model, physics, time step and parameters may differ from the planner's. If the planner's time step is a
+    multiple of the plant's, ``lw.control`` and ``lw.control_async`` apply the plan as ``between`` says. Random streams
+    are counter-based: a plan depends on the seed, on the number of plans before it, and on the plan it starts from. In
+    each sample, the task's functions draw from a separate stream seeded by the planner, so a plan cannot anticipate the
     plant's random numbers.
 
     ``plants=n`` plans for n plants at a time, as in ``env.step(plan(env.get_state()))`` with n worlds. Plant i uses the
@@ -540,8 +540,8 @@ class MPPI(Planner):  # noqa: D101
 class CEM(MPPI):
     """The cross-entropy method: ``lw.CEM(task, ...)`` is ``lw.MPPI(task, update="cem", ...)``.
 
-    The mean of the best samples is the new plan. Their standard deviation becomes the standard deviation of the noise
-    and persists between calls; ``reset`` restores the initial one. Names in other packages:
+    The mean of the best samples is the new plan. The standard deviation of the best samples becomes the standard
+    deviation of the noise and persists between calls; ``reset`` restores the initial value. Names in other packages:
 
     ============= =============== ========================
     here          hydrax          judo

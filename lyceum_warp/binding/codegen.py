@@ -1,7 +1,7 @@
 """Generate the source that turns a task's functions of one world into kernels over a batch of worlds.
 
 The generated source defines a struct of the fields with an additional axis for the worlds, a function that returns a
-view of world w, and default functions. It is text, because Warp compiles source.
+view of world w, and default functions. Warp compiles source, so the result is text.
 """
 
 import dataclasses

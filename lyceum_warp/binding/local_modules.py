@@ -83,7 +83,7 @@ def stamps(files: Iterable[Path]) -> Stamps:
 def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
     """Context in which a task's file can import the modules beside it, as returned by ``local_modules``.
 
-    It replaces loaded modules of the same names if they have changed or come from another folder. If the block raises
+    Loaded modules of the same names are replaced if they have changed or come from another folder. If the block raises
     an error, ``sys.modules`` is restored.
     """
     before = {name: sys.modules.get(name) for name in modules}

@@ -99,7 +99,7 @@ def compile_model(
 ) -> mujoco.MjModel:
     """Compile a model for either engine.
 
-    - Newton replaces the PGS solver, which MuJoCo Warp lacks. It converges to the same accelerations.
+    - Newton replaces the PGS solver, which MuJoCo Warp lacks. Newton converges to the same accelerations.
     - Sleep is turned off, because a saved state does not say which bodies are asleep.
     - Fields that MuJoCo computes only for a sensor get such a sensor, after the model's own; if no field needs sensors,
       they are turned off. If a function reads the energy, its computation is enabled.

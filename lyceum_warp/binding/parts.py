@@ -89,7 +89,7 @@ def _floats(dtype: Any) -> int:
 def length(what: str, size: int | str, params: Mapping[str, Any]) -> int:
     """Resolve a size: a number, or the name of a table in ``params``, whose rows are counted.
 
-    ``what`` is its name in error messages.
+    ``what`` names the size in error messages.
 
     Raises:
         ValueError: The size is not a positive number or the name of a table.

@@ -139,7 +139,7 @@ class _Reader:
 
     Args:
         function: The function.
-        places: For each argument, the memory of the analysed function's arguments that it refers to, or None.
+        places: For each argument, the memory to which it refers among the arguments of the analysed function, or None.
         arguments: Names of the arguments of the analysed function.
         writes: Collects the writes.
         seen: The functions that were read, with their places.

@@ -56,8 +56,8 @@ class Eval:
     which: str = "last"
     """Which policy: last, best, or the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """A task, by name or file, to use with its own physics and defaults instead of the run's task. It may be the
-    current version of the run's task. Observations and actions must have the same sizes."""
+    """A task, by name or file, to use with its own physics and defaults instead of the run's task. The task may also be
+    the current version of the run's task. Observations and actions must have the same sizes."""
     param: ParamWords = ()
     episodes: int = 32
     """Number of episodes."""

@@ -36,7 +36,8 @@ class New:
     """Write a task file for a model, with a reward of zero; it can be checked, stepped and trained immediately.
 
     The policy observes positions, velocities and the model's sensors, or only the sensors if they measure every joint.
-    It acts through the model's actuators. A step lasts about 20 ms. Comments in the file explain the next steps.
+    The policy acts through the model's actuators. A step lasts about 20 ms. Comments in the file explain the next
+    steps.
 
     $ lyceum-warp new walk --model robots/dog.xml
     $ lyceum-warp new tasks/hop.py --model gymnasium:hopper.xml
@@ -53,8 +54,8 @@ class New:
 
     template: Literal["plain", "velocity"] = "plain"
     """velocity: a task of the family of walking robots, which follow velocity commands. The robot needs a floating
-    base, and legs made of hinges with one actuator each. Its file is short, because the family defines functions,
-    rewards and most parameters."""
+    base, and legs made of hinges with one actuator each. The task's file is short, because the family defines
+    functions, rewards and most parameters."""
     feet: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
     """With --template velocity: sites, geoms or bodies that are feet. By default, the ends of the legs that reach
     lowest."""

@@ -88,7 +88,7 @@ class Plan:
 
     With --real-time the world keeps its rate. The command then measures planning times for a few seconds, and chooses
     the largest number of samples that meets the deadline on this machine, or if none does, a shorter horizon or other
-    physics of the task. It does not change given values of --samples, --horizon and --physics.
+    physics of the task. Given values of --samples, --horizon and --physics do not change.
 
     The command writes config.json, versions.json, report.json, plan.png, a video of the first episode (video.mp4), and
     one file per episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy) into a

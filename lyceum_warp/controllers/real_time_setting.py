@@ -86,7 +86,7 @@ def choose_setting(
     for name in physics:
         for horizon in horizons:
             times: dict[int, float] = {}
-            low, high, tried = -1, len(samples), 0  # the number at index low meets the deadline, and at high misses it
+            low, high, tried = -1, len(samples), 0  # samples[low] meets the deadline, and samples[high] misses it
             while high - low > 1:
                 setting = RealTimeSetting(samples[tried], horizon, name)
                 found = times[samples[tried]] = measure(setting)

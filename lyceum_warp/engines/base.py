@@ -21,8 +21,8 @@ from lyceum_warp.support.docstrings import document_attributes
 class Engine(abc.ABC):
     """Many worlds of one model, stepped together.
 
-    An engine knows nothing of tasks. Its fields are Warp arrays with a leading ``nworld`` axis. Their addresses never
-    change, so graphs that read them are captured once.
+    An engine knows nothing of tasks. The fields of an engine are Warp arrays with a leading ``nworld`` axis. The
+    addresses of the fields never change, so graphs that read fields are captured once.
 
     The order of calls in a step is: write ``ctrl`` and other inputs, call ``step`` and ``find_faults``, read fields and
     ``fault``. For worlds that restart, the caller then calls ``reset``, writes state fields and model fields, and calls

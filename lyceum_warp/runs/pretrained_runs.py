@@ -16,7 +16,8 @@ def pretrained_tasks() -> list[str]:
 def pretrained_run(task: str) -> Path:
     """The folder of a task's pretrained policy; functions such as ``lw.load`` accept it like any run.
 
-    Its config.json holds the settings of the training, and under ``evaluated`` the return that the policy reached.
+    The folder's config.json holds the settings of the training and, under ``evaluated``, the return that the policy
+    reached.
 
     Example:
         >>> policy = lw.load(lw.pretrained_run("hopper"))

@@ -126,7 +126,7 @@ def check_success_steps(ctx: Context) -> None:
 def check_events(ctx: Context) -> None:
     """An event runs after a step is judged, and changes the state and the next observation of some worlds.
 
-    It does not run in worlds that restart, and worlds without an event keep every bit.
+    Events do not run in worlds that restart, and worlds without an event keep every bit.
     """
     a, b = ctx.a, ctx.b
     if a.task.functions["event"] is None:

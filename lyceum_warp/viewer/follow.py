@@ -97,8 +97,8 @@ class RunViewer:
     """Shows a run while it trains, in another process: ``with lw.RunViewer(folder): lw.train(npg, folder)``.
 
     The process waits for the folder, and shows the run's newest policy in worlds of its own on the CPU, at a lower
-    priority than the training. It ends with ``close``, at the end of a ``with`` block, and with this program. Closing
-    its window does not end the training.
+    priority than the training. The viewer ends with ``close``, at the end of a ``with`` block, and with this program.
+    Closing its window does not end the training.
 
     Args:
         folder: The run's folder, which need not exist yet.

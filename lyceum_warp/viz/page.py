@@ -33,7 +33,7 @@ def write_page(env: Env, states: torch.Tensor, out: str | Path, *, camera: Camer
     Args:
         env: Environment of the states.
         states: States of one world, one row per step, (steps, state_space.size).
-        out: The file. It is replaced when the page is complete.
+        out: The file. The file is replaced when the page is complete.
         camera: The first camera, as in ``write_video``. The page can turn it.
 
     Returns:

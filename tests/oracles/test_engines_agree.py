@@ -1,6 +1,6 @@
 """Compare the C engine with the Warp engine for every task of the package.
 
-Both run the same task functions on different physics: the C engine in float64, the Warp engine in float32. With
+Both engines run the same task functions on different physics: the C engine in float64, the Warp engine in float32. With
 pyramidal friction cones MuJoCo Warp uses a different contact frame for a capsule on a plane, so trajectories differ.
 These tests use elliptic cones, which do not depend on the contact frame.
 """

@@ -1,7 +1,7 @@
 """Compare tasks with their Gymnasium environments on the C engine.
 
-Both run the same C code in float64. From equal states, warm start included, they differ only by rounding of
-observations and rewards to float32. The tests read the tasks' attribute ``gymnasium`` and Gymnasium's registry and
+Both environments run the same C code in float64. From equal states, warm start included, they differ only by rounding
+of observations and rewards to float32. The tests read the tasks' attribute ``gymnasium`` and Gymnasium's registry and
 signatures, so they include new tasks automatically.
 """
 
@@ -207,7 +207,7 @@ def test_every_named_environment_is_registered() -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_a_thousand_steps_equal_gymnasiums(task: str) -> None:
-    """Some of the random actions are beyond the control range."""
+    """Some random actions exceed the control range."""
     pair = Pair(make_ours(task), make_theirs(task))
     assert pair.ours.timestep == pytest.approx(pair.theirs.dt, rel=1e-12)
     assert pair.ours.obs.shape == (1, *pair.theirs.observation_space.shape)

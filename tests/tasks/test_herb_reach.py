@@ -242,7 +242,7 @@ def reachable(model: mujoco.MjModel, goals: np.ndarray, start: np.ndarray) -> bo
 
 
 def test_success_needs_both_hands_for_ten_steps() -> None:
-    """One hand is not enough; a step off the target restarts the count, and a reset clears it."""
+    """Success needs both hands; a step off the target restarts the count, and a reset clears it."""
     env = lw.make("herb_reach", engine="mujoco", nworld=4, autoreset=False, horizon=0)
     offset = np.array([[0.0, 0.0], [0.06, 0.0], [0.0, 0.06], [0.045, -0.045]])
     put_targets(env, offset)

@@ -29,8 +29,8 @@ _FEW = 256
 class DeterministicEngine(WarpEngine):
     """A Warp engine whose steps are reproducible bit for bit on a CUDA device, as on the CPU.
 
-    It sorts contacts and constraint rows, makes MuJoCo Warp sum in a fixed order, and shares the scratch memory for
-    this between all launches. It takes the arguments of ``WarpEngine``.
+    The engine sorts contacts and constraint rows, makes MuJoCo Warp sum in a fixed order, and uses the same scratch
+    memory for all launches. The arguments are the same as for ``WarpEngine``.
     """
 
     __signature__ = inspect.signature(WarpEngine)  # placement reads the names of the options from this signature

@@ -109,7 +109,7 @@ class Arena(Reserve):
     """An allocator for loops and branches of CUDA graphs, where Warp cannot allocate.
 
     A run outside a graph allocates from the device, counts the bytes, and reserves the same number. Graphs then use the
-    reserve. They never run at the same time, so they can all share it.
+    reserve. The graphs never run at the same time, so they can share the reserve.
 
     Args:
         device: Where the launches run; on the CPU nothing is reserved.

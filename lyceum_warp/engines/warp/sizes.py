@@ -39,7 +39,7 @@ _known: dict[str, tuple[int, int]] = {}
 def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[int, int]:
     """Numbers of contacts and constraints to allocate for each world.
 
-    These are twice the peak of random rollouts, plus constraints that a task may turn on: inactive equality
+    The sizes are twice the peak of random rollouts, plus constraints that a task may turn on: inactive equality
     constraints, friction losses if they are randomized, and all limits if their ranges are randomized. In the rollouts,
     32 worlds start in the model's initial state or a keyframe, half of them with random velocities, and run 500
     substeps on the C engine under random controls, each held for 20 substeps. The result is cached per model.

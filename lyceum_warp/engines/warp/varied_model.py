@@ -166,8 +166,8 @@ _GROUPS = {
 class ModelConstants:
     """Recomputes constants in the worlds whose fields changed since the last call.
 
-    They are computed in a small group of worlds with a separate Data, because ``mujoco_warp.set_const`` overwrites the
-    kinematics.
+    The constants are computed in a small group of worlds with a separate Data, because ``mujoco_warp.set_const``
+    overwrites the kinematics.
 
     Args:
         model: The compiled model.

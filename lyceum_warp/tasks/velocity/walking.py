@@ -419,7 +419,7 @@ class BipedParams(Params):
 
 
 class Biped(Velocity):
-    """A robot with two legs, which is rewarded for steps and for a calm trunk. Its feet are given by two sites."""
+    """A robot with two legs, which is rewarded for steps and for a calm trunk. Two sites mark the feet."""
 
     frame_skip, keyframe = 5, "home"
     rewards = Velocity.rewards | {"action_rate_l2": -0.05, "single_stance": 2.0, "roll_pitch_rate_l2": -0.05}

@@ -141,7 +141,7 @@ class Live:
         """Make a step, or restore the state after a step that was taken back.
 
         Args:
-            act: Writes the actions of all worlds into ``env.action``. It is not called if the state is restored.
+            act: Writes the actions of all worlds into ``env.action``. If the state is restored, ``act`` is not called.
         """
         if self.past.ahead:
             self._move(1)
