@@ -264,7 +264,7 @@ class Side:
             self.start()
             self.answer()
         assert self._process is not None and self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # the answer gives the reason
+        with contextlib.suppress(BrokenPipeError):  # the answer then gives the reason
             print(json.dumps(unit), file=self._process.stdin, flush=True)
 
     def answer(self) -> dict[str, Any]:

@@ -138,7 +138,7 @@ def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **pl
             env.step()
 
     whole, alone = [], []
-    # captures graphs and leaves the initial states; a walking robot needs two seconds until it walks
+    # the steps capture graphs and leave the initial states; a robot walks only after two seconds
     warm = max(2 if policy is None else 20, env.horizon // 500)
     for repetition in range(warm + blocks):
         choose_actions()

@@ -234,7 +234,7 @@ def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
     functions, nact = own.functions, plain.action.shape[1]
     file = Path(sys.modules[parent.__module__].__file__ or "")
     source = file.read_text().replace("@lw.register\n", "")
-    own_model = r'"(\w+\.xml)"'  # relative to the task's file
+    own_model = r'"(\w+\.xml)"'  # the model's path is relative to the task's file
     source = re.sub(own_model, lambda m: repr(str(path)) if (path := file.parent / m[1]).exists() else m[0], source)
     fields = [f"    {name}: Row[float]\n" for name in ("userdata", "body_mass") if name not in own.world.vars]
     source = source.replace("class World:\n", "".join(["class World:\n", *fields]), 1)
@@ -318,7 +318,7 @@ def tally(
 def inject(case: Faults, options: Options) -> dict[str, Any]:
     """Step a task for a chunk with injected faults, together with a twin without faults."""
     torch.set_num_threads(1)
-    gc.collect()  # frees the environments of the previous chunk
+    gc.collect()  # free the environments of the previous chunk
     before = case.state(options.work, case.chunk)
     if case.chunk and not before.exists():
         raise Skipped(f"there is no {before}: give the folder in which chunk {case.chunk - 1} ran as --work")

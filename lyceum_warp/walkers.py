@@ -113,12 +113,12 @@ def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
     Lists are in the order of ``joints``.
     """
     actuators, stages = servos(model, p), np.asarray(p.stages)
-    # the part of the gain that the model defines
+    # the joint's own damping, which adds to the servo's
     damping = model.dof_damping[joint_dof(model, p)].reshape(len(actuators), -1)[:, 0]
     yaw, lateral = float(stages[:, 3].max()), float(np.max(p.lateral_velocity))
     return {
         "base": model.body(base(model)).name,
-        "velocimeter": np.asarray(p.imu).tolist(),  # position of the gyro on the base, m
+        "velocimeter": np.asarray(p.imu).tolist(),  # position on the base, m
         "joints": [model.joint(joint).name for joint in p.joints],
         "default_pose": np.asarray(p.default_pose).tolist(),
         "action_scale": np.asarray(p.action_scale).tolist(),

@@ -94,7 +94,7 @@ def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
     folder, bytecode = str(file.resolve().parent), sys.dont_write_bytecode
     sys.path.insert(0, folder)
     importlib.invalidate_caches()
-    sys.dont_write_bytecode = True  # the folder may be a run's copy, with time stamps in whole seconds
+    sys.dont_write_bytecode = True  # the folder may be a run's; bytecode compares times in whole seconds
     try:
         yield
     except BaseException:

@@ -36,7 +36,7 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         raise ValueError("a task's model must be a file or an MjSpec, not a compiled MjModel: give its MjSpec")
     if isinstance(source, mujoco.MjSpec):
         spec = source.copy()
-        spec.modelfiledir = str(Path(spec.modelfiledir).absolute())  # mesh paths are relative to the file's folder
+        spec.modelfiledir = str(Path(spec.modelfiledir).absolute())  # mesh paths are relative to this folder
         return spec
     if isinstance(source, ModelFile):
         return source.spec()

@@ -257,7 +257,7 @@ def test_a_sample_that_fails_in_one_model_fails() -> None:
 def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
     settings: dict[str, Any] = dict(horizon=4, samples=40, smoothing=(1, 0, 0), temperature=1.0, engine=engine)
     if how == "physics":
-        # motors so strong that only small actions keep MuJoCo's accelerations, and Warp's velocities, below 1e10
+        # strong motors: only small actions keep MuJoCo's accelerations and Warp's velocities below 1e10
         settings |= dict(noise=1.0, limit=1e9, model=rail({"mujoco": 1e10, "warp": 2.5e12}[engine]))
     elif how == "value":
         settings |= dict(noise=1.0, limit=1e9, value=lambda obs: torch.where(obs[:, 0] > 0, torch.nan, 1.0))
@@ -397,7 +397,7 @@ def test_a_value_function_gets_the_step_at_the_end_of_the_plan(engine: str) -> N
     value = lw.ValueFunction(6, (16,), scale=50.0, time_orders=2, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         torch.nn.init.xavier_uniform_(value.network[-1].weight)  # a new value function predicts 0
-        value.network[0].weight[:, 6:] *= 300  # so that ten steps change the value
+        value.network[0].weight[:, 6:] *= 300  # large weights, so that ten steps change the value
     settings = POINT | dict(engine=engine, noise=0.5)
     plan = MPPI(value=value, **settings)
 

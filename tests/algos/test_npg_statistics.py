@@ -33,7 +33,7 @@ def floats(sums: EpisodeSums) -> EpisodeSums:
 def rollout() -> lw.Rollout:
     env = lw.make(Metered, nworld=6)
     rollout = lw.Rollout(env, 150)
-    rollout.running_return[0] = math.nan  # an episode whose beginning was not sampled does not count
+    rollout.running_return[0] = math.nan  # an episode does not count if its first steps were not sampled
     generator = torch.Generator().manual_seed(1)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, log_std=0.0, generator=generator)
     rollout.collect(policy, torch.randn(rollout.action.shape, generator=torch.Generator().manual_seed(0)))

@@ -141,7 +141,7 @@ def test_a_resumed_run_keeps_its_tensorboard_and_video_settings(tmp_path: Path) 
     assert len(list(out.glob("events.out.tfevents.*"))) == 2
     config = Run.open(out).config
     assert (config.pop("tensorboard"), config.pop("video_every")) == (False, 0)
-    (out / "config.json").write_text(json.dumps(config))  # written by an earlier release
+    (out / "config.json").write_text(json.dumps(config))  # an earlier release wrote such a file
     assert cli.main([*resume, "4"]) == 0
 
 

@@ -43,7 +43,7 @@ N = 3
 def compiled(spec: mujoco.MjSpec | None = None) -> mujoco.MjModel:
     spec = spec or mujoco.MjSpec.from_string(XML)
     for body in spec.bodies[1:]:
-        body.simple = 0  # allows inertial frames to move
+        body.simple = 0  # simple="false" allows inertial frames to move
     return spec.compile()
 
 

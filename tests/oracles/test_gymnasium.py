@@ -391,7 +391,7 @@ def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
     fixed = spread < 1e-9
     np.testing.assert_allclose(b[:, fixed], a[:, fixed], atol=1e-6)
     a, b = ((x - middle)[:, ~fixed] / spread[~fixed] for x in (a, b))
-    # the mean, and the standard deviation, whose error follows from the fourth moment
+    # the mean and the standard deviation; the fourth moment determines the latter's error
     kurtosis = np.mean(a**4, axis=0)
     assert np.abs(b.mean(axis=0)).max() < 5.0 * math.sqrt(2.0 / n)
     assert (np.abs(b.std(axis=0) - 1.0) < 5.0 * np.sqrt((kurtosis - 1.0) / (2.0 * n))).all()

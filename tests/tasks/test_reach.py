@@ -149,7 +149,7 @@ def test_random_start_draws_every_joint_from_its_range() -> None:
     low, high = RANGES.T.astype(np.float32).astype(np.float64)
     middle = np.concatenate([(2.0 * qpos - low - high) / (high - low), targets(env) / (0.3, 0.2, 0.25)], axis=1)
     check_uniform(middle / (1.0 + 1e-6))
-    for _ in range(20):  # some start with the palm inside the table
+    for _ in range(20):  # some episodes start with the palm inside the table
         env.step(torch.zeros(2000, 7))
     assert not env.done.any()
 

@@ -77,6 +77,6 @@ def bytes_per_world(model: mujoco.MjModel, fields: Iterable[ModelField]) -> int:
     batch = Batch(model, 1, 1)
     models = WorldModels(batch, fields)
     moved = {field.name: 1.001 * field.value(model).reshape(1, -1).astype(np.float32) for field in models.fields}
-    models.apply(moved)  # constants that do not differ take no memory
+    models.apply(moved)  # a constant takes memory only if it differs
     expanded = [rows for name in MODEL_FIELDS if (rows := batch.expanded(name)) is not None]
     return sum(rows.nbytes for rows in expanded) + 4 * sum(field.size for field in fields)
