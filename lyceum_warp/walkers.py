@@ -68,7 +68,7 @@ def controls(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """A quarter of the position error at which each joint's servo reaches its force limit, rad, (joints,).
+    """A quarter of the position error, rad, at which the servo of each joint reaches its force limit, (joints,).
 
     0.25 * limit / kp, mjlab's scale of actions.
 

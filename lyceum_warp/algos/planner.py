@@ -80,7 +80,7 @@ class Planner:
     ``plants=n`` plans for n plants at a time, as in ``env.step(plan(env.get_state()))`` with n worlds. Plant i uses the
     seed ``seed + i`` for its noise, so its plan equals the plan of a single-plant planner with this seed on the same
     engine. With ``models``, all plants use the models of the first seed. All buffers except ``model_fields`` then have
-    an axis for the plants: the second axis if the first is steps or knots, otherwise the first.
+    an axis for the plants. It comes after an axis for steps or knots, and otherwise first.
 
     A task's ``planning`` (see ``lw.Planning``) provides default settings of the planner, and options and parameters of
     its worlds. Arguments override them.

@@ -1,4 +1,4 @@
-"""Find the writes of a Warp function, and of its callees, into its arguments.
+"""Find all places where a Warp function, or a function that it calls, writes into its arguments.
 
 The analysis follows elements, components, calls, local names of a row, and rows in the fields of a local struct. A row
 that is used in any other way (returned, put into a tuple, selected by ``wp.where``, passed to a native function) counts

@@ -213,7 +213,7 @@ def _stem(task: str) -> str:
 def _worlds(
     options: Plan, params: dict[str, Any], planner_params: dict[str, Any]
 ) -> tuple[Env, Callable[[RealTimeSetting | None], MPPI]]:
-    """Make the controlled world, and a function that makes its planner from a chosen setting or from the flags."""
+    """Make the controlled world, and a function that makes a planner from a measured setting or from flags."""
     steps: dict[str, Any] = {} if options.steps is None else {"horizon": whole_number("steps", options.steps, low=1)}
     plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
     if plant.horizon == 0:
@@ -228,7 +228,7 @@ def _worlds(
     def make(setting: RealTimeSetting | None) -> MPPI:
         chosen, physics = config, {}
         if setting is not None:
-            # the time between plans does not change
+            # keep the time between knots
             knots = config.knots and max(1, config.knots * setting.horizon // config.horizon)
             chosen = config.changed({"samples": setting.samples, "horizon": setting.horizon, "knots": knots})
             if setting.physics not in (None, _suggested_physics(task)):
@@ -245,7 +245,8 @@ _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
     """Choose the settings that are not given as flags, from measured planning times; None if all are given.
 
-    The deadline is a step of the plant, or if nothing meets it, a longer step of the planner.
+    The deadline is a step of the plant. If no setting meets it, the deadline is a step of the planner, which may be
+    longer.
     """
     task, flags = plant.task.task, given(options.mppi)
     config = options.mppi.on_top_of(task_config(task))

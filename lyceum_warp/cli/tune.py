@@ -158,5 +158,5 @@ def _planning_columns(reference: dict[str, Any]) -> dict[str, Cell]:
 
 
 def _short(ratio: float) -> str:
-    """A ratio of any size in few characters."""
+    """Format a ratio of any size in a few characters."""
     return f"{ratio:.0e}" if ratio >= 1e4 else f"{ratio:.2g}" if ratio < 10 else f"{ratio:,.0f}"

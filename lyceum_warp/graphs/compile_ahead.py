@@ -56,7 +56,7 @@ def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str)
             for future in concurrent.futures.as_completed(futures):
                 report(*future.result())
         finally:
-            pool.shutdown(cancel_futures=True)  # after an error, or Ctrl-C
+            pool.shutdown(cancel_futures=True)  # needed after an error or Ctrl-C
     return Built(len(missing), len(wanted) - len(missing), time.perf_counter() - start)
 
 

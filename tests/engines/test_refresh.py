@@ -229,7 +229,7 @@ def test_sensors_of_the_acceleration_stage_keep_their_values_from_the_last_subst
     np.testing.assert_array_equal(pushed[:, late], left[:, late])
     np.testing.assert_array_equal(pushed[[1, 3]], left[[1, 3]])
     assert (pushed[[0, 2]] != left[[0, 2]]).any()
-    # in a restored world, sensors belong to its state, before and after another refresh
+    # the sensors of a restored world belong to the restored state, also after another refresh
     engine.step(1)
     put(engine, before, only(engine, 1))
     engine.refresh_current(everyone(engine))
