@@ -82,9 +82,9 @@ class Settings:
 class Plan:
     """Control a task with a planner that replans at every step, and report rewards, success and planning times.
 
-    The planner is MPPI, or with --update the cross-entropy method (cem) or predictive sampling. Its default settings
-    come from the task. Physics options (--physics, --integrator, ...) apply only to the planner; --physics exact is the
-    controlled world's physics.
+    The planner is MPPI, or with --update the cross-entropy method (cem) or predictive sampling. The default settings of
+    the planner come from the task. Physics options (--physics, --integrator, ...) apply only to the planner; --physics
+    exact is the controlled world's physics.
 
     With --real-time the world keeps its rate. The command then measures planning times for a few seconds, and chooses
     the largest number of samples that meets the deadline on this machine, or if none does, a shorter horizon or other
@@ -123,7 +123,7 @@ class Plan:
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder; by default runs/plan-TASK-DATE."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """NPG or PPO run of this task. Its value function gives the value of each sample's final state."""
+    """NPG or PPO run of this task. The run's value function gives the value of each sample's final state."""
     param: ParamWords = ()
     planner_param: Repeated = ()
     """A parameter for the planner only, if it differs from the controlled world's; may be repeated."""

@@ -94,8 +94,8 @@ class Train:
     resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Continue the run in this folder exactly, with its settings, up to --iterations."""
     from_run: Annotated[Path | None, tyro.conf.arg(name="from", metavar="RUN")] = None
-    """Start a new run from the policy, the value function and the normaliser of this run. Its settings are the
-    defaults, except its parameters if TASK is a different task, and its hyperparameters if --algorithm is different."""
+    """Start a new run from the policy, the value function and the normaliser of this run. The run's settings are the
+    defaults, except the parameters if TASK is a different task, and the hyperparameters if --algorithm is different."""
     which: str = "last"
     """Which policy of --from: last, best, or the number of a saved iteration."""
     target_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None

@@ -34,7 +34,7 @@ class Tune:
 
     task: TaskWord
     run_folder: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
-    """A run of this task. Its policy also plays the episodes, and its task parameters are the defaults."""
+    """A run of this task. The run's policy also plays the episodes, and the run's task parameters are the defaults."""
     which: str = "last"
     """Which policy of --run: last, best, or the number of a saved iteration."""
     tolerance: Annotated[str, tyro.conf.arg(metavar="strict|loose|any")] = "strict"

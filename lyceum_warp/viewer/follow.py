@@ -44,7 +44,7 @@ class Follower:
         return acting(self.policy)(obs)
 
     def update(self) -> list[str]:
-        """Load new weights, if any; return messages about it."""
+        """Load new weights, if there are any, and return messages about them."""
         stamp = self._stamp()
         if stamp is None or stamp == self._seen:
             return []
