@@ -206,7 +206,7 @@ def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
         folder: An empty folder for it.
 
     Raises:
-        ValueError: ``given`` is neither.
+        ValueError: ``given`` is neither a folder with a checkout nor a revision.
     """
     if Path(given, PACKAGE, "__init__.py").is_file():
         yield Path(given).resolve(), str(Path(given).resolve())

@@ -115,7 +115,7 @@ def converted(text: str) -> list[str]:
 
 
 def short_signature(app: Any, what: str, name: str, obj: Any, options: Any, signature: str, result: str) -> Any:
-    """Leave out a dataclass's fields, which follow as members, and the fields of default values."""
+    """Remove a dataclass's fields, which are documented as members, and the fields of objects that are defaults."""
     if what == "class" and dataclasses.is_dataclass(obj):
         return "", result
     return signature and re.sub(r"(PhysicsOptions)\(.*?\)", r"\1()", signature), result

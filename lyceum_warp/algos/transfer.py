@@ -126,8 +126,8 @@ def transfer(
 
     The Warp engine is compared with the C engine under the environment's physics. On the C engine, each physics of the
     task and the environment's own physics are compared with the task's exact physics. The episodes of a pair have equal
-    random numbers: initial states, model fields, pushes and commands. Intervals of returns and lengths are Student's t
-    over the pairs; the interval of the terminated share is Agresti and Min's.
+    random numbers: initial states, model fields, pushes and commands. The intervals of returns and lengths use
+    Student's t over the pairs; the interval of the terminated share uses Agresti and Min's method.
 
     Args:
         env: An environment of the task; its worlds do not change.

@@ -85,7 +85,7 @@ def check_inputs(ctx: Context) -> None:
             before = env.get_state()
             b.set_state(before)
             b.action.copy_(action)
-            b.worlds.act()  # writes the inputs without stepping
+            b.worlds.act()  # compute the inputs without a step
             env.step(action)
             after = env.get_state()
             calm = ctx.calm(env) & ~ctx.faulty(env)

@@ -93,7 +93,7 @@ class SetGhosts:
     episodes: int = 0
     """Number of episodes to draw as ghosts, at the same step, beginning after the shown episode."""
     burst: int = 0
-    """Number of states along the trajectory, past red and future blue, at most ``MOST_BURST``."""
+    """Number of past (red) and future (blue) states along the trajectory, at most ``MOST_BURST``."""
     plan: bool = True
     """Whether the plan's final pose and the samples' traces are drawn."""
 

@@ -209,7 +209,7 @@ def _bytes_of(data: Any) -> int:
 
 
 def _margin(model: mujoco.MjModel) -> float:
-    """A world's memory relative to MuJoCo Warp's Data."""
+    """Memory of a world, divided by the memory of MuJoCo Warp's Data."""
     collides = (model.geom_contype | model.geom_conaffinity) != 0
     kinds = [int(kind) for kind in model.geom_type[collides]]
     convex = not _CONVEX.isdisjoint(kinds) or kinds.count(int(mujoco.mjtGeom.mjGEOM_BOX)) > 1

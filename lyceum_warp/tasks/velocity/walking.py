@@ -92,7 +92,7 @@ class Params:
     walking_pose_std: wp.array[float] = lw.from_model(lambda model, p: len(p.joints) * [0.3])
     soft_limit: float = 0.9  # share of a joint's range
     swing_target: float = 0.1  # height of a foot's site in a swing, m
-    longest_step: float = 0.4  # seconds in single stance from which the term is constant
+    longest_step: float = 0.4  # s; in a longer single stance the term is constant
     least_command: float = 0.05  # for smaller commands, the gait terms are 0 and the pose term uses standing_pose_std
     fall_angle: float = math.radians(70.0)
     least_height: float = 0.0  # of the base, m

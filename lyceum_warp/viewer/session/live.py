@@ -27,7 +27,7 @@ _CURVE_ROWS = 512  # curve points between two frames; older points are overwritt
 class Past:
     """Ring buffer with the states of all worlds before each of the last steps.
 
-    Without memory for two states of all worlds, it stays empty.
+    Without memory for two states of all worlds, the buffer stays empty.
 
     Args:
         env: The worlds.

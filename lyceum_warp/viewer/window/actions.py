@@ -87,7 +87,7 @@ class Actions:
             self.do(protocol.Drive(command))
 
     def toggle_driving(self) -> None:
-        """Begin to drive, from a standstill, or let the task draw commands again."""
+        """Start driving from a standstill, or return to commands that the task draws."""
         if self.scene.speeds is not None:
             self.do(protocol.Drive(None if self.status.driven else (0.0, 0.0, 0.0)))
 
