@@ -107,7 +107,7 @@ def estimate(case: Case) -> float:
 
 @torch.no_grad()
 def measure(case: Case, options: Options) -> dict[str, Any]:
-    """Run episodes in real time until their steps take the case's seconds."""
+    """Run episodes in real time until their total duration reaches the seconds of the case."""
     if case.task.startswith("adroit"):
         installed("gymnasium_robotics", "gymnasium-robotics")
     torch.set_num_threads(1)

@@ -67,8 +67,8 @@ class NPG(OnPolicyLearner):
             calls with the same arguments, and get the same statistics.
 
     Raises:
-        ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy
-            cannot be learned (``lyceum_warp.algos.policy_check``).
+        ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy is not
+            trainable (``lyceum_warp.algos.policy_check``).
         FloatingPointError: The policy's step or the value function's fit was not finite in 10 consecutive iterations.
             Such updates are skipped and counted in ``NPGIteration.skipped_updates``.
     """
@@ -315,9 +315,9 @@ class NPG(OnPolicyLearner):
         """Add a step to the policy's parameters, or a fraction of the step that obeys the limit of the KL divergence.
 
         The Fisher information approximates the KL divergence only to second order and on a subset of the samples. If
-        the measured divergence exceeds its limit, the step is shortened by the second-order estimate, at least by half,
-        up to four times. If that is not enough, or if the step is not finite, the policy does not change. The host does
-        not wait for the device.
+        the measured divergence exceeds its limit, the step is shortened to the second-order estimate, but at least by
+        half. This is repeated up to four times. If that is not enough, or if the step is not finite, the policy does
+        not change. The host does not wait for the device.
 
         Args:
             step: The step, (parameters,).

@@ -162,7 +162,7 @@ def test_a_run_keeps_its_physics(tmp_path: Path, made_envs: list[lw.Env], capsys
     assert cli.main([*resume, "3", "--solver", "iterations=7", "--integrator", "euler"]) == 0
     assert cli.main(["eval", str(out), "--episodes", "2", "--video"]) == 0
     assert {physics(env) for env in made_envs} == {(mujoco.mjtIntegrator.mjINT_EULER, 7, 9, True)}
-    assert {env.nworld for env in made_envs} == {1, 2, 32}  # the video; training and eval; the evaluation at the end
+    assert {env.nworld for env in made_envs} == {1, 2, 32}  # video, training and eval, final evaluation
     capsys.readouterr()
     for other, words in [
         (["--integrator", "rk4"], "has integrator euler, not rk4"),

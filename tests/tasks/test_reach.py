@@ -164,7 +164,7 @@ def put_targets(env: lw.Env, distance: np.ndarray) -> None:
 
 
 def test_success_needs_ten_steps_at_the_target() -> None:
-    """A larger distance does not shorten the ten steps. A reset clears the count, which is part of the state."""
+    """Success takes ten steps also with a larger distance. A reset clears the count, which is part of the state."""
     env = lw.make("reach", engine="mujoco", nworld=3, success_distance=np.array([0.05, 0.05, 0.99]), horizon=0)
     put_targets(env, np.array([0.0, 0.06, 0.0]))
     still = torch.zeros(3, 7)

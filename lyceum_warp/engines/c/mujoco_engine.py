@@ -88,7 +88,7 @@ class MujocoEngine(Engine):
         """The model that the batch runs."""
         # a world with a fault must be reported, not silently reset within a step
         self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        # The batch is not persistent. A persistent one could reuse the stages computed after the last step, but one
+        # The batch is not persistent. A persistent batch could reuse the stages computed after the last step, but one
         # MjData per world does not fit into the CPU's caches: the six tasks that need such stages became 4 to 33 %
         # slower (128 and 1,024 worlds on two cores).
         self.batch = Batch(self.native_model, nworld, self.nthread)

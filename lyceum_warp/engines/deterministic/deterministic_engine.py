@@ -52,7 +52,7 @@ class DeterministicEngine(WarpEngine):
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
         """Make another Model and Data with the same options and sizes, to benchmark MuJoCo Warp alone.
 
-        Graphs of their steps take about a hundred times the memory, because they do not share scratch memory.
+        A graph of their step takes about a hundred times the memory, because its launches do not share scratch memory.
         """
         model, data = super().bare()
         with wp.ScopedDevice(self.device):

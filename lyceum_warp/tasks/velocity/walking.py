@@ -116,11 +116,11 @@ class Params:
     joint_velocity_noise: float = 1.5
     # pushes
     push_seconds: wp.vec2 = wp.vec2(1.0, 3.0)
-    push_velocity: wp.vec3 = wp.vec3(0.5, 0.5, 0.4)  # +-, in the world's axes, m/s
-    push_spin: wp.vec3 = wp.vec3(0.52, 0.52, 0.78)  # +-, in the world's axes, rad/s
+    push_velocity: wp.vec3 = wp.vec3(0.5, 0.5, 0.4)  # largest, in the world's axes, m/s
+    push_spin: wp.vec3 = wp.vec3(0.52, 0.52, 0.78)  # largest, in the world's axes, rad/s
     # differences between robots
-    encoder_bias: float = 0.015  # +-, rad
-    trunk_offset: wp.vec3 = wp.vec3(0.025, 0.025, 0.03)  # +-, of the trunk's centre of mass, m
+    encoder_bias: float = 0.015  # largest, rad
+    trunk_offset: wp.vec3 = wp.vec3(0.025, 0.025, 0.03)  # largest shift of the trunk's centre of mass, m
     sliding_friction: wp.vec2 = wp.vec2(0.3, 1.5)
     spinning_friction: wp.vec2 = wp.vec2(1e-4, 2e-2)  # log-uniform, like the rolling friction
     rolling_friction: wp.vec2 = wp.vec2(1e-5, 5e-3)
@@ -128,7 +128,7 @@ class Params:
     start_height: float = lw.from_model(walkers.home_height)
     start_low: wp.vec3 = wp.vec3(-0.5, -0.5, 0.01)  # offset of the base, m
     start_high: wp.vec3 = wp.vec3(0.5, 0.5, 0.05)
-    start_yaw: float = 3.14  # +-
+    start_yaw: float = 3.14  # largest
 
 
 @wp.struct

@@ -262,7 +262,7 @@ class Stage:
         frame = self.frames.of_worlds(self.live, self.main, self._traces(), self._status, paused=self.paused)
         wanted, command, live = self.driving.wanted, frame.status.command, self.live
         if wanted and command and not live.past.ahead and not np.allclose(command, wanted, atol=1e-6):
-            self.driving.apply(live)  # a new episode, or another world
+            self.driving.apply(live)  # a new episode or another world has its own command
             live.expect_steps()
         return frame
 

@@ -240,7 +240,7 @@ class Windows:
                 imgui.SetItemTooltip(what)
         if self._scene.nworld > 1:
             changed, grid = imgui.Checkbox("grid: worlds beside each other", ghosts.grid)
-            if changed:  # as many as a browser draws
+            if changed:  # show as many worlds as a browser can draw
                 self._actions.set_ghosts(grid=grid, worlds=ghosts.worlds or min(self._scene.nworld - 1, MOST_GHOSTS))
         changed, plan = imgui.Checkbox("plan", ghosts.plan)
         if changed:
