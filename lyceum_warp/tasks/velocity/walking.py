@@ -128,7 +128,7 @@ class Params:
     start_height: float = lw.from_model(walkers.home_height)
     start_low: wp.vec3 = wp.vec3(-0.5, -0.5, 0.01)  # offset of the base, m
     start_high: wp.vec3 = wp.vec3(0.5, 0.5, 0.05)
-    start_yaw: float = 3.14  # largest
+    start_yaw: float = 3.14  # largest, rad
 
 
 @wp.struct
