@@ -65,8 +65,8 @@ class Options:
     new: tyro.conf.Positional[str] = str(ROOT)
     """The revision or folder to compare with; by default this working tree."""
     tasks: tuple[str, ...] = ()
-    """Tasks; by default all. The parts learners and commands compare only a few default tasks; if none of these is
-    given, they compare the given ones."""
+    """Tasks; by default all. The parts learners and commands compare only a few tasks by default; if none of these few
+    is given, they compare the given tasks."""
     engines: tuple[Literal["mujoco", "warp"], ...] = ENGINES
     """Engines."""
     device: str = "cpu"

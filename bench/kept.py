@@ -124,7 +124,7 @@ def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **pl
     bare = bare_engine(env)
 
     def choose_actions() -> None:
-        """Write the policy's next actions into ``actions``, off the clock."""
+        """Write the policy's next actions into ``actions``, outside the measured time."""
         if acting is not None:
             start = env.get_state()
             for t in range(BLOCK):

@@ -415,9 +415,9 @@ class Env:
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
         """A live view of a field of MjData or MjModel, by MuJoCo's name.
 
-        An environment keeps ``time``, ``ctrl`` and the fields that its task reads. Request others when you make it, as
-        in ``make("hopper", fields=["site_xpos", "body_mass"])``. Do not write into the view: use ``set_state`` or
-        ``set_dynamics``.
+        An environment keeps ``time``, ``ctrl`` and the fields that its task reads. Request other fields when you make
+        the environment, as in ``make("hopper", fields=["site_xpos", "body_mass"])``. Do not write into the view: use
+        ``set_state`` or ``set_dynamics``.
 
         Args:
             name: Attribute of MjData or MjModel, for instance "qpos", "site_xpos" or "body_mass".

@@ -217,7 +217,7 @@ class Planner:
             self._value_in_torch = True
             try:
                 self._torch_values()
-            # such as missing weights, another input size, or critics, which also take actions
+            # for example, weights are missing, the input size differs, or critics also take actions
             except (RuntimeError, TypeError) as error:
                 observations = described(self._value_obs)
                 raise ValueError(f"value cannot take observations {observations}: {error}") from error

@@ -107,8 +107,8 @@ def kernels_of(
 
     Args:
         source: The task.
-        groups: The functions that write its observation groups.
-        memory: The layouts of its rows of memory.
+        groups: The functions that write the task's observation groups.
+        memory: The layouts of the task's rows of memory.
         structs: The layouts of rows that functions access as structs: observation groups, Shared and Sums.
     """
     layouts = tuple((name, *layout.items()) for name, layout in (*memory.items(), *structs.items()))

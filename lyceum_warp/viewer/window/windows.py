@@ -34,7 +34,7 @@ class Windows:
         """Draw every open window."""
         size = imgui.GetIO().DisplaySize
         width, height = size.x, size.y
-        # the windows may be moved until the browser's window changes its size
+        # a moved window stays in its place until the size of the browser's window changes
         self._size, resized = (width, height), (width, height) != self._size
         cond = int(imgui.Cond.Always if resized else imgui.Cond.FirstUseEver)
         tall = min(len(self._plotted) * 138 + 60, height - 50)
