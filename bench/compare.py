@@ -203,7 +203,7 @@ def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
 
     Args:
         given: A folder, or a git revision whose package is unpacked.
-        folder: An empty folder for it.
+        folder: An empty folder for the checkout.
 
     Raises:
         ValueError: ``given`` is neither a folder with a checkout nor a revision.
@@ -444,7 +444,7 @@ def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
 
 
 def written(report: Report, options: Options, checkouts: Mapping[str, str], seconds: float) -> dict[str, Any]:
-    """Return the content of the file of --out."""
+    """Return the content for the file that --out names."""
     return {
         "checkouts": checkouts,
         "options": dataclasses.asdict(options) | {"out": str(options.out)},

@@ -173,7 +173,7 @@ class Memory:
 
 @dataclasses.dataclass(frozen=True)
 class Kills:
-    """A training that is killed and resumed."""
+    """A training run that is killed and resumed."""
 
     task: str
     words: str

@@ -257,7 +257,7 @@ def parameters(task: BoundTask) -> list[tuple[Any, ...]]:
 
 
 def spelled(default: Any, value: Any) -> str:
-    """A default as in a table."""
+    """Format a default value for a table."""
     elements = default if isinstance(default, list) else [default]
     if isinstance(default, FromModel):
         return "from the model"
@@ -291,7 +291,7 @@ def comments(task: type) -> dict[str, str]:
 
 
 def table(headings: tuple[str, ...], rows: list[tuple[Any, ...]]) -> list[str]:
-    """A table in Markdown, and a blank line."""
+    """Format a table in Markdown, followed by a blank line."""
     cells = [headings, ("---",) * len(headings), *rows]
     return [*(f"| {' | '.join(map(str, row))} |" for row in cells), ""]
 

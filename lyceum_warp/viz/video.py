@@ -204,7 +204,7 @@ class Recorder:
                 drawing.finish()
         except (NoVideoError, OSError) as error:
             self._error = NoVideoError(f"the video {self.out} was cancelled") if self._cancelled else error
-        except Exception as error:  # the thread has no caller
+        except Exception as error:  # the thread has no caller that could catch the error
             self._error = NoVideoError(f"the video could not be written ({' '.join(str(error).split())})")
         finally:
             self._done.set()
