@@ -65,8 +65,8 @@ class Options:
     new: tyro.conf.Positional[str] = str(ROOT)
     """The revision or folder to compare with; by default this working tree."""
     tasks: tuple[str, ...] = ()
-    """Tasks; by default all. The parts learners and commands compare only a few default tasks; if none of these is
-    given, they compare the given ones."""
+    """Tasks; by default all. The parts learners and commands compare only a few tasks by default; if none of these few
+    is given, they compare the given tasks."""
     engines: tuple[Literal["mujoco", "warp"], ...] = ENGINES
     """Engines."""
     device: str = "cpu"
@@ -203,10 +203,10 @@ def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
 
     Args:
         given: A folder, or a git revision whose package is unpacked.
-        folder: An empty folder for it.
+        folder: An empty folder for the checkout.
 
     Raises:
-        ValueError: ``given`` is neither.
+        ValueError: ``given`` is neither a folder with a checkout nor a revision.
     """
     if Path(given, PACKAGE, "__init__.py").is_file():
         yield Path(given).resolve(), str(Path(given).resolve())
@@ -225,7 +225,7 @@ def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
 
 
 class Side:
-    """The subprocess of a checkout. It starts with the first request, and restarts if it has died.
+    """The subprocess of a checkout. The process starts with the first request, and restarts if it has died.
 
     Args:
         name: "old" or "new".
@@ -240,7 +240,7 @@ class Side:
 
     def start(self) -> None:
         path = os.pathsep.join([str(self.root), *filter(None, [os.environ.get("PYTHONPATH")])])
-        # a killed process leaves temporary files of Warp's compiler
+        # if the process is killed, Warp's compiler leaves temporary files
         own = {"PYTHONPATH": path, "TMPDIR": str(self.folder), "CUBLAS_WORKSPACE_CONFIG": ":4096:8"}
         with self._log.open("w") as log:
             # -P omits bench/ from the path, because its modules could shadow others; a new session can be killed as a
@@ -264,7 +264,7 @@ class Side:
             self.start()
             self.answer()
         assert self._process is not None and self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # the answer gives the reason
+        with contextlib.suppress(BrokenPipeError):  # the answer then gives the reason
             print(json.dumps(unit), file=self._process.stdin, flush=True)
 
     def answer(self) -> dict[str, Any]:
@@ -444,7 +444,7 @@ def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
 
 
 def written(report: Report, options: Options, checkouts: Mapping[str, str], seconds: float) -> dict[str, Any]:
-    """Return the content of the file of --out."""
+    """Return the content for the file that --out names."""
     return {
         "checkouts": checkouts,
         "options": dataclasses.asdict(options) | {"out": str(options.out)},

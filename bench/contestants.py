@@ -118,8 +118,8 @@ def actions(env: lw.Env, seed: int) -> list[torch.Tensor]:
 class Native:
     """``mujoco.rollout`` without a task, with one call for each environment step.
 
-    It starts each step in the same state as lyceum_warp's environment, with the same controls, substeps and restarts,
-    but computes no observations or rewards.
+    Each step starts in the same state as lyceum_warp's environment, with the same controls, substeps and restarts, but
+    computes no observations or rewards.
     """
 
     def __init__(self, task: str, nworld: int, threads: int, seed: int, warm: int) -> None:

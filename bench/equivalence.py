@@ -75,7 +75,7 @@ def measure(case: Case, options: experiment.Options) -> dict[str, Any]:
         it = next(learner)
         assert it.return_mean is not None
         curve.append([it.samples, it.return_mean])
-    returns = [value for _, value in curve if math.isfinite(value)]  # NaN if no episode ended
+    returns = [value for _, value in curve if math.isfinite(value)]  # a return is NaN if no episode ended
     return {"area": sum(returns) / len(returns), "curve": [[n, v if math.isfinite(v) else None] for n, v in curve]}
 
 

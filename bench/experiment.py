@@ -433,7 +433,7 @@ def outcomes(
 
 def _measure_apart(measure: Callable[[Any, Any], Any], case: Any, options: Options) -> Any:
     """Measure a case in this subprocess, and end on SIGTERM or with the parent process."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that it ends its own subprocesses, too
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # KeyboardInterrupt also ends its subprocesses
     threading.Thread(target=_interrupt_after_parent, daemon=True).start()
     return measure(case, options)
 

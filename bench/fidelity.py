@@ -4,8 +4,8 @@
 
 Worlds of both engines start in the same float32 states and get the same random actions. The C engine (float64) is
 compared with the Warp engine (float32), with itself when its state is rounded to float32 after every step, and with
-itself from an initial state perturbed by float32 rounding. The last two comparisons give the scale: chaos separates any
-two trajectories, so the Warp engine is as accurate as float32 allows if it diverges no earlier than they do. A
+itself from an initial state perturbed by float32 rounding. Chaos separates any two trajectories, so the last two
+comparisons are the scale: if the Warp engine does not diverge earlier, it is as accurate as float32 allows. A
 difference is the largest difference of a world's observations, relative to the larger of 1 and the value. Contact
 forces are excluded, because a solver is accurate only to its tolerance. Worlds continue after the end of an episode,
 and are dropped at a fault.
@@ -46,7 +46,7 @@ class Options(experiment.Options):
     """Options of the comparison of engines."""
 
     steps: int = 1000
-    """Number of compared steps, at most an episode's."""
+    """Number of compared steps; at most the length of an episode."""
     nworld: int = 128
     """Number of worlds."""
 
@@ -152,7 +152,7 @@ def quantiles(error: torch.Tensor, shown: Sequence[int]) -> dict[str, list[float
 
 
 def half_apart(error: torch.Tensor) -> int | None:
-    """Return the number of steps after which half of the worlds have diverged; None if fewer have at the end."""
+    """Return the number of steps after which half of the worlds have diverged; None if fewer diverge."""
     ever = (error > APART).cummax(0).values.double().mean(1) >= 0.5
     return int(ever.int().argmax()) + 1 if ever.any() else None
 

@@ -109,7 +109,7 @@ def digest(folder: Path, options: Options) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Steps:
-    """What happened in each step of each world."""
+    """Outcomes of each step in each world."""
 
     velocity_error: torch.Tensor
     """(steps, nworld), m/s."""
@@ -166,7 +166,7 @@ def calm(env: lw.Env) -> dict[str, Any]:
 
 
 def home(env: lw.Env) -> torch.Tensor:
-    """Return the task's fixed initial state, with the first push never due."""
+    """Return the task's fixed initial state, but without pushes."""
     env.reset()
     state = env.get_state()
     env.state_space.split(state)["push_timer"][:] = NEVER

@@ -24,7 +24,7 @@ from lyceum_warp.controllers.control_report import wilson
 from lyceum_warp.support.machine import cpu_cores
 
 SECONDS = 20.0
-STARTS = dict(start_noise=0.02)  # rad and rad/s, uniform, of every joint
+STARTS = dict(start_noise=0.02)  # noise of every joint, uniform, rad and rad/s
 PUSHES = dict(push_times=[5.0, 10.0, 15.0], push_impulse=[10.0, 20.0])  # s; N s, in uniformly drawn directions
 TASKS = {
     "humanoid_stand": PUSHES, "humanoid_walk": PUSHES, "humanoid_get_up": dict(push_times=[15.0]),

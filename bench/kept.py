@@ -1,4 +1,4 @@
-"""Compare the cost of an environment's step with the bare engine's, on the same states.
+"""Compare the time of an environment's step with the bare engine's time, on the same states.
 
 Environment and bare engine alternate every ten steps. The states before the environment's steps are copied to the bare
 engine, outside the clock, so that both step the same states, resets included, under the same machine load. The bare
@@ -124,7 +124,7 @@ def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **pl
     bare = bare_engine(env)
 
     def choose_actions() -> None:
-        """Write the policy's next actions into ``actions``, off the clock."""
+        """Write the policy's next actions into ``actions``, outside the measured time."""
         if acting is not None:
             start = env.get_state()
             for t in range(BLOCK):
@@ -138,7 +138,7 @@ def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **pl
             env.step()
 
     whole, alone = [], []
-    # captures graphs and leaves the initial states; a walking robot needs two seconds until it walks
+    # the steps capture graphs and leave the initial states; a robot walks only after two seconds
     warm = max(2 if policy is None else 20, env.horizon // 500)
     for repetition in range(warm + blocks):
         choose_actions()

@@ -44,8 +44,8 @@ class Options(experiment.Options):
     horizons: tuple[int, ...] = ()
     """Horizons of plans, in steps; by default 16, 32 and 64."""
     physics: tuple[str, ...] = ()
-    """Names of the planner's physics: exact, or names that a task gives; by default the task's suggestion, and exact if
-    it suggests a name."""
+    """Names of the planner's physics: exact, or names that a task defines. By default the physics that the task
+    suggests, and exact if the suggestion has a name."""
     seconds: float = 10.0
     """Seconds of a case; the 99.9 % quantile needs a thousand plans."""
 
@@ -65,7 +65,7 @@ class Case:
     threads: int
     seconds: float
     repeat: int
-    """Also the seed of the first episode."""
+    """Number of the repeat, and seed of the first episode."""
 
 
 def cases(options: Options) -> list[Case]:
@@ -107,7 +107,7 @@ def estimate(case: Case) -> float:
 
 @torch.no_grad()
 def measure(case: Case, options: Options) -> dict[str, Any]:
-    """Run episodes in real time until their steps take the case's seconds."""
+    """Run episodes in real time until their total duration reaches the seconds of the case."""
     if case.task.startswith("adroit"):
         installed("gymnasium_robotics", "gymnasium-robotics")
     torch.set_num_threads(1)

@@ -5,10 +5,9 @@
 
 The time includes graph captures, sampling and updates, and excludes kernel compilation and evaluations. The mean
 return is taken over the last 100 episodes, without each world's first episode, which starts at a random step. If
-iterations are too short for whole episodes, it is taken over 16 separate episodes of the stochastic policy every few
-iterations. On go1_velocity a robot that stands still reaches high returns, too. For that
-task the mean policy therefore also walks for 10 s in new worlds, with noise and pushes, and its tracking errors and
-falls are measured.
+iterations are too short for whole episodes, the mean is taken over 16 separate episodes of the stochastic policy every
+few iterations. On go1_velocity a robot that stands still reaches high returns, too. So on this task the mean policy
+also walks for 10 s in new worlds, with noise and pushes, and its tracking errors and falls are measured.
 """
 
 import collections
@@ -49,7 +48,7 @@ class Options(experiment.Options):
     """Time until NPG or PPO reaches a target return."""
 
     algorithm: Literal["npg", "ppo"] | None = None
-    """Algorithm; by default the task's."""
+    """Algorithm; by default an algorithm for each task."""
     settings: tuple[str, ...] = ("default",)
     """Names of the settings to run: default, or "desired_kl 0.01" (PPO only)."""
     seconds: float = 300.0
@@ -174,7 +173,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    """Plot the returns of go1_velocity over seconds, together with mjlab's."""
+    """Plot the returns of go1_velocity over seconds, together with mjlab's returns."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         if (row.case["task"], row.case["algorithm"]) == ("go1_velocity", "ppo"):

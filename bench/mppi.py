@@ -9,7 +9,7 @@ plan from given states.
 The Python planner (python_mppi.py) sends one message per plan to each process. All planners control the same plant, and
 take turns in blocks of episodes. The contestants "a set at a time" run last: one planner controls the plants of all
 episodes of a set. With --jobs, blocks run at the same time, each in a subprocess on separate cores. ``mppi_fast`` plans
-with the physics that a task names "fast"; the plant keeps the task's own.
+with the physics that a task names "fast"; the plant keeps the exact physics.
 """
 
 import dataclasses
@@ -163,7 +163,7 @@ def run_episodes(case: Case, options: Options) -> dict[str, Any]:
         successes, returns, times = episodes_together(case, options, seeds)
     else:
         made, env = controller(case, options), plant(case.task, case.steps)
-        lw.control(env, made, seed=0, steps=3)  # captures graphs and wakes threads
+        lw.control(env, made, seed=0, steps=3)  # the first plan captures graphs and wakes threads
         done = [lw.control(env, made, seed=seed) for seed in seeds]
         successes, returns = [episode.succeeded for episode in done], [episode.episode_return for episode in done]
         times = [episode.wall_seconds for episode in done]
@@ -201,7 +201,7 @@ def episodes_together(
     return success.tolist(), returns.tolist(), [seconds] * case.count
 
 
-# plans from the same states
+# plans of all planners from the same states
 
 
 @functools.cache

@@ -108,7 +108,7 @@ class PythonMPPI:
             pipe, other = context.Pipe()
             settings = (task, int(share), config.horizon, config.noise, config.smoothing, i)
             context.Process(target=_roll_out, args=(other, *settings), daemon=True).start()
-            other.close()  # makes recv raise EOFError if the subprocess has ended
+            other.close()  # close this end, so that recv raises EOFError if the subprocess has ended
             self.pipes.append(pipe)
         for pipe in self.pipes:
             pipe.recv()

@@ -4,8 +4,8 @@
 
 Each line of results/rank-loss.jsonl is a task and a setting: the rank correlations of ``lyceum-warp tune --planning``,
 and returns of the same episodes in the task's own physics, planned at every step with these physics, with the setting,
-and without a plan. The loss is the difference of the first two relative to the difference of the first and the last.
-Plans wait for nothing, so a busy machine changes no number.
+and without a plan. With these three returns R_exact, R_setting and R_none, the loss is (R_exact - R_setting) / (R_exact
+- R_none). Plans wait for nothing, so a busy machine changes no number.
 """
 
 import dataclasses

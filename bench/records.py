@@ -109,7 +109,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     folder, notes = options.runs / name, options.runs / f"{name}.json"
     earlier = json.loads(notes.read_text()) if notes.exists() and (folder / "checkpoint.pt").exists() else [0.0, 0]
     if not earlier[1]:
-        shutil.rmtree(folder, ignore_errors=True)  # of a call that was killed
+        shutil.rmtree(folder, ignore_errors=True)  # the folder of a call that was killed
     options.runs.mkdir(parents=True, exist_ok=True)
     with cache(case, options, folder) as environment:
         reached, seconds = timed(command(case, folder, options.device), folder, environment, options.seconds)
@@ -162,7 +162,7 @@ def timed(
             reached = json.loads(config.read_text()).get("reached")
         seconds = time.perf_counter() - began
         if reached is not None:
-            process.wait()  # it saves the policy and evaluates it
+            process.wait()  # the process saves the policy and evaluates it
             return reached, seconds
         if code is not None:
             raise RuntimeError(f"{' '.join(words)} ended with code {code} before its target")

@@ -173,7 +173,7 @@ class Memory:
 
 @dataclasses.dataclass(frozen=True)
 class Kills:
-    """A training that is killed and resumed."""
+    """A training run that is killed and resumed."""
 
     task: str
     words: str
@@ -234,7 +234,7 @@ def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
     functions, nact = own.functions, plain.action.shape[1]
     file = Path(sys.modules[parent.__module__].__file__ or "")
     source = file.read_text().replace("@lw.register\n", "")
-    own_model = r'"(\w+\.xml)"'  # relative to the task's file
+    own_model = r'"(\w+\.xml)"'  # the model's path is relative to the task's file
     source = re.sub(own_model, lambda m: repr(str(path)) if (path := file.parent / m[1]).exists() else m[0], source)
     fields = [f"    {name}: Row[float]\n" for name in ("userdata", "body_mass") if name not in own.world.vars]
     source = source.replace("class World:\n", "".join(["class World:\n", *fields]), 1)
@@ -295,7 +295,7 @@ def tally(
     clean_inout: wp.array[bool], injected_inout: wp.array2d[int], reasons_inout: wp.array2d[int],
     outcome_inout: wp.array2d[int],
 ):  # fmt: skip
-    """Count faults after a step, and compare clean worlds with the twin's; launched over (nworld,)."""
+    """Count faults after a step, and compare clean worlds with the worlds of the twin; launched over (nworld,)."""
     w = wp.tid()
     due = wp.where(pending_inout[w], 6, wp.where(kind_in[w] < 6, kind_in[w], 0))
     pending_inout[w] = kind_in[w] == 6 and not done_in[w]  # a world that restarts gets no event in this step
@@ -318,7 +318,7 @@ def tally(
 def inject(case: Faults, options: Options) -> dict[str, Any]:
     """Step a task for a chunk with injected faults, together with a twin without faults."""
     torch.set_num_threads(1)
-    gc.collect()  # frees the environments of the previous chunk
+    gc.collect()  # free the environments of the previous chunk
     before = case.state(options.work, case.chunk)
     if case.chunk and not before.exists():
         raise Skipped(f"there is no {before}: give the folder in which chunk {case.chunk - 1} ran as --work")

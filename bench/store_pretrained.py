@@ -1,7 +1,7 @@
 """Store the policies of runs in the package: lyceum-warp bench store_pretrained RUN...
 
-Each becomes lyceum_warp/pretrained/TASK with the run's settings, the weights of the policy in float16, and the return
-of the stored policy.
+Each run becomes lyceum_warp/pretrained/TASK with its settings, the policy's weights in float16, and the return of the
+stored policy.
 """
 
 import argparse

@@ -195,7 +195,7 @@ def kept_line(row: Row) -> list[str]:
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    """Draw the part sampling's ratios to native C as points on a logarithmic axis."""
+    """Draw the ratios of the part ``sampling`` to native C as points on a logarithmic axis."""
     groups = grouped(rows, "sampling", "task")
     ratios = {task: experiment.paired(same, "env_steps_per_second", "native") for (task,), same in groups.items()}
     names = [name for name in PARTS["sampling"][1:] if any(found.get(name) for found in ratios.values())]

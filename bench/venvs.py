@@ -1,6 +1,6 @@
 """Run peers' programs, in separate virtual environments if they need other versions of our packages.
 
-``peers/NAME/requirements.txt`` pins the packages that a peer needs. Its environment is made at first use in
+``peers/NAME/requirements.txt`` pins the packages that a peer needs. The peer's environment is made at first use in
 ``~/.cache/lyceum_warp/peers`` (or ``$LYCEUM_WARP_PEERS``), one per set of requirements and Python version.
 """
 

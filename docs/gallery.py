@@ -197,8 +197,8 @@ def families() -> dict[str, tuple[str, list[str]]]:
 def page(results: dict[str, dict[str, str]]) -> str:
     """The page of the gallery."""
     lines = ["# Gallery", "", "Tasks of the package under a policy or a planner, with the result and a command that "
-             "shows or trains it. A policy's", "return is the mean of whole episodes, a planner's is that of the "
-             "seconds shown. A name leads to the task's details.", ""]  # fmt: skip
+             "shows or trains it. The return of a", "policy is the mean over whole episodes; the return of a planner "
+             "covers the seconds shown. A name leads to the task's", "details.", ""]  # fmt: skip
     for stem, (title, names) in families().items():
         cells = []
         for name in names:

@@ -56,7 +56,7 @@ def names(words: str) -> str:
 
 
 def modules(words: str) -> str:
-    """The documentation of modules whose functions have no names in the package itself, such as ``lw.walkers``."""
+    """The documentation of modules that are public names themselves, such as ``lw.walkers``."""
     lines = ["```{eval-rst}"]
     for word in words.split():
         module = importlib.import_module(f"lyceum_warp.{word}")
@@ -92,7 +92,7 @@ def is_public(cls: type) -> bool:
 
 
 def members(cls: type) -> list[str]:
-    """The public members of a class that have a docstring, with those of base classes without a public name."""
+    """The public members of a class that have a docstring, including members of base classes without a public name."""
     found: dict[str, None] = {}
     for base in reversed(cls.__mro__):
         if base is cls or (base.__module__.startswith("lyceum_warp.") and not is_public(base)):
@@ -115,7 +115,7 @@ def converted(text: str) -> list[str]:
 
 
 def short_signature(app: Any, what: str, name: str, obj: Any, options: Any, signature: str, result: str) -> Any:
-    """Leave out a dataclass's fields, which follow as members, and the fields of default values."""
+    """Remove a dataclass's fields, which are documented as members, and the fields of objects that are defaults."""
     if what == "class" and dataclasses.is_dataclass(obj):
         return "", result
     return signature and re.sub(r"(PhysicsOptions)\(.*?\)", r"\1()", signature), result
@@ -257,7 +257,7 @@ def parameters(task: BoundTask) -> list[tuple[Any, ...]]:
 
 
 def spelled(default: Any, value: Any) -> str:
-    """A default as in a table."""
+    """Format a default value for a table."""
     elements = default if isinstance(default, list) else [default]
     if isinstance(default, FromModel):
         return "from the model"
@@ -291,7 +291,7 @@ def comments(task: type) -> dict[str, str]:
 
 
 def table(headings: tuple[str, ...], rows: list[tuple[Any, ...]]) -> list[str]:
-    """A table in Markdown, and a blank line."""
+    """Format a table in Markdown, followed by a blank line."""
     cells = [headings, ("---",) * len(headings), *rows]
     return [*(f"| {' | '.join(map(str, row))} |" for row in cells), ""]
 

@@ -38,7 +38,7 @@ class World:
     actuator_gainprm: Row[lw.vec10]
     command: Row[float] = lw.memory()  # m/s
     air_time: Row[float] = lw.memory()  # seconds since a foot touched the ground
-    level: Row[float] = lw.lasting_memory()  # of the curriculum, 0 to 1
+    level: Row[float] = lw.lasting_memory()  # level of the curriculum, 0 to 1
 
 
 @wp.struct
@@ -129,12 +129,12 @@ def difficulty(level: Row[float]) -> float:
 
 
 @wp.func
-def startup(s: World, p: Params, rng: Row[wp.uint32]):  # once for each world
+def startup(s: World, p: Params, rng: Row[wp.uint32]):  # run once for each world
     s.gravity[2] = s.gravity[2] * lw.uniform(rng, 0.95, 1.05)
 
 
 @wp.func
-def randomize(s: World, p: Params, rng: Row[wp.uint32]):  # at every reset, from nominal values
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):  # run at every reset, from nominal values
     for i in range(1, 8):
         s.body_mass[i] = s.body_mass[i] * lw.uniform(rng, 0.8, 1.2)
     for i in range(6):

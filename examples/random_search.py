@@ -47,7 +47,7 @@ class RandomSearch(lw.Learner):
         returns, going = torch.zeros_like(env.reward), torch.ones_like(env.done)
         for _ in range(env.horizon):
             env.step(torch.einsum("wao,wo->wa", tried, normalizer(env.obs)))
-            returns += env.reward * going  # only the first episode of each world counts
+            returns += env.reward * going  # count only the first episode of each world
             going &= ~env.done
         self.policy.observe(env.obs)
         plus, minus = returns.chunk(2)

@@ -102,7 +102,7 @@ class Env:
     metrics: dict[str, torch.Tensor]
     """The task's metrics of the last step by name, each (nworld,), float32."""
     episode_metrics: dict[str, torch.Tensor]
-    """The sums of the metrics over the episode of the last step, each (nworld,), float32."""
+    """The task's metrics summed over the episode up to the last step, each (nworld,), float32."""
     episode_metric_sums: torch.Tensor
     """``episode_metrics`` as one tensor, (nworld, number of metrics), in the order of ``metrics``."""
     shared: dict[str, torch.Tensor]
@@ -192,7 +192,7 @@ class Env:
             probe = Probe(self.task, worlds.after, worlds.params, self.device)
             probe.check_bounds()  # check writes before any function of the task writes into an array
             self.rand_reset(options.seed)
-            if self.task.dynamics and not _replica:  # a bad draw in a later reset is a fault of its world
+            if self.task.dynamics and not _replica:  # at later resets, invalid values are a fault of the world
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
             probe.check_observations()
             if not _replica:
@@ -291,7 +291,7 @@ class Env:
     def get_state(self, out: torch.Tensor | None = None, mask: torch.Tensor | None = None) -> torch.Tensor:
         """The complete state of every world, (nworld, state_space.size), float64; it determines the world's future.
 
-        It holds the engine's integration state, fields left by the last substep, model fields that differ between
+        A state holds the engine's integration state, fields left by the last substep, model fields that differ between
         worlds, the step and episode counters, the random stream, the task's memory, the metric sums, and the count for
         ``success_steps``. ``state_space.parts`` names their columns.
 
@@ -415,9 +415,9 @@ class Env:
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
         """A live view of a field of MjData or MjModel, by MuJoCo's name.
 
-        An environment keeps ``time``, ``ctrl`` and the fields that its task reads. Request others when you make it, as
-        in ``make("hopper", fields=["site_xpos", "body_mass"])``. Do not write into the view: use ``set_state`` or
-        ``set_dynamics``.
+        An environment keeps ``time``, ``ctrl`` and the fields that its task reads. Request other fields when you make
+        the environment, as in ``make("hopper", fields=["site_xpos", "body_mass"])``. Do not write into the view: use
+        ``set_state`` or ``set_dynamics``.
 
         Args:
             name: Attribute of MjData or MjModel, for instance "qpos", "site_xpos" or "body_mass".

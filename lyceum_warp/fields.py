@@ -15,7 +15,7 @@ vec10 = wp.types.vector(length=10, dtype=wp.float32)
 
 
 class Stage(enum.IntEnum):
-    """A stage of a forward pass; the values are those of mjtStage."""
+    """A stage of a forward pass, with the values of mjtStage."""
 
     NONE = 0
     POSITION = 1
@@ -159,7 +159,7 @@ class Field:
     refresh: Stage
     """The stage to compute after a step so that the field matches the new state."""
     reset: Stage
-    """The stage to compute after a reset; NONE for a field that a reset clears."""
+    """The stage to compute after a reset; ``Stage.NONE`` for a field that a reset sets to zero."""
     lagged: bool
     """Whether the field keeps the value left by ``mj_step``, which lags one substep behind the state."""
     snapshot: bool

@@ -14,11 +14,11 @@ Reflection = tuple[Sequence[int], Sequence[float]]
 class Mirror:
     """The mirror image of a task in the plane between left and right, for ``lw.Task.mirror``.
 
-    A reflection applies to a part's name wherever it occurs: in observations, actions and states. It gives the signs of
-    the part's columns, such as ``"command": (1, -1, -1)`` for velocities forwards and to the left and a yaw rate; or an
-    order of the columns followed by their signs, such as ``"foot_force": ([1, 0], [1, 1])`` for a left and a right
-    foot. In the base's axes, a vector has the signs (1, -1, 1), and an angular velocity (-1, 1, -1). The reflection
-    "action" applies to a whole action whose parts are actuators.
+    A reflection applies to a part's name wherever it occurs: in observations, actions and states. A reflection consists
+    of the signs of the part's columns, such as ``"command": (1, -1, -1)`` for velocities forwards and to the left and a
+    yaw rate; or of an order of the columns followed by their signs, such as ``"foot_force": ([1, 0], [1, 1])`` for a
+    left and a right foot. In the base's axes, a vector has the signs (1, -1, 1), and an angular velocity (-1, 1, -1).
+    The reflection "action" applies to a whole action whose parts are actuators.
 
     Args:
         parts: Reflections by the names of parts.

@@ -8,8 +8,8 @@ from lyceum_warp.support.validate import positive_number
 def follow_velocity(actuator: mujoco.MjsActuator, speed: float) -> None:
     """Turn a position servo into one whose control is the velocity of its target.
 
-    The gains do not change. The target becomes an activation of the model (``act``), limited to the former control
-    range.
+    The gains do not change. The target becomes an activation of the model (``act``), limited to the control range that
+    the actuator had before.
 
     Args:
         actuator: A position servo with a control range; changed in place.

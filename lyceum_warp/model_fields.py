@@ -243,7 +243,7 @@ def _described(name: str, shape: tuple[int, ...], constants: Constants) -> Model
 
 
 MOVED_INERTIA = {"body_ipos", "body_iquat"}
-"""Fields that cannot differ for "simple" bodies, whose inertial frame must equal the body frame."""
+"""Fields that must be equal in all worlds for "simple" bodies, whose inertial frame equals the body frame."""
 
 
 def check_simple(model: mujoco.MjModel, name: str) -> None:

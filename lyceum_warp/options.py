@@ -90,7 +90,7 @@ class PhysicsOptions:
     integrator: str | None = None
     """Integrator: euler, rk4, implicit or implicitfast."""
     jacobian: str | None = None
-    """Constraint Jacobian: dense, sparse or auto. It changes speed and memory, and results only by rounding."""
+    """Constraint Jacobian: dense, sparse or auto. The form changes speed and memory, and results only by rounding."""
     impratio: float | None = None
     """Stiffness of contacts against slip, relative to their stiffness against penetration; for elliptic cones."""
     solver: Mapping[str, int] | None = None

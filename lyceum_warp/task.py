@@ -137,7 +137,7 @@ RESULTS = ("obs", "ctrl", "metrics", "rng", "sums", "shared")
 """Arguments that are rows for results, which a function may write."""
 
 MEMORIES = ("memory", "lasting_memory")
-"""The rows of floats that hold the parts of memory in World, one row of each kind per world."""
+"""The kinds of memory. Each world has one row of floats for each kind, which holds the parts of this kind in World."""
 
 GROUP_PREFIX = "observe_"
 """``observe_critic`` writes the group ``critic`` of the observations."""
@@ -171,7 +171,7 @@ class Part:
 def memory(size: int | str = 1) -> Any:
     """Declare task memory, as a default in World: a row that ``advance`` or ``substep`` writes and a reset clears.
 
-    It belongs to the state. Its type is ``Row[float]``, ``Row[wp.vec3]`` or another row of numbers.
+    Task memory belongs to the state. The field's type is ``Row[float]``, ``Row[wp.vec3]`` or another row of numbers.
 
     Args:
         size: Number of elements, or the name of a table in Params: one element for each of its rows.
@@ -182,7 +182,8 @@ def memory(size: int | str = 1) -> Any:
 def lasting_memory(size: int | str = 1) -> Any:
     """Declare memory that outlives episodes, as a default in World: for instance the level of a curriculum.
 
-    It is cleared only when a world's random stream starts (``rand_reset(seed=...)``); ``startup`` may then write it.
+    Lasting memory is cleared only when a world's random stream starts (``rand_reset(seed=...)``); ``startup`` may then
+    write it.
 
     Args:
         size: Number of elements, or the name of a table in Params: one element for each of its rows.
@@ -332,8 +333,8 @@ class FromModel:
 def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
     """Declare a value that is computed from the compiled model and other parameters, as a default in Params.
 
-    ``mass: float = lw.from_model(lambda model, p: model.body_subtreemass[p.trunk])`` is the mass of the robot. It is
-        recomputed if another parameter changes, unless its own value was given.
+    ``mass: float = lw.from_model(lambda model, p: model.body_subtreemass[p.trunk])`` is the mass of the robot. The
+        value is recomputed if another parameter changes, unless it was given explicitly.
 
     Args:
         function: A function of the MjModel and of an object with parameters as attributes: the parameters with ordinary
@@ -356,8 +357,8 @@ class Planning:
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Options of the planner's worlds, by the names of ``lw.make``, such as ``{"physics": "fast"}``."""
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Parameters of the planner's worlds, by the names of the task's ``Params``. They are ignored if MPPI has a value
-    function, because it was fitted to the rewards of the unchanged task."""
+    """Parameters of the planner's worlds, by the names of the task's ``Params``. If MPPI has a value function, these
+    parameters are ignored, because the function was fitted to the rewards of the unchanged task."""
 
     def __post_init__(self) -> None:
         """Check the type of every part."""
@@ -436,8 +437,9 @@ class Task:
     World. The reward is dt times the sum of weight times term. ``lw.make(task, upright=2.0)`` and ``set_params`` change
     weights, and each term is a metric, with its weight and dt. ``env.task.reward_text`` shows the generated source."""
     terminations: ClassVar[tuple[str, ...]] = ()
-    """Names of functions that end the episode if one returns True, in place of ``terminated``. They may take ``s``,
-    ``p`` and the named arguments of terms. Each is a metric: 1 if it returns True after the step, otherwise 0."""
+    """Names of functions that end the episode if one returns True, in place of ``terminated``. The functions may take
+    ``s``, ``p`` and the named arguments of terms. Each function is also a metric: 1 if it returns True after the step,
+    otherwise 0."""
     metrics: ClassVar[tuple[str, ...]] = ()
     """Names of the metrics that ``measure`` writes. Without ``measure``, they are functions with the arguments of terms
     that return a float or a bool."""
@@ -449,9 +451,8 @@ class Task:
     lagged: ClassVar[tuple[str, ...]] = ()
     """Fields that keep the values left by ``mj_step``, one substep behind the state, as in some Gymnasium tasks."""
     cleared: ClassVar[tuple[str, ...]] = ()
-    """Fields left by the last substep, such as contact forces, to zero at the start of an episode. Other such fields
-    are computed at that time, which takes a forward pass of the worlds that restart. A reset clears them before
-    ``initialize``."""
+    """Fields left by the last substep, such as contact forces, to zero at the start of an episode. Without this entry,
+    a forward pass of the worlds that restart computes these fields. A reset clears them before ``initialize``."""
     actions: ClassVar[Mapping[str, int | str] | None] = None
     """The parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls;
     ``control`` then turns them into inputs. A size may be the name of a table in Params: one number for each of its
@@ -462,7 +463,7 @@ class Task:
     keyframe: ClassVar[str | None] = None
     """Name of the model's keyframe at which ``reset`` starts, before ``initialize``; None for the model's ``qpos0``."""
     draws: ClassVar[int] = 10
-    """The most random initial states that a reset draws while ``reject`` returns True; the last is kept."""
+    """Maximum number of initial states that a reset draws while ``reject`` returns True; the last one is kept."""
     settle: ClassVar[int] = 0
     """Substeps in which an initial state settles before the first observation of its episode, under its own controls
     and without ``substep``. The time then starts from 0."""
@@ -490,7 +491,7 @@ class Task:
 
     @staticmethod
     def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
-        """Return what a robot needs to run a policy, for the metadata of ONNX files: JSON values by name.
+        """Return metadata for ONNX files, such as gains, that a robot needs to run a policy: JSON values by name.
 
         The default is empty.
 
@@ -502,7 +503,7 @@ class Task:
         super().__init_subclass__(**keywords)
         if "gymnasium" not in vars(cls):
             cls.gymnasium = None
-        # copied now, because a later cell of a notebook may define another task with the same names
+        # a copy, because a later cell of a notebook may define another task with the same names
         module = vars(sys.modules[cls.__module__])
         cls.scope = {
             name: value

@@ -23,7 +23,7 @@ _BASE = 1.0
 
 
 def _inwards(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Distance from the outline of a patch, m, limited to the distance of the platform's edge."""
+    """Distance of points from the outline of a patch, m, but not more than the distance of the platform."""
     half = float(x.max())
     return np.clip(half - np.maximum(abs(x), abs(y)), 0.0, max(half - _PLATFORM, 0.0))
 
@@ -120,7 +120,7 @@ class Terrain:
     seed: int = 0
     """Seed of all random heights."""
     scale: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Sizes at difficulty 1 that replace the table's, by kind."""
+    """Sizes at difficulty 1, by kind, in place of the sizes in the table."""
 
     def __post_init__(self) -> None:
         """Check the description.

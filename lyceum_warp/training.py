@@ -23,7 +23,7 @@ from lyceum_warp.runs.replay_files import read_replay
 from lyceum_warp.runs.saving import Saver
 from lyceum_warp.runs.task_copy import note_changes, run_params, task_copy
 from lyceum_warp.support.files import replaced
-from lyceum_warp.support.interrupts import Interrupted, ending, postponed
+from lyceum_warp.support.interrupts import Interrupted, postponed
 from lyceum_warp.support.validate import check_flag, check_function, check_kind, positive_number, whole_number
 from lyceum_warp.support.versions import versions
 from lyceum_warp.viz.cameras import CameraChoice, find_camera
@@ -78,8 +78,8 @@ def train(
     """Train, and write metrics, policies and checkpoints into a run folder, as ``lyceum-warp train`` does.
 
     ``lw.load(folder)`` returns the last policy, and ``lw.load(folder, which="best")`` the policy with the best return.
-    The return is ``mean_return`` if the learner evaluates the mean policy. Otherwise it is ``return_mean`` over the
-    iteration's sampled episodes, which the policy before the update generated.
+    The return is ``mean_return`` if the learner evaluates the mean policy. Otherwise the return is ``return_mean`` over
+    the iteration's episodes, which the policy sampled before the update.
 
     The policy and the complete state are saved at the start, at the end, and every 30 s, or more often if saving takes
     at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run resumes from the last save and produces the
@@ -162,8 +162,8 @@ def train(
             if resume:
                 _load_checkpoint(run, learner, settings, display.note if leads else log.debug)
         saver = Saver(
-            run if leads else None, learner, keep_every=keep_every, save_every=save_every,
-            saved=learner.iteration if resume else -1, lock=lock, note=display.note,
+            run if leads else None, lock, learner, keep_every=keep_every, save_every=save_every,
+            saved=learner.iteration if resume else -1, note=display.note,
         )  # fmt: skip
         callbacks: list[Callback] = []
         if leads:
@@ -213,10 +213,10 @@ def _learn(
     learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None,
     limit: float,
 ) -> None:  # fmt: skip
-    """Iterate for at most about ``limit`` seconds. All ranks save and end at the same iterations."""
+    """Iterate until the target, the last iteration or the time limit, in seconds; all ranks save and end together."""
     team, run, deadline = learner.team, saver.run, time.monotonic() + limit
     ended = False
-    with ending(), postponed(insist=team.size == 1) as noted:
+    with postponed(insist=team.size == 1) as noted:
         if saver.saved != learner.iteration:
             saver.save()
         while learner.iteration < iterations and not ended:
@@ -270,7 +270,7 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
         text = " ".join(str(error).split())
         raise ValueError(f"{run.checkpoint} does not fit the configuration beside it: {text}") from error
     if learner.team.leads:
-        cut_rows(run.metrics, done)  # a killed run may have rows for unsaved iterations
+        cut_rows(run.metrics, done)  # a killed run may have written rows of iterations that were not saved
         if changed := run.changed(versions(run.config["device"])):
             text = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
             note(f"versions have changed, so numbers may differ from an uninterrupted run's: {text}")

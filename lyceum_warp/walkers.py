@@ -1,6 +1,6 @@
 """Compute the tables of a walking robot from its compiled model, and prepare models for walking.
 
-The functions of ``(model, p)`` are for ``lw.from_model``: ``p`` has the parameters ``joints`` and ``feet``, which are
+Functions with the arguments ``(model, p)`` are for ``lw.from_model``: ``p`` has the parameters ``joints`` and ``feet``,
 indices of joints and of sites. The base is the body of the first joint, which must be free.
 """
 
@@ -68,7 +68,7 @@ def controls(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """A quarter of the position error at which each joint's servo reaches its force limit, rad, (joints,).
+    """A quarter of the position error, rad, at which the servo of each joint reaches its force limit, (joints,).
 
     0.25 * limit / kp, mjlab's scale of actions.
 
@@ -108,17 +108,17 @@ def home_height(model: mujoco.MjModel, p: Any) -> float:
 
 
 def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
-    """Collect what a robot needs to run a velocity policy, for ``lw.Task.deployment``.
+    """Collect the names, gains and poses with which a robot runs a velocity policy, for ``lw.Task.deployment``.
 
     Lists are in the order of ``joints``.
     """
     actuators, stages = servos(model, p), np.asarray(p.stages)
-    # the model's own value, part of the gain
+    # the joint's own damping, which adds to the servo's
     damping = model.dof_damping[joint_dof(model, p)].reshape(len(actuators), -1)[:, 0]
     yaw, lateral = float(stages[:, 3].max()), float(np.max(p.lateral_velocity))
     return {
         "base": model.body(base(model)).name,
-        "velocimeter": np.asarray(p.imu).tolist(),  # its position on the base, m
+        "velocimeter": np.asarray(p.imu).tolist(),  # position on the base, m
         "joints": [model.joint(joint).name for joint in p.joints],
         "default_pose": np.asarray(p.default_pose).tolist(),
         "action_scale": np.asarray(p.action_scale).tolist(),
@@ -174,7 +174,7 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
         "linear_velocity": flip, "angular_velocity": spin, "gravity": flip, "command": (1.0, -1.0, -1.0),
         **dict.fromkeys(("joint_position", "joint_velocity", "last_action"), joints),
         **dict.fromkeys(("foot_height", "foot_air_time", "foot_contact"), feet), "foot_force": vectors,
-        # states of the physics; the model's other joints are mirrored, too
+        # these state fields also contain joints that the task does not use
         "qpos": ([*range(7), *(partner[hinges] + 6)], [*flip, 1.0, *spin, *sign[hinges]]),
         "qvel": ([*range(6), *(partner[hinges] + 5)], [*flip, *spin, *sign[hinges]]),
     }  # fmt: skip
@@ -188,7 +188,7 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
 # legs
 #
 # With all joints at 0, every joint of a leg has a constant axis in the base's axes, and a constant position relative to
-# the joint before it. Turning a joint turns everything beyond it.
+# the joint before it. A joint turns all later joints of its leg.
 
 
 def leg_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:

@@ -28,7 +28,7 @@ def own_bytes_per_world(task: BoundTask) -> int:
 
 
 def own_parts(task: BoundTask) -> dict[str, int]:
-    """Sizes of the parts that ``Worlds`` adds to a state, besides the counters."""
+    """Sizes of the parts that ``Worlds`` adds to a state, except the counters."""
     form, found = task.task, dict[str, int]()
     for layout in task.memory.values():
         found |= sizes(layout)
@@ -123,7 +123,7 @@ class WorldArrays:
         self.metrics: wp.array = wp.zeros((n, len(self.task.metrics)), dtype=float)
         """The metrics of the last step, (nworld, number of metrics)."""
         self.episode_metrics: wp.array = wp.zeros_like(self.metrics)
-        """The sums of the metrics over the last step's episode."""
+        """The metrics summed over the episode up to the last step."""
         self.outcome.metrics = self.metrics  # type: ignore[assignment]
         self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
         parts = int(steps.OBSERVE_FIRST) + len(self.obs_spaces)
@@ -219,7 +219,7 @@ class WorldArrays:
             yield arrays[name] if name in arrays else getattr(self, name), self.state[:, place]
 
     def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
-        """Set the masked worlds' counters from the columns after the engine's state."""
+        """Read the masked worlds' counters from the state columns that follow the engine's columns."""
         own = self.counters
         counters = [mask, columns, own.step, own.key, own.episode, self.outcome.done_reason]
         wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)

@@ -60,7 +60,7 @@ class Worlds(WorldArrays):
     def configure(self, *, horizon: int, autoreset: bool, graphs: bool) -> None:
         """Set the horizon, whether episodes restart automatically, and whether launches are captured as graphs.
 
-        The first two are baked into captured graphs, so each combination has its own graphs.
+        Captured graphs contain the horizon and the automatic restarts, so each combination has separate graphs.
         """
         self.horizon, self.autoreset = horizon, autoreset
         key = (horizon, autoreset, graphs)
@@ -358,7 +358,7 @@ class Worlds(WorldArrays):
         self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)
 
     def _read_state(self) -> None:
-        # with automatic resets done_reason lasts for one step only; without them it is part of the state
+        # with automatic resets done_reason lasts for one step; otherwise it is part of the state
         self.pack_state(self._no_fault if self.autoreset else self.outcome.done_reason)
 
     # used by environments and open-loop rollouts
@@ -366,7 +366,7 @@ class Worlds(WorldArrays):
     def judge_transition(self, action: torch.Tensor) -> None:
         """Judge the transition from ``before`` to the current state under given actions; ignore engine faults."""
         torch_view(self.safe_action).copy_(action)
-        self._judged.zero_()  # receives this transition's faults
+        self._judged.zero_()  # will hold the faults of this transition
         self._judge(self.everyone, self._judged, self._no_fault, transition=True)
 
     def seed_streams(self, seed: int) -> None:

@@ -23,7 +23,7 @@ SAME_FUNCTIONS = (
     *(name for name in SUITE if name not in ("dm/manipulator_bring_ball", "dm/cheetah_run")),
 )  # fmt: skip
 """Tasks that share their functions with ``go1_velocity``, ``g1_velocity``, ``go1_rough_velocity`` or
-``humanoid_stand``; and those of dm_control's suite, whose functions are as simple as others."""
+``humanoid_stand``; and the tasks of dm_control's suite, whose functions are simple."""
 SAME_MODELS = (
     "dm/cheetah_run", "dm/manipulator_bring_ball",
     "adroit_door", "adroit_hammer", "adroit_relocate", "aloha_lift", "arm_hand_pickup", "herb_reach", "humanoid_get_up",

@@ -1,4 +1,4 @@
-"""Replace the window process by an object that collects frames and sends a test's commands."""
+"""Replace the window process by an object that collects frames and sends the commands of a test."""
 
 import time
 from collections import deque
@@ -11,7 +11,7 @@ from lyceum_warp.viewer.session.clock import Session
 
 
 class MemoryWindow:
-    """A window that shows nothing.
+    """A window that collects frames without showing them.
 
     Args:
         script: Called after each frame with the frame and its number; returns commands, or None to close the window.

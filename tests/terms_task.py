@@ -34,7 +34,7 @@ def distance(place: float, target: float) -> float:
 
 
 @wp.func
-def fast(qvel: Row[float], scale: float = 2.0) -> float:  # a field of World, and a default
+def fast(qvel: Row[float], scale: float = 2.0) -> float:  # arguments: a field of World, and a default
     return scale * wp.abs(qvel[0])
 
 
@@ -67,7 +67,7 @@ def outside(place: float, border: float) -> bool:
 
 
 @wp.func
-def too_fast(s: Any) -> bool:  # for the World of any task
+def too_fast(s: Any) -> bool:  # this function works with the World of any task
     return wp.abs(s.qvel[0]) > 3.0
 
 

@@ -38,7 +38,7 @@ class World:
     sensordata: Row[float]
     level: Row[float] = lw.lasting_memory()
     column: Row[float] = lw.lasting_memory()
-    walked: Row[float] = lw.lasting_memory()  # distance in the episode so far, m
+    walked: Row[float] = lw.lasting_memory()  # distance walked in this episode, m
     commanded: Row[float] = lw.lasting_memory()
 
 

@@ -1,7 +1,7 @@
 """Check that a fault affects only its world, and that errors for wrong arguments name the value and the fix.
 
 The conformance suite covers NaN, infinite and out-of-range states and actions for every task and engine. These faults
-need a particular model, and both engines can produce each kind. The C engine has no shared contact pool, so only the
+need particular models, and both engines can produce every kind. The C engine has no shared contact pool, so only the
 Warp engine's contact overflow affects other worlds.
 """
 

@@ -284,7 +284,7 @@ def test_parameters_may_change_between_rollouts(engine: str) -> None:
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Forgetful, Servo])
 def test_worlds_draw_from_the_given_keys(task: type[lw.Task], engine: str) -> None:
-    """The draws equal those of steps from states with these keys."""
+    """The draws equal the draws of steps from states with these keys."""
     env = lw.make(task, engine=engine, nworld=4, autoreset=False)
     numbers = np.array([5, 2**32 - 1, 77, 1234567890], dtype=np.uint32)
     keys = wp.zeros(4, dtype=wp.uint32, device="cpu")

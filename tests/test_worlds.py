@@ -99,7 +99,7 @@ def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.En
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_held_success_needs_its_steps_in_a_row_within_an_episode(engine: str) -> None:
-    """The end of an episode or a fault restarts the count; all other numbers equal the plain task's."""
+    """The end of an episode or a fault restarts the count; all other numbers equal the numbers of the plain task."""
     held, plain = held_and_plain(engine, horizon=12)
     rows, rises, falls = torch.zeros(16), 0, 0
     generator = torch.Generator().manual_seed(0)

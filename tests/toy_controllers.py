@@ -1,4 +1,4 @@
-"""Controllers for tests, and a simulated clock with a planner that takes simulated time."""
+"""Controllers for tests, and a planner on a simulated clock."""
 
 import math
 import time
@@ -22,7 +22,7 @@ def towards(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
 class StepPlanner:
     """A planner whose actions encode two numbers: the step at which the plan was made, and the action's index.
 
-    Both are divided by 100; ``hundredths`` converts them back.
+    Both numbers are divided by 100; ``hundredths`` converts the actions back.
     """
 
     def __init__(self, env: lw.Env, horizon: int = 8, seconds: float = 0.0) -> None:

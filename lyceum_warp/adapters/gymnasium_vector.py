@@ -28,12 +28,13 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
       ``infos["final_obs"]`` and ``infos["final_info"]`` hold the last observations and infos of ended episodes, and the
       masks ``_final_obs`` and ``_final_info`` select their worlds. With NumPy these entries exist only if an episode
       ended, and ``final_obs`` is an object array with None for the other worlds, as Gymnasium's wrappers expect. With
-      ``torch=True`` they always exist, as tensors over all worlds, because the step does not wait for the device.
+      ``torch=True`` the entries always exist, as tensors over all worlds: a step does not wait to learn whether an
+      episode ended.
     - DISABLED: only by ``reset(options={"reset_mask": mask})``. Until then the world keeps stepping, and its
       termination or truncation stays set. A world with a fault is reset at once, but returns its last valid
       observation.
     - NEXT_STEP: in the next step, which ignores the world's action. Every step then has a second reset phase. Some
-      wrappers, such as ``NormalizeObservation``, require this mode.
+      wrappers, such as ``NormalizeObservation``, require NEXT_STEP.
 
     As in Gymnasium's own environments, a first reset without a seed draws one at random, unless ``seed=`` is given
     here. With a given seed, the worlds differ from each other, but are the same in every run.

@@ -23,8 +23,9 @@ RECENT = 100
 class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     """An environment for rsl_rl's runners: ``OnPolicyRunner(RslRlVecEnv("hopper", 4096, device="cuda"), config)``.
 
-    ``step`` never waits for the device. It returns copies of the observations, because rsl_rl stores observations only
-    after the next step. All other results are buffers that the next step overwrites; rsl_rl copies them before that.
+    ``step`` never waits for the device. ``step`` returns copies of the observations, because rsl_rl stores observations
+    only after the next step. All other results are buffers that the next step overwrites; rsl_rl copies them before
+    that.
 
     Args:
         task: A task, as in ``lw.make``, or an environment with automatic resets.
@@ -134,8 +135,8 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     def _log(self) -> dict[str, torch.Tensor]:
         """Means of the metrics over recent episodes, computed on the device.
 
-        rsl_rl averages the log over the steps of an iteration. With means over only the last step, a step in which one
-        episode ended would weigh as much as a step in which a thousand ended.
+        rsl_rl averages the log over the steps of an iteration. If each log held only the last step, a step with one
+        finished episode would weigh as much as a step with a thousand.
         """
         env = self.env
         if not env.metrics:

@@ -145,7 +145,7 @@ class StableBaselines3VecEnv(VecEnv):
             raise ValueError(f"{attr_name!r} belongs to all worlds together: omit indices")
         if attr_name not in self.env.task.parameters.values and hasattr(self, attr_name):
             setattr(self, attr_name, value)
-        else:  # its error suggests the closest names
+        else:  # the error of set_params suggests the closest names
             self.env.set_params(**{attr_name: value})
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:

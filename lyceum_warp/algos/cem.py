@@ -7,8 +7,8 @@ The planner's noise (``planner.py``) then has a standard deviation s_t for each 
 
 This is the method of Rubinstein (1999, "The cross-entropy method for combinatorial and continuous optimization") with a
 diagonal covariance, as in hydrax, judo and MuJoCo MPC. The standard deviations are shifted in time with the plan, and
-the end is filled with their initial values. If noise is smoothed over time, s_t refers to the noise before smoothing:
-the elites' standard deviation is divided by that of smoothed standard normal noise.
+the end is filled with their initial values. If the noise is smoothed over time, s_t is the standard deviation before
+smoothing: the elites' standard deviation, divided by the standard deviation of smoothed standard normal noise.
 """
 
 from collections.abc import Sequence

@@ -36,8 +36,9 @@ _ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[[tor
 place. The slope is computed from the activation's output."""
 
 _FEW = 2**18
-"""NumPy computes products of up to this size (rows times weights of the largest layer). With cold caches, as between
-two steps of the worlds, a NumPy call has less overhead; larger products run faster in torch."""
+"""Maximum size of a product, as rows times weights of the largest layer, that NumPy computes; torch computes larger
+ones. With cold caches, as between two steps of the worlds, a NumPy call has less overhead; larger products run faster
+in torch."""
 
 
 class DensePasses:
@@ -127,7 +128,7 @@ class DensePasses:
         """Compute J^T u at the last inputs, from u, (rows, outputs), into tensors of the parameters' shapes."""
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
-            if x.shape[1] < u.shape[1]:  # the product with longer rows is faster
+            if x.shape[1] < u.shape[1]:  # the faster of two equal products: its result has the longer rows
                 out[2 * i].copy_((x.t() @ u).t())
             else:
                 torch.mm(u.t(), x, out=out[2 * i])

@@ -163,7 +163,7 @@ class Captured:
         self.forget()
 
     def forget(self) -> None:
-        """Discard the graph because its tensors were replaced."""
+        """Discard the graph; required after one of its tensors was replaced."""
         self._warm = False
         self.graph: torch.cuda.CUDAGraph | None = None
 

@@ -62,15 +62,15 @@ def evaluate(
 ) -> Episodes:
     """Run a policy without noise for whole episodes from random initial states.
 
-    Every world contributes the same number of episodes; counting all episodes that end would bias the statistics
-    towards short episodes.
+    Every world contributes the same number of episodes. If all finished episodes counted, short episodes would be too
+    frequent.
 
     Args:
         env: The environment; its worlds are reset.
         policy: A module with a method ``act``, or a function; maps observations (nworld, nobs) to actions
             (nworld, nact).
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
-        seed: Seed of the initial states, which differ from those of an environment made with this seed. By default the
+        seed: Seed of the initial states; an environment made with the same seed draws different ones. By default the
             worlds continue their random streams.
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
@@ -175,7 +175,7 @@ class MeanPolicyEvaluation:
         return dict(zip(MEAN_STATISTICS, means.tolist(), strict=True))
 
     def added(self, statistics: Mapping[str, Any], policy: torch.nn.Module, *, due: bool) -> dict[str, Any]:
-        """Add the evaluation's statistics to those of the samples; each is None if no evaluation is due."""
+        """Add the results of an evaluation to the samples' statistics; they are None if no evaluation is due."""
         mean: dict[str, Any] = self(policy) if due else dict.fromkeys(MEAN_STATISTICS)
         success = self.env.task.functions["success"] is not None
         return {**statistics, **mean} | ({} if success else {"success": math.nan, "mean_success": None})

@@ -84,7 +84,7 @@ class Learner(abc.ABC):
     """Base class of learning algorithms: an infinite iterator of ``Iteration``, which ``lw.train`` runs.
 
     A subclass sets ``algorithm``, ``policy`` and ``config``, and implements ``__next__``, which counts ``iteration``
-    and ``samples``. It extends ``state_dict`` and ``load_state_dict`` by any additional state of the algorithm.
+    and ``samples``. If the algorithm has more state, the subclass extends ``state_dict`` and ``load_state_dict``.
     docs/learners.md has an example.
 
     Args:

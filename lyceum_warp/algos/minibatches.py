@@ -12,11 +12,11 @@ Samples = Mapping[str, torch.Tensor]
 """Tensors by name, each with one row per sample."""
 
 _SURE = 6.0
-"""Capacity for a process's samples in a mini-batch, in standard deviations above their mean number."""
+"""A process's mini-batches have room for the mean number of its samples plus this number of standard deviations."""
 
 
 def room(batch: int, team: Team) -> int:
-    """Capacity for a process's samples in a mini-batch of ``batch`` samples of all processes."""
+    """Number of rows that a process reserves in a mini-batch of ``batch`` samples of all processes."""
     share = batch / team.size
     return min(batch, math.ceil(share + _SURE * math.sqrt(share)))
 
@@ -25,8 +25,8 @@ class Minibatches:
     """Shuffles a rollout's samples once, and learns from the same mini-batches in every epoch.
 
     The mini-batches do not depend on the number of processes: each process uses the samples of its own worlds, in a
-    tensor of fixed size that is padded with rows of weight 0. The size is six standard deviations above the mean number
-    of samples; excess samples are dropped.
+    tensor of fixed size that is padded with rows of weight 0. The tensor has room for the mean number of samples plus
+    six standard deviations; further samples are dropped.
 
     On a GPU an epoch is ``Captured``, so ``learn`` must update tensors in place.
 

@@ -1,4 +1,4 @@
-"""Sort a planner's arguments into settings, options and parameters, with defaults from the task's ``planning``."""
+"""Divide a planner's arguments into settings, options and parameters, with defaults from the task's ``planning``."""
 
 import contextlib
 import dataclasses
@@ -113,7 +113,7 @@ def plant_seeds(seed: int | Sequence[int], plants: int) -> Sequence[int]:
 
 @contextlib.contextmanager
 def explained_worlds(config: MPPIConfig, plants: int) -> Iterator[None]:
-    """If the worlds made in this block do not fit into memory, name the settings that determine their number.
+    """Add the settings that determine the number of worlds to a NotEnoughMemoryError of the block.
 
     Raises:
         NotEnoughMemoryError: The worlds do not fit.

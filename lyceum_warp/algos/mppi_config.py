@@ -60,8 +60,8 @@ class MPPIConfig:
     """Interpolation between knots: piecewise constant ("zero"), piecewise linear ("linear"), or cubic Hermite
     ("cubic")."""
     between: Literal["hold", "linear"] = "hold"
-    """Actions of the plant's steps between two actions of the plan, if the planner's time step is a multiple of the
-    plant's: the earlier action ("hold"), or linear interpolation ("linear")."""
+    """Actions between two actions of the plan, if the planner's time step is a multiple of the plant's time step: the
+    earlier action ("hold"), or linear interpolation ("linear")."""
     discount: float | None = None
     """Discount factor of rewards and of the terminal value. None means the value function's discount, or 1 without
     one."""

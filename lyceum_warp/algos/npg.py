@@ -37,7 +37,7 @@ from lyceum_warp.support.docstrings import document_attributes
 log = logging.getLogger(__name__)
 
 _SHORTER = 4
-"""Maximum number of times that a step, or a change of the normaliser, is shortened."""
+"""Maximum number of times that NPG shortens a step or a change of the normaliser."""
 
 _LARGEST = 1e30
 """Bound on rewards, so that float32 can represent the sum of an episode's rewards."""
@@ -67,8 +67,8 @@ class NPG(OnPolicyLearner):
             calls with the same arguments, and get the same statistics.
 
     Raises:
-        ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy
-            cannot be learned (``lyceum_warp.algos.policy_check``).
+        ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy is not
+            trainable (``lyceum_warp.algos.policy_check``).
         FloatingPointError: The policy's step or the value function's fit was not finite in 10 consecutive iterations.
             Such updates are skipped and counted in ``NPGIteration.skipped_updates``.
     """
@@ -283,7 +283,7 @@ class NPG(OnPolicyLearner):
                 square = (old_mean - mean(obs)).square()
                 kl = 0.5 * (square * torch.exp(-2 * self.policy.log_std)).sum(-1).mean()
                 kl = self.team.sum(kl) / self.team.size
-                if self._reads_numbers and kl <= limit:  # more rounds would change nothing
+                if self._reads_numbers and kl <= limit:  # further rounds would not change it
                     break
                 part = torch.where(kl <= limit, part, part * (limit / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5))
             normalizer.interpolate(before, after, part)
@@ -312,12 +312,12 @@ class NPG(OnPolicyLearner):
     def move(
         self, step: torch.Tensor, obs: torch.Tensor, old_mean: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Add a step, or a fraction of it, to the policy's parameters, within the limit of the KL divergence.
+        """Add a step to the policy's parameters, or a fraction of the step that obeys the limit of the KL divergence.
 
         The Fisher information approximates the KL divergence only to second order and on a subset of the samples. If
-        the measured divergence exceeds its limit, the step is shortened by the second-order estimate, at least by half,
-        up to four times. If that is not enough, or if the step is not finite, the policy does not change. The host does
-        not wait for the device.
+        the measured divergence exceeds its limit, the step is shortened to the second-order estimate, but at least by
+        half. This is repeated up to four times. If that is not enough, or if the step is not finite, the policy does
+        not change. The host does not wait for the device.
 
         Args:
             step: The step, (parameters,).
@@ -350,7 +350,7 @@ class NPG(OnPolicyLearner):
         fraction = finite.float()
         for _ in range(_SHORTER):
             kl = measured(fraction)
-            if self._reads_numbers and kl <= limit:  # more rounds would change nothing
+            if self._reads_numbers and kl <= limit:  # further rounds would not change it
                 break
             factor = (wanted / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5)
             fraction = torch.where(kl <= limit, fraction, fraction * factor)

@@ -15,7 +15,7 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 _LONG_EPISODE = 20
-"""Restarts are on by default if an episode spans more iterations than this. On hopper with some seeds, NPG's return
+"""If an episode spans more iterations than this, restarts are on by default. On hopper with some seeds, NPG's return
 stayed low for a long time with 63 and 31 iterations per episode, but not with 16 (bench/README.md, "NPG's learning
 curves")."""
 
@@ -36,13 +36,13 @@ class NPGConfig:
     """"episodes" starts new episodes in every iteration, as in the paper; "segments" continues the last iteration's
     episodes, for many worlds with few steps each; "auto" selects "episodes" if samples / worlds >= horizon."""
     min_restarts: float | None = None
-    """With segments and a time limit: the minimum number of worlds that start an episode in each iteration, as a
-    multiple of samples / horizon, which is the average number if no episode ends early. If fewer worlds started an
-    episode in the last iteration, random worlds are restarted. Without restarts, worlds that started together reach the
-    time limit together, and in between few samples come from the start of an episode. Interrupted episodes are not
-    counted in the statistics, so values well above 1 bias ``return_mean`` towards short episodes. 0 turns restarts off.
-    The default is 0.5 if an episode lasts longer than 20 iterations (as with 205 or more worlds, 1,000 steps and the
-    default samples), and 0 otherwise."""
+    """Minimum number of worlds that start an episode in each iteration, divided by samples / horizon, the average
+    number if no episode ends early. Applies to segments with a time limit. If fewer worlds started an episode in the
+    last iteration, random worlds are restarted. Without restarts, worlds that started together reach the time limit
+    together, and in between few samples come from the start of an episode. Interrupted episodes are not counted in the
+    statistics, so values well above 1 bias ``return_mean`` towards short episodes. 0 turns restarts off. The default is
+    0.5 if an episode lasts longer than 20 iterations (as with 205 or more worlds, 1,000 steps and the default samples),
+    and 0 otherwise."""
     gamma: float = 0.995
     """Discount factor."""
     lam: float = 0.97

@@ -48,17 +48,17 @@ class PlanSamples:
 class PlanUpdate(abc.ABC):
     """Base class of updates, which turn samples into the next plan: ``lw.Planner(task, update=MyUpdate(...))``.
 
-    A subclass implements ``weigh``; the new plan is the weighted mean of the samples. It may also implement ``fit``,
-    for example to adapt the noise. Each planner uses a shallow copy of the given object, so ``prepare`` may store
-    buffers as attributes.
+    A subclass implements ``weigh``; the new plan is the weighted mean of the samples. A subclass may also implement
+    ``fit``, for example to adapt the noise. Each planner uses a shallow copy of the given object, so ``prepare`` may
+    store buffers as attributes.
     """
 
     capturable: ClassVar[bool] = False
     """Whether ``weigh`` and ``fit`` consist of Warp launches on arrays at fixed addresses, so that they can be part of
-    the planner's graph. Otherwise they may use torch and run between two graphs."""
+    the planner's graph. If False, the methods may use torch, and run between two graphs."""
     adapts_noise: ClassVar[bool] = False
     """Whether the noise has a standard deviation for each element of a plan, which is shifted in time with the plan and
-    adapted by ``fit``. Otherwise the planner's setting ``noise`` applies."""
+    adapted by ``fit``. If False, the planner's setting ``noise`` applies."""
 
     def prepare(self, samples: PlanSamples) -> None:
         """Check sizes and allocate buffers; called once, when the planner is made."""

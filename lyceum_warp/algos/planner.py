@@ -58,7 +58,7 @@ _BUFFERS = (
     "actions", "nominal", "knot_actions", "standard_noise", "adapted_noise", "sampled", "model_returns", "returns",
     "weights", "model_fields",
 )  # fmt: skip
-_MODELS = 0x6D6F64656C73  # "models" in ASCII: derives different seeds from the planner's
+_MODELS = 0x6D6F64656C73  # "models" in ASCII; with the planner's seed, it gives the seeds of the models
 _DRAWING = ("startup", "initialize", "randomize")
 """The task functions that can randomize a planner's model fields."""
 
@@ -69,18 +69,18 @@ Value: TypeAlias = ValueFunction | wp.Function | Callable[[torch.Tensor], torch.
 class Planner:
     """A controller that replans at every step: ``action = plan(state)``.
 
-    The planner simulates in its own worlds, one per sample. It controls a plant: an environment, with
-    ``plan(env.get_state()[0])``, or a robot, with ``plan(plan.state_of(qpos=..., qvel=..., time=...))``. The plant's
-    model, physics, time step and parameters may differ from the planner's. If the planner's time step is a multiple of
-    the plant's, ``lw.control`` and ``lw.control_async`` apply the plan as ``between`` says. Random streams are
-    counter-based: a plan depends on the seed, on the number of plans before it, and on the plan it starts from. In each
-    sample, the task's functions draw from a separate stream seeded by the planner, so a plan cannot anticipate the
+    The planner simulates in its own worlds, one per sample. The controlled world is called the plant: an environment,
+    with ``plan(env.get_state()[0])``, or a robot, with ``plan(plan.state_of(qpos=..., qvel=..., time=...))``. The
+    plant's model, physics, time step and parameters may differ from the planner's. If the planner's time step is a
+    multiple of the plant's, ``lw.control`` and ``lw.control_async`` apply the plan as ``between`` says. Random streams
+    are counter-based: a plan depends on the seed, on the number of plans before it, and on the plan it starts from. In
+    each sample, the task's functions draw from a separate stream seeded by the planner, so a plan cannot anticipate the
     plant's random numbers.
 
     ``plants=n`` plans for n plants at a time, as in ``env.step(plan(env.get_state()))`` with n worlds. Plant i uses the
     seed ``seed + i`` for its noise, so its plan equals the plan of a single-plant planner with this seed on the same
     engine. With ``models``, all plants use the models of the first seed. All buffers except ``model_fields`` then have
-    an axis for the plants: the second axis if the first is steps or knots, otherwise the first.
+    an axis for the plants. It comes after an axis for steps or knots, and otherwise first.
 
     A task's ``planning`` (see ``lw.Planning``) provides default settings of the planner, and options and parameters of
     its worlds. Arguments override them.
@@ -135,7 +135,7 @@ class Planner:
     weights: torch.Tensor
     """The samples' weights, (samples,)."""
 
-    _only_update: str | None = None  # the only update of a subclass
+    _only_update: str | None = None  # the update of a subclass that has only one
 
     def __init__(
         self,
@@ -165,7 +165,7 @@ class Planner:
         self.env.reset()
         self.timestep, self.between = self.env.timestep, self.config.between
         self._initial = self.env.get_state()[0]
-        for name, row in self.env.engine.nominal.items():  # a robot has the nominal model, not one drawn by startup
+        for name, row in self.env.engine.nominal.items():  # for a robot, not what startup drew
             self._initial[self.env.state_space.parts[name]] = torch_view(flat(row))[0].double()
         if "lasting_memory" in self.env.task.writes.get("startup", ()):
             self._initial[memory_columns(self.env.task, self.env.state_space)["lasting_memory"]] = 0.0
@@ -217,7 +217,7 @@ class Planner:
             self._value_in_torch = True
             try:
                 self._torch_values()
-            # such as missing weights, another input size, or critics, which also take actions
+            # for example, weights are missing, the input size differs, or critics also take actions
             except (RuntimeError, TypeError) as error:
                 observations = described(self._value_obs)
                 raise ValueError(f"value cannot take observations {observations}: {error}") from error
@@ -540,8 +540,8 @@ class MPPI(Planner):  # noqa: D101
 class CEM(MPPI):
     """The cross-entropy method: ``lw.CEM(task, ...)`` is ``lw.MPPI(task, update="cem", ...)``.
 
-    The mean of the best samples is the new plan. Their standard deviation becomes the standard deviation of the noise
-    and persists between calls; ``reset`` restores the initial one. Names in other packages:
+    The mean of the best samples is the new plan. The standard deviation of the best samples becomes the standard
+    deviation of the noise and persists between calls; ``reset`` restores the initial value. Names in other packages:
 
     ============= =============== ========================
     here          hydrax          judo

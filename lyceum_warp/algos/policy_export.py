@@ -83,7 +83,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
 
 
 def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
-    """Describe what a program needs to run a policy on a robot or in another simulator; JSON values by name.
+    """Describe a policy's inputs, outputs and timing for a program that runs it on a robot or in another simulator.
 
     ================  ===================================================================================
     ``task``          name of the task

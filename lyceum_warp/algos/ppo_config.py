@@ -38,7 +38,7 @@ class PPOConfig:
     """Clipping range of the probability ratio around 1 and, with clip_value_loss, of the values around the old
     values."""
     clip_value_loss: bool = True
-    """Whether the value loss is the larger of two errors: with the prediction and with the clipped prediction."""
+    """Whether the value loss is the larger of two errors: the prediction's and the clipped prediction's."""
     value_coef: float = 1.0
     """Coefficient of the value loss."""
     entropy_coef: float = 0.01

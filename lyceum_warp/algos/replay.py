@@ -14,7 +14,7 @@ Rows: TypeAlias = dict[str, torch.Tensor]
 """Contents of consecutive steps by name, each (steps, nworld, ...)."""
 
 _TRANSITIONS, _STEPS = 1_000_000, 1_024
-"""Default capacity: this number of transitions, or this number of steps of every world if that is more."""
+"""Default capacity: a million transitions or 1,024 steps of every world, whichever is more."""
 
 _SHARE = 0.3
 """The default capacity takes at most this share of the device's free memory."""

@@ -14,7 +14,7 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 MANY_WORLDS = 256
-"""Smallest number of worlds for which the defaults for many worlds apply."""
+"""With this number of worlds or more, the defaults for many worlds apply."""
 
 _FEW: dict[str, Any] = {
     "batch": 256, "actor_every": 1, "gamma": 0.99, "tau": 0.005, "temperature": 1.0, "target_entropy": -1.0,
@@ -93,7 +93,7 @@ class SACConfig:
     image; "loss" adds symmetry_coef times the squared difference between both; "augment" learns from the mirror images
     of all samples, too."""
     symmetry_coef: float = 1.0
-    """Coefficient of the loss of symmetry "loss"."""
+    """Coefficient of the symmetry loss, if symmetry is "loss"."""
     normalize: bool = True
     """Whether to normalise observations by their running mean and variance, updated in every step."""
     tf32: bool = True

@@ -36,7 +36,7 @@ class SquashedPolicy(Normalized):
         generator: Draws the initial weights.
 
     Raises:
-        ValueError: The bounds are not those of their mirror image.
+        ValueError: The mirror image of the actions has other bounds.
     """
 
     shape: dict[str, Any]
@@ -78,13 +78,13 @@ class SquashedPolicy(Normalized):
             self.use_mirror(mirror)
 
     def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:
-        """Average the Gaussian with that of the mirror image from now on.
+        """From now on, average the Gaussian with its mirror image.
 
         Args:
             reflections: The reflections of ``obs`` and ``action`` (``algos.symmetry.reflections``).
 
         Raises:
-            ValueError: The bounds of the actions are not those of their mirror image.
+            ValueError: The mirror image of the actions has other bounds.
         """
         low, high = self.shape["low"], self.shape["high"]
         bounds = list(zip(low, high, strict=True))

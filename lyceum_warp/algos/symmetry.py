@@ -45,7 +45,7 @@ class PolicyMirror(nn.Module):
         self.obs, self.action = Reflected(reflections["obs"]), Reflected(reflections["action"])
 
     def average(self, function: Callable[[torch.Tensor], torch.Tensor], obs: torch.Tensor) -> torch.Tensor:
-        """Average the actions of a function of observations with the mirror image's.
+        """Make a function of observations symmetric: average actions with their mirror images.
 
         Mirrored observations then give exactly the mirrored actions, bit for bit.
         """

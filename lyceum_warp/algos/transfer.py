@@ -126,16 +126,16 @@ def transfer(
 
     The Warp engine is compared with the C engine under the environment's physics. On the C engine, each physics of the
     task and the environment's own physics are compared with the task's exact physics. The episodes of a pair have equal
-    random numbers: initial states, model fields, pushes and commands. Intervals of returns and lengths are Student's t
-    over the pairs; the interval of the terminated share is Agresti and Min's.
+    random numbers: initial states, model fields, pushes and commands. The intervals of returns and lengths use
+    Student's t over the pairs; the interval of the terminated share uses Agresti and Min's method.
 
     Args:
         env: An environment of the task; its worlds do not change.
         policy: A module with a method ``act``, or a function; maps observations to actions, without noise.
         episodes: Number of pairs, each in a separate world.
         seed: Seed of the initial states.
-        margin: Largest irrelevant difference: for returns and lengths, a fraction of the mean absolute return or mean
-            length in the first simulation; for the terminated share, an absolute difference.
+        margin: Largest difference that counts as equal: for returns and lengths, a fraction of the mean absolute return
+            or mean length in the first simulation; for the terminated share, an absolute difference.
         device: Device of the Warp engine; by default the environment's GPU, or else one of this machine, or else the
             CPU, where its kernels may take minutes to compile.
         warp: Whether to play on the Warp engine.
@@ -180,7 +180,7 @@ def _show(progress: Callable[[int, int], object] | None, play: int, plays: int, 
 
 
 def task_physics(env: Env) -> tuple[dict[str, PhysicsOptions], str]:
-    """The physics of a task by name, including the environment's own physics, and the name of the latter.
+    """The physics of a task by name, including the environment's physics, and the name of the environment's physics.
 
     Options of the Warp engine alone are omitted.
     """

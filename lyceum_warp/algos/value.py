@@ -22,8 +22,8 @@ class ValueFunction(Normalized):
         hidden: Widths of the hidden layers.
         activation: Activation of the hidden layers.
         scale: Factor on the network's output until ``rescale`` fits it to returns.
-        time_orders: Highest power of the time features t, t^2, ... with t = step / 1000 (as in mjrl); 0 for none. They
-            help if the time limit is not observable, because returns then depend on the step.
+        time_orders: Highest power of the time features t, t^2, ... with t = step / 1000 (as in mjrl); 0 for none. Time
+            features help if the time limit is not observable, because returns then depend on the step.
         normalize: Whether to normalise observations by their running mean and variance.
         limit: Normalised observations are clipped to [-limit, limit]; inf for no limit.
         discount: Discount factor of the predicted returns, if known.

@@ -177,7 +177,7 @@ class BoundTask:
         self.source = TaskSource(task, self.name)
         self.functions = self.source.functions
         self.metrics = self.source.terms.metrics
-        """The names of the metrics: terms of the reward, those in the attribute ``metrics``, and terminations."""
+        """The names of the metrics: reward terms, the names in the attribute ``metrics``, and terminations."""
         self._check_class()
         memory = self.source.memory
         own_names = [*memory, *(["shared"] if self.source.shared is not None else [])]
@@ -192,7 +192,7 @@ class BoundTask:
         own = [name for name in named if is_data_field(name)]
         of_model = [name for name in named if name not in own]
         self.spec = _read_spec(task, model)
-        """The model before ``edit_model``. Replicas are made from it, because the file may have changed."""
+        """The model before ``edit_model``. Replicas use this model, because the file may have changed."""
         self.model = models.compile_model(_edited(task, self.spec), own, physics, varied={*of_model, *dynamics})
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.frame_skip = whole_number(f"frame_skip of the task {self.name!r}", skip, low=1)
@@ -245,7 +245,7 @@ class BoundTask:
         rights: dict[str, Rights] = {name: self._rights(function) for name, function in FUNCTIONS.items()}
         check_writes(self.name, written, rights)
         for name, function in self.source.terms.functions.items():
-            for overload in overloads(function):  # a term may write nothing
+            for overload in overloads(function):  # terms must not write
                 check_writes(self.name, {name: overload}, rights | {name: dict.fromkeys(overload.input_types, ())})
         memory = self.source.memory
         return {
@@ -276,7 +276,7 @@ class BoundTask:
         }
 
     def _sort_model_fields(self, named: list[str], dynamics: Collection[str]) -> None:
-        """Sort the model fields into varied fields and constants."""
+        """Divide the model fields into varied fields and constants."""
         drawn = {name: self.writes.get(name, frozenset()) for name in ("startup", "initialize", "randomize", "event")}
         between = drawn["initialize"] | drawn["randomize"] | drawn["event"]
         self.reset_dynamics = [name for name in named if name in between]
@@ -308,7 +308,7 @@ class BoundTask:
         previous, self.parameters = self.parameters, self.parameters.changed(params)
         try:
             changed = "the observation's" if obs_layouts(self.source, self.params) != self.obs_layouts else ""
-        except ValueError:  # a parameter that sets a size has one value per world
+        except ValueError:  # a size must not differ between worlds
             changed = "the observation's"
         layouts = (self._memory_layouts(), self._shared_layouts())
         changed = changed or ("the memory's" if layouts != (self.memory, self.shared) else "")

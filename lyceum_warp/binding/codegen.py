@@ -1,7 +1,7 @@
 """Generate the source that turns a task's functions of one world into kernels over a batch of worlds.
 
 The generated source defines a struct of the fields with an additional axis for the worlds, a function that returns a
-view of world w, and default functions. It is text, because Warp compiles source.
+view of world w, and default functions. Warp compiles source, so the result is text.
 """
 
 import dataclasses
@@ -107,8 +107,8 @@ def kernels_of(
 
     Args:
         source: The task.
-        groups: The functions that write its observation groups.
-        memory: The layouts of its rows of memory.
+        groups: The functions that write the task's observation groups.
+        memory: The layouts of the task's rows of memory.
         structs: The layouts of rows that functions access as structs: observation groups, Shared and Sums.
     """
     layouts = tuple((name, *layout.items()) for name, layout in (*memory.items(), *structs.items()))
@@ -174,7 +174,7 @@ def _generated(
         scope[f"observe_{number}"] = function
         noisy = draws_noise(function)
         observe.append(f"if group == {number}:")
-        if noisy:  # a stream for each group, so that no group's draws depend on another group
+        if noisy:  # a separate stream for each group, so that its draws do not depend on other groups
             observe.append(f"    rng[0] = substream(base, {number})")
         row = f"out.{group}[w]"
         if group in structs:

@@ -84,7 +84,7 @@ class TaskSource:
         return {group: list(function.input_types.values())[2] for group, function in functions.items()}
 
     def _observers(self, owner: type[Task]) -> list[str]:
-        """Names of functions for groups: in a class, or in its module if no other code of the module uses them."""
+        """Names of the functions of a class that write groups, or of its module if no other code there uses them."""
         module = vars(sys.modules[owner.__module__])
         functions = {name: self._seen(value) for name, value in module.items() if isinstance(value, wp.Function)}
         tasks = [kind for kind in (owner, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
@@ -96,7 +96,7 @@ class TaskSource:
             name
             for name, function in functions.items()
             if name not in called and id(function) not in used
-            and tuple(map(self._kind, function.input_types.values())) in forms  # not of another task
+            and tuple(map(self._kind, function.input_types.values())) in forms  # unless they belong to another task
             and (self._has_structs or not any(_may_list(task, name.removeprefix(GROUP_PREFIX)) for task in tasks))
         ]  # fmt: skip
         return [name for name in (*own, *unused) if name.startswith(GROUP_PREFIX)]
@@ -151,7 +151,7 @@ class TaskSource:
         return own
 
     def _memory(self) -> dict[str, Part]:
-        """The parts of memory in World. A task that only gives their number is refused."""
+        """The parts of memory in World. A task that declares only the number of elements is refused."""
         counted = [name for name in MEMORIES if hasattr(self.task, name)]
         parts = parts_of(self.world, "World")
         if old := [*counted, *(name for name in MEMORIES if name in self.world.vars and name not in parts)]:
@@ -193,7 +193,7 @@ class TaskSource:
         structs = [kind for kind in types if is_struct(kind)]
         foreign = structs and self.world not in structs and self.params not in structs
         if foreign and function.func.__module__ in {owner.__module__ for owner in self.task.__mro__}:
-            return None  # it belongs to another task of the module
+            return None  # the function belongs to another task of the module
         annotations = function.func.__annotations__
         if any(isinstance(annotation, str) for annotation in annotations.values()):
             raise ValueError(

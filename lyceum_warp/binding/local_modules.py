@@ -44,7 +44,7 @@ def local_modules(file: Path) -> dict[str, Path]:
 
 
 def _imported_names(tree: ast.AST, package: str) -> Iterator[str]:
-    """Full names of everything that a module of this package imports: modules, and names in modules."""
+    """Full names of the modules that a module of this package imports, and of names imported from modules."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -83,18 +83,18 @@ def stamps(files: Iterable[Path]) -> Stamps:
 def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
     """Context in which a task's file can import the modules beside it, as returned by ``local_modules``.
 
-    It replaces loaded modules of the same names if they have changed or come from another folder. If the block raises
+    Loaded modules of the same names are replaced if they have changed or come from another folder. If the block raises
     an error, ``sys.modules`` is restored.
     """
     before = {name: sys.modules.get(name) for name in modules}
     if any(name in _taken and _taken[name] != stamps([path]) for name, path in modules.items()):
-        for name in modules:  # all of them, because they may have imported names from each other
+        for name in modules:  # reload all modules, because they may have imported names from each other
             if name in _taken:
                 sys.modules.pop(name, None)
     folder, bytecode = str(file.resolve().parent), sys.dont_write_bytecode
     sys.path.insert(0, folder)
     importlib.invalidate_caches()
-    sys.dont_write_bytecode = True  # the folder may belong to a run, whose time stamps are in whole seconds
+    sys.dont_write_bytecode = True  # the folder may be a run's; bytecode compares times in whole seconds
     try:
         yield
     except BaseException:

@@ -36,7 +36,7 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         raise ValueError("a task's model must be a file or an MjSpec, not a compiled MjModel: give its MjSpec")
     if isinstance(source, mujoco.MjSpec):
         spec = source.copy()
-        spec.modelfiledir = str(Path(spec.modelfiledir).absolute())  # its mesh paths are relative to it
+        spec.modelfiledir = str(Path(spec.modelfiledir).absolute())  # mesh paths are relative to this folder
         return spec
     if isinstance(source, ModelFile):
         return source.spec()
@@ -99,10 +99,10 @@ def compile_model(
 ) -> mujoco.MjModel:
     """Compile a model for either engine.
 
-    - Newton replaces the PGS solver, which MuJoCo Warp lacks. It converges to the same accelerations.
+    - Newton replaces the PGS solver, which MuJoCo Warp lacks. Newton converges to the same accelerations.
     - Sleep is turned off, because a saved state does not say which bodies are asleep.
     - Fields that MuJoCo computes only for a sensor get such a sensor, after the model's own; if no field needs sensors,
-      they are turned off. The energy is turned on if it is read.
+      they are turned off. If a function reads the energy, its computation is enabled.
     - If ``contact`` lists a pair of geoms twice, only the first entry is kept: MuJoCo would make the contact twice,
       MuJoCo Warp once.
 

@@ -72,7 +72,7 @@ class Parameters:
             )
         found = defaults(struct, owner) | self._weights | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
         self._computed = {name for name, value in found.items() if isinstance(value, FromModel)}
-        """Names of values that are computed from the model."""
+        """Names of the parameters whose values are computed from the model."""
         self.values: dict[str, Any] = {name: found[name] for name in (*struct.vars, *self._weights) if name in found}
         self.values = self.changed(given).values
         self._computed -= set(given)
@@ -181,7 +181,7 @@ class Parameters:
             return elements(self._model, default.field, value).start
         shape = tuple(getattr(kind, "_shape_", ()))
         try:
-            array = np.asarray(value, dtype=np.float64)  # also converts Warp's vectors, lists and tensors
+            array = np.asarray(value, dtype=np.float64)  # this also converts Warp's vectors, lists and tensors
         except (TypeError, ValueError) as error:
             raise ValueError(f"{given} is not a number: {error}") from error
         if np.isnan(array).any():

@@ -55,7 +55,7 @@ def layout(struct: Any, kind: str, params: Mapping[str, Any], owner: str) -> Lay
     """Lay out a struct's parts of one kind; ``params`` has the tables that determine sizes.
 
     Raises:
-        ValueError: A size is not a positive number, or names no table of Params.
+        ValueError: A size is neither a positive number nor the name of a table of Params.
     """
     slices, start = dict[str, Slice](), 0
     for name, part in parts_of(struct, owner).items():
@@ -89,7 +89,7 @@ def _floats(dtype: Any) -> int:
 def length(what: str, size: int | str, params: Mapping[str, Any]) -> int:
     """Resolve a size: a number, or the name of a table in ``params``, whose rows are counted.
 
-    ``what`` is its name in error messages.
+    ``what`` names the size in error messages.
 
     Raises:
         ValueError: The size is not a positive number or the name of a table.

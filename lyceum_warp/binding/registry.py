@@ -192,7 +192,7 @@ def _run(path: Path, name: str, source: bytes) -> None:
     before = sys.modules.get(name)
     sys.modules[name] = module
     try:
-        code = compile(source, file, "exec")  # otherwise imports would use bytecode written in the same second
+        code = compile(source, file, "exec")  # a stale bytecode file may have the same time stamp, in whole seconds
         # Warp reads the source of functions from the line cache, so later changes of the file do not matter
         text = importlib.util.decode_source(source)
         linecache.cache[file] = (len(text), None, list(io.StringIO(text)), file)
@@ -245,7 +245,7 @@ def _task_of_file(path: Path, attribute: str) -> type[Task]:
 
 
 def kernel_name(task: type[Task]) -> str:
-    """The task's name in Warp's cache, by the contents of its file, not by its path, so copies share kernels."""
+    """The task's name in Warp's cache; it contains a hash of the file, so that copies share kernels."""
     module = task.__module__
     if module.startswith(_FILE) and task in _sources:
         module = f"{module[:-8]}{zlib.crc32(b''.join(_sources[task].values())):08x}"

@@ -114,7 +114,7 @@ def name_of(function: wp.Function) -> str:
 
 
 def builtin(name: str) -> Any:
-    """Find a builtin by name, among Warp's and then Python's.
+    """Find a builtin function by name, first of Warp, then of Python.
 
     Returns None if there is none. Warp's builtins need not be attributes of its module.
     """
@@ -124,7 +124,7 @@ def builtin(name: str) -> Any:
 def overloads(function: wp.Function) -> list[wp.Function]:
     """The overloads of a function with Python source: functions of the same name with other argument types."""
     found = [*function.user_overloads.values(), *function.user_templates.values()]
-    # without instances that Warp made from a generic function
+    # omit the instances that Warp made from a generic function
     return [overload for overload in found if overload.generic_parent is None] or [function]
 
 
@@ -134,7 +134,7 @@ def _scope(function: Any) -> dict[str, Any]:
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         try:
             scope[name] = cell.cell_contents
-        except ValueError:  # the enclosing function has not assigned it yet
+        except ValueError:  # the enclosing function has not assigned the variable yet
             scope.pop(name, None)
     return scope
 

@@ -19,7 +19,7 @@ _STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
 """The names that refer to the transition in reward terms and metrics, with their names in the generated text."""
 
 _STATE = {"s": "s", "s1": "s", "p": "p"}
-"""The same for terminations, which depend on one state."""
+"""The names that refer to the state in terminations, with their names in the generated text."""
 
 _OWN = ("weights", "metrics", "total")
 """Other names that the generated source uses."""
@@ -242,7 +242,7 @@ class _Body:
         self._values: dict[str, tuple[wp.Function, Any]] = {}
 
     def value(self, name: str, *wanted: type) -> str:
-        """The variable that holds the result of a task's function; check the result's type if types are given."""
+        """Return the variable that holds a function's result; check the result's type if types are given."""
         if name not in self._values:
             function, kind = self._terms.choose(name, self._given)
             arguments, named = [], False

@@ -1,4 +1,4 @@
-"""Find the writes of a Warp function, and of its callees, into its arguments.
+"""Find all places where a Warp function, or a function that it calls, writes into its arguments.
 
 The analysis follows elements, components, calls, local names of a row, and rows in the fields of a local struct. A row
 that is used in any other way (returned, put into a tuple, selected by ``wp.where``, passed to a native function) counts
@@ -84,7 +84,7 @@ def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mappin
 
 
 def _advice(write: Write, name: str, rights: Mapping[str, Rights]) -> str:
-    """List the fields that the function may write, and the functions that may write this field."""
+    """Say which fields the function may write, and which functions may write this field."""
     may = [field for fields in rights[name].values() for field in fields or ()]
     results = [argument for argument, fields in rights[name].items() if fields is None and argument != "rng"]
     own = f"{name} may write {', '.join(dict.fromkeys([*results, *may])) or 'nothing'}"
@@ -139,7 +139,7 @@ class _Reader:
 
     Args:
         function: The function.
-        places: For each argument, the memory of the analysed function's arguments that it refers to, or None.
+        places: For each argument, the memory to which it refers among the arguments of the analysed function, or None.
         arguments: Names of the arguments of the analysed function.
         writes: Collects the writes.
         seen: The functions that were read, with their places.
@@ -155,7 +155,7 @@ class _Reader:
     ) -> None:
         self.arguments, self.writes, self.seen = arguments, writes, seen
         self.source = FunctionSource(function)
-        # by name, and "name.field" for a row in a local struct
+        # keys: a name, or "name.field" for a row in a local struct
         self.places: dict[str, _Place | None] = dict(zip(function.input_types, places, strict=True))
         # a loop may use a local struct in its first iteration, before a later line puts a row into it
         for _ in range(2):

@@ -103,9 +103,16 @@ def optional_flags(
 
 
 def given(flags: Any) -> dict[str, Any]:
-    """The flags that differ from their defaults, by name."""
+    """The flags that differ from their defaults, by name.
+
+    Raises:
+        ValueError: A limit of the solver is not of the form NAME=VALUE.
+    """
     fields = flags.__dataclass_fields__
-    return {name: value for name, value in vars(flags).items() if value != fields[name].default}
+    found = {name: value for name, value in vars(flags).items() if value != fields[name].default}
+    if "solver" in found:
+        found["solver"] = dict(map(parameter, found["solver"]))
+    return found
 
 
 NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "model", "fields", "dynamics", "physics")
@@ -144,15 +151,6 @@ class Physics:
     solver: Repeated = ()
     """A limit of the constraint solver, such as iterations=4, ls_iterations=10 or noslip_iterations=0; may be repeated.
     By default the model's limits."""
-
-    def given(self) -> dict[str, Any]:
-        """The given options, by name.
-
-        Raises:
-            ValueError: A limit is not of the form NAME=VALUE.
-        """
-        limits = {"solver": dict(map(parameter, self.solver))} if self.solver else {}
-        return given(self) | limits
 
 
 def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str] | None = None) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from lyceum_warp.cli.arguments import ParamWords, Physics, Placement, TaskWord, parameters
+from lyceum_warp.cli.arguments import ParamWords, Physics, Placement, TaskWord, given, parameters
 from lyceum_warp.cli.display import make_console
 from lyceum_warp.testing import CHECKS, Context, check_task
 
@@ -43,7 +43,7 @@ class Check:
 
     def run(self) -> int:
         """Run the command, and return the exit code."""
-        words = vars(self.env) | self.physics.given() | parameters(self.param, self)
+        words = vars(self.env) | given(self.physics) | parameters(self.param, self)
         checks = [_check(name) for name in self.rule] or CHECKS
         console = make_console()
         try:

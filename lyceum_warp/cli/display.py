@@ -162,7 +162,7 @@ def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omi
 
 
 def curve_table(rows: list[dict[str, float | None]], console: Console) -> Table:
-    """A table of at most 15 of a run's iterations, without empty columns and those for which the console is too narrow.
+    """A table of at most 15 of a run's iterations; it omits empty columns, and columns that do not fit the console.
 
     If the mean policy was evaluated in at least 4 iterations between the first and the last, other iterations are
     omitted.
@@ -198,7 +198,7 @@ def _known(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
-    """Call a function that writes a file; return the path, or "none" with the reason if it fails.
+    """Call a function that writes a file; return the path, or "none" with the reason of the failure.
 
     Plots and videos are made from saved results, so the command succeeds even if one of them fails.
     """

@@ -56,13 +56,13 @@ class Eval:
     which: str = "last"
     """Which policy: last, best, or the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """A task, by name or file, to use with its own physics and defaults instead of the run's task. It may be the
-    current version of the run's task. Observations and actions must have the same sizes."""
+    """A task, by name or file, to use with its own physics and defaults instead of the run's task. The task may also be
+    the current version of the run's task. Observations and actions must have the same sizes."""
     param: ParamWords = ()
     episodes: int = 32
     """Number of episodes."""
     seed: int = 1
-    """Seed of the initial states, which differ from those of training with this seed."""
+    """Seed of the initial states; training with the same seed draws different ones."""
     nworld: int = 32
     """Maximum number of worlds; never more than episodes."""
     video: bool = False
@@ -95,7 +95,7 @@ class Eval:
         run = Run.open(pretrained_run(str(self.folder)) if self.pretrained else self.folder)
         nworld = min(self.nworld, self.episodes)
         path = run.policy_file(self.which)
-        words, params = given(self.env) | self.physics.given(), parameters(self.param, self)
+        words, params = given(self.env) | given(self.physics), parameters(self.param, self)
         env = run_worlds(run, words, params, nworld=nworld, task=self.task, trust=self.trust)
         find_camera(env.model, camera)
         origin = _source(env, run)

@@ -21,8 +21,8 @@ class Export:
     """Write a run's policy, including its observation normaliser, to a file that runs without lyceum_warp.
 
     An .onnx file has the input "obs", (n, observations) float32 for any n, and the output "action", the mean actions.
-    Its metadata describe the robot: parts of observations, joints, gains, control interval and more. Writing it needs
-    pip install 'lyceum-warp[export]'. torch loads a .pt2 file: torch.export.load(file).module()(obs).
+    The file's metadata describe the robot: parts of observations, joints, gains, control interval and more. Writing it
+    needs pip install 'lyceum-warp[export]'. torch loads a .pt2 file: torch.export.load(file).module()(obs).
 
     $ lyceum-warp export runs/hopper-20260101-120000
     $ lyceum-warp export runs/hopper-20260101-120000 --which best --to robot/policy.onnx

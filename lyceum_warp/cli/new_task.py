@@ -28,7 +28,7 @@ _SOURCES: dict[str, Callable[[str], ModelFile]] = {
 """Functions that locate a model, by the prefix before the colon in --model."""
 
 _TAKEN = ("World", "Params", "Row")
-"""Names that the file uses itself."""
+"""Names that a generated file defines, so that a task cannot have them."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,8 @@ class New:
     """Write a task file for a model, with a reward of zero; it can be checked, stepped and trained immediately.
 
     The policy observes positions, velocities and the model's sensors, or only the sensors if they measure every joint.
-    It acts through the model's actuators. A step lasts about 20 ms. Comments in the file explain the next steps.
+    The policy acts through the model's actuators. A step lasts about 20 ms. Comments in the file explain the next
+    steps.
 
     $ lyceum-warp new walk --model robots/dog.xml
     $ lyceum-warp new tasks/hop.py --model gymnasium:hopper.xml
@@ -52,12 +53,11 @@ class New:
     of these packages. A relative path is written relative to the task file."""
 
     template: Literal["plain", "velocity"] = "plain"
-    """velocity: a task of the family of walking robots, which follow velocity commands. The robot needs a floating
-    base, and legs made of hinges with one actuator each. Its file is short, because the family defines functions,
-    rewards and most parameters."""
+    """velocity: a task in which a walking robot follows velocity commands. The robot needs a floating
+    base, and legs made of hinges with one actuator each. The task's file is short, because the family defines
+    functions, rewards and most parameters."""
     feet: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
-    """With --template velocity: sites, geoms or bodies that are feet. By default, the ends of the legs that reach
-    lowest."""
+    """With --template velocity: sites, geoms or bodies that are feet. By default, the lowest ends of legs."""
     joints: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
     """With --template velocity: names of the actuated joints, with one actuator each. By default, all leg joints with
     an actuator; other joints keep their pose."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import tyro
 
-_CONFIG = (tyro.conf.DisallowNone,)  # an option that defaults to None takes no None
+_CONFIG = (tyro.conf.DisallowNone,)  # options with the default None do not accept the word None
 
 
 def parse(command: type, prog: str, words: Sequence[str]) -> Any:

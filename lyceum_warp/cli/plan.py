@@ -82,13 +82,13 @@ class Settings:
 class Plan:
     """Control a task with a planner that replans at every step, and report rewards, success and planning times.
 
-    The planner is MPPI, or with --update the cross-entropy method (cem) or predictive sampling. Its default settings
-    come from the task. Physics options (--physics, --integrator, ...) apply only to the planner; --physics exact is the
-    controlled world's physics.
+    The planner is MPPI, or with --update the cross-entropy method (cem) or predictive sampling. The default settings of
+    the planner come from the task. Physics options (--physics, --integrator, ...) apply only to the planner; --physics
+    exact is the controlled world's physics.
 
     With --real-time the world keeps its rate. The command then measures planning times for a few seconds, and chooses
     the largest number of samples that meets the deadline on this machine, or if none does, a shorter horizon or other
-    physics of the task. It does not change given values of --samples, --horizon and --physics.
+    physics of the task. Given values of --samples, --horizon and --physics do not change.
 
     The command writes config.json, versions.json, report.json, plan.png, a video of the first episode (video.mp4), and
     one file per episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy) into a
@@ -123,7 +123,7 @@ class Plan:
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder; by default runs/plan-TASK-DATE."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """NPG or PPO run of this task. Its value function gives the value of each sample's final state."""
+    """NPG or PPO run of this task. The run's value function gives the value of each sample's final state."""
     param: ParamWords = ()
     planner_param: Repeated = ()
     """A parameter for the planner only, if it differs from the controlled world's; may be repeated."""
@@ -213,7 +213,7 @@ def _stem(task: str) -> str:
 def _worlds(
     options: Plan, params: dict[str, Any], planner_params: dict[str, Any]
 ) -> tuple[Env, Callable[[RealTimeSetting | None], MPPI]]:
-    """Make the controlled world, and a function that makes its planner from a chosen setting or from the flags."""
+    """Make the controlled world, and a function that makes a planner from a measured setting or from flags."""
     steps: dict[str, Any] = {} if options.steps is None else {"horizon": whole_number("steps", options.steps, low=1)}
     plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
     if plant.horizon == 0:
@@ -221,14 +221,14 @@ def _worlds(
     task = plant.task.task
     value = None if options.value is None else load_value(options.value)
     config = options.mppi.on_top_of(task_config(task, value))
-    words = vars(options.planner) | options.planner_physics.given()
+    words = vars(options.planner) | given(options.planner_physics)
     if options.planner_model is not None:
         words["model"] = _model(options.planner_model)
 
     def make(setting: RealTimeSetting | None) -> MPPI:
         chosen, physics = config, {}
         if setting is not None:
-            # the time between plans does not change
+            # keep the time between knots
             knots = config.knots and max(1, config.knots * setting.horizon // config.horizon)
             chosen = config.changed({"samples": setting.samples, "horizon": setting.horizon, "knots": knots})
             if setting.physics not in (None, _suggested_physics(task)):
@@ -245,7 +245,8 @@ _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
     """Choose the settings that are not given as flags, from measured planning times; None if all are given.
 
-    The deadline is a step of the plant, or if nothing meets it, a longer step of the planner.
+    The deadline is a step of the plant. If no setting meets it, the deadline is a step of the planner, which may be
+    longer.
     """
     task, flags = plant.task.task, given(options.mppi)
     config = options.mppi.on_top_of(task_config(task))
@@ -256,7 +257,7 @@ def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) 
     if config.horizon > 1 and not {"horizon", "knots"} & flags.keys():
         horizons.append(config.horizon // 2)
     physics = [options.planner_physics.physics]
-    if not options.planner_physics.given():
+    if not given(options.planner_physics):
         physics = list(dict.fromkeys((_suggested_physics(task), *task.physics)))
     if len(samples) == len(horizons) == len(physics) == 1:
         return None

@@ -30,10 +30,10 @@ _ELEMENTS = {
 _Sensor = mujoco.mjtSensor
 
 _UNOBSERVED = (_Sensor.mjSENS_USER, _Sensor.mjSENS_PLUGIN, _Sensor.mjSENS_CLOCK)
-"""Sensors that do not measure the robot's state, or only with custom code."""
+"""Sensors that do not measure the robot's state, or that need custom code."""
 
 _FREE_SENSORS = (_Sensor.mjSENS_FRAMEQUAT, _Sensor.mjSENS_GYRO, _Sensor.mjSENS_FRAMEANGVEL)
-"""Any of these sensors on a floating body shows that the model measures the body's motion."""
+"""If a floating body has one of these sensors, the model measures the body's motion."""
 
 
 def task_text(file: str, class_name: str, source: str, title: str, model: mujoco.MjModel) -> str:
@@ -104,7 +104,7 @@ def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list
 
 
 def _sensor_places(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """The ranges of sensordata that are observed, as (first, last), with first <= i < last."""
+    """The ranges (first, last) of sensordata that the policy observes, with first <= i < last."""
     places: list[tuple[int, int]] = []
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
         return places

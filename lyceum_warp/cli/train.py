@@ -94,8 +94,8 @@ class Train:
     resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Continue the run in this folder exactly, with its settings, up to --iterations."""
     from_run: Annotated[Path | None, tyro.conf.arg(name="from", metavar="RUN")] = None
-    """Start a new run from the policy, the value function and the normaliser of this run. Its settings are the
-    defaults, except its parameters if TASK is a different task, and its hyperparameters if --algorithm is different."""
+    """Start a new run from the policy, the value function and the normaliser of this run. The run's settings are the
+    defaults, except the parameters if TASK is a different task, and the hyperparameters if --algorithm is different."""
     which: str = "last"
     """Which policy of --from: last, best, or the number of a saved iteration."""
     target_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
@@ -208,7 +208,7 @@ class Train:
 
     def configuration(self, source: Run | None, team: Team) -> Configuration:
         """The configuration of the source run, or the defaults, overridden by the given flags."""
-        words = given(self.env) | self.physics.given()
+        words = given(self.env) | given(self.physics)
         for name, value in (("nworld", self.nworld), ("seed", self.seed)):
             if value is not None:
                 words[name] = value

@@ -34,7 +34,7 @@ class Tune:
 
     task: TaskWord
     run_folder: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
-    """A run of this task. Its policy also plays the episodes, and its task parameters are the defaults."""
+    """A run of this task. The run's policy also plays the episodes, and the run's task parameters are the defaults."""
     which: str = "last"
     """Which policy of --run: last, best, or the number of a saved iteration."""
     tolerance: Annotated[str, tyro.conf.arg(metavar="strict|loose|any")] = "strict"
@@ -158,5 +158,5 @@ def _planning_columns(reference: dict[str, Any]) -> dict[str, Cell]:
 
 
 def _short(ratio: float) -> str:
-    """A ratio of any size in few characters."""
+    """Format a ratio of any size in a few characters."""
     return f"{ratio:.0e}" if ratio >= 1e4 else f"{ratio:.2g}" if ratio < 10 else f"{ratio:,.0f}"

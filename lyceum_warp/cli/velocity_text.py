@@ -17,11 +17,10 @@ _STEP = 0.02
 """Seconds in a step."""
 
 _NEAR = 0.1
-"""A leg ends in a foot if its lowest point is at most this fraction of the base's height above the lowest point of all
-legs."""
+"""The end of a leg is a foot if it is at most this fraction of the base's height above the lowest point of all legs."""
 
 _FLAT = 0.01
-"""Spheres of a sole are at most this much higher than its lowest sphere, m."""
+"""Maximum height of a sole's spheres above its lowest sphere, m."""
 
 _AT = 0.06
 """A site of the robot marks a foot if it is at most this far from the centre of the sole, m."""
@@ -151,7 +150,7 @@ class Walker:
         return names
 
     def _moved(self) -> np.ndarray:
-        """Whether an actuator moves each joint, (njnt,), also through tendons, which ``walkers.servos`` refuses."""
+        """Whether an actuator moves each joint, (njnt,); actuators of tendons count, too."""
         m, d = self.model, self.data
         mujoco.mj_forward(m, d)
         moment = np.zeros((m.nu, m.nv))

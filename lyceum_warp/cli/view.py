@@ -35,12 +35,12 @@ from lyceum_warp.viewer.show import view
 _RUN_WORLDS = 16
 _WAIT = 10.0  # seconds that --follow waits for a run
 _LONG = 1e9
-_NICE = 10  # niceness of the process of `lw.RunViewer`
+_NICE = 10  # niceness of the subprocess of `lw.RunViewer`
 
 
 @optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)")
 class Place:
-    """Where the worlds run; with --mppi, where the planner's worlds run."""
+    """Engine and device of the worlds; with --mppi, of the planner's worlds."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto."""
@@ -104,7 +104,7 @@ class View:
         return self.show(_WAIT)
 
     def show(self, seconds: float) -> int:
-        """Show it until the viewer is closed; returns the exit code.
+        """Run the command until the viewer is closed, and return the exit code.
 
         Args:
             seconds: Maximum time that --follow waits for the run.
@@ -202,7 +202,7 @@ def _planner(options: View, env: Env) -> MPPI:
 
 def _words(options: View) -> dict[str, Any]:
     """The options of the worlds, or with --mppi of the planner's worlds."""
-    return given(options.place) | options.physics.given()
+    return given(options.place) | given(options.physics)
 
 
 def _run(options: View, seconds: float) -> Run:

@@ -91,8 +91,8 @@ class CheckedController:
     def action(self, plan: torch.Tensor, plant_steps: int) -> torch.Tensor:
         """The action of a plan to apply ``plant_steps`` steps of the plant after the plan's state.
 
-        If a step of the plan is several steps of the plant, they all apply its action, or with ``between="linear"``
-        interpolate to the next one. After the end of the plan, its last action applies.
+        If a step of the plan takes several steps of the plant, all of them apply the plan's action, or, with
+        ``between="linear"``, interpolate to the next action. After the end of the plan, its last action applies.
 
         Args:
             plan: The plan, (horizon, nact).

@@ -202,7 +202,7 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-# the quantiles, each with the smallest number of plans at which one plan is expected beyond it
+# each quantile with the number of plans of which one, on average, lies beyond it
 _QUANTILES = {"p50": (0.5, 2), "p90": (0.9, 10), "p99": (0.99, 100), "p99_9": (0.999, 1000)}
 
 
@@ -263,7 +263,7 @@ def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:
 
 
 def _sample_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
-    """Numbers of failed and effective samples, over the plans for which the controller reports them."""
+    """Statistics of failed and effective samples; plans for which the controller does not report them are omitted."""
     failed, effective = (_joined(getattr(e, name) for e in episodes) for name in ("plan_failed", "plan_effective"))
     failed, effective = failed[np.isfinite(failed)], effective[np.isfinite(effective)]
     samples = episodes[0].controller.get("samples")

@@ -43,8 +43,8 @@ class PlanningController(Controller, Protocol):
             obs: See ``Controller``.
             shift: Number of steps of length ``timestep`` since the state of the last plan; 0 for the first plan after a
                 reset. With ``reset=False`` the loops assume that the last plan was made in the previous step, or with
-                ``replan_every`` in the last step when a plan was due. They pass ``shift`` only to controllers that have
-                this argument.
+                ``replan_every`` in the last step when a plan was due. The loops pass ``shift`` only to controllers that
+                have this argument.
 
         Returns:
             The first action of the plan, (nu,). If the controller has ``actions``, the loops read these instead.
@@ -64,7 +64,7 @@ class PlanningController(Controller, Protocol):
     def timestep(self) -> float:
         """Simulated seconds between two actions of the plan; by default the plant's time step.
 
-        It must be a multiple of the plant's time step, or a fraction of it.
+        The interval must be a multiple or a whole fraction of the plant's time step.
         """
         ...
 
@@ -95,5 +95,5 @@ class PlanningController(Controller, Protocol):
 
     @property
     def env(self) -> Env:
-        """Environment that simulates the plans. It must not be the plant, because planning changes its state."""
+        """Environment that simulates the plans. The plant itself is not allowed, because planning changes the state."""
         ...

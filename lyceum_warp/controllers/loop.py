@@ -35,7 +35,7 @@ def control(
 
     Args:
         env: The plant: one world, made with ``autoreset=False``.
-        controller: Called for each plan; see ``lw.Controller``. It must not step ``env``.
+        controller: Called for each plan; see ``lw.Controller``. The controller must not step ``env``.
         steps: Steps after which to stop if the episode has not ended.
         replan_every: Number of steps from one plan to the next. The steps in between apply the next actions of the
             plan, so values above 1 need a controller with ``actions``.
@@ -44,10 +44,10 @@ def control(
             and the controller's last plan; ``replan_every`` must be the same as in the last run.
         on_step: Called with a ``ControlProgress`` after each step. Planning times do not include it.
         on_abort: Called with the trajectory of the complete steps, if there are any, when an exception, including
-            Ctrl-C, ends the run. Its ``done_reason`` is 0. The exception is raised afterwards.
+            Ctrl-C, ends the run. The trajectory's ``done_reason`` is 0. The exception is raised afterwards.
 
     Returns:
-        The episode. Its ``period`` is the plant's time step.
+        The episode. The trajectory's ``period`` is the plant's time step.
 
     Raises:
         ValueError: The environment has several worlds or automatic resets, the episode is over or may never end, an

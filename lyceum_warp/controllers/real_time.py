@@ -72,7 +72,8 @@ def control_async(
 
     Args:
         env: The plant: one world, made with ``autoreset=False``.
-        controller: Called in the second thread; see ``lw.Controller``. It must plan in a separate environment.
+        controller: Called in the second thread; see ``lw.Controller``. The controller must plan in a separate
+            environment.
         period: Wall time between steps, seconds; by default the plant's time step, which is real time.
         steps: Steps after which to stop if the episode has not ended.
         seed: Seed of the initial state and of the controller.
@@ -80,7 +81,7 @@ def control_async(
             and the controller's last plan.
         on_step: Called with a ``ControlProgress`` after each step, in the calling thread. Slow calls delay the plant.
         on_abort: Called with the trajectory of the complete steps, if there are any, when an exception, including
-            Ctrl-C, ends the run. Its ``done_reason`` is 0. The exception is raised afterwards.
+            Ctrl-C, ends the run. The trajectory's ``done_reason`` is 0. The exception is raised afterwards.
         clock: Replaces the wall clock, for instance by a subclass that does other work while the plant waits.
 
     Returns:

@@ -70,8 +70,7 @@ def choose_setting(
 ) -> RealTimeChoice:
     """Choose the largest number of samples whose plans meet a deadline.
 
-    Shorter horizons, and after them other physics, are tried only if the smallest number of samples misses the
-    deadline.
+    If the smallest number of samples misses the deadline, shorter horizons are tried, and then other physics.
 
     Args:
         samples: Numbers of samples, in ascending order.
@@ -87,7 +86,7 @@ def choose_setting(
     for name in physics:
         for horizon in horizons:
             times: dict[int, float] = {}
-            low, high, tried = -1, len(samples), 0  # the number at index low meets the deadline, and at high misses it
+            low, high, tried = -1, len(samples), 0  # samples[low] meets the deadline, and samples[high] misses it
             while high - low > 1:
                 setting = RealTimeSetting(samples[tried], horizon, name)
                 found = times[samples[tried]] = measure(setting)

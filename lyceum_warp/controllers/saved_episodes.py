@@ -52,7 +52,7 @@ def episode_env(
     Args:
         episodes: The episodes, as ``load_episodes`` returns them.
         task: The task. Required if it was defined in a notebook, if its file has moved, or if other users can write to
-            the file. It must have the same name as the episodes' task.
+            the file. The given task must have the same name as the episodes' task.
         changes: Additional options and parameters of ``lw.make``.
 
     Raises:

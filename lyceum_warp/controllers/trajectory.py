@@ -17,7 +17,7 @@ from lyceum_warp.support.files import newer_format, replaced
 from lyceum_warp.support.versions import versions
 
 FORMAT = 1
-"""Version of the file format. It increases when older releases cannot read new files."""
+"""Version of the file format. The version increases when older releases cannot read new files."""
 
 # dtype and axes of each array; axes with the same name have the same length
 _ARRAYS = {

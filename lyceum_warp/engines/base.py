@@ -21,8 +21,8 @@ from lyceum_warp.support.docstrings import document_attributes
 class Engine(abc.ABC):
     """Many worlds of one model, stepped together.
 
-    An engine knows nothing of tasks. Its fields are Warp arrays with a leading ``nworld`` axis. Their addresses never
-    change, so graphs that read them are captured once.
+    An engine knows nothing of tasks. The fields of an engine are Warp arrays with a leading ``nworld`` axis. The
+    addresses of the fields never change, so graphs that read fields are captured once.
 
     The order of calls in a step is: write ``ctrl`` and other inputs, call ``step`` and ``find_faults``, read fields and
     ``fault``. For worlds that restart, the caller then calls ``reset``, writes state fields and model fields, and calls
@@ -33,7 +33,7 @@ class Engine(abc.ABC):
         model: The compiled model; the engine stores it and does not change it.
         nworld: Number of worlds.
         device: Where the arrays live.
-        fields: The fields to provide, from ``fields.describe``. No other field can be read later.
+        fields: The fields to provide, from ``fields.describe``. Other fields cannot be read later.
         dynamics: The model fields that differ between worlds, from ``model_fields.describe_model_field``.
         initial: The state that ``reset`` puts worlds into, (integration_size,); None for the model's own.
 
@@ -146,7 +146,7 @@ class Engine(abc.ABC):
         """
 
     def step_phases(self, nstep: int) -> list[Phase]:
-        """The phases of ``step``. An engine that is not ``capturable`` can thus still capture its copies of fields."""
+        """The phases of ``step``. So an engine that is not ``capturable`` can still capture its copies of fields."""
         return [Phase("physics", partial(self.step, nstep), engine=True)]
 
     @abc.abstractmethod
@@ -185,7 +185,8 @@ class Engine(abc.ABC):
     def settle(self, mask: wp.array, nstep: int) -> None:
         """Advance only the masked worlds by ``nstep`` substeps from their committed states, and update state fields.
 
-        Their time is 0 afterwards; ``refresh`` then updates derived fields. No bit of any other world changes.
+        Afterwards the time of these worlds is 0; ``refresh`` then updates derived fields. No bit of any other world
+        changes.
         """
         raise NotImplementedError(f"the {self.name} engine cannot settle individual worlds")
 

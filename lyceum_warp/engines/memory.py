@@ -30,9 +30,9 @@ def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: 
     """
     free = free_memory(device)
     if free is not None and nworld > _most(bytes_per_world, free + held):
-        gc.collect()  # frees environments that are no longer used
+        gc.collect()  # free environments that are no longer used
         if device.is_cuda:
-            torch.cuda.empty_cache()  # frees memory that torch has cached
+            torch.cuda.empty_cache()  # free memory that torch has cached
         free = free_memory(device)
     if free is None or nworld <= (most := _most(bytes_per_world, free + held)):
         return

@@ -26,11 +26,12 @@ _DETERMINISTIC = "lyceum_warp.engines.deterministic.deterministic_engine", "Dete
 """The engine that replaces "warp" on a CUDA device with deterministic=True."""
 
 _SAMPLES_PER_CORE = 40
-"""With fewer samples per CPU core, the C engine plans faster than an H100. Measured with 16 cores, the break-even
-points are 27 samples per core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah (bench/README.md)."""
+"""With fewer samples per CPU core than this, the C engine plans faster than an H100. Measured with 16 cores, the
+break-even points are 27 samples per core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah
+(bench/README.md)."""
 
 _MOST_CORES = 16
-"""Additional cores do not count: they were not measured, and a plan's work besides physics runs on one core."""
+"""Further cores do not count: more were not measured, and the other work of a plan runs on one core."""
 
 _NOSLIP = 6
 """Factor on the break-even point if the model uses the noslip solver, which is slow on a GPU."""

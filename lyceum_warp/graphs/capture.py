@@ -150,7 +150,7 @@ class _Graph:
                 self._loaded = True
                 self._run()
                 return
-            if self._device.is_cuda:  # a capture may zero memory that running launches still use
+            if self._device.is_cuda:  # a capture may clear memory that running launches still use
                 wp.synchronize_device(self._device)
             self._replay = self._capture_part(0, 1)
         if self._times is None:
@@ -164,7 +164,7 @@ class _Graph:
             self._share(shortest)
 
     def _share(self, seconds: float) -> None:
-        """Split the graph among workers if its duration on one thread makes that worthwhile."""
+        """Split the graph among workers if it takes long enough on one thread."""
         assert self._workers is not None
         parts = min(self._workers.nthread, int(seconds / SECONDS_A_THREAD))
         if parts > 1:

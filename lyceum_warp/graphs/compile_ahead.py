@@ -37,8 +37,8 @@ def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str)
     """Compile the kernels that a function launches and that are not cached, and report progress on stderr.
 
     Args:
-        function: Consists of launches. It is called with kernel launches disabled, so its arrays may hold garbage
-            afterwards.
+        function: Consists of launches. The function is called with kernel launches disabled, so its arrays may hold
+            garbage afterwards.
         device: Where the kernels will run.
         purpose: What the kernels are for, such as "hopper"; shown in the report.
     """
@@ -56,7 +56,7 @@ def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str)
             for future in concurrent.futures.as_completed(futures):
                 report(*future.result())
         finally:
-            pool.shutdown(cancel_futures=True)  # after an error, or Ctrl-C
+            pool.shutdown(cancel_futures=True)  # needed after an error or Ctrl-C
     return Built(len(missing), len(wanted) - len(missing), time.perf_counter() - start)
 
 

@@ -36,7 +36,7 @@ def rehearse() -> Iterator[Rehearsal]:
     rehearsal = Rehearsal()
     functions: dict[str, Callable[..., None]] = {"launch": rehearsal.launch, "launch_tiled": rehearsal.launch}
     functions |= {"capture_while": _loop, "capture_if": _branch}
-    # their inputs would be garbage
+    # sorts and scans would read garbage
     functions |= dict.fromkeys(("radix_sort_pairs", "segmented_sort_pairs", "array_scan"), _nothing)
     with _lock, replaced_in_this_thread(functions):
         yield rehearsal

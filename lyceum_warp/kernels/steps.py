@@ -134,7 +134,7 @@ class TaskCode:
     valid_model: wp.Function  # whether the model fields that the task writes are valid
     terms: Mapping[
         str, wp.Function
-    ]  # ``reward``, ``score`` and ``terminated`` of a task with terms; see ``binding.terms``
+    ]  # ``reward``, ``score`` and ``terminated`` of a task with terms; see ``binding.task_terms``
     has_state: bool  # whether ``copy_state`` is needed
     has_memory: bool  # whether ``finite_memory`` is needed
     checks_model: bool  # whether ``valid_model`` is needed

@@ -172,9 +172,14 @@ def read_checkpoint(
     if not path.is_file():
         raise FileNotFoundError(f"there is no checkpoint {path}: train the run first")
     try:
-        data = path.read_bytes()
-        _check_records(data)
-        content = torch.load(io.BytesIO(data), map_location=device, weights_only=True)
+        data = io.BytesIO(path.read_bytes())
+        with zipfile.ZipFile(data) as archive:
+            # torch writes checksums but does not check them, and it ignores the content of records marked as folders
+            folders = (record.filename for record in archive.infolist() if record.external_attr & 0x10)
+            if (name := archive.testzip() or next(folders, None)) is not None:
+                raise ValueError(f"its record {name} is corrupt")
+        data.seek(0)
+        content = torch.load(data, map_location=device, weights_only=True)
     except OSError:
         raise
     except Exception as error:  # zipfile and torch raise many types of errors
@@ -211,19 +216,6 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
     "score": lambda value: isinstance(value, dict) and isinstance(value.get("value"), int | float),
 }  # fmt: skip
 """Checks of the entries of a file, by name."""
-
-
-def _check_records(data: bytes) -> None:
-    """Verify the CRC-32 of the records in a torch archive, which torch writes but does not check.
-
-    Raises:
-        ValueError: A record is damaged.
-    """
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        # torch ignores the content of records that are marked as folders
-        folders = (record.filename for record in archive.infolist() if record.external_attr & 0x10)
-        if (name := archive.testzip() or next(folders, None)) is not None:
-            raise ValueError(f"its record {name} is corrupt")
 
 
 def check_format(path: Path, number: Any) -> None:

@@ -122,7 +122,7 @@ class Configuration:
 
         Args:
             team: The processes that train together.
-            run: The run whose task to use. Its copies replace files that have moved or changed.
+            run: The run whose task to use. The run's copies replace files that have moved or changed.
             networks: The initial policy and value function; None for new ones.
             note: Called with messages about the task's files.
             task: A task to use instead of the run's; its current version is used.
@@ -157,10 +157,10 @@ def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, 
     """The initial policy and value function for a learner, and their iteration.
 
     Args:
-        run: The run of the networks.
+        run: The run that saved the networks.
         which: Which policy of the run; None to resume the run. The networks are then None if the hyperparameters
-            describe them completely, which they do not if the run started from another run's networks or uses
-            ``limit``.
+            describe them completely. The hyperparameters are not enough if the run started from the networks of another
+            run, or if it uses ``limit``.
 
     Raises:
         FileNotFoundError: The run has no such policy.

@@ -63,13 +63,13 @@ class Run:
     previous: Path
     """Path of the previous checkpoint."""
     replay: Path
-    """Path of the folder with the replay buffer."""
+    """Path of the folder that holds the replay buffer."""
     policy: Path
     """Path of the last policy."""
     best: Path
     """Path of the best policy."""
     transfer: Path
-    """Path of the verdict on the last policy's transfer."""
+    """Path of ``transfer.json``, the verdict on the last policy."""
     task_folder: Path
     """Path of the folder with the copies of the task's file and model."""
 
@@ -131,7 +131,7 @@ class Run:
         folder = Path(folder)
         cls.check_free(folder)
         run = cls(folder, {"format": FORMAT, **config})
-        text = json.dumps(run.config, indent=2)  # may fail, so it comes before the folder is created
+        text = json.dumps(run.config, indent=2)  # this may fail, so the folder is created later
         task, now = folder / f"{_TASK}.tmp", json.dumps(versions(device), indent=2)
         try:
             shutil.rmtree(task, ignore_errors=True)

@@ -45,20 +45,14 @@ def read_metrics(path: Path, *, lines: list[str] | None = None) -> list[dict[str
     Raises:
         ValueError: A cell is not a number, or the rows differ in length.
     """
-    reader = csv.DictReader(_lines(path) if lines is None else lines, strict=True)
+    if lines is None:
+        with path.open(newline="", errors="replace") as file:  # a replaced character is not part of a number
+            lines = file.readlines()
+    reader = csv.DictReader(lines, strict=True)
     try:
         return [{key: float(cell) if cell else None for key, cell in row.items()} for row in reader]
     except (ValueError, TypeError, csv.Error) as error:
         raise ValueError(f"{path} is not a table of metrics: line {reader.line_num}: {error}") from error
-
-
-def _lines(path: Path) -> list[str]:
-    """The lines of the table, with their ends."""
-    try:
-        with path.open(newline="") as file:
-            return file.readlines()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not a table of metrics: {error}") from error
 
 
 def cut_rows(path: Path, iteration: int) -> None:
@@ -73,12 +67,13 @@ def cut_rows(path: Path, iteration: int) -> None:
     """
     if not path.exists():
         return
-    lines = _lines(path)
+    with path.open(newline="", errors="replace") as file:
+        lines = file.readlines()
     header = next(csv.reader(lines[:1]), [])
     column = header.index("iteration") if "iteration" in header else None
     kept = []
     for i, line in enumerate(lines):
-        number: float = i  # the line's index if the cell is broken; _rows below reports broken lines
+        number: float = i  # the line's index if the cell is broken; read_metrics below reports broken lines
         with contextlib.suppress(ValueError, IndexError, csv.Error):
             number = float(next(csv.reader([line]))[column]) if i and column is not None else i
         if line.endswith("\n") and (i == 0 or number <= iteration):

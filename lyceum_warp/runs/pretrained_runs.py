@@ -15,9 +15,10 @@ def pretrained_tasks() -> list[str]:
 
 
 def pretrained_run(task: str) -> Path:
-    """The folder of a task's pretrained policy, which ``lw.load`` and others take as they take a run.
+    """The folder of a task's pretrained policy; functions such as ``lw.load`` accept it like any run.
 
-    Its config.json holds the settings of the training, and under ``evaluated`` the return that the policy reached.
+    The folder's config.json holds the settings of the training and, under ``evaluated``, the return that the policy
+    reached.
 
     Example:
         >>> policy = lw.load(lw.pretrained_run("hopper"))
@@ -26,7 +27,7 @@ def pretrained_run(task: str) -> Path:
         task: The task's name.
 
     Raises:
-        ValueError: The task has no pretrained policy; the message names those that have one.
+        ValueError: The task has no pretrained policy; the message lists the tasks that have one.
     """
     tasks = pretrained_tasks()
     if task not in tasks:

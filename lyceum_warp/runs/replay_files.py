@@ -6,17 +6,18 @@ new file name. The old files are deleted after the checkpoint has been replaced,
 steps.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.replay import Replay
 from lyceum_warp.runs.checkpoints import FORMAT, read_checkpoint, write_content
+from lyceum_warp.runs.lock import RunLock
 
 _PARTS = 64
 
 
-def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, check: Callable[[], object]) -> None:
+def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, lock: RunLock | None) -> None:
     """Write the parts that have grown; all ranks must call this.
 
     Args:
@@ -24,18 +25,18 @@ def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, ch
         replay: The replay buffer.
         team: The processes.
         since: Number of stored steps at the last save.
-        check: Called before each file is written.
+        lock: The run's lock, checked before each file is written; None with ``folder``.
     """
     oldest = replay.stored - replay.count
     for start, end in _parts(replay, max(since, oldest), replay.stored):
         first = max(start, oldest)
-        rows = {  # the axis of the worlds comes first while they are gathered
+        rows = {  # gather concatenates along the first axis, so the axis of the worlds comes first
             name: team.gather(part.transpose(0, 1).contiguous()).transpose(0, 1).cpu().contiguous()
             for name, part in replay.rows(first, end).items()
         }
         with team.together():
-            if folder is not None:
-                check()
+            if folder is not None and lock is not None:
+                lock.check()
                 folder.mkdir(exist_ok=True)
                 content = {"lyceum_warp": FORMAT, "first": first, "rows": rows}
                 write_content(folder / _name(start, end), content, durable=True)
@@ -63,7 +64,7 @@ def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
     """
     oldest = max(0, stored - replay.steps)
     for start, end in _parts(replay, oldest, stored):
-        # a longer part, from a save whose checkpoint is lost, begins with the same steps
+        # the part may have grown in a later save whose checkpoint is lost; it begins with the same steps
         longer = sorted(path for path in folder.glob(f"{start:012d}-*.pt") if path.name >= _name(start, end))
         if not longer:
             raise ValueError(f"{folder} lacks steps {start} to {end} of the replay buffer")

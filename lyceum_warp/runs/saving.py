@@ -18,10 +18,10 @@ SAVE_SECONDS = 30.0
 """Maximum number of seconds between saves."""
 
 SHARE = 100
-"""A run is saved earlier once it has trained for this multiple of the last save's duration."""
+"""A run is saved earlier once it has trained this many times as long as the last save took."""
 
 LONG = 20
-"""A run is saved later if a save takes long: once it has trained for this multiple of the last save's duration."""
+"""After a long save, a run is saved only once it has trained this many times as long as the save took."""
 
 
 class Saver:
@@ -37,11 +37,11 @@ class Saver:
 
     Args:
         run: The run; None on ranks that do not write.
+        lock: The run's lock, checked before every write; None with ``run``.
         learner: The algorithm.
         keep_every: Iterations between two numbered policies; 0 for none.
         save_every: Iterations between two saves; 0 for the rule above.
         saved: Number of the iteration whose state is saved; -1 for none.
-        lock: The run's lock, checked before every write.
         note: Called with a message if the file of the best policy is damaged.
     """
 
@@ -51,12 +51,12 @@ class Saver:
     def __init__(
         self,
         run: Run | None,
+        lock: RunLock | None,
         learner: Learner,
         *,
         keep_every: int = 0,
         save_every: int = 0,
         saved: int = -1,
-        lock: RunLock | None = None,
         note: Callable[[str], None] = log.warning,
     ) -> None:
         self.run, self.learner, self.keep_every, self.save_every = run, learner, keep_every, save_every
@@ -73,8 +73,8 @@ class Saver:
         Returns:
             The return that selects the best policy; None if the iteration has no return.
         """
-        assert self.run is not None
-        self._check()
+        assert self.run is not None and self._lock is not None
+        self._lock.check()
         append_row(self.run.metrics, iteration.row())
         learner, name = self.learner, self.learner.best_by
         score = getattr(iteration, name)
@@ -109,18 +109,13 @@ class Saver:
         learner, run, replay = self.learner, self.run, self.learner.replay
         state = learner.state_dict()  # gathers the worlds of all ranks
         if replay is not None:
-            write_replay(None if run is None else run.replay, replay, learner.team, self._stored, self._check)
+            write_replay(None if run is None else run.replay, replay, learner.team, self._stored, self._lock)
         with learner.team.together():
-            if run is not None:
-                self._check()
+            if run is not None and self._lock is not None:
+                self._lock.check()
                 run.save(policy_content(learner.iteration, learner.policy, learner.value), state)
                 if replay is not None:
                     clean_replay(run.replay, replay)
         self._stored = 0 if replay is None else replay.stored
         self.saved, self._when = learner.iteration, time.perf_counter()
         self._seconds = self._when - start
-
-    def _check(self) -> None:
-        """Check that no other process has taken the run over."""
-        if self._lock is not None:
-            self._lock.check()

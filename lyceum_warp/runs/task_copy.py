@@ -195,7 +195,7 @@ def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, b
 
 
 def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = True) -> None:
-    """Report differences between an environment's task and model and those of the run.
+    """Report differences of an environment's task and model from the run's task and model.
 
     The environment's versions are used.
 
@@ -203,11 +203,11 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = 
         run: The run.
         env: The environment.
         note: Called with each message.
-        model: Whether to compare the compiled model, too. Other physics also change it.
+        model: Whether to compare the compiled model, too. Other physics also change the compiled model.
     """
     kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
     file = next(iter(loaded), None)
-    hashed = None if kept.get("program") else kept.get("source_hash")  # a training script may change for other reasons
+    hashed = None if kept.get("program") else kept.get("source_hash")  # a training script contains more than the task
     for change in _source_changes(file, {**kept, "source_hash": hashed}, loaded) if file is not None else ():
         note(f"{change}: it is used as it is now" if "changed" in change else change)
     if model and _model_changed(run, env):

@@ -52,7 +52,7 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
 
 
 def _record(folder: Path, config: Mapping[str, Any]) -> Path:
-    """The file that records a run. Its name is a hash of everything that the run can execute or read."""
+    """The file that records a run as trusted; its name is a hash of everything that the run can execute or read."""
     kept = config.get("kept", {})
     paths = [{key: value for key, value in config.get(part, {}).items() if isinstance(value, str)}
              for part in ("params", "options")]  # fmt: skip

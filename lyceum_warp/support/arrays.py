@@ -38,7 +38,7 @@ def shared_rows(row: np.ndarray, dtype: type, count: int, device: wp.Device) -> 
 def with_memory(array: wp.array) -> wp.array:
     """The array itself, or, if it is empty, an empty array of the same shape with memory behind it.
 
-    Otherwise a task that reads an element by mistake would crash the process.
+    Without the memory, a task that reads an element by mistake would crash the process.
     """
     if array.size:
         return array

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -30,8 +31,12 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
             try:
                 os.link(path, previous)
             except OSError:  # a file system without hard links
-                _moved(path, previous)
-        _moved(temporary, path)
+                shutil.copyfile(path, previous)
+        try:
+            os.replace(temporary, path)
+        except OSError:  # on a network drive, or while another program reads the file
+            time.sleep(0.1)
+            os.replace(temporary, path)
     except OSError as error:
         if error.filename is None:  # for instance on a full disk
             error.filename = str(path)
@@ -39,15 +44,6 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
-
-
-def _moved(source: Path, target: Path) -> None:
-    """Move a file, and retry once: a move can fail on a network drive or while another program reads the file."""
-    try:
-        os.replace(source, target)
-    except OSError:
-        time.sleep(0.1)
-        os.replace(source, target)
 
 
 def newer_format(path: Path, number: int, known: int) -> ValueError:

@@ -29,17 +29,14 @@ def _interrupt(number: int, frame: Any) -> None:
     raise Interrupted(number)
 
 
-def _leave(number: int, frame: Any) -> None:
-    raise SystemExit(128 + number)
-
-
 @contextlib.contextmanager
-def _handling(handler: Callable[[int, Any], None], replaces: Callable[[Any], bool]) -> Iterator[dict[int, Any]]:
+def _handling(handler: Callable[[int, Any], None], *, replaces: Any = None) -> Iterator[dict[int, Any]]:
     """Within the context, ``handler`` replaces other handlers.
 
     Args:
         handler: The handler.
-        replaces: Called with a current handler; returns whether to replace it.
+        replaces: The handler to replace; by default every handler except those that ignore the signal. Shells make
+            background programs ignore SIGINT, and nohup makes programs ignore SIGHUP.
 
     Yields:
         The replaced handlers by signal, to be restored at the end.
@@ -47,7 +44,8 @@ def _handling(handler: Callable[[int, Any], None], replaces: Callable[[Any], boo
     previous: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # only the main thread may set handlers
         for number in _NUMBERS:
-            if replaces(signal.getsignal(number)):
+            current = signal.getsignal(number)
+            if current is replaces or (replaces is None and current not in (signal.SIG_IGN, _ignore)):
                 previous[number] = signal.signal(number, handler)
     try:
         yield previous
@@ -56,31 +54,13 @@ def _handling(handler: Callable[[int, Any], None], replaces: Callable[[Any], boo
             signal.signal(number, other)
 
 
-def _is_active(handler: Any) -> bool:
-    """Whether a signal with this handler reaches the program.
-
-    Shells make background programs ignore SIGINT, and nohup makes programs ignore SIGHUP.
-    """
-    return handler not in (signal.SIG_IGN, _ignore)
-
-
 @contextlib.contextmanager
 def signals() -> Iterator[None]:
     """Within the context, the first Ctrl-C, SIGTERM or SIGHUP raises Interrupted.
 
     Later signals do so only within ``obeyed``.
     """
-    with _handling(_interrupt, _is_active):
-        yield
-
-
-@contextlib.contextmanager
-def ending() -> Iterator[None]:
-    """Within the context SIGTERM and SIGHUP raise SystemExit, unless the program handles them.
-
-    By default these signals end a program immediately, without running its ``finally`` blocks.
-    """
-    with _handling(_leave, lambda handler: handler is signal.SIG_DFL):
+    with _handling(_interrupt):
         yield
 
 
@@ -90,21 +70,36 @@ def obeyed() -> Iterator[None]:
 
     This allows the user to cancel long work at the end of a program.
     """
-    with _handling(_interrupt, lambda handler: handler is _ignore):
+    with _handling(_interrupt, replaces=_ignore):
         yield
+
+
+def _raise(number: int) -> None:
+    """Raise a signal for its current handler.
+
+    The default of SIGTERM and SIGHUP would end the program without its ``finally`` blocks.
+
+    Raises:
+        SystemExit: The signal has its default handler.
+    """
+    if signal.getsignal(number) is signal.SIG_DFL:
+        raise SystemExit(128 + number)
+    signal.raise_signal(signal.Signals(number))
 
 
 @contextlib.contextmanager
 def postponed(*, insist: bool = False) -> Iterator[list[int]]:
     """Within the context, collect Ctrl-C, SIGTERM and SIGHUP in the yielded list; the first is handled at the end.
 
-    Once Interrupted is raised, later signals are ignored.
+    A signal that the program does not handle then raises SystemExit. Once Interrupted is raised, later signals are
+    ignored.
 
     Args:
         insist: Whether a second signal is handled immediately.
 
     Raises:
         Interrupted: A signal was postponed, and ``signals`` is active.
+        SystemExit: A signal was postponed that has its default handler.
     """
     noted: list[int] = []
 
@@ -112,15 +107,15 @@ def postponed(*, insist: bool = False) -> Iterator[list[int]]:
         if noted and insist:
             noted.clear()
             signal.signal(number, previous[number])
-            signal.raise_signal(signal.Signals(number))
+            _raise(number)
         else:
             noted.append(number)
 
-    with _handling(note, _is_active) as previous:
+    with _handling(note) as previous:
         try:
             yield noted
         except Interrupted:
             previous.update(dict.fromkeys(previous, _ignore))
             raise
     if noted:
-        signal.raise_signal(signal.Signals(noted[0]))
+        _raise(noted[0])

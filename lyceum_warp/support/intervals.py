@@ -14,7 +14,7 @@ def student_quantile(probability: float, freedom: float) -> float:
         freedom: Degrees of freedom.
     """
     log_factor = math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2) - 0.5 * math.log(freedom * math.pi)
-    # with x = sqrt(freedom) tan(angle) the integral is over a finite interval and its integrand is smooth
+    # x = sqrt(freedom) tan(angle) turns the integral into one over a finite interval, with a smooth integrand
     nodes, weights = np.polynomial.legendre.leggauss(64)
 
     def beyond_half(angle: float) -> float:

@@ -102,8 +102,8 @@ class _Tiles(threading.local):
 
 tiles = _Tiles()
 TILES_ON_CPU = threading.RLock()
-"""Lock held while kernels with tiles run on the CPU. Compiled for x86, they store the address of their tiles in a
-static variable, so two threads would overwrite each other's tiles."""
+"""Lock held while kernels with tiles run on the CPU. Kernels that are compiled for x86 store the address of their tiles
+in a static variable, so two threads would overwrite each other's tiles."""
 
 
 def separate_tiles() -> None:

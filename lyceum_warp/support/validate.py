@@ -57,7 +57,7 @@ def check_function(name: str, value: Any) -> None:
 
 
 def check_flag(name: str, value: Any) -> None:
-    """Check that a value is a bool.
+    """Check that a value is True or False.
 
     Raises:
         ValueError: The value is something else.

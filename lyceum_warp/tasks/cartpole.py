@@ -1,8 +1,8 @@
 """Cartpole: keep a pole upright on a cart in the middle of its rail (dm_control's cartpole balance).
 
 The reward is dm_control's smooth reward; ``sparse=True`` selects the reward of balance_sparse. Success: cart and pole
-are within the bounds of the sparse reward. Episodes do not terminate. In Gymnasium's CartPole-v1, for comparison, they
-end when the pole tilts by 12 degrees, and the action is one of two forces.
+are within the bounds of the sparse reward. Episodes do not terminate. In Gymnasium's CartPole-v1, for comparison,
+episodes end when the pole tilts by 12 degrees, and the action is one of two forces.
 """
 
 import warp as wp

@@ -2,9 +2,9 @@
 
 The paper's model is not published; this one is built from the robot's published data (see herb.xml). An action is a
 fraction of each motor's peak torque, including the fingers, and is added to gravity compensation. The targets are mocap
-bodies, and so part of the state. They are drawn from two boxes within reach, in front of the shoulders. Episodes start
-near HERB's home position. Success: both palms have been within 5 cm of their targets for ten consecutive steps, 0.2 s.
-MuJoCo Warp finds fewer contact points than MuJoCo between two boxes of the arms.
+bodies, and so part of the state. The targets are drawn from two boxes within reach, in front of the shoulders. Episodes
+start near HERB's home position. Success: both palms have been within 5 cm of their targets for ten consecutive steps,
+0.2 s. MuJoCo Warp finds fewer contact points than MuJoCo between two boxes of the arms.
 """
 
 import warp as wp

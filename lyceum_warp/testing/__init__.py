@@ -1,6 +1,6 @@
 """Check the rules of an environment for any task on any engine.
 
-Each check is one rule. It takes the environments under test, raises an AssertionError that names the task, the
+Each check is one rule. A check takes the environments under test, raises an AssertionError that names the task, the
 engine, the rule, the values, the seed and a world's state, and leaves the environments usable for the next check.
 """
 

@@ -58,7 +58,7 @@ def check_addresses(ctx: Context) -> None:
 
 
 def check_getters(ctx: Context) -> None:
-    """``get_x(out=)`` writes what ``get_x()`` returns, which is a copy of ``env.x``."""
+    """``get_x(out=)`` writes the result of ``get_x()``, a copy of ``env.x``."""
     env = ctx.a
     ctx.restart()
     for action in ctx.actions(3):

@@ -97,7 +97,7 @@ class CheckedFunctions:
         return len(self.places) - 1
 
     def number(self, function: wp.Function) -> int:
-        """Number the copy of a function; the first call makes the copy."""
+        """Return the number of a function's copy; the first call makes the copy."""
         if function not in self._numbers:
             number = self._numbers[function] = len(self._numbers)
             for overload in overloads(function):

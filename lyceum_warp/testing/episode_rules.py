@@ -24,7 +24,7 @@ def _check_flags(ctx: Context, env: Env) -> None:
 def check_truncation(ctx: Context) -> None:
     """At the horizon an episode is truncated.
 
-    ``final_obs`` is its last observation, ``obs`` the first of the next episode.
+    ``final_obs`` is the last observation of the episode, and ``obs`` the first observation of the next one.
 
     Truncation does not set ``terminated``. In worlds that continue, both observations are equal. All of this holds for
     every group of observations.
@@ -92,7 +92,7 @@ def check_graphs(ctx: Context) -> None:
 def _memory(device: wp.Device) -> dict[str, int]:
     gc.collect()
     found = {"Python bytes": tracemalloc.get_traced_memory()[0]}
-    # not isinstance: it would load modules that are loaded lazily
+    # type(), because isinstance would load modules that are loaded lazily
     found["arrays"] = sum(issubclass(type(thing), (wp.array, torch.Tensor)) for thing in gc.get_objects())
     if device.is_cuda:
         found["Warp bytes"] = wp.get_mempool_used_mem_current(device)

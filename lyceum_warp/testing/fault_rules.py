@@ -45,7 +45,7 @@ def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, 
         b.step(action)
         ctx.finite(a, f"{i + 1} steps after {what}")
         again = again or bool(ctx.faulty(a)[bad])
-        diverges = diverges or bool(ctx.faulty(b)[bad])  # the task itself may be unstable
+        diverges = diverges or bool(ctx.faulty(b)[bad])  # the task may be unstable even without this fault
     ctx.that(not again or diverges, f"{what}: the world has another fault")
 
 

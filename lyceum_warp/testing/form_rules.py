@@ -90,7 +90,7 @@ def check_success_steps(ctx: Context) -> None:
 
     The count belongs to the state; a reset clears it.
 
-    To see whether a state meets the goal, the check sets it with a full count and reads ``success``.
+    To find whether a state meets the goal, the check sets the state with a full count and reads ``success``.
     """
     a, b, needed = ctx.a, ctx.b, int(ctx.a.task.task.success_steps)
     if needed == 1:
@@ -126,7 +126,7 @@ def check_success_steps(ctx: Context) -> None:
 def check_events(ctx: Context) -> None:
     """An event runs after a step is judged, and changes the state and the next observation of some worlds.
 
-    It does not run in worlds that restart, and worlds without an event keep every bit.
+    Events do not run in worlds that restart, and worlds without an event keep every bit.
     """
     a, b = ctx.a, ctx.b
     if a.task.functions["event"] is None:

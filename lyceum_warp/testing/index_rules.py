@@ -149,7 +149,7 @@ class _Run:
             values["obs"] = self.obs[name]
         types = self.functions[name].input_types
         form = FUNCTIONS.get("observe" if name in self.obs else name)
-        names = form.argument_names[: len(types)] if form else types  # problems of a generated function
+        names = form.argument_names[: len(types)] if form else types  # the problems belong to a generated function
         given = [values[argument] for argument in names]
         kernel = self.checked.kernels[name]
         wp.launch(kernel, self.env.nworld, [self.report, *given], device=self.env.device)

@@ -16,7 +16,7 @@ from lyceum_warp.testing.context import SHORT, Context
 from lyceum_warp.world_arrays import memory_columns
 
 _SMALLEST = 1e-4
-"""Coordinates are compared only if inputs or model fields move at least one of them by this much."""
+"""If inputs and model fields move every coordinate by less than this, coordinates are not compared."""
 
 
 def predicted(
@@ -85,7 +85,7 @@ def check_inputs(ctx: Context) -> None:
             before = env.get_state()
             b.set_state(before)
             b.action.copy_(action)
-            b.worlds.act()  # writes the inputs without stepping
+            b.worlds.act()  # compute the inputs without a step
             env.step(action)
             after = env.get_state()
             calm = ctx.calm(env) & ~ctx.faulty(env)

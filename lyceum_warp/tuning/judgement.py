@@ -84,7 +84,7 @@ def episodes_needed(found: Difference, half_width: float) -> int:
 
 
 def buys(speedup: float, memory: float) -> bool:
-    """Whether a setting is faster or smaller, given the lower bound of its speed-up and the ratio of memory."""
+    """Whether a setting is faster or takes less memory, by the lower bound of its speed-up and the ratio of memory."""
     return speedup >= LEAST_GAIN or memory <= _LEAST_SAVING
 
 

@@ -84,7 +84,8 @@ def tune(
 
     Args:
         task: Name of a task, a file with one, or its class.
-        run: Folder of a run of this task. Its policy also plays the episodes, and its parameters are the defaults.
+        run: Folder of a run of this task. The run's policy also plays the episodes, and the run's parameters are the
+            defaults.
         which: Which policy of the run: "last", "best", or the number of a saved iteration.
         tolerance: "strict": the 95 % interval of the difference of returns lies within 2 % of the mean absolute
             return; "loose": within 5 %; "any": only faults count.

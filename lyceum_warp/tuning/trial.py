@@ -77,7 +77,7 @@ class Trials:
     # states in the middle of a run, and actions that follow them
 
     def _record(self) -> None:
-        """Record states under random actions and, in half of the worlds, the policy, and 50 actions after each."""
+        """Record states, and 50 actions after each; half of the worlds follow the policy, the others act at random."""
         env, draw = self.reference, random_actions(self.reference, self.seed)
         policy_worlds = torch.arange(env.nworld, device=env.obs.device)[:, None] % 2 == 1
         self._parts = [env.state_space.parts[name] for name in ("qpos", "qvel")]

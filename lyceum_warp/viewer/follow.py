@@ -1,4 +1,4 @@
-"""Follow a training run: show its newest policy in worlds of the viewer's own.
+"""Follow a training run: show its newest policy in separate worlds.
 
 The viewer only reads the run's files. So the run has the same numbers with and without it, also on another machine that
 shares the folder.
@@ -44,7 +44,7 @@ class Follower:
         return acting(self.policy)(obs)
 
     def update(self) -> list[str]:
-        """Load new weights, if any; return messages about it."""
+        """Load new weights, if there are any, and return messages about them."""
         stamp = self._stamp()
         if stamp is None or stamp == self._seen:
             return []
@@ -61,7 +61,7 @@ class Follower:
         return read_checkpoint(self.run.policy_file(), self.device, parts=("iteration", "policy"))
 
     def _stamp(self) -> tuple[int, int, int] | None:
-        """Numbers that change when the file is replaced."""
+        """Attributes of the file that change when it is replaced."""
         try:
             found = os.stat(self.run.policy_file())
         except OSError:
@@ -97,8 +97,8 @@ class RunViewer:
     """Shows a run while it trains, in another process: ``with lw.RunViewer(folder): lw.train(npg, folder)``.
 
     The process waits for the folder, and shows the run's newest policy in worlds of its own on the CPU, at a lower
-    priority than the training. It ends with ``close``, at the end of a ``with`` block, and with this program. Closing
-    its window does not end the training.
+    priority than the training. The viewer ends with ``close``, at the end of a ``with`` block, and with this program.
+    Closing its window does not end the training.
 
     Args:
         folder: The run's folder, which need not exist yet.
@@ -120,7 +120,7 @@ class RunViewer:
             self._process.stdin.flush()
 
     def _print(self) -> None:
-        """Print the lines of the process above a live display, which redirects only what this process prints."""
+        """Print the viewer's output through this process, so that a live display stays below it."""
         assert self._process.stdout is not None
         for line in self._process.stdout:
             print(line, end="", flush=True)

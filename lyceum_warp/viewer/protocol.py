@@ -23,7 +23,7 @@ BEST_COLOUR = (0.1, 0.75, 0.3, 1.0)
 """Colours of a planner's samples and of the best sample, in the window and in videos."""
 
 MAX_POINTS, MAX_MESSAGES = 20_000, 200
-"""Maximum numbers of curve points and of messages that a frame carries over from earlier frames."""
+"""Maximum numbers of curve points and messages of skipped frames that the next frame contains."""
 
 
 # from the session to the window
@@ -69,7 +69,7 @@ class Ghost:
     colour: tuple[float, float, float, float] | None
     """Red, green, blue and opacity, each from 0 to 1; None for the model's own colours."""
     shift: tuple[float, float] = (0.0, 0.0)
-    """Where it is drawn, relative to its position, metres."""
+    """Displacement of the drawn bodies from their positions, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +93,7 @@ class SetGhosts:
     episodes: int = 0
     """Number of episodes to draw as ghosts, at the same step, beginning after the shown episode."""
     burst: int = 0
-    """Number of states along the trajectory, past red and future blue, at most ``MOST_BURST``."""
+    """Number of past (red) and future (blue) states along the trajectory, at most ``MOST_BURST``."""
     plan: bool = True
     """Whether the plan's final pose and the samples' traces are drawn."""
 
@@ -129,7 +129,7 @@ class Status:
     command: tuple[float, float, float] | None = None
     """Commanded forward and lateral velocity, m/s, and yaw rate, rad/s, of a walking robot."""
     driven: bool = False
-    """Whether the command is the user's."""
+    """Whether the user gave the command."""
     planner: tuple[tuple[str, float], ...] = ()
     """Names and values of the planner's settings that can be changed."""
     params: tuple[tuple[str, float], ...] = ()

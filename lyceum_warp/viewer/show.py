@@ -48,7 +48,7 @@ def view(
         host: Address to serve the page on. The default is the loopback address, which other machines cannot reach.
         port: Port of the page; by default the first free port from 8080.
         watchers: Functions that are called about twice a second and return new messages, a sequence of strings.
-        block: Whether to return only when the user quits. False steps the worlds in a thread: leave them to it until
+        block: Whether to return only when the user quits. False steps the worlds in a thread: do not use them before
             the view is closed. The default is False in a notebook, which then shows the page and a link to it.
 
     Returns:

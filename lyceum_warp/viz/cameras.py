@@ -67,7 +67,7 @@ def parsed_camera(words: Iterable[str]) -> str | FreeCamera | None:
 
     Args:
         words: A name or an index; or parts of a pose as NAME=VALUE: lookat=X,Y,Z, distance, azimuth, elevation, track.
-            Without words the result is None.
+            Returns None if there are no words.
 
     Raises:
         ValueError: The words have a different form.

@@ -18,7 +18,7 @@ def control_plot(episodes: Sequence[Trajectory], out: str | Path, *, title: str 
     deadline.
 
     Args:
-        episodes: Episodes of one task, at least one. The deadline is the period of the first one.
+        episodes: Episodes of one task, at least one. The deadline is the period of the first episode.
         out: The PNG file.
         title: Title of the plot; by default task, engine and mode.
 
@@ -70,7 +70,7 @@ def _draw_outcomes(reward: Any, evaluation: Any, episodes: Sequence[Trajectory])
 def _draw_times(planning: Any, age: Any, episodes: Sequence[Trajectory]) -> None:
     dots = _line_style(episodes) | {"linestyle": "", "marker": ".", "markersize": 3}
     for episode in episodes:
-        # the first plan loads kernels: its time would compress the scale of the others
+        # the first plan loads kernels; its time would dominate the scale
         planning.plot(episode.plan_starts[1:], 1000 * episode.plan_times[1:], **dots)
         age.plot(episode.times, 1000 * episode.ages, **dots)
     deadline = 1000 * episodes[0].period

@@ -29,7 +29,7 @@ def check_video() -> None:
     """Check that the packages for videos are installed.
 
     Raises:
-        NoVideoError: One of them is not installed.
+        NoVideoError: One of the packages is not installed.
     """
     if missing := [name for name in ("imageio", "imageio_ffmpeg") if importlib.util.find_spec(name) is None]:
         raise NoVideoError(f"videos need {' and '.join(missing)}: {EXTRA}")

@@ -33,8 +33,8 @@ def write_page(env: Env, states: torch.Tensor, out: str | Path, *, camera: Camer
     Args:
         env: Environment of the states.
         states: States of one world, one row per step, (steps, state_space.size).
-        out: The file. It is replaced when the page is complete.
-        camera: The first camera, as in ``write_video``. The page can turn it.
+        out: The file. The file is replaced when the page is complete.
+        camera: The first camera, as in ``write_video``. The reader of the page can turn the camera.
 
     Returns:
         The file's path.
@@ -135,7 +135,7 @@ def _triangles(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[tupl
 
 
 def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Red, green, blue and opacity of a geom; a material's, unless the geom has its own."""
+    """Red, green, blue and opacity of a geom, from its material unless the geom has its own colour."""
     own, material = model.geom_rgba[geom].astype(float), model.geom_matid[geom]
     if material < 0 or not np.allclose(own, (0.5, 0.5, 0.5, 1.0)):
         return own
@@ -205,7 +205,7 @@ def _round(kind: mujoco.mjtGeom, size: np.ndarray) -> Surface:
         place = np.stack([radius * size[0], height * size[1]])
     else:
         angle = np.linspace(-np.pi / 2, np.pi / 2, _ALONG + 1)
-        if kind == types.mjGEOM_CAPSULE:  # its middle is doubled
+        if kind == types.mjGEOM_CAPSULE:  # the middle of the capsule is doubled
             angle = np.concatenate([np.linspace(-np.pi / 2, 0, _ALONG // 2), np.linspace(0, np.pi / 2, _ALONG // 2)])
         out, rise = np.cos(angle), np.sin(angle)
         lift = np.sign(np.arange(len(angle)) - len(angle) / 2 + 0.5) * size[1] if kind == types.mjGEOM_CAPSULE else 0.0

@@ -2,9 +2,9 @@
 
 ``drawing.py`` runs this program as a subprocess and writes pickled objects to its stdin: first a dict with ``size``,
 ``fps``, ``camera`` and ``background``, then a ``Shot`` for each picture, then None. The folder holds the model,
-``model.mjb``. The program writes ``video.mp4``, or if ``fps`` is None each picture into ``picture.raw``. It prints
-"ready" once it can draw, and "frame" after each picture. EOF without None means that its parent has died; it then
-deletes the folder.
+``model.mjb``. The program writes ``video.mp4``, or if ``fps`` is None each picture into ``picture.raw``. The process
+prints "ready" once it can draw, and "frame" after each picture. EOF without None means that its parent has died; it
+then deletes the folder.
 
 MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. ``drawing.py``
 therefore starts a process for each library that it tries. This file imports nothing of the package. Exit code 3 means

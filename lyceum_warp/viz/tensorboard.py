@@ -42,8 +42,8 @@ _TAGS = {
 class TensorBoard:
     """Writes a run's iterations where TensorBoard reads them; the horizontal axis counts iterations from 0.
 
-    Every number of an iteration is a curve. Curves that rsl_rl or mjlab writes, too, have their names, units and axis,
-    so that runs overlay: Train/, Loss/, Policy/, Perf/, Episode_Metrics/ and, with ``env``, Episode_Reward/ and
+    Every number of an iteration becomes a curve. Curves that rsl_rl or mjlab writes, too, have their names, units and
+    axis, so that runs overlay: Train/, Loss/, Policy/, Perf/, Episode_Metrics/ and, with ``env``, Episode_Reward/ and
     Episode_Termination/. The groups of the others are return/, episode/, mean_policy/, policy/, value/, time/ and
     metrics/.
 

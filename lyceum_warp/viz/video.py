@@ -47,7 +47,7 @@ def write_video(
     Args:
         env: Environment of the states.
         states: States of one world, one row per step, (steps, state_space.size).
-        out: The file. It is replaced when the video is complete.
+        out: The file. The file is replaced when the video is complete.
         camera: A camera of the model by its name or index, a ``FreeCamera`` or ``mujoco.MjvCamera``, or "free" for
             MuJoCo's default free camera. By default the model's first tracking camera, else its first camera fixed to
             the world, else a camera that follows the first body.
@@ -204,7 +204,7 @@ class Recorder:
                 drawing.finish()
         except (NoVideoError, OSError) as error:
             self._error = NoVideoError(f"the video {self.out} was cancelled") if self._cancelled else error
-        except Exception as error:  # the thread has no caller
+        except Exception as error:  # the thread has no caller that could catch the error
             self._error = NoVideoError(f"the video could not be written ({' '.join(str(error).split())})")
         finally:
             self._done.set()

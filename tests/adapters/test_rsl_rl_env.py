@@ -74,7 +74,7 @@ def test_a_fault_is_a_time_out_and_a_termination_is_not(shared_env: SharedEnv) -
     worlds = RslRlVecEnv(env)
     worlds.episode_length_buf = torch.tensor([0, 0, 9, 9])
     state = env.get_state()
-    # both worlds leave the rail, the second one at its time limit
+    # both worlds leave the rail; the second world also reaches its time limit
     state[[0, 2], env.state_space.parts["qpos"].start] = 5.0
     env.set_state(state)
     action = torch.zeros(4, 1)

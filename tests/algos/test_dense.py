@@ -31,7 +31,7 @@ def test_hand_written_products_equal_autograds(activation: str, hidden: tuple[in
     policy = policy_of(activation, hidden)
     dense = DensePolicy.of(policy)
     assert dense is not None
-    for rows in (30, 7, 30):  # fewer rows use part of the buffers
+    for rows in (30, 7, 30):  # a batch with fewer rows uses only part of the buffers
         generator = torch.Generator().manual_seed(rows)
         obs, action, weight = (torch.randn(rows, n, generator=generator) for n in (5, 2, 1))
         torch.testing.assert_close(dense(obs), policy(obs).detach())

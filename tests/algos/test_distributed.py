@@ -1,4 +1,4 @@
-"""Train in several processes: worlds and updates equal those of a single process, and any number of processes can
+"""Train in several processes: worlds and updates equal the results of a single process, and any number of processes can
 resume."""
 
 import csv
@@ -74,7 +74,7 @@ def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
         for name, tensor in wanted[part].items():
             torch.testing.assert_close(state[part][name], tensor, **close)
     torch.testing.assert_close(state["returns"], wanted["returns"], **close, equal_nan=True)
-    if tolerance < 1e-3:  # with a larger tolerance a foot may touch the ground a step earlier
+    if tolerance < 1e-3:  # rounding may let a foot touch the ground a step earlier
         torch.testing.assert_close(state["env"], wanted["env"], **close)
 
 
@@ -179,7 +179,7 @@ def test_gpu_two_processes_end_when_torchrun_is_interrupted(tmp_path: Path) -> N
         if "iteration    2/" in line:
             process.send_signal(signal.SIGTERM)
             break
-    rest, error = process.communicate(timeout=25)  # torchrun kills them after 30 s
+    rest, error = process.communicate(timeout=25)  # after 30 s torchrun would kill the processes
     rows = table(run)
     assert f"interrupted by SIGTERM after {len(rows)} of 100000 iterations" in output + rest, (output, rest, error)
     assert Run.open(run).read()["iteration"] == len(rows) >= 2

@@ -11,7 +11,7 @@ from lyceum_warp.algos.evaluation import evaluation_seed
 
 
 def test_evaluate_counts_equally_many_episodes_of_every_world() -> None:
-    """A world with short episodes contributes no additional episodes; the results equal a plain loop's."""
+    """A world with short episodes contributes no additional episodes; the results equal the results of a plain loop."""
     env = lw.make("hopper", nworld=4, horizon=60)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
     counts: list[tuple[int, int]] = []

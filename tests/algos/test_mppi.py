@@ -70,7 +70,7 @@ def heavy_arm() -> mujoco.MjSpec:
     return spec
 
 
-# override the reward weights that the task's planning sets
+# undo the reward weights that the task's planning sets
 HOPPER = dict(task="hopper", horizon=12, samples=24, temperature=0.5, noise=0.8, healthy_reward=1.0,
               forward_reward_weight=1.0, integrator="euler")  # fmt: skip
 POINT = dict(task="point_mass", horizon=9, samples=40, temperature=0.3)
@@ -154,7 +154,7 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
         assert summary["mean_return"] == pytest.approx(plain.returns.mean(), rel=1e-4)
         assert summary["effective_samples"] == pytest.approx(1 / (plain.weights**2).sum(), rel=1e-2)
         assert summary["failed_samples"] == 0
-        plain.knots = plan.knot_actions.double().numpy()  # at low temperatures differences would grow
+        plain.knots = plan.knot_actions.double().numpy()  # a low temperature would amplify rounding differences
         if plan.adapted_noise is not None:
             plain.deviation = plan.adapted_noise.double().numpy()
         plant.step(action[None])
@@ -257,7 +257,7 @@ def test_a_sample_that_fails_in_one_model_fails() -> None:
 def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
     settings: dict[str, Any] = dict(horizon=4, samples=40, smoothing=(1, 0, 0), temperature=1.0, engine=engine)
     if how == "physics":
-        # motors so strong that only small actions keep MuJoCo's accelerations, and Warp's velocities, below 1e10
+        # strong motors: only small actions keep MuJoCo's accelerations and Warp's velocities below 1e10
         settings |= dict(noise=1.0, limit=1e9, model=rail({"mujoco": 1e10, "warp": 2.5e12}[engine]))
     elif how == "value":
         settings |= dict(noise=1.0, limit=1e9, value=lambda obs: torch.where(obs[:, 0] > 0, torch.nan, 1.0))
@@ -326,7 +326,7 @@ def test_actions_stay_within_the_control_ranges() -> None:
         assert (plan.actions >= low).all() and (plan.actions <= high).all()
         at_bounds = (plan.sampled == low) | (plan.sampled == high)
         assert at_bounds.float().mean() > 0.5
-    free = MPPI(Picky, noise=10.0, horizon=4, limit=1e9)  # its controls are unlimited
+    free = MPPI(Picky, noise=10.0, horizon=4, limit=1e9)  # Picky's controls are unlimited
     free(free.state_of())
     assert free.sampled.abs().max() > 10
 
@@ -397,7 +397,7 @@ def test_a_value_function_gets_the_step_at_the_end_of_the_plan(engine: str) -> N
     value = lw.ValueFunction(6, (16,), scale=50.0, time_orders=2, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         torch.nn.init.xavier_uniform_(value.network[-1].weight)  # a new value function predicts 0
-        value.network[0].weight[:, 6:] *= 300  # so that ten steps change the value
+        value.network[0].weight[:, 6:] *= 300  # large weights, so that ten steps change the value
     settings = POINT | dict(engine=engine, noise=0.5)
     plan = MPPI(value=value, **settings)
 
@@ -488,7 +488,7 @@ def test_half_cheetah_runs() -> None:
 
 @pytest.mark.long
 def test_hopper_hops_without_falling() -> None:
-    """With other tasks' settings, it falls after about 100 steps."""
+    """With the settings of other tasks, the robot falls after about 100 steps."""
     plant, rewards, evals = drive("hopper", 130, 1)
     assert len(evals) == 130 and not plant.terminated.item()
     assert evals[-1] > 0.3 and rewards.sum() > 165, (evals[-1], rewards.sum())
@@ -497,8 +497,8 @@ def test_hopper_hops_without_falling() -> None:
 def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
     """Return the mean return over runs of 100 steps, and the standard deviation of this mean if coins are unknown.
 
-    Plant and planner have equal seeds. If no action depends on its coin, the variance of a return, the sum of action
-    times coin, is the sum of the squared actions.
+    Plant and planner have equal seeds. A return is the sum of action times coin. If no action depends on its coin, its
+    variance is the sum of the squared actions.
     """
     plan = MPPI(task, engine="mujoco", horizon=4, noise=2.0, smoothing=(1, 0, 0))
     plant = lw.make(task, autoreset=False)

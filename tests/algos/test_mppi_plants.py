@@ -1,4 +1,4 @@
-"""Plan for several plants at once; the plans equal those of planners with one plant each."""
+"""Plan for several plants at once; the plans equal the plans of separate planners."""
 
 from typing import Any
 
@@ -34,7 +34,7 @@ CASES: dict[str, dict[str, Any]] = {
     "frame skip": dict(task="reach", frame_skip=2),
 }
 ON_WARP = ("mppi", "cem with knots", "models", "control of the task")
-BUFFERS = ("actions", "nominal", "knot_actions", "standard_noise", "sampled", "adapted_noise")  # axis 1 is the plant
+BUFFERS = ("actions", "nominal", "knot_actions", "standard_noise", "sampled", "adapted_noise")  # plants: axis 1
 FIRST = ("returns", "weights", "model_returns")
 
 
@@ -125,7 +125,7 @@ def test_a_plant_whose_samples_all_fail_keeps_its_plan(update: str) -> None:
 def test_a_plan_for_each_world_controls_an_environment() -> None:
     env = lw.make("point_mass", nworld=4, seed=2, horizon=30)
     state = env.get_state()
-    state[1, env.state_space.parts["step"]] = 10  # its episode ends after 20 steps
+    state[1, env.state_space.parts["step"]] = 10  # the episode of world 1 ends after 20 steps
     env.set_state(state)
     settings: dict[str, Any] = dict(task="point_mass", horizon=12, samples=64, temperature=0.1)
     plan, alone = lw.MPPI(**settings, plants=4), lw.MPPI(**settings, seed=101)

@@ -175,7 +175,7 @@ def test_a_state_of_another_number_of_worlds_is_refused(env: lw.Env) -> None:
 def test_segments_continue_the_previous_episodes(env: lw.Env) -> None:
     env.rand_reset(0)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=16 * 5, mean_every=0))
-    assert npg.segments  # selected automatically: 5 steps are shorter than an episode of 12
+    assert npg.segments  # NPG selects segments, because 5 steps are shorter than an episode of 12
     lengths, steps = [], []
     for _ in range(6):
         lengths.append(next(npg).length_mean)
@@ -183,7 +183,7 @@ def test_segments_continue_the_previous_episodes(env: lw.Env) -> None:
     joined = torch.cat(steps)
     assert torch.equal(joined, (joined[0] + torch.arange(30.0)[:, None]) % 12)
     assert len(joined[0].unique()) > 5  # the worlds' episodes end at different times
-    # an episode whose beginning was not sampled does not count
+    # an episode does not count if its first steps were not sampled
     assert math.isnan(lengths[0])
     assert lengths[-1] == 12.0
 
@@ -393,7 +393,7 @@ def test_gpu_a_resumed_run_continues() -> None:
     assert again.gradient_norm == pytest.approx(first.gradient_norm, rel=1e-2)
 
 
-@pytest.mark.parametrize("kl_limit", [1.0, 1.5])  # with 1.0 many steps are shortened
+@pytest.mark.parametrize("kl_limit", [1.0, 1.5])  # a limit of 1.0 shortens many steps
 def test_optimized_iterations_equal_those_with_autograd(kl_limit: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The plain version uses autograd, all rounds of the line search, and a value fit after the policy's step."""
     threads, learned = torch.get_num_threads(), []

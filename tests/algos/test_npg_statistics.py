@@ -33,7 +33,7 @@ def floats(sums: EpisodeSums) -> EpisodeSums:
 def rollout() -> lw.Rollout:
     env = lw.make(Metered, nworld=6)
     rollout = lw.Rollout(env, 150)
-    rollout.running_return[0] = math.nan  # an episode whose beginning was not sampled does not count
+    rollout.running_return[0] = math.nan  # an episode does not count if its first steps were not sampled
     generator = torch.Generator().manual_seed(1)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, log_std=0.0, generator=generator)
     rollout.collect(policy, torch.randn(rollout.action.shape, generator=torch.Generator().manual_seed(0)))
@@ -50,7 +50,7 @@ def part_of(rollout: lw.Rollout, worlds: slice) -> Any:
 
 
 def test_episode_statistics_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
-    """The statistics of one rollout equal those pooled from two parts of its worlds."""
+    """The statistics of one rollout equal the pooled statistics of two parts of its worlds."""
     ended = rollout.done & ~rollout.episode_return.isnan()
     assert 6 < ended.sum() < rollout.done.sum()
     returns = rollout.episode_return[ended].double()
@@ -80,7 +80,7 @@ def test_value_statistics_of_two_processes_equal_statistics_of_all_samples() -> 
 
 
 def test_metric_means_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
-    """The means of one rollout equal those pooled from two parts of its worlds; they are NaN if no episode ended."""
+    """The means of one rollout equal the pooled means of two parts of its worlds; they are NaN if no episode ended."""
     ended = rollout.done & ~rollout.episode_return.isnan()
     expected = {name: sums[ended].mean().item() for name, sums in rollout.episode_metrics.items()}
     assert list(expected) == ["forward", "effort"] and expected["effort"] > 0.1
@@ -95,7 +95,7 @@ def test_metric_means_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
     for processes in ([numbers(slice(None))], parts):
         assert summary(processes, 10, list(expected))["metrics"] == pytest.approx(expected, rel=1e-5)
     steps = {name: values.mean().item() for name, values in rollout.metrics.items()}
-    for count in (rollout.env.nworld, 1):  # one process, and one process per world
+    for count in (rollout.env.nworld, 1):  # one process for all worlds, and one process per world
         shares = [numbers(slice(k, k + count)) for k in range(0, rollout.env.nworld, count)]
         assert summary(shares, 10, list(steps))["step_metrics"] == pytest.approx(steps, rel=1e-5)
     none = [part._replace(episodes=EpisodeSums(*[0.0] * 9), metrics=(0.0,) * 4) for part in parts]

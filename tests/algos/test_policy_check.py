@@ -1,4 +1,4 @@
-"""Test user-defined policy networks: NPG refuses unsuitable ones, and trains the others like its own."""
+"""Test user-defined policy networks: NPG refuses unsuitable networks, and trains others like its default network."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -73,7 +73,7 @@ def test_an_update_equals_plain_torch_in_float64(changes: dict[str, Any], env: l
     sac = made(env, target_entropy=-0.7, temperature=0.3, **changes)
     for _ in range(2):
         next(sac)
-    with torch.no_grad():  # otherwise the target would equal the critics
+    with torch.no_grad():  # without a change, the target would equal the critics
         for p in sac.target.parameters():
             p += 0.05
     sac.draw()

@@ -107,7 +107,7 @@ def test_mirrored_samples_have_the_gradient_of_the_mirrored_task(env: lw.Env) ->
     weight = ppo.policy.network[0].weight.grad
     signs = torch.tensor([1.0, -1.0])
     rows, columns = signs, signs.repeat(3)
-    assert weight.abs().min() < 1e-6 * weight.abs().max()  # entries that mix x and y are odd
+    assert weight.abs().min() < 1e-6 * weight.abs().max()  # reflection changes the sign of entries that mix x and y
     torch.testing.assert_close(weight, weight * rows[:, None] * columns, rtol=0.0, atol=1e-6)
 
 
@@ -127,7 +127,7 @@ def test_sac_learns_symmetric_policies_and_keeps_them(symmetry: str, env: lw.Env
     policy = lw.load(lw.train(sac, tmp_path / "run", iterations=2))
     assert asymmetry(policy.act, env) == asymmetry(sac.policy.act, env)
     if symmetry == "exact":
-        assert max(before, asymmetry(policy.act, env)) < 1e-6  # bounds are added to unit actions, which rounds
+        assert max(before, asymmetry(policy.act, env)) < 1e-6  # adding the bounds to unit actions rounds
         assert lw.SAC(env, lw.load(tmp_path / "run"), config=lw.SACConfig(batch=64)).config.symmetry == "exact"
     else:
         assert asymmetry(policy.act, env) < before

@@ -11,7 +11,7 @@ def test_a_short_experiment_continues_and_ends_with_a_verdict(
 ) -> None:
     out = ["--short", "--out", str(tmp_path / "equivalence.jsonl"), "--threads", "1"]
     assert experiment.main(equivalence.EXPERIMENT, [*out, "--seeds", "0"]) == 0
-    assert "| inverted_double_pendulum" not in capsys.readouterr().out  # one seed has no standard deviation
+    assert "| inverted_double_pendulum" not in capsys.readouterr().out  # the standard deviation needs two seeds
     assert experiment.main(equivalence.EXPERIMENT, out) == 0
     shown = capsys.readouterr().out
     assert "equivalence: 2 of 4 cases are stored" in shown
@@ -36,4 +36,4 @@ def test_different_engines_are_seldom_called_equivalent() -> None:
     random = np.random.default_rng(1)
     a, b = random.normal(size=(2, 400, 20))
     wrong = sum(equivalence.equivalence(x, y + 1.0)["verdict"] == "equivalent" for x, y in zip(a, b, strict=True))
-    assert wrong <= 30  # 5 %, and the margin is estimated
+    assert wrong <= 30  # 5 % of 400 are 20; the margin is only an estimate

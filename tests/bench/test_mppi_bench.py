@@ -19,7 +19,7 @@ def test_python_environments_give_our_rewards(task: str) -> None:
         pytest.importorskip("gymnasium_robotics")
     env = lw.make(task, autoreset=False, nthread=1, seed=3)
     theirs = mppi.python_mppi.ENVS[task](lw.make(task, nthread=1).model)
-    env.step(torch.full_like(env.action, 0.1))  # steps away from the initial state
+    env.step(torch.full_like(env.action, 0.1))  # this step leaves the initial state
     theirs.set_state(env.get_state()[0].numpy())
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):
@@ -38,7 +38,7 @@ def test_the_short_mode_runs_and_resumes(tmp_path: Path, capsys: pytest.CaptureF
     rows = experiment.read(out)
     assert all(row.result["plan_ms"] > 0.0 for row in rows)
     returns = [row.result["return"] for row in rows if row.case["part"] == "episodes"]
-    assert max(returns) - min(returns) < 0.2 * abs(min(returns))  # the same planner on the same plant
+    assert max(returns) - min(returns) < 0.2 * abs(min(returns))  # both have the same planner and plant
 
 
 def test_an_episode_that_two_blocks_share_counts_once() -> None:

@@ -55,7 +55,7 @@ def test_rates_are_measured_by_cores_and_worlds(tmp_path: Path, capsys: pytest.C
 
 @pytest.mark.parametrize("task", ["cartpole", "herb_reach"])
 def test_python_tasks_give_our_observations_and_rewards(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From equal states and actions, Gymnasium's version of a task returns the same observations and rewards."""
+    """From equal states and actions, Gymnasium's environment returns the same observations and rewards."""
     monkeypatch.syspath_prepend(str(BENCH / "peers" / "environments"))
     import gymnasium
     import numpy as np

@@ -1,4 +1,4 @@
-"""Test that equal functions share their kernels, whose names are the same in every process."""
+"""Test that equal functions share kernels, and that the kernels have the same names in every process."""
 
 from pathlib import Path
 from typing import Any

@@ -13,7 +13,7 @@ from lyceum_warp.task import FUNCTIONS, Task
 MEANT = {
     name: f"def {function.signature}:\n    {function.default or 'obs[0] = 1.0'}"
     for name, function in FUNCTIONS.items()
-    if name not in ("tally", "share")  # the functions for shared memory need each other and additional structs
+    if name not in ("tally", "share")  # these functions need each other and additional structs
 }
 """Every function of the table, as written in a task's file."""
 

@@ -262,7 +262,7 @@ def test_other_environments_get_the_tables() -> None:
     """A larger replica, scratch worlds, followers, a planner, and the evaluation of a policy get the tables."""
     motion = np.array([[0.25, 0.0]])
     env = lw.make(Follow, motion=motion, gain=[1.0, 2.0], nworld=2)
-    motion[:] = 9.0  # the environment has a copy
+    motion[:] = 9.0  # changing the array has no effect, because the environment has a copy
     more = env.replicate(nworld=3)
     assert more.obs[:, 1].tolist() == [0.25] * 3
     env.set_params(motion=[[0.75, 0.0], [0.5, 0.0]])

@@ -37,7 +37,7 @@ def test_an_edit_is_refused(edit: Callable[[mujoco.MjModel], object], pickled: b
         model = pickle.loads(pickle.dumps(model))
         assert type(model) is ReadOnlyModel
     own = r"^env\.model is read-only, .* in startup or randomize, or .* as model=$"
-    message = rf"{own}|^(assignment destination|output array) is read-only$"  # NumPy raises the second message
+    message = rf"{own}|^(assignment destination|output array) is read-only$"  # the second message is NumPy's
     with pytest.raises((AttributeError, ValueError), match=message):
         edit(model)
     assert (model.body_mass == mujoco.MjModel.from_xml_string(XML).body_mass).all()

@@ -45,10 +45,10 @@ FLAGS = (
 )  # fmt: skip
 
 STEPS = 60
-LEFT = (24, 92)  # the second controller in the panel's list, in pixels
-PAUSE = (106, 178)  # the pause button in the mode "passive"
+LEFT = (24, 92)  # position of the second controller in the panel's list, in pixels
+PAUSE = (106, 178)  # position of the pause button in the mode "passive"
 SCRUBBER = (20, 316, 282)  # left end, right end and height of the slider
-MIDDLE = (500, 300)  # centre of the block
+MIDDLE = (500, 300)  # position of the block's centre
 
 MODEL = """
 <mujoco>

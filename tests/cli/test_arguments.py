@@ -71,7 +71,7 @@ def test_every_option_of_the_physics_has_a_flag() -> None:
     names = [field.name for field in dataclasses.fields(Physics)]
     options = ["physics", *(field.name for field in dataclasses.fields(PhysicsOptions))]
     options.remove("base")
-    assert sorted(names) == sorted(options) and Physics().given() == {}
+    assert sorted(names) == sorted(options) and given(Physics()) == {}
 
 
 def test_every_option_of_an_environment_has_a_flag_or_is_listed_in_no_flags() -> None:

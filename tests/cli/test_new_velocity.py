@@ -45,8 +45,8 @@ SLED = """
   </actuator>
 </mujoco>
 """
-"""Two legs with boxes as feet, in bodies without joints, and a tail. The order of actuators differs from that of
-joints."""
+"""Two legs with boxes as feet, in bodies without joints, and a tail. The order of the actuators differs from the order
+of the joints."""
 
 
 @pytest.fixture

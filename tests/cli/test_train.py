@@ -141,7 +141,7 @@ def test_a_resumed_run_keeps_its_tensorboard_and_video_settings(tmp_path: Path) 
     assert len(list(out.glob("events.out.tfevents.*"))) == 2
     config = Run.open(out).config
     assert (config.pop("tensorboard"), config.pop("video_every")) == (False, 0)
-    (out / "config.json").write_text(json.dumps(config))  # written by an earlier release
+    (out / "config.json").write_text(json.dumps(config))  # an earlier release wrote such a file
     assert cli.main([*resume, "4"]) == 0
 
 
@@ -162,7 +162,7 @@ def test_a_run_keeps_its_physics(tmp_path: Path, made_envs: list[lw.Env], capsys
     assert cli.main([*resume, "3", "--solver", "iterations=7", "--integrator", "euler"]) == 0
     assert cli.main(["eval", str(out), "--episodes", "2", "--video"]) == 0
     assert {physics(env) for env in made_envs} == {(mujoco.mjtIntegrator.mjINT_EULER, 7, 9, True)}
-    assert {env.nworld for env in made_envs} == {1, 2, 32}  # the video; training and eval; the evaluation at the end
+    assert {env.nworld for env in made_envs} == {1, 2, 32}  # video, training and eval, final evaluation
     capsys.readouterr()
     for other, words in [
         (["--integrator", "rk4"], "has integrator euler, not rk4"),

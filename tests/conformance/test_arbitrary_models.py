@@ -129,7 +129,7 @@ def test_a_model_that_the_warp_engine_does_not_support_is_refused_in_a_line(reas
         lw.make(task, engine="warp")
 
 
-# fields of only some models
+# not every model has these fields
 
 RICH = text(
     ARM

@@ -78,7 +78,7 @@ def test_indices_out_of_range_are_found_and_named(task_file: TaskFile, engine: s
     with pytest.raises(AssertionError, match="tiny on the .* engine breaks the rule 'bounds': ") as caught:
         check_task(task_file("wrong.py", WRONG), engine=engine, steps=10, checks=[check_bounds])
     message = str(caught.value)
-    assert message.count("\n") == 1  # the report of the state follows the first line
+    assert message.count("\n") == 1  # the first line is the problem; the state follows
     for pattern in MISTAKES:
         assert re.search(pattern, message), f"{pattern} is not in {message}"
     assert message.count("out of range") == len(MISTAKES)

@@ -74,7 +74,7 @@ def spoil_rewards(env: lw.Env) -> None:
 
 
 def count_steps_as_none(method: Function) -> Function:
-    """Set the step counter to zero while states are judged, so that their noise equals that of the reset."""
+    """Set the step counter to zero while states are judged, so that their noise equals the noise of the reset."""
 
     def judge(self: Worlds, *args: Any, **kwargs: Any) -> None:
         kept = self.counters.step.numpy().copy()

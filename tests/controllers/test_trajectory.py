@@ -61,7 +61,7 @@ def test_a_damaged_file_is_refused(episode: Trajectory, tmp_path: Path) -> None:
         states = archive.getinfo("states.npy")
     whole, broken = path.read_bytes(), tmp_path / "broken.npz"
     half = len(whole) // 2
-    data = states.header_offset + 100 + states.compress_size // 2  # inside the compressed states
+    data = states.header_offset + 100 + states.compress_size // 2  # a byte inside the compressed states
     for content in (b"", b"no zip", whole[:half], whole[:-1], whole[:data] + b"????????" + whole[data + 8 :]):
         broken.write_bytes(content)
         with pytest.raises(ValueError, match=r"broken\.npz is broken, or is not a trajectory"):

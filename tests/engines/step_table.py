@@ -307,7 +307,7 @@ def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
     while missing:
         first = next(iter(missing))
         if (case := _completed(dict(first), rng, missing, strength)) is None:
-            del missing[first]  # refused with all levels of the other factors
+            del missing[first]  # the combination is refused with all levels of the other factors
             continue
         for part in itertools.combinations(((name, case[name]) for name in FACTORS), strength):
             missing.pop(part, None)

@@ -201,7 +201,7 @@ def test_captured_launches_share_their_scratch(monkeypatch: pytest.MonkeyPatch) 
     scratch.deallocate(more, 2000)
     assert not device.freed
     for within in (True, False):
-        # memory of the graph, or allocated without a capture
+        # this memory belongs to the graph, or was allocated without a capture
         device.stream.is_capturing, device.is_capturing = within, within
         assert scratch.allocate(300) == -300
         scratch.deallocate(-300, 300)

@@ -43,7 +43,7 @@ N = 3
 def compiled(spec: mujoco.MjSpec | None = None) -> mujoco.MjModel:
     spec = spec or mujoco.MjSpec.from_string(XML)
     for body in spec.bodies[1:]:
-        body.simple = 0  # allows inertial frames to move
+        body.simple = 0  # simple="false" allows inertial frames to move
     return spec.compile()
 
 
@@ -224,7 +224,7 @@ def test_a_model_that_becomes_nominal_again_runs_as_before(engine: type[Engine])
     draw(made)
     for name, nominal in made.nominal.items():
         made.arrays[name].numpy()[:] = nominal.numpy()
-    for _ in range(2):  # the second pass changes nothing
+    for _ in range(2):  # the second pass must change nothing
         made.apply_model(worlds())
     np.testing.assert_array_equal(run(made), run(untouched))
 
@@ -242,7 +242,7 @@ def test_a_rollout_honours_the_model_of_each_state(engine: type[Engine], integra
     controls = wp.array(np.full((4, N, MODEL.nu), 0.3), dtype=float)
     names = ("qpos", "qvel", "body_mass", *current)
     buffers = {name: wp.zeros((5, *source.arrays[name].shape), dtype=source.arrays[name].dtype) for name in names}
-    for _ in range(2):  # in the second pass no model changes
+    for _ in range(2):  # no model changes in the second pass
         planner.rollout(state, controls, 2, buffers)
         for t in range(4):
             for name, buffer in buffers.items():

@@ -209,7 +209,7 @@ def test_integrator_and_solver_options_reach_the_engine(engine: str) -> None:
 def test_fields_that_the_task_does_not_read_are_kept_if_listed(engine: str) -> None:
     """A sensor is enabled only if a listed field needs it."""
     env = lw.make("adroit_pen", engine=engine, fields=["sensordata", "cfrc_ext"])
-    size = env.state_space.size  # includes the contact forces
+    size = env.state_space.size  # cfrc_ext includes the contact forces
     env.step()
     assert env.field("sensordata").abs().max() > 0
     assert env.field("cfrc_ext").shape == (1, env.model.nbody, 6)

@@ -229,7 +229,7 @@ def test_sensors_of_the_acceleration_stage_keep_their_values_from_the_last_subst
     np.testing.assert_array_equal(pushed[:, late], left[:, late])
     np.testing.assert_array_equal(pushed[[1, 3]], left[[1, 3]])
     assert (pushed[[0, 2]] != left[[0, 2]]).any()
-    # a restored world has its state's sensor values, before and after another refresh
+    # the sensors of a restored world belong to the restored state, also after another refresh
     engine.step(1)
     put(engine, before, only(engine, 1))
     engine.refresh_current(everyone(engine))
@@ -308,7 +308,7 @@ def test_worlds_that_share_an_mjdata_do_not_mix_their_fields() -> None:
             rows = np.concatenate([engine.arrays[field.name].numpy() for engine in apart])
             np.testing.assert_array_equal(together.arrays[field.name].numpy(), rows, err_msg=f"{field.name} {lagged}")
             assert len(np.unique(rows.reshape(4, -1), axis=0)) == 4, field.name
-    early = early_sensor_columns(model)  # sensors of the current state; the other sensors belong to the last substep
+    early = early_sensor_columns(model)  # these sensors belong to the current state, and the others to the last substep
     for state, shown in zip(together.batch.state, together.arrays["sensordata"].numpy(), strict=True):
         data = mujoco.MjData(model)
         mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)

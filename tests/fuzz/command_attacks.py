@@ -170,7 +170,7 @@ def warm_up() -> None:
         assert cli.main(_line("train", "point_mass", SMALL["train"])) == 0
         (HERE / "out").rename(RUN)
     for command in SMALL:
-        if command != "bench":  # it starts another process
+        if command != "bench":  # bench starts another process
             run(_line(command, FIRST.get(command, "point_mass"), SMALL[command]))
 
 

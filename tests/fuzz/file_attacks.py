@@ -251,11 +251,11 @@ def _make(folder: Path) -> None:
     command("train", "point_mass", "--horizon", "8", "--out", folder / "run", *options)
     motion = f"motion={folder / 'table.npy'}"
     command("train", folder / "slide.py", "--out", folder / "kept", "--param", motion, *options)
-    for run in ("run", "kept"):  # makes the length of the files constant
+    for run in ("run", "kept"):  # shorten measured times, so that all files have the same length
         path = folder / run / "metrics.csv"
         path.write_text(re.sub(r"\d+\.\d{9,}", lambda found: found[0][:8], path.read_text()))
     config = json.loads((folder / "kept/config.json").read_text())
-    # makes readers use the run's copies
+    # without the originals, readers use the run's copies
     config |= {"task": "/nowhere/slide.py", "params": {"motion": "/nowhere/table.npy"}}
     (folder / "kept/config.json").write_text(json.dumps(config, indent=2))
     plant = lw.make("point_mass", autoreset=False, horizon=4)

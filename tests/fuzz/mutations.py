@@ -64,7 +64,7 @@ def mutated_value(tree: Any, random: Random, values: tuple[Any, ...] = VALUES) -
             entries[name] = mutated_value(entries[name], random, values)
         return entries if isinstance(tree, dict) else list(entries.values())
     if isinstance(tree, torch.Tensor) and random.random() < 0.8:
-        huge = torch.zeros(1).expand(10**9)  # a shape of 4 GB backed by four bytes
+        huge = torch.zeros(1).expand(10**9)  # four bytes that claim a shape of 4 GB
         other = tree.to(random.choice((torch.float64, torch.bool, torch.complex64, torch.int64)))
         return random.choice((huge, other, tree.flatten()[:-1], tree[None], tree.to_sparse(), tree * math.nan))
     return [tree] if random.random() < 0.1 else random.choice(values)
@@ -138,7 +138,7 @@ def _mutated_archive(data: bytes, random: Random, main: str, hostile: bytes) -> 
     ))  # fmt: skip
     file = io.BytesIO()
     with warnings.catch_warnings(), zipfile.ZipFile(file, "w") as archive:
-        warnings.simplefilter("ignore")  # the same name twice
+        warnings.simplefilter("ignore")  # an archive may have the same name twice
         for entry in (*entries[:place], *new, *entries[place + 1 :]):
             archive.writestr(*entry)
     return file.getvalue()

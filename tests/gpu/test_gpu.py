@@ -180,7 +180,7 @@ def test_memory_of_the_deterministic_mode_is_as_measured_in_advance() -> None:
         return torch.cuda.mem_get_info(CUDA)[0]
 
     few = lw.make("hopper", nworld=256, device=CUDA, deterministic=True)
-    few.step()  # allocates memory that does not depend on the number of worlds
+    few.step()  # the first call allocates memory that does not depend on the number of worlds
     engine = few.engine
     assert isinstance(engine, DeterministicEngine)
     sizes = ScratchSizes.probe(engine._captured_step)

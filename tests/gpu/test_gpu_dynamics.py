@@ -19,7 +19,7 @@ pytestmark = pytest.mark.gpu
 
 DRAWN = "body_mass body_inertia geom_friction geom_quat dof_damping dof_armature actuator_gear gravity".split()
 N = 200
-CHOSEN = [0, 3, *range(50, 150)]  # more worlds than one refresh group
+CHOSEN = [0, 3, *range(50, 150)]  # more worlds than a refresh group has
 
 
 def draws(model: mujoco.MjModel, turn: int) -> dict[str, np.ndarray]:
@@ -38,7 +38,7 @@ def draws(model: mujoco.MjModel, turn: int) -> dict[str, np.ndarray]:
 def write(engine: Engine, name: str, factors: np.ndarray) -> None:
     array = engine.arrays[name]
     values = engine.nominal[name].numpy().reshape(1, -1) * factors
-    if name == "geom_quat":  # makes the floor a slope
+    if name == "geom_quat":  # the rotation makes the floor a slope
         angles = 0.1 * np.arange(N) / N
         values.reshape(N, -1, 4)[:, 0] = np.stack([np.cos(angles), 0 * angles, np.sin(angles), 0 * angles], axis=1)
     wp.copy(array, wp.array(values.reshape(array.numpy().shape), dtype=array.dtype, device=engine.device))

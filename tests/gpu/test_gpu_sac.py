@@ -1,4 +1,4 @@
-"""Test SAC on a GPU: captured updates equal direct ones, nothing synchronizes, and resumption is exact."""
+"""Test SAC on a GPU: captured updates equal eager ones, no call waits for the device, and resuming is exact."""
 
 from pathlib import Path
 from typing import Any

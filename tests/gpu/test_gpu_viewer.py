@@ -38,12 +38,12 @@ def test_any_world_is_shown_after_one_frame() -> None:
     session.stage.frame()
     shown = env.get_state()[3000].cpu().numpy()
     session.stage.advance(5)
-    frame = session.stage.frame()  # shows the time of the previous frame
+    frame = session.stage.frame()  # the frame shows the time of the previous frame
     np.testing.assert_array_equal(frame.state, shown[: len(frame.state)])
     session.obey(SetPaused(True))
     session.obey(SetGhosts(worlds=1, burst=3))
     session.obey(SetWorld("best"))
-    frame = session.stage.frame()  # while paused, shows the current time
+    frame = session.stage.frame()  # a paused viewer shows the current time
     assert frame.status.world == int(session.stage.live.returns.argmax())
     state, qpos = env.get_state(), env.state_space.parts["qpos"]
     np.testing.assert_array_equal(frame.state, state[frame.status.world, : len(frame.state)].cpu().numpy())

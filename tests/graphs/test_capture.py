@@ -50,7 +50,7 @@ def test_consecutive_phases_become_one_graph_that_is_replayed_from_the_third_cal
     calls = graphs().sequence([digits.phase(1), digits.phase(2, engine=True), digits.phase(3)])
     assert len(calls) == 1
     assert [digits.after(calls) for _ in range(4)] == [123] * 4
-    assert digits.calls == 6  # the first call runs, the second captures
+    assert digits.calls == 6  # the first call launches, the second captures
 
 
 def test_engine_calls_stay_between_graphs_if_they_are_not_made_of_launches() -> None:
@@ -181,7 +181,7 @@ def test_forget_captures_changed_launches_again() -> None:
     calls = made.sequence([Phase("digit", lambda: wp.launch(append, 1, [digit[0], digits.number], device="cpu"))])
     assert [digits.after(calls) for _ in range(3)] == [1] * 3
     digit[0] = 2
-    assert digits.after(calls) == 1  # the graph holds the argument
+    assert digits.after(calls) == 1  # the graph keeps the argument alive
     made.forget()
     assert [digits.after(calls) for _ in range(3)] == [2] * 3
 
@@ -192,7 +192,7 @@ def test_unused_objects_are_deleted_after_a_capture() -> None:
 
     class Unused:
         def __init__(self) -> None:
-            self.itself = self  # only the garbage collector finds it
+            self.itself = self  # only the garbage collector can delete the cycle
 
         def __del__(self) -> None:
             deleted.append(captures)

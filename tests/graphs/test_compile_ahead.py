@@ -67,7 +67,7 @@ def test_compiling_is_reported_and_done_once(
 def test_kernels_of_a_new_task_are_reported_on_the_c_engine_too(
     shared_env: SharedEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    shared_env("point_mass").step()  # loads the package's own kernels
+    shared_env("point_mass").step()  # this step loads the package's own kernels
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     file = tiny_task.write(tmp_path, tiny_task.changed(("class Tiny", "class Compiled")), "compiled.py")
     env = lw.make(str(file), engine="mujoco")

@@ -56,7 +56,7 @@ def test_a_rehearsal_lists_launches_without_running_them(arrays: tuple[wp.array,
     flag = wp.zeros(1, dtype=int, device="cpu")
     with rehearse() as rehearsal:
         launch(*arrays)
-        wp.capture_if(flag, on_true=lambda: launch(*arrays))  # runs for any flag
+        wp.capture_if(flag, on_true=lambda: launch(*arrays))  # this launch runs for any flag
         wp.capture_while(flag, while_body=lambda: launch(*arrays))
     assert list(rehearsal.modules) == [(fill_rows64.module, None)]
     assert not arrays[2].numpy().any()
@@ -108,7 +108,7 @@ def test_overlapping_rehearsals_of_two_threads_take_turns(arrays: tuple[wp.array
     assert originals() == before
 
 
-# names of Warp; a failure here means that graphs/rehearsal.py or graphs/compile_ahead.py needs the new ones
+# names in Warp; if they are missing, update graphs/rehearsal.py and graphs/compile_ahead.py
 
 
 def test_warp_has_the_functions_that_a_rehearsal_replaces() -> None:

@@ -19,7 +19,7 @@ def test_calls_run_side_by_side_on_the_threads() -> None:
     together, threads = threading.Barrier(3), []
 
     def call() -> None:
-        together.wait(10)  # returns once three threads have called it
+        together.wait(10)  # wait() returns once three threads have called it
         threads.append(threading.current_thread())
 
     workers = Workers(3)

@@ -1,6 +1,6 @@
 """Store reference data of mjlab's Go1 for the tests: trajectories, reward terms and observations.
 
-It needs mjlab 1.6.0 with MuJoCo 3.11, so run it in a separate virtual environment:
+mjlab 1.6.0 needs MuJoCo 3.11, so run this script in a separate virtual environment:
 
     python -m venv mjlab && mjlab/bin/pip install mjlab==1.6.0
     mjlab/bin/python tests/oracles/store_go1.py tests/data/go1_mjlab.npz

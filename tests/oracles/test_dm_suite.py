@@ -23,7 +23,7 @@ from lyceum_warp.tasks.dm import TASKS
 
 DATA = Path(__file__).parent.parent / "data" / "dm_control"
 LAST_SUBSTEP = ("touch", "imu", "force_torque")
-"""Parts of observations that the last substep leaves, so that they are not functions of the state."""
+"""Parts of observations that the last substep computed, and that therefore are not functions of the state."""
 RESETS = 512
 QUICK = ("dm/cartpole_swingup", "dm/finger_turn_hard", "dm/manipulator_bring_ball", "dm/walker_walk")
 EVERY = [pytest.param(task, marks=() if task in QUICK else pytest.mark.long) for task in TASKS]
@@ -99,7 +99,7 @@ def dm_controls_model(task: str) -> mujoco.MjModel:
     xml = made[0] if isinstance(made, tuple) else made
     assets = importlib.import_module("dm_control.suite.common").ASSETS
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # settotalmass of cheetah is deprecated
+        warnings.simplefilter("ignore")  # MuJoCo warns that cheetah's settotalmass is deprecated
         return mujoco.MjModel.from_xml_string(xml if isinstance(xml, str) else xml.decode(), assets)
 
 
@@ -119,12 +119,12 @@ def test_the_model_is_the_one_that_dm_controls_python_makes(shared_env: SharedEn
     for field in ("dof_armature", "dof_frictionloss", "dof_M0", "qpos0", "qpos_spring", "key_qpos"):
         np.testing.assert_allclose(getattr(ours, field), getattr(theirs, field), rtol=1e-9, atol=1e-12, err_msg=field)
     damping = theirs.dof_damping.copy()
-    if task == "dm/finger_spin":  # dm_control sets it at each reset
+    if task == "dm/finger_spin":  # dm_control sets this field at each reset
         damping[2] = 0.03
     np.testing.assert_allclose(ours.dof_damping, damping)
     for field in ("timestep", "integrator", "cone", "gravity", "density", "viscosity"):
         assert np.array_equal(getattr(ours.opt, field), getattr(theirs.opt, field)), field
-    without_sensors = ours.opt.disableflags & ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # if the task reads none
+    without_sensors = ours.opt.disableflags & ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # for tasks that read no sensor
     assert without_sensors == theirs.opt.disableflags
 
 
@@ -137,7 +137,7 @@ def test_a_task_has_dm_controls_sizes_and_times(shared_env: SharedEnv, task: str
     assert env.model.opt.timestep == pytest.approx(theirs["timestep"])
     np.testing.assert_allclose(env.action_space.low, theirs["minimum"])
     np.testing.assert_allclose(env.action_space.high, theirs["maximum"])
-    # every episode has a first step, the steps between and a last one, whose discount is 1: it ends, but not the task
+    # an episode has a first step, middle steps and a last step; a discount of 1 shows that the time limit ended it
     assert (theirs["step_type"] == [0, *(env.task.task.horizon - 1) * [1], 2]).all() and (theirs["discount"] == 1).all()
 
 

@@ -1,6 +1,6 @@
 """Compare the C engine with the Warp engine for every task of the package.
 
-Both run the same task functions on different physics: the C engine in float64, the Warp engine in float32. With
+Both engines run the same task functions on different physics: the C engine in float64, the Warp engine in float32. With
 pyramidal friction cones MuJoCo Warp uses a different contact frame for a capsule on a plane, so trajectories differ.
 These tests use elliptic cones, which do not depend on the contact frame.
 """
@@ -21,7 +21,7 @@ from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.tasks.velocity import TASKS as VELOCITY
 
 NWORLD = 32
-TASKS = [name for name in package_task_names() if not name.startswith("dm/")]  # models like those of others
+TASKS = [name for name in package_task_names() if not name.startswith("dm/")]  # dm_control's models add no feature
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 FORCE_PARTS = ("contact_force",)

@@ -1,7 +1,7 @@
 """Compare tasks with their Gymnasium environments on the C engine.
 
-Both run the same C code in float64. From equal states, warm start included, they differ only by rounding of
-observations and rewards to float32. The tests read the tasks' attribute ``gymnasium`` and Gymnasium's registry and
+Both environments run the same C code in float64. From equal states, warm start included, they differ only by rounding
+of observations and rewards to float32. The tests read the tasks' attribute ``gymnasium`` and Gymnasium's registry and
 signatures, so they include new tasks automatically.
 """
 
@@ -207,7 +207,7 @@ def test_every_named_environment_is_registered() -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_a_thousand_steps_equal_gymnasiums(task: str) -> None:
-    """Some of the random actions are beyond the control range."""
+    """Some random actions exceed the control range."""
     pair = Pair(make_ours(task), make_theirs(task))
     assert pair.ours.timestep == pytest.approx(pair.theirs.dt, rel=1e-12)
     assert pair.ours.obs.shape == (1, *pair.theirs.observation_space.shape)
@@ -391,7 +391,7 @@ def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
     fixed = spread < 1e-9
     np.testing.assert_allclose(b[:, fixed], a[:, fixed], atol=1e-6)
     a, b = ((x - middle)[:, ~fixed] / spread[~fixed] for x in (a, b))
-    # the mean, and the standard deviation, whose error follows from the fourth moment
+    # the mean and the standard deviation; the fourth moment determines the latter's error
     kurtosis = np.mean(a**4, axis=0)
     assert np.abs(b.mean(axis=0)).max() < 5.0 * math.sqrt(2.0 / n)
     assert (np.abs(b.std(axis=0) - 1.0) < 5.0 * np.sqrt((kurtosis - 1.0) / (2.0 * n))).all()
@@ -459,8 +459,8 @@ class Numbers:
     steps: list[tuple[float, float, bool]]
 
     def changed(self, default: "Numbers") -> float:
-        """Return the fraction of terminal steps if terminations differ from the default's; otherwise of changed
-        steps."""
+        """Return the fraction of terminal steps if the terminations differ from the default; otherwise the fraction of
+        changed steps."""
         ends, default_ends = ([step[2] for step in numbers.steps] for numbers in (self, default))
         if ends != default_ends:
             return float(np.mean(ends))

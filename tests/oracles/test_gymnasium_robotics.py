@@ -333,7 +333,7 @@ def test_model_equals_theirs_except_for_edits(shared_env: SharedEnv, task: str) 
 
 
 def test_fixed_resets_give_the_initial_positions_of_their_model(make_pair: MakePair, task: str) -> None:
-    """Positions equal those of their model before any reset."""
+    """Positions equal the positions of their model before any reset."""
     pair = make_pair(registered(task))
     pair.ours.reset()
     pair.put()

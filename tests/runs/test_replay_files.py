@@ -95,7 +95,7 @@ def test_a_save_writes_only_the_parts_that_have_grown(tmp_path: Path, monkeypatc
     lw.train(made(replay=800), folder, iterations=2, save_every=1)
     ends = [int(name.rpartition("-")[2]) for name in written]
     assert ends == [4, 8, 12, 16, 20, 24]
-    (folder / "checkpoint.pt").write_bytes(b"")  # simulate a power loss; previous.pt remains
+    (folder / "checkpoint.pt").write_bytes(b"")  # after a power loss, only previous.pt remains
     notes: list[str] = []
     monkeypatch.setattr("lyceum_warp.training.log.warning", notes.append)
     lw.train(made(replay=800), folder, iterations=3, resume=True, save_every=1)

@@ -14,6 +14,7 @@ from training_runs import QUIET, algorithm, metrics, refused, six_iterations
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.lock import RunLock
 from lyceum_warp.runs.saving import LONG, SAVE_SECONDS, SHARE, Saver
 
 
@@ -29,8 +30,10 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("seconds, wait", [(0.02, SHARE * 0.02), (1.0, SAVE_SECONDS), (9.0, LONG * 9.0)])
 def test_saving_takes_a_small_fraction_of_the_time(seconds: float, wait: float, npg: lw.NPG, tmp_path: Path) -> None:
-    saver = Saver(Run.create(tmp_path / "run", {}), npg)
-    saver.save()
+    run = Run.create(tmp_path / "run", {})
+    with RunLock(run.folder) as lock:
+        saver = Saver(run, lock, npg)
+        saver.save()
     assert saver.saved == 0 and not saver.due()
     saver._seconds = seconds  # simulate the duration of a save with more worlds
     saver._when -= 0.9 * wait

@@ -292,7 +292,7 @@ def test_a_task_defined_in_a_program_is_evaluated_from_a_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=SMALL), tmp_path / "run", iterations=1)
-    Run.open(tmp_path / "run").amend(task=None)  # as the configuration is saved for a class in a notebook
+    Run.open(tmp_path / "run").amend(task=None)  # for a class in a notebook, the configuration has no task
     assert cli.main(["eval", str(tmp_path / "run")]) == 2
     refused(
         capsys,

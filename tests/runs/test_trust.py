@@ -97,7 +97,7 @@ def test_a_foreign_run_is_refused_until_it_is_trusted(
     assert record == str(theirs)
     shutil.rmtree(tmp_path / "out", ignore_errors=True)
     arguments = [word if word != "2" else "3" for word in command]
-    assert cli.main(arguments) == 0  # trusted from now on
+    assert cli.main(arguments) == 0  # the run is trusted from now on
     (theirs / "task" / "told.py").write_text(SOURCE + "\n")
     assert cli.main(command) == 2  # a changed copy is not trusted
 

@@ -38,7 +38,7 @@ def test_a_task_keeps_the_functions_of_its_own_cell(notebook: types.ModuleType, 
     assert tiny.eval.item() == 1.0
     assert torch.equal(tiny.obs, tiny.field("qpos")[:, :1])
     assert other.obs.item() == 2.0
-    assert torch.equal(other.eval, other.reward)  # the default, not the first cell's function
+    assert torch.equal(other.eval, other.reward)  # the default function, not the function of the first cell
 
 
 def test_a_cell_that_is_run_again_replaces_its_registered_task(notebook: types.ModuleType, tmp_path: Path) -> None:

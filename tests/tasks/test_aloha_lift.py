@@ -40,7 +40,7 @@ def test_a_scripted_grasp_lifts_the_pot_in_every_world(shared_env: SharedEnv) ->
             handle = data.site(f"lift/{side}_handle").xpos
             inwards = data.body("partnet_100015/").xpos - handle
             inwards = np.array([*inwards[:2], 0.0]) / np.linalg.norm(inwards[:2])
-            # 52 degrees down, one finger above the other
+            # the gripper points 52 degrees down, one finger above the other
             x, y = 0.61 * inwards - [0.0, 0.0, 0.79], 0.79 * inwards + [0.0, 0.0, 0.61]
             axes = np.stack([x, y, np.cross(x, y)], axis=1)
             names = [f"{side}\\{joint}" for joint in JOINTS]

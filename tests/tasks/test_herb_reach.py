@@ -42,7 +42,7 @@ ARM = {  # range in rad (Barrett D1001, tables 5 and 6; HERB turns the first joi
 }
 FINGERS = {"j00": 180, "j10": 180, "j01": 140, "j11": 140, "j21": 140, "j02": 48, "j12": 48, "j22": 48}  # degrees
 
-# inertias (xx, yy, zz, xy, xz, yz) of the WAM's links in Barrett's frames, whose z axis is that of the next joint
+# inertias (xx, yy, zz, xy, xz, yz) of the WAM's links in Barrett's frames, whose z axes are the axes of the next joints
 INERTIAS = {
     "wam1": (0.13488033, 0.11328369, 0.09046330, -0.00213041, -0.00012485, 0.00068555),
     "wam2": (0.02140958, 0.01377875, 0.01558906, 0.00027172, 0.00002461, -0.00181920),
@@ -242,7 +242,7 @@ def reachable(model: mujoco.MjModel, goals: np.ndarray, start: np.ndarray) -> bo
 
 
 def test_success_needs_both_hands_for_ten_steps() -> None:
-    """One hand is not enough; a step off the target restarts the count, and a reset clears it."""
+    """Success needs both hands; a step off the target restarts the count, and a reset clears it."""
     env = lw.make("herb_reach", engine="mujoco", nworld=4, autoreset=False, horizon=0)
     offset = np.array([[0.0, 0.0], [0.06, 0.0], [0.0, 0.06], [0.045, -0.045]])
     put_targets(env, offset)

@@ -64,7 +64,7 @@ def test_a_scripted_grasp_lifts_the_cube_in_every_world(shared_env: SharedEnv) -
     waypoints = np.zeros((3, 4, 8))
     for world in range(4):
         yaw = 2.0 * np.arctan2(at[world, 6], at[world, 3])
-        yaw -= np.round(yaw / (0.5 * np.pi)) * 0.5 * np.pi  # the edge that is nearest to the fingers
+        yaw -= np.round(yaw / (0.5 * np.pi)) * 0.5 * np.pi  # yaw of the edge nearest to the fingers
         y, z = np.array([-np.sin(yaw), np.cos(yaw), 0.0]), np.array([0.0, 0.0, -1.0])
         axes = np.stack([np.cross(y, z), y, z], axis=1)
         for i, height in enumerate((0.12, 0.02, 0.2)):

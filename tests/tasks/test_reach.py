@@ -149,7 +149,7 @@ def test_random_start_draws_every_joint_from_its_range() -> None:
     low, high = RANGES.T.astype(np.float32).astype(np.float64)
     middle = np.concatenate([(2.0 * qpos - low - high) / (high - low), targets(env) / (0.3, 0.2, 0.25)], axis=1)
     check_uniform(middle / (1.0 + 1e-6))
-    for _ in range(20):  # some start with the palm inside the table
+    for _ in range(20):  # some episodes start with the palm inside the table
         env.step(torch.zeros(2000, 7))
     assert not env.done.any()
 
@@ -164,7 +164,7 @@ def put_targets(env: lw.Env, distance: np.ndarray) -> None:
 
 
 def test_success_needs_ten_steps_at_the_target() -> None:
-    """A larger distance does not shorten the ten steps. A reset clears the count, which is part of the state."""
+    """Success takes ten steps also with a larger distance. A reset clears the count, which is part of the state."""
     env = lw.make("reach", engine="mujoco", nworld=3, success_distance=np.array([0.05, 0.05, 0.99]), horizon=0)
     put_targets(env, np.array([0.0, 0.06, 0.0]))
     still = torch.zeros(3, 7)

@@ -28,7 +28,7 @@ def bound(task: str) -> BoundTask:
 
 
 def symmetric(model: mujoco.MjModel, mirror: lw.Mirror) -> mujoco.MjModel:
-    """Average masses, gains and ranges of a model with those of its mirror image.
+    """Make a model symmetric: average its masses, gains and ranges with their mirror images.
 
     Published models are not symmetric: centres of mass differ by up to 6 mm, and both hips of the G1 have the left
     hip's range.

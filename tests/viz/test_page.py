@@ -67,7 +67,7 @@ def test_surfaces_have_the_sizes_of_their_geoms(tmp_path: Path) -> None:
         data = content(write_poses(model, [pose], tmp_path / "page.html", dt=1.0, title="</title>", camera=camera))
         assert "</title></title>" not in (tmp_path / "page.html").read_text()
         world, (first, count) = data["ranges"]
-        assert world[0] == 0 and first == world[1] == 6 + 36 + 12 and count > 0  # without the hidden sphere
+        assert world[0] == 0 and first == world[1] == 6 + 36 + 12 and count > 0  # the hidden sphere is not counted
         corners = data["vertices"][data["indices"][first : first + count]]
         np.testing.assert_allclose(np.abs(corners["f0"]).max(0), reach.get(kind, size), atol=1e-6)
         normals = corners["f1"][:, :3] / 127

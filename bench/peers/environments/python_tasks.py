@@ -1,7 +1,8 @@
 """Define tasks for Gymnasium and dm_control with the formulas and models of lyceum_warp's tasks.
 
-Gymnasium has all tasks except cartpole and herb_reach, and dm_control has cartpole. The others are written here in
-NumPy, as users of the libraries would. This file runs in peers' virtual environments and does not import lyceum_warp.
+Gymnasium has all tasks except cartpole and herb_reach, and dm_control has cartpole. This file defines the other tasks
+in NumPy, as a user of the libraries would. This file runs in peers' virtual environments and does not import
+lyceum_warp.
 """
 
 from pathlib import Path
@@ -33,7 +34,7 @@ GYMNASIUM = {
 """Gymnasium's names of the tasks."""
 
 JUDGE_NEW_STATE = {"humanoid_standup", "reacher", "pusher", "inverted_pendulum", "inverted_double_pendulum"}
-"""Tasks whose step in Gymnasium uses no state from before the physics."""
+"""Tasks whose step in Gymnasium reads only the state after the physics."""
 
 
 class CartpoleEnv(MujocoEnv):

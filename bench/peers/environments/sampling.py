@@ -1,7 +1,8 @@
 """Measure environment steps per second of other libraries, as a worker of bench/venvs.py.
 
-It reads a JSON object (contestant, task, envs, threads, seconds, warm, seed) and prints one. Actions are uniform within
-their bounds and drawn before the clock starts. An episode restarts within its last step if the library supports it.
+The program reads a JSON object (contestant, task, envs, threads, seconds, warm, seed) and prints another. Actions are
+uniform within their bounds and drawn before the clock starts. An episode restarts within its last step if the library
+supports it.
 """
 
 import json
@@ -74,8 +75,8 @@ class Gymnasium:
 class DmControl:
     """dm_control's environments in persistent subprocesses, or one environment in this process.
 
-    Its authors recommend subprocesses (github.com/google-deepmind/dm_control/issues/94). Each process steps its share
-    of the environments and gets one message per step; actions and results are in shared memory.
+    The authors of dm_control recommend subprocesses (github.com/google-deepmind/dm_control/issues/94). Each process
+    steps its share of the environments and gets one message per step; actions and results are in shared memory.
     """
 
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:

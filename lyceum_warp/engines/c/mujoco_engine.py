@@ -82,13 +82,13 @@ class MujocoEngine(Engine):
         super().__init__(model, nworld, device, fields, dynamics, initial)
         quiet()
         self.nthread = whole_number("nthread", nthread, low=0)
-        # a subclass may add launches over all worlds, which every thread would repeat
+        # one thread, because a subclass may launch over all worlds, and every thread would repeat this
         self.launch_threads = (self.nthread or cpu_cores()) if type(self) is MujocoEngine else 1
         self.native_model = copy.copy(model)
         """The model that the batch runs."""
         # a world with a fault must be reported, not silently reset within a step
         self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        # The batch is not persistent. A persistent one could reuse the stages computed after the last step, but one
+        # The batch is not persistent. A persistent batch could reuse the stages computed after the last step, but one
         # MjData per world does not fit into the CPU's caches: the six tasks that need such stages became 4 to 33 %
         # slower (128 and 1,024 worlds on two cores).
         self.batch = Batch(self.native_model, nworld, self.nthread)
@@ -111,12 +111,12 @@ class MujocoEngine(Engine):
         shown = [field for field in kept if field.name != "ctrl"]  # an input
         late = [field for field in shown if field not in computed or field.snapshot] if self._apart else []
         self._before_stage = [field for field in late if field.name not in STATE_FIELDS]
-        """Fields to copy before that call, because it may run in an MjData that another world used."""
+        """Fields to copy before the separate call, because it may run in an MjData that another world used."""
         self._after_stage = [field for field in self._before_stage if field in computed]
-        """Fields that the separate call computes in part: sensors up to its stage."""
+        """Fields of which the separate call computes only a part: sensors up to its stage."""
         self._last = [field for field in shown if field not in self._before_stage]
         """Fields to copy at the end of a step, by kernel launches."""
-        # positions do not depend on contacts, and collision detection takes most of the position stage
+        # skip collision detection, most of the position stage: positions do not depend on contacts
         without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if positions and computed else 0
         self._disabled = self.batch.expand("opt.disableflags") if without else np.zeros(0, dtype=int)
         self._step_flags, self._stage_flags = self._disabled.copy(), self._disabled | without
@@ -310,7 +310,7 @@ class MujocoEngine(Engine):
         launch_several_rows(widen_four, mask, numbers)
 
     def refresh(self, mask: wp.array) -> None:
-        computed = [field for field in self._derived if field.reset > Stage.NONE]  # the other bits are cleared
+        computed = [field for field in self._derived if field.reset > Stage.NONE]  # clear the other bits
         self._forward(mask, self.reset_stage, computed)
 
     def refresh_current(self, mask: wp.array) -> None:

@@ -16,9 +16,10 @@ from lyceum_warp.model_fields import ModelField
 def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
     """Whether ``Batch.rollout`` returns the same values as one call of ``Batch.step`` per step.
 
-    A row holds values as ``mj_step`` leaves them. Its state is the new state, but quantities of the position and
-    velocity stages belong to the state before the last substep, and the next row holds their new values. With RK4 they
-    belong to an intermediate stage instead. Sensor data mix the stages, so they are not exact either.
+    Each row of a native rollout holds values as ``mj_step`` leaves them. Its state is the new state, but quantities of
+    the position and velocity stages belong to the state before the last substep, and the next row holds their new
+    values. With RK4 they belong to an intermediate stage instead. Sensor data mix the stages, so they are not exact
+    either.
     """
     current = [field for field in fields if field.refresh > Stage.NONE]
     if any(field.snapshot for field in current):
@@ -101,7 +102,7 @@ class NativeRollout:
         if self.model_columns:
             self.models.apply({name: state[:, part].astype(np.float32) for name, part in self.model_columns.items()})
         np.copyto(self.by_step, controls.transpose(1, 0, 2)[:, :, None])
-        # a world with a warning stops and repeats its last row; only the warning shows this
+        # a world with a warning stops and repeats its last row, so the warnings must be read
         with ErrorsAsWarnings(batch):
             batch.rollout(nstep=self.control.shape[1], control=self.control, **self._outputs)
         if self.stage > Stage.NONE:
@@ -115,7 +116,7 @@ class NativeRollout:
         key = STATE_FIELDS[field.name].value if field.name in STATE_FIELDS else field.name
         rows, nstep = self.rows[key], self.nstep
         if field.name in self.final:
-            # the row of a step's first substep holds values from before the step
+            # the first substep's row holds the values from before the step
             values, end = rows[:, ::nstep], self.final[field.name]
             np.copyto(target[:-1], values.swapaxes(0, 1).reshape(target[:-1].shape), "unsafe")
             np.copyto(target[-1], end.reshape(target[-1].shape), "unsafe")

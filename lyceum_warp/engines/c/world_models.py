@@ -36,7 +36,7 @@ class WorldModels:
             self._rounded[field.name] = self._own[field.name].astype(np.float32)
             if field.name in self._follows:
                 self._applied[field.name] = self._rows[field.name].astype(np.float32)
-        # even with the model's own values, constants come from set_const, not from the compiler
+        # set_const computes all constants, also for the model's own values, so that equal values give equal constants
         self._stale = np.full(batch.nsim, bool(self._follows))
 
     def apply(self, values: Mapping[str, np.ndarray], mask: np.ndarray | None = None) -> None:
@@ -77,6 +77,6 @@ def bytes_per_world(model: mujoco.MjModel, fields: Iterable[ModelField]) -> int:
     batch = Batch(model, 1, 1)
     models = WorldModels(batch, fields)
     moved = {field.name: 1.001 * field.value(model).reshape(1, -1).astype(np.float32) for field in models.fields}
-    models.apply(moved)  # only constants that differ are allocated
+    models.apply(moved)  # a constant takes memory only if it differs
     expanded = [rows for name in MODEL_FIELDS if (rows := batch.expanded(name)) is not None]
     return sum(rows.nbytes for rows in expanded) + 4 * sum(field.size for field in fields)

@@ -16,7 +16,7 @@ class CanonicalOrder:
     """Sorts a Data's contacts and constraint rows in every forward pass, through MuJoCo Warp's callbacks.
 
     MuJoCo Warp's own deterministic mode makes sums of atomic additions reproducible, but does not sort contacts and
-    rows. Its callbacks run after collision detection, and after constraints are made but before they are solved. For
+    rows. The callbacks run after collision detection, and between making and solving constraints. For
     the order see ``order_kernels``.
 
     Args:

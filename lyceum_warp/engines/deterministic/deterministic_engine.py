@@ -19,8 +19,8 @@ from lyceum_warp.graphs.capture import capturing
 from lyceum_warp.model_fields import ModelField
 
 _TIMES_THE_MEMORY = 5
-"""A world's memory relative to the estimate for the plain Warp engine: 4.9 on humanoid, 6.1 on half_cheetah and 6.3 on
-hopper (measured). ``prepare_capture`` measures it for the actual model."""
+"""Memory of a world, divided by the estimate for the plain Warp engine. Measured: 4.9 on humanoid, 6.1 on half_cheetah
+and 6.3 on hopper. ``prepare_capture`` measures it for the actual model."""
 
 _FEW = 256
 """Below this number of worlds, scratch memory fits on any device and is allocated on demand."""
@@ -29,11 +29,11 @@ _FEW = 256
 class DeterministicEngine(WarpEngine):
     """A Warp engine whose steps are reproducible bit for bit on a CUDA device, as on the CPU.
 
-    It sorts contacts and constraint rows, makes MuJoCo Warp sum in a fixed order, and shares the scratch memory for
-    this between all launches. It takes the arguments of ``WarpEngine``.
+    The engine sorts contacts and constraint rows, makes MuJoCo Warp sum in a fixed order, and uses the same scratch
+    memory for all launches. The arguments are the same as for ``WarpEngine``.
     """
 
-    __signature__ = inspect.signature(WarpEngine)  # placement reads the option names from it
+    __signature__ = inspect.signature(WarpEngine)  # placement reads the names of the options from this signature
 
     partial_refresh = False
 
@@ -52,11 +52,11 @@ class DeterministicEngine(WarpEngine):
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
         """Make another Model and Data with the same options and sizes, to benchmark MuJoCo Warp alone.
 
-        Graphs of their steps take about a hundred times the memory, because they do not share scratch memory.
+        A graph of their step takes about a hundred times the memory, because its launches do not share scratch memory.
         """
         model, data = super().bare()
         with wp.ScopedDevice(self.device):
-            CanonicalOrder(model, data)  # the model's callbacks keep it alive
+            CanonicalOrder(model, data)  # the model's callbacks keep the sorter alive
         return model, data
 
     def prepare_capture(self) -> None:

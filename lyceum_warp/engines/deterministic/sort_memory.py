@@ -90,6 +90,6 @@ class ScratchSizes:
 
 
 def _line(few: int, more: int) -> tuple[int, int]:
-    """Fixed bytes and bytes per world, from the bytes for the two probed numbers of worlds."""
+    """Compute the fixed bytes and the bytes per world from the bytes for two numbers of worlds."""
     each = -(-(more - few) // (_PROBED[1] - _PROBED[0]))
     return max(0, few - _PROBED[0] * each), each

@@ -51,8 +51,8 @@ def inertia(model: mjw.Model, data: mjw.Data) -> None:
 def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
     """MuJoCo Warp's own functions, except that the first forward pass skips the parts in ``done``.
 
-    They are copies with some global names replaced, so a step does everything that MuJoCo Warp's does, and other users
-    of MuJoCo Warp are not affected.
+    The functions are copies with some global names replaced, so a step equals MuJoCo Warp's step, and other users of
+    MuJoCo Warp are not affected.
 
     For connect and weld constraints, ``mjw.make_constraint`` reads body velocities before MuJoCo Warp has computed
     them: it reads stale values of the last forward pass or, after a fault, NaN. Here ``com_vel`` runs right after the

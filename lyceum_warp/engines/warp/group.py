@@ -57,8 +57,8 @@ class Turns:
         nworld: Number of worlds.
         size: Number of worlds in the group.
         device: Where they live.
-        loop: Whether turns run in a loop. If False, the group must have room for every world, and there is exactly one
-            turn for any mask. Deterministic launches require False, because they cannot allocate within a graph's loop.
+        loop: Whether turns run in a loop. If False, the group must have room for every world, and any mask takes
+            exactly one turn. Deterministic launches require False, because they cannot allocate within a graph's loop.
     """
 
     def __init__(self, nworld: int, size: int, device: wp.Device, *, loop: bool = True) -> None:
@@ -109,7 +109,7 @@ class Arena(Reserve):
     """An allocator for loops and branches of CUDA graphs, where Warp cannot allocate.
 
     A run outside a graph allocates from the device, counts the bytes, and reserves the same number. Graphs then use the
-    reserve. They never run at the same time, so they can all share it.
+    reserve. The graphs never run at the same time, so they can share the reserve.
 
     Args:
         device: Where the launches run; on the CPU nothing is reserved.

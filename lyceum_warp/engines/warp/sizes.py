@@ -39,7 +39,7 @@ _known: dict[str, tuple[int, int]] = {}
 def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[int, int]:
     """Numbers of contacts and constraints to allocate for each world.
 
-    These are twice the peak of random rollouts, plus constraints that a task may turn on: inactive equality
+    The sizes are twice the peak of random rollouts, plus constraints that a task may turn on: inactive equality
     constraints, friction losses if they are randomized, and all limits if their ranges are randomized. In the rollouts,
     32 worlds start in the model's initial state or a keyframe, half of them with random velocities, and run 500
     substeps on the C engine under random controls, each held for 20 substeps. The result is cached per model.
@@ -151,7 +151,7 @@ def _probe_once(model: mujoco.MjModel) -> tuple[int, int]:
 
 def _probe(model: mujoco.MjModel) -> tuple[int, int]:
     with wp.ScopedDevice("cpu"):
-        mjw.put_model(model)  # raises early for an unsupported model: a probe may take a minute
+        mjw.put_model(model)  # an unsupported model raises here, before the probe, which may take a minute
     batch = Batch(model, _WORLDS)
     rng = np.random.default_rng(0)
     ncon, nefc = batch.bind("ncon"), batch.bind("nefc")
@@ -163,7 +163,7 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
     for _ in range(_HOLDS):
         batch.ctrl[:] = rng.uniform(low, high, size=(_WORLDS, model.nu))
         for _ in range(_SUBSTEPS):
-            # the counts are valid even if the memory is too small
+            # if the memory is too small, the counts are still correct
             with contextlib.suppress(SimulationError):
                 batch.step()
             contacts, constraints = max(contacts, int(ncon.max())), max(constraints, int(nefc.max()))
@@ -209,7 +209,7 @@ def _bytes_of(data: Any) -> int:
 
 
 def _margin(model: mujoco.MjModel) -> float:
-    """A world's memory relative to MuJoCo Warp's Data."""
+    """Memory of a world, divided by the memory of MuJoCo Warp's Data."""
     collides = (model.geom_contype | model.geom_conaffinity) != 0
     kinds = [int(kind) for kind in model.geom_type[collides]]
     convex = not _CONVEX.isdisjoint(kinds) or kinds.count(int(mujoco.mjtGeom.mjGEOM_BOX)) > 1

@@ -166,8 +166,8 @@ _GROUPS = {
 class ModelConstants:
     """Recomputes constants in the worlds whose fields changed since the last call.
 
-    They are computed in a small group of worlds with a separate Data, because ``mujoco_warp.set_const`` overwrites the
-    kinematics.
+    The constants are computed in a small group of worlds with a separate Data, because ``mujoco_warp.set_const``
+    overwrites the kinematics.
 
     Args:
         model: The compiled model.
@@ -201,7 +201,7 @@ class ModelConstants:
             self._rows = ModelRows(put, [*names, *self._outputs], size, written - set(self._outputs))
             self._scratch = mjw.make_data(model, nworld=size, nconmax=1, njmax=1)
             self._given = [flat(getattr(owner(put, name), name)).view(wp.int32) for name in names]
-            # the bits of a NaN that never occurs
+            # the bits of a NaN that no computation produces
             self._applied = [wp.full_like(given, -1) for given in self._given]
             self._changed = wp.zeros(nworld, dtype=bool)
             self._everyone = wp.full(size, True, dtype=bool)

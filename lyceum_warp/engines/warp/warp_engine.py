@@ -103,12 +103,13 @@ class WarpEngine(Engine):
         if self.reset_stage < Stage.ACCELERATION:
             self._reset_parts = forward_parts(model, self._reset)
         self._columns: wp.array = wp.array(early_sensor_columns(model), dtype=int, device=device)
-        # a step reuses the parts already computed for its initial state after the last step or restart
+        # parts that the last step or restart already computed for the next step's initial state
         moved = any(field.written for name, field in self.fields.items() if name in ("mocap_pos", "mocap_quat"))
         current_parts = () if moved else self._current_parts or ()
         self._shared = tuple(part for part in current_parts if part in forward.POSITION)
-        # A geom whose position is NaN has contacts with every element of a flex. The NaN in their Jacobian rows would
-        # survive a reset, because the solver multiplies unused rows by zero. So a reset clears the rows.
+        # A geom whose position is NaN has contacts with every element of a flex. The NaN in the Jacobian rows of these
+        # contacts would survive a reset, because the solver multiplies unused rows by zero. Therefore a reset clears
+        # the Jacobian rows.
         self._jacobian = flat(self.d.efc.J if model.nflex else wp.zeros((nworld, 0), dtype=float, device=device))
         self._zeros = wp.zeros(self._jacobian.shape[1], dtype=float, device=device)
         self._conditional = Conditional(device)
@@ -211,7 +212,7 @@ class WarpEngine(Engine):
                 if stage == Stage.VELOCITY:
                     mjw.fwd_velocity(m, d)
                     mjw.sensor_vel(m, d)
-                if "energy" in self.fields:  # the model's sensors do not compute this field
+                if "energy" in self.fields:  # no sensor of the model computes this field
                     mjw.energy_pos(m, d)
                     mjw.energy_vel(m, d)
 
@@ -293,7 +294,7 @@ class WarpEngine(Engine):
 
     def _forward_group(self, model: mjw.Model, group: mjw.Data) -> None:
         self._forward(None, self.reset_stage, group, model)
-        self._forward(self._shared, self.reset_stage)  # the next step reuses these parts
+        self._forward(self._shared, self.reset_stage)  # the next step does not compute these parts again
 
     def _refresh(self, mask: wp.array) -> None:
         """Run a forward pass of all worlds; the fields of worlds outside the mask do not change."""

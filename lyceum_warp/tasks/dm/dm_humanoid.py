@@ -57,7 +57,7 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     suite.draw_joints(s.qpos, p.drawn_joints, p.drawn_range, rng)
-    # not uniform over the rotations; dm_control keeps this distribution for its benchmarks' sake
+    # dm_control keeps this non-uniform distribution of rotations, so that benchmarks stay comparable
     quat = wp.vec4()
     for i in range(4):
         quat[i] = lw.uniform(rng, 0.0, 1.0)
@@ -77,7 +77,7 @@ class HumanoidStand(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Count contacts, so that no episode starts with one, and leave out sensors of forces that nothing reads."""
+        """Count contacts, so that no episode starts with one, and remove force sensors that no function reads."""
         for sensor in list(spec.sensors)[1:]:
             spec.delete(sensor)
         suite.count_contacts(spec)

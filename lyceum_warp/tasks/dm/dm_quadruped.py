@@ -88,7 +88,7 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    """Start in a random orientation, at the least multiple of 1 cm at which no geom touches the floor."""
+    """Start in a random orientation, at the lowest height, in steps of 1 cm, at which no geom touches the floor."""
     quat = lw.quat_random(rng)
     lw.put(s.qpos, 3, quat)
     down = lw.quat_rotate_inverse(quat, wp.vec3(0.0, 0.0, -1.0))
@@ -108,7 +108,7 @@ class QuadrupedWalk(lw.Task):
 
     @classmethod
     def edit_model(cls, spec: mujoco.MjSpec) -> None:
-        """Remove what only dm_control's other tasks need, and size the floor."""
+        """Remove elements that only dm_control's other tasks use, and set the size of the floor."""
         unused = (spec.site("target"), spec.body("ball"), spec.geom("terrain"), spec.hfield("terrain"))
         for element in (*unused, *(spec.geom(f"wall_{side}") for side in ("px", "py", "nx", "ny"))):
             spec.delete(element)

@@ -1,4 +1,4 @@
-"""Load the models of dm_control's suite, and share what its domains have in common."""
+"""Load the models of dm_control's suite, and define the functions that several domains use."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from lyceum_warp import Row
 
 
 def model(domain: str) -> lw.ModelFile:
-    """The model of a domain, which the package dm-control brings."""
+    """Load a domain's model from the package dm-control."""
     file = f"suite/{domain}.xml"
     return lw.package_model("dm_control", file, install="lyceum-warp[dm-control]", before_python="3.13")
 
@@ -39,7 +39,7 @@ def random_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def random_range(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The range of each drawn joint, (joints, 2); a hinge without limits is drawn from a whole turn."""
+    """The range of each drawn joint, (joints, 2); for a hinge without limits, a whole turn."""
     joints = np.searchsorted(model.jnt_qposadr, p.drawn_joints)
     return np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.pi, np.pi])
 

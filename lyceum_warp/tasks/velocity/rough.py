@@ -30,7 +30,7 @@ class Params(walking.Params):
     patch: float = TERRAIN.patch
     episode_seconds: float = 20.0
     scan: wp.array[wp.vec2] = lw.scan_grid(1.6, 1.0)
-    scan_noise: float = 0.1  # +-, m
+    scan_noise: float = 0.1  # largest, m
 
 
 @wp.struct

@@ -92,7 +92,7 @@ class Params:
     walking_pose_std: wp.array[float] = lw.from_model(lambda model, p: len(p.joints) * [0.3])
     soft_limit: float = 0.9  # share of a joint's range
     swing_target: float = 0.1  # height of a foot's site in a swing, m
-    longest_step: float = 0.4  # seconds in single stance from which the term is constant
+    longest_step: float = 0.4  # s; in a longer single stance the term is constant
     least_command: float = 0.05  # for smaller commands, the gait terms are 0 and the pose term uses standing_pose_std
     fall_angle: float = math.radians(70.0)
     least_height: float = 0.0  # of the base, m
@@ -116,11 +116,11 @@ class Params:
     joint_velocity_noise: float = 1.5
     # pushes
     push_seconds: wp.vec2 = wp.vec2(1.0, 3.0)
-    push_velocity: wp.vec3 = wp.vec3(0.5, 0.5, 0.4)  # +-, in the world's axes, m/s
-    push_spin: wp.vec3 = wp.vec3(0.52, 0.52, 0.78)  # +-, in the world's axes, rad/s
+    push_velocity: wp.vec3 = wp.vec3(0.5, 0.5, 0.4)  # largest, in the world's axes, m/s
+    push_spin: wp.vec3 = wp.vec3(0.52, 0.52, 0.78)  # largest, in the world's axes, rad/s
     # differences between robots
-    encoder_bias: float = 0.015  # +-, rad
-    trunk_offset: wp.vec3 = wp.vec3(0.025, 0.025, 0.03)  # +-, of the trunk's centre of mass, m
+    encoder_bias: float = 0.015  # largest, rad
+    trunk_offset: wp.vec3 = wp.vec3(0.025, 0.025, 0.03)  # largest shift of the trunk's centre of mass, m
     sliding_friction: wp.vec2 = wp.vec2(0.3, 1.5)
     spinning_friction: wp.vec2 = wp.vec2(1e-4, 2e-2)  # log-uniform, like the rolling friction
     rolling_friction: wp.vec2 = wp.vec2(1e-5, 5e-3)
@@ -128,7 +128,7 @@ class Params:
     start_height: float = lw.from_model(walkers.home_height)
     start_low: wp.vec3 = wp.vec3(-0.5, -0.5, 0.01)  # offset of the base, m
     start_high: wp.vec3 = wp.vec3(0.5, 0.5, 0.05)
-    start_yaw: float = 3.14  # +-
+    start_yaw: float = 3.14  # largest, rad
 
 
 @wp.struct
@@ -419,7 +419,7 @@ class BipedParams(Params):
 
 
 class Biped(Velocity):
-    """A robot with two legs, which is rewarded for steps and for a calm trunk. Its feet are given by two sites."""
+    """A robot with two legs, which is rewarded for steps and for a calm trunk. Two sites mark the feet."""
 
     frame_skip, keyframe = 5, "home"
     rewards = Velocity.rewards | {"action_rate_l2": -0.05, "single_stance": 2.0, "roll_pitch_rate_l2": -0.05}

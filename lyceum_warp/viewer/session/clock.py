@@ -171,7 +171,7 @@ class Session:
         self._next_step = time.perf_counter()
 
     def _stepped(self, progress: ControlProgress) -> None:
-        """Account for a step of the plant."""
+        """Update the statistics after a step of the plant."""
         self.stage.live.stepped()
         self.stage.steps += 1
         if (

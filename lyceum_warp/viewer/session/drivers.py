@@ -105,7 +105,7 @@ class WorldControl:
         """Part of the state that is set to zero for the controller: a push, which a robot cannot foresee."""
 
     def new_run(self) -> "ControlRun":
-        """The controller for a new run of a loop. Calls from earlier runs fail from now on."""
+        """The controller for a new run of a loop. From now on, calls from earlier runs fail."""
         self._run += 1
         return ControlRun(self, self._run)
 

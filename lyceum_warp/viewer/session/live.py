@@ -27,7 +27,7 @@ _CURVE_ROWS = 512  # curve points between two frames; older points are overwritt
 class Past:
     """Ring buffer with the states of all worlds before each of the last steps.
 
-    Without memory for two states of all worlds, it stays empty.
+    Without memory for two states of all worlds, the buffer stays empty.
 
     Args:
         env: The worlds.
@@ -141,7 +141,7 @@ class Live:
         """Make a step, or restore the state after a step that was taken back.
 
         Args:
-            act: Writes the actions of all worlds into ``env.action``. It is not called if the state is restored.
+            act: Writes the actions of all worlds into ``env.action``. If the state is restored, ``act`` is not called.
         """
         if self.past.ahead:
             self._move(1)
@@ -181,7 +181,7 @@ class Live:
         self._clock += 1
         self.made += 1
         ended, reward = self._ended.copy_(env.done), self._reward.copy_(env.reward)
-        if not env.autoreset:  # done stays set, and the return stays the episode's
+        if not env.autoreset:  # done stays set, and the return keeps its value
             ended.logical_and_(~self._over)
             reward.masked_fill_(self._over, 0.0)
         self.returns.add_(reward)

@@ -165,7 +165,7 @@ class Stage:
         self.frames.add_point(self.playback)
 
     def end_old_push(self) -> None:
-        """End a push that was restored with a past state, once the worlds continue from there."""
+        """End a push that belongs to a restored past state, before the worlds continue from this state."""
         live = self.live
         if live.pushed is not None and not self.dragging and not live.past.ahead:
             live.end_push()
@@ -220,7 +220,7 @@ class Stage:
         self._trace()
 
     def show_world(self, world: int) -> None:
-        """Show another world, and end a push and the driving of the one before."""
+        """Show another world; end a push and the driving of the previous world."""
         before = self.live
         before.end_push()
         if self.driving.wanted is not None:
@@ -262,7 +262,7 @@ class Stage:
         frame = self.frames.of_worlds(self.live, self.main, self._traces(), self._status, paused=self.paused)
         wanted, command, live = self.driving.wanted, frame.status.command, self.live
         if wanted and command and not live.past.ahead and not np.allclose(command, wanted, atol=1e-6):
-            self.driving.apply(live)  # a new episode, or another world
+            self.driving.apply(live)  # a new episode or another world has its own command
             live.expect_steps()
         return frame
 

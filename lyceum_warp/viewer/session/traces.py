@@ -1,8 +1,8 @@
 """Roll out a planner's plan and samples again to get their paths, in a thread.
 
 A planner stores no positions. This module rolls out the actions of some samples from the plan's initial state, in
-worlds of the planner's own task, model and time step. Their random streams differ from the planner's, so in a task that
-draws random numbers during an episode the paths differ from those that the planner evaluated.
+worlds of the planner's own task, model and time step. These worlds have other random streams than the planner, so if
+the task draws random numbers during an episode, the planner evaluated other paths.
 """
 
 import dataclasses
@@ -37,8 +37,8 @@ class TracePoint:
 def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
     """Choose the point of a robot whose path is drawn.
 
-    The default is the centre of mass of a robot with an unactuated base (a hopper, a humanoid). Otherwise it is the end
-    of the longest chain of actuated bodies (an arm): its first site, or its centre of mass.
+    The default is the centre of mass of a robot with an unactuated base (a hopper, a humanoid). For an arm, the default
+    is the end of the longest chain of actuated bodies: its first site, or its centre of mass.
 
     Args:
         model: The model.

@@ -47,7 +47,7 @@ class VideoTaker:
         self._pictures: list[threading.Thread] = []
         self._done: list[str] = []  # messages of pictures and pages
         self.files: list[Path] = []
-        """Complete files, for the next frame."""
+        """Complete files, which the next frame reports to the window."""
 
     @property
     def name(self) -> str | None:

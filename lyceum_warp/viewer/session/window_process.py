@@ -40,7 +40,7 @@ class Window:
     """Show frames in a window process, and collect the user's commands.
 
     The window process is not a fork and does not import the caller's program, so the caller needs no ``__main__``
-    guard. It ends when this process ends, even by SIGKILL. Ctrl-C does not reach it.
+    guard. The window process ends when this process ends, even by SIGKILL. Ctrl-C does not reach the window process.
 
     Args:
         scene: The constant part of the display.

@@ -20,7 +20,7 @@ MANY_STEPS = 50
 _DRIVING = tuple(getattr(imgui.Key, name) for name in "WSADQE")  # ahead, back, left, right, turn left, turn right
 
 KEY_NAMES = {"Right": "RightArrow", "Left": "LeftArrow", "Up": "UpArrow", "Down": "DownArrow"}
-"""Studio's names of keys that have others here."""
+"""Studio's names of keys that the panel names differently."""
 
 
 class Actions:
@@ -87,7 +87,7 @@ class Actions:
             self.do(protocol.Drive(command))
 
     def toggle_driving(self) -> None:
-        """Begin to drive, from a standstill, or let the task draw commands again."""
+        """Start driving from a standstill, or return to commands that the task draws."""
         if self.scene.speeds is not None:
             self.do(protocol.Drive(None if self.status.driven else (0.0, 0.0, 0.0)))
 

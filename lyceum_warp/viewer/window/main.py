@@ -1,7 +1,7 @@
 """Run the window process: receive frames, draw them with studio, and send commands.
 
-It imports mujoco and NumPy, and of this package only ``viewer/window`` and ``viewer/protocol.py``: torch and Warp would
-cost seconds and hundreds of megabytes.
+The process imports mujoco and NumPy, and of this package only ``viewer/window`` and ``viewer/protocol.py``: torch and
+Warp would cost seconds and hundreds of megabytes.
 """
 
 import contextlib

@@ -1,7 +1,7 @@
 """Serve studio's page through a reverse proxy with access control.
 
-Studio's own server has no password. It listens on a private socket (``sockets.py``), which refuses other processes. The
-proxy forwards a request only if
+Studio's own server has no password. The server listens on a private socket (``sockets.py``), which refuses other
+processes. The proxy forwards a request only if
 
 - its ``Host`` is an address or a name of this machine (against DNS rebinding);
 - its ``Origin`` and ``Sec-Fetch-*`` headers show that no page of another site sent it;
@@ -12,7 +12,7 @@ Browsers send a cookie to every port of its host, and so to other users' servers
 therefore limited to a random path (``Path=/RANDOM/``), below which the page is served. Studio's page requests addresses
 from the root of the host; a script that the proxy inserts prefixes them with the path.
 
-aiohttp parses the requests and limits their heads (8 KiB per line, 128 lines). It runs in a thread.
+aiohttp parses the requests and limits their heads (8 KiB per line, 128 lines). The proxy runs in a thread.
 """
 
 import asyncio
@@ -291,8 +291,8 @@ class Proxy:
         }
         if not _is_cross_site(request):
             return web.Response(status=303, headers={**headers, "Location": target})
-        # After a link on another site, browsers send the cookie (SameSite=Strict) neither at once nor after a redirect,
-        # but when a page of this site leads on.
+        # If the user follows a link on another site, browsers do not send a SameSite=Strict cookie, not even after a
+        # redirect. They send it after this page, which belongs to the proxy's site.
         page = f'<!doctype html><meta http-equiv="refresh" content="0; url={target}">'
         return web.Response(text=page, content_type="text/html", headers=headers)
 

@@ -23,7 +23,7 @@ VISIBLE = (
     "body_quat", "jnt_pos", "jnt_axis", "qpos0", "mat_", "tendon_rgba", "tendon_width", "cam_", "light_", "hfield_",
     "mesh_", "skin_", "flex_",
 )  # fmt: skip
-"""Prefixes of fields that change the picture."""
+"""Prefixes of the model fields that change the drawing."""
 
 
 # ghosts and traces
@@ -41,7 +41,7 @@ class ExtraGeoms:
         self.model, self.limit = model, limit
         self._data = mujoco.MjData(model)
         self._options, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
-        # with room for one ghost beyond the limit
+        # beyond the limit, there is room for one more ghost
         self._scene = mujoco.MjvScene(model, limit + 2 * (model.ngeom + model.nsite) + 10)
 
     def draw(

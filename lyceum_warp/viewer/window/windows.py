@@ -11,7 +11,8 @@ from lyceum_warp.viewer.window.actions import MANY_STEPS, OTHER_KEYS, SPEEDS, Ac
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS, PLOT_SECONDS = 200, 20.0
-"""Maximum number of points of a plotted curve, all of which each frame sends to the browser, and its length."""
+"""Maximum number of points of a plotted curve, and its length in seconds. Every frame sends all points to the
+browser."""
 NARROW = 1100
 """Width, in pixels, below which the first windows would cover the robot, as in a notebook."""
 FEW_CURVES = 2
@@ -38,7 +39,7 @@ class Windows:
         """Draw every open window."""
         size = imgui.GetIO().DisplaySize
         width, height = size.x, size.y
-        # the windows may be moved until the browser's window changes its size
+        # a moved window stays in its place until the size of the browser's window changes
         self._size, resized = (width, height), (width, height) != self._size
         cond = int(imgui.Cond.Always if resized else imgui.Cond.FirstUseEver)
         if resized and width < NARROW:
@@ -251,7 +252,7 @@ class Windows:
                 imgui.SetItemTooltip(what)
         if self._scene.nworld > 1:
             changed, grid = imgui.Checkbox("grid: worlds beside each other", ghosts.grid)
-            if changed:  # as many as a browser draws
+            if changed:  # show as many worlds as a browser can draw
                 self._actions.set_ghosts(grid=grid, worlds=ghosts.worlds or min(self._scene.nworld - 1, MOST_GHOSTS))
         changed, plan = imgui.Checkbox("plan", ghosts.plan)
         if changed:
@@ -404,7 +405,7 @@ class Curves:
         """(points, 2 + number): times in seconds, whether an episode ended, then a value per curve."""
 
     def add(self, rows: np.ndarray) -> None:
-        """Append points. If time goes back, as after steps back, later points are dropped."""
+        """Append points. If time decreases, as after steps back, points of later times are dropped."""
         for part in np.split(rows, np.flatnonzero(np.diff(rows[:, 0]) < 0) + 1):
             if len(part):
                 kept = self.rows[: np.searchsorted(self.rows[:, 0], part[0, 0])]

@@ -41,7 +41,7 @@ def test_arrows_show_the_commanded_and_the_measured_velocity(shared_env: SharedE
     stage.live.set_row(state)
     stage.frame()
     ways = [arrow.end - arrow.start for arrow in stage.frame().arrows]
-    expected = [[0, 0.4, 0], [0, 0.2, 0], [0, 0, 0.2], [0, 0, -0.4]]  # towards y, as the robot looks
+    expected = [[0, 0.4, 0], [0, 0.2, 0], [0, 0, 0.2], [0, 0, -0.4]]  # the robot looks along y
     np.testing.assert_allclose(ways, expected, atol=1e-6)
 
 

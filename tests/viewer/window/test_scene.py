@@ -22,7 +22,7 @@ def ghost(x: float, opacity: float = 0.3) -> Ghost:
 
 def test_ghost_has_the_models_moving_geoms_in_its_colour() -> None:
     geoms = ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(2.0)])
-    assert [geom.type for geom in geoms] == [int(mujoco.mjtGeom.mjGEOM_SPHERE)]  # the plane is static
+    assert [geom.type for geom in geoms] == [int(mujoco.mjtGeom.mjGEOM_SPHERE)]  # no static plane
     np.testing.assert_allclose(geoms[0].pos, [2, 0, 1])
     np.testing.assert_allclose(geoms[0].rgba, [0.2, 0.4, 0.6, 0.3])
     assert geoms[0].transparent
