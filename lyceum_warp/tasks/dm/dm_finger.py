@@ -23,6 +23,7 @@ class World:
 @wp.struct
 class Params(suite.RandomJoints):
     spin_velocity: float = 15.0  # rad/s
+    spin_margin: float = 0.0  # rad/s
     spinner: int = lw.body("spinner")
     tip: int = lw.site("tip")
     touch_top: int = lw.sensor("touchtop")
@@ -46,7 +47,7 @@ def observe(s: World, p: Params, obs: Row[float]):
 
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    return wp.where(s1.qvel[2] <= -p.spin_velocity, 1.0, 0.0)
+    return lw.tolerance(s1.qvel[2], wp.vec2(-wp.inf, -p.spin_velocity), p.spin_margin)
 
 
 @wp.func
