@@ -431,7 +431,8 @@ def step_randomly(case: Random, options: Options) -> dict[str, Any]:
                  for bound in (env.action_space.low, env.action_space.high))  # fmt: skip
     low, width = low.to(env.action.device), (high - low).to(env.action.device)
     generator = torch.Generator(env.action.device).manual_seed(case.seed)
-    steps, first, began = -(-case.steps // case.nworld), None, time.perf_counter()
+    steps, began = -(-case.steps // case.nworld), time.perf_counter()
+    first: list[Any] | None = None
     for t in range(steps):
         env.action.uniform_(generator=generator).mul_(width).add_(low)
         env.step()
