@@ -2,12 +2,14 @@
 
     lyceum-warp bench latency
     lyceum-warp bench latency --tasks reach humanoid --samples 256 1024 --horizons 32 --device cuda
+    lyceum-warp bench latency --tasks dm/cartpole_swingup --own --seconds 50
 
 Each case is one cell of the table: a task, the physics of the planner's worlds, a number of samples, a horizon, an
 engine and its device. Episodes run in real time (``lw.control_async``) until their steps take ``--seconds``: the plant
 keeps its rate, and the planner plans as often as it can. A plan meets its deadline if it takes at most a step of the
 plant. Run this on idle cores: other work on them delays plans. Without --samples and --horizons, cells whose plans take
-long on two cores are omitted.
+long on two cores are omitted. With --own, each task has one cell, with the samples and the horizon that it suggests for
+planners.
 """
 
 import dataclasses
@@ -17,9 +19,10 @@ from typing import Any
 
 import experiment
 import torch
-from experiment import Row, Table, choose, installed
+from experiment import Row, Table, choose, installed, median_and_range
 
 import lyceum_warp as lw
+from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.support.machine import cpu_cores
@@ -43,6 +46,8 @@ class Options(experiment.Options):
     """Numbers of samples; by default 16, 64, 256 and 1024."""
     horizons: tuple[int, ...] = ()
     """Horizons of plans, in steps; by default 16, 32 and 64."""
+    own: bool = False
+    """Whether to use the samples and the horizon that each task suggests."""
     physics: tuple[str, ...] = ()
     """Names of the planner's physics: exact, or names that a task defines. By default the physics that the task
     suggests, and exact if the suggestion has a name."""
@@ -75,13 +80,20 @@ def cases(options: Options) -> list[Case]:
     contestants = choose(options.contestants, CONTESTANTS, ("warp",) if cuda else ("mujoco",), what="contestant")
     samples = options.samples or (SAMPLES[:1] if short else SAMPLES)
     horizons = options.horizons or (HORIZONS[:1] if short else HORIZONS)
+    sizes = {task: [(number, horizon) for horizon in horizons for number in samples] for task in tasks}
+    chosen = bool(options.samples or options.horizons or cuda)
+    if options.own:
+        if options.samples or options.horizons:
+            raise ValueError("--own takes the samples and the horizon of each task: omit --samples and --horizons")
+        configs, chosen = {task: task_config(find_task(task)) for task in tasks}, True
+        sizes = {task: [(config.samples, config.horizon)] for task, config in configs.items()}
     seconds, threads = 1.0 if short else options.seconds, options.threads or cpu_cores()
     devices = {"mujoco": "cpu", "warp": options.device}
     return [
         Case(task, physics, number, horizon, name, devices[name], threads, seconds, repeat)
         for repeat in range(options.repeats or 1) for task in tasks for physics in physics_of(task, options.physics)
-        for horizon in horizons for number in samples for name in contestants
-        if options.samples or options.horizons or cuda or expected(task, physics, number, horizon) < LONGEST
+        for number, horizon in sizes[task] for name in contestants
+        if chosen or expected(task, physics, number, horizon) < LONGEST
     ]  # fmt: skip
 
 
@@ -132,6 +144,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
         "age_steps_max": report.age_steps_max, "age_ms": report.age_mean_ms, "late_steps": report.late_ticks,
         "reward_per_second": sum(episode.episode_return for episode in done) / (report.steps * plant.timestep),
         "episodes": len(done), "terminated": sum(episode.terminated for episode in done),
+        "returns": [episode.episode_return for episode in done], "settings": report.controller,
     }  # fmt: skip
 
 
@@ -148,10 +161,10 @@ def tables(rows: Sequence[Row]) -> list[Table]:
             number(found["p99_9_ms"], ".3g") or f"{number(found['max_ms'], '.3g')} (longest)",
             number(found["met"], ".1%"), f"{found['age_steps']:.2f} (at most {found['age_steps_max']})",
             f"{found['age_ms']:.0f}", f"{found['reward_per_second']:.4g}",
-            f"{found['terminated']} of {found['episodes']}",
+            f"{found['terminated']} of {found['episodes']}", median_and_range(found.get("returns", ()), ".4g"),
         ])  # fmt: skip
     header = ["physics", "samples x horizon", "engine", "plan, ms", "99.9 %, ms", "deadlines met", "age, steps",
-              "age, ms", "reward a second", "ended early"]  # fmt: skip
+              "age, ms", "reward a second", "ended early", "returns"]  # fmt: skip
     return [
         Table(f"{task}, a step every {deadlines[task]:.3g} ms. Plan: median time; below a thousand plans, the longest "
               "time stands for the 99.9 % quantile. Age of actions: mean and maximum.", header, lines)

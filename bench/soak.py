@@ -1,6 +1,7 @@
-"""Run tasks for very long with injected faults, watch the memory, and kill and resume trainings.
+"""Run tasks for very long with and without injected faults, watch the memory, and kill and resume trainings.
 
     lyceum-warp bench soak --threads 2
+    lyceum-warp bench soak --parts random --tasks dm/walker_walk dm/fish_swim --engine mujoco
     lyceum-warp bench soak --parts faults --device cuda --work runs/soak
 
 Part faults: worlds step under random actions, and every thousandth step of a world gets a fault. Invalid or too fast
@@ -13,8 +14,9 @@ until its first fault. Every fourth world gets no faults, so its numbers must al
 A run is divided into chunks. A chunk is one result, and ends with a file of the worlds' states in the folder
 ``--work``. The next chunk continues from this file, also on another machine with a copy of the folder.
 
-Part memory: environments are made and deleted. Part kills: trainings are killed and resumed, and must end like an
-uninterrupted training.
+Part random: worlds step under uniformly random actions, without injected faults. The result has the number of faults by
+reason, and step and world of the first. Part memory: environments are made and deleted. Part kills: trainings are
+killed and resumed, and must end like an uninterrupted training.
 """
 
 import collections
@@ -46,7 +48,7 @@ from lyceum_warp.done import FAULTS, Done
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.validate import whole_number
 
-PARTS = ("faults", "memory", "kills")
+PARTS = ("faults", "random", "memory", "kills")
 KINDS = {"state": Done.NAN, "speed": Done.NAN, "action": Done.ACTION, "reward": Done.REWARD,
          "observation": Done.OBSERVATION, "model": Done.MODEL}  # fmt: skip
 """Kinds of faults by the place of injection, numbered from 1, with the reasons that must be reported."""
@@ -125,9 +127,9 @@ class Options(experiment.Options):
     """Very long runs with injected faults, memory checks, and kills."""
 
     parts: tuple[str, ...] = ()
-    """Parts: faults, memory, kills; by default all."""
+    """Parts: faults, random, memory, kills; by default all."""
     engine: str = "auto"
-    """Engine of the parts faults and memory."""
+    """Engine of the parts faults, random and memory."""
     nworld: int | None = None
     """Number of worlds; by default the task's."""
     steps: int | None = None
@@ -157,6 +159,19 @@ class Faults:
         """Return the path of the state before a chunk."""
         run = f"{self.task}-{self.engine}-{self.device.partition(':')[0]}-{self.nworld}-{self.steps}-{self.seed}"
         return work / f"{run}{'-same-bits' if self.compared else ''}-{chunk}.pt"
+
+
+@dataclasses.dataclass(frozen=True)
+class Random:
+    """A task under random actions."""
+
+    task: str
+    steps: int
+    nworld: int
+    engine: str
+    device: str
+    seed: int
+    part: str = "random"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,6 +216,10 @@ def cases(options: Options) -> list[Any]:
             # a machine that gets another machine's folder continues from its last state
             done = max((i for i in range(1, len(chunks) + 1) if chunks[0].state(options.work, i).exists()), default=1)
             found += chunks[done - 1 :]
+        for task, sizes, _ in runs if "random" in parts else ():
+            many = options.nworld or (sizes[0] if short else OTHERS[0])
+            found.append(Random(task, options.steps or (sizes if short else OTHERS)[1], many, options.engine,
+                                options.device, seed))  # fmt: skip
         if "kills" in parts and not cuda:
             trainings = {"point_mass": SHORT_TRAINING} if short else TRAININGS
             kills = (1, 0.2) if short else (10, options.kill_every)
@@ -214,13 +233,15 @@ def estimate(case: Any) -> float:
     if isinstance(case, Faults):
         table = SAME_BITS if case.compared and case.device != "cpu" else TASKS | GPU_TASKS
         return 5.0 + table.get(case.task, OTHERS)[3] * case.steps / 1e6
+    if isinstance(case, Random):
+        return 5.0 + 100.0 * case.steps / 1e6
     return 20.0 if isinstance(case, Memory) else 20.0 + 2.0 * case.kills * case.kill_every
 
 
 def measure(case: Any, options: Options) -> dict[str, Any]:
     options.work.mkdir(parents=True, exist_ok=True)
-    # type: ignore[operator]
-    return {"faults": inject, "memory": make_and_delete, "kills": kill}[case.part](case, options)
+    parts: dict[str, Any] = {"faults": inject, "random": step_randomly, "memory": make_and_delete, "kills": kill}
+    return parts[case.part](case, options)
 
 
 # faults
@@ -395,6 +416,34 @@ def inject(case: Faults, options: Options) -> dict[str, Any]:
     }  # fmt: skip
 
 
+# random
+
+
+def step_randomly(case: Random, options: Options) -> dict[str, Any]:
+    """Step a task under random actions."""
+    torch.set_num_threads(1)
+    try:
+        env = lw.make(case.task, nworld=case.nworld, engine=case.engine, device=case.device, seed=case.seed,
+                      nthread=options.threads)  # fmt: skip
+    except (FileNotFoundError, ImportError) as error:
+        raise Skipped(f"{case.task}: {error}") from error
+    low, high = (torch.as_tensor(np.nan_to_num(bound, posinf=1.0, neginf=-1.0), dtype=torch.float32)
+                 for bound in (env.action_space.low, env.action_space.high))  # fmt: skip
+    low, width = low.to(env.action.device), (high - low).to(env.action.device)
+    generator = torch.Generator(env.action.device).manual_seed(case.seed)
+    steps, began = -(-case.steps // case.nworld), time.perf_counter()
+    first: list[Any] | None = None
+    for t in range(steps):
+        env.action.uniform_(generator=generator).mul_(width).add_(low)
+        env.step()
+        if first is None and (faulty := env.done_reason & int(FAULTS) != 0).any():
+            world = int(faulty.nonzero()[0])
+            first = [t, world, Done(int(env.done_reason[world]) & int(FAULTS)).name]
+    seconds = time.perf_counter() - began
+    return {"faults": env.fault_counts, "first": first, "steps": steps * case.nworld,
+            "steps_per_second": steps * case.nworld / seconds}  # fmt: skip
+
+
 # memory
 
 
@@ -476,7 +525,7 @@ def table(folder: Path) -> list[dict[str, str]]:
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    faults, grown, made, kills = [], [], [], []
+    faults, grown, calm, made, kills = [], [], [], [], []
     runs: dict[str, list[Row]] = {}
     for row in rows:
         case, result = row.case, row.result
@@ -484,6 +533,12 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         if case["part"] == "memory":
             made.append([case["task"], case["device"], f"{case['nworld']}", f"{case['made']}",
                          f"{result['bytes_per_env']:,.0f}", f"{result['gpu_bytes_per_env']:,.0f}"])  # fmt: skip
+        elif case["part"] == "random":
+            counts = ", ".join(f"{name} {number:,}" for name, number in result["faults"].items() if number)
+            first = result["first"] and "step {:,}, world {}: {}".format(*result["first"])
+            calm.append([case["task"], f"{case['engine']}, {case['device']}", f"{case['nworld']}",
+                         f"{result['steps']:,}", f"{result['steps_per_second']:,.0f}", counts or "none",
+                         first or ""])  # fmt: skip
         elif case["part"] == "kills":
             kills.append([f"{case['task']} {case['words']}", *(f"{result[name]}" for name in (
                 "kills", "iterations", "equal_rows", "equal_policy"))])  # fmt: skip
@@ -510,7 +565,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
                 slopes = [round(1e6 * slope(result["memory"], column)) for result in results]
                 grown.append([name, what, f"{levels[0]:,.0f}", f"{max(levels):,.0f}", f"{levels[-1]:,.0f}",
                               experiment.median_and_range(slopes, ",.0f")])  # fmt: skip
-    return [
+    every = [
         Table(
             "Faults reported where they were injected (one number if all were), other bits reported with them, and "
             "faults reported elsewhere; whether fault_counts agrees; steps with numbers that are not finite; steps of "
@@ -521,15 +576,19 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         ),
         Table("Memory, MiB, and its growth, bytes per million steps: median over chunks and range.",
               ["task", "memory", "first", "most", "last", "growth"], grown),
+        Table("Uniformly random actions: faults by reason, and the first fault.",
+              ["task", "engine", "worlds", "steps", "steps/s", "faults", "first"], calm),
         Table("Bytes that remain allocated per environment that was made and deleted.",
               ["task", "device", "worlds", "made", "resident", "GPU"], made),
         Table("Trainings that were killed and resumed, compared with an uninterrupted one.",
               ["training", "kills", "iterations", "equal metrics", "equal policy"], kills),
     ]  # fmt: skip
+    return [table for table in every if table.rows]
 
 
 EXPERIMENT = Experiment(
-    name="soak", summary="Very long runs with injected faults, memory growth, and killed and resumed trainings.",
+    name="soak",
+    summary="Very long runs with and without injected faults, memory growth, and killed and resumed trainings.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
 )  # fmt: skip
 

@@ -3,10 +3,11 @@
     lyceum-warp bench throughput --short
     lyceum-warp bench throughput --parts worlds kept --device cuda
 
-Five parts. ``sampling``: many worlds on all threads, relative to native C, which is ``mujoco.rollout`` with the same
-substeps on all threads. ``single``: one world on one thread, relative to Gymnasium. ``cores``: as ``sampling``, on 1,
-2, 4, ... cores. ``worlds``: lyceum_warp with 1 to 131,072 worlds. ``kept``: an environment compared with its bare
-engine (kept.py). contestants.py defines a sample, and how each contestant takes it.
+Six parts. ``sampling``: many worlds on all threads, relative to native C, which is ``mujoco.rollout`` with the same
+substeps on all threads. ``suite``: tasks of dm_control's suite with equal numbers of worlds, relative to dm_control
+itself. ``single``: one world on one thread, relative to Gymnasium. ``cores``: as ``sampling``, on 1, 2, 4, ... cores.
+``worlds``: lyceum_warp with 1 to 131,072 worlds. ``kept``: an environment compared with its bare engine (kept.py).
+contestants.py defines a sample, and how each contestant takes it.
 """
 
 import dataclasses
@@ -30,17 +31,23 @@ TASKS = (
     "pusher", "reacher", "inverted_pendulum", "inverted_double_pendulum",
 )  # fmt: skip
 SHORT_TASKS = ("half_cheetah", "humanoid")
+SUITE = (
+    "dm/cartpole_swingup", "dm/cheetah_run", "dm/walker_walk", "dm/quadruped_walk", "dm/humanoid_walk",
+)  # fmt: skip
+"""Tasks of the part suite."""
+SUITE_WORLDS = (2, 16, 128)
 SCALED = ("humanoid",)
 """Default tasks of the parts cores and worlds."""
 PARTS = {
     "sampling": ("native", "c", "warp", "envpool", "gym-async", "gym-sync", "dm_control"),
+    "suite": ("dm_control", "c", "envpool"),
     "single": ("gymnasium", "c", "envpool", "dm_control"),
     "cores": ("native", "c", "envpool", "gym-async", "dm_control"),
     "worlds": ("warp", "c"),
     "kept": ("c", "warp"),
 }
 """Contestants of each part. The Warp engine takes part on a GPU, or if it is requested by name."""
-UNITS = {"sampling": "native", "single": "gymnasium", "cores": "native"}
+UNITS = {"sampling": "native", "suite": "dm_control", "single": "gymnasium", "cores": "native"}
 """The reference contestant of each part."""
 WORLDS = {"warp": (1, 8, 64, 512, 2_048, 8_192, 16_384, 32_768, 65_536, 131_072), "c": (1, 8, 64, 512, 4_096)}
 CPU_WORLDS = 512
@@ -52,11 +59,12 @@ class Options(experiment.Options):
     """Environment steps per second of lyceum_warp, native C and other libraries."""
 
     parts: tuple[str, ...] = ()
-    """Parts: sampling, single, cores, worlds, kept; by default all."""
+    """Parts: sampling, suite, single, cores, worlds, kept; by default all."""
     seconds: float = 1.0
     """Duration of each measurement in seconds."""
     worlds: int | None = None
-    """Number of worlds of lyceum_warp and of native C; by default 64 per thread, and 16,384 on a GPU."""
+    """Number of worlds of lyceum_warp and of native C; by default 64 per thread, and 16,384 on a GPU. In the part suite
+    of all contestants; by default 2, 16 and 128."""
     policy: str | None = None
     """Folder of a run whose policy acts in the part kept; by default actions are random."""
 
@@ -83,6 +91,7 @@ def cases(options: Options) -> list[Case]:
     named = choose(options.contestants, everything, what="contestant")
     known = (*TASKS, *sorted({*lw.task_names()} - {*TASKS}))
     given = choose(options.tasks, known, SHORT_TASKS if options.short else TASKS, what="task")
+    usual = {"cores": SCALED, "worlds": SCALED, "suite": SUITE[:1] if options.short else SUITE}
     threads, gpu = options.threads or cpu_cores(), options.device.startswith("cuda")
     repeats = options.repeats or (1 if options.short else 3)
     seconds, warm = (0.2, 20) if options.short else (options.seconds, 100)
@@ -96,6 +105,9 @@ def cases(options: Options) -> list[Case]:
         if part == "cores":
             doubled = [1 << k for k in range(threads.bit_length()) if 1 << k < threads]
             return [(size(part, name, cores), cores) for cores in (*doubled, threads)]
+        if part == "suite":
+            many = (options.worlds,) if options.worlds else SUITE_WORLDS[:1] if options.short else SUITE_WORLDS
+            return [(number, threads) for number in many]
         if part == "worlds" and not options.worlds:
             most = 64 if options.short else CPU_WORLDS if name == "warp" and not gpu else max(WORLDS[name])
             return [(many, threads) for many in WORLDS[name] if many <= most]
@@ -106,11 +118,12 @@ def cases(options: Options) -> list[Case]:
              0 if part == "kept" else warm if worlds <= contestants.GPU_WORLDS else 20,
              options.policy if part == "kept" else None)
         for part in choose(options.parts, PARTS, what="part")
-        for task in (SCALED if part in ("cores", "worlds") and not options.tasks else given)
+        for task in (given if options.tasks else usual.get(part, given))
         for repeat in range(1 if part == "kept" else repeats)
         for name in PARTS[part]
         if name in named and (name != "warp" or gpu or options.contestants)
-        and (part == "kept" or (task in TASKS and contestants.takes_part(name, task)))
+        and (part == "kept" or (task.startswith("dm/") if part == "suite" else task in TASKS))
+        and (part == "kept" or contestants.takes_part(name, task))
         for worlds, cores in sizes(part, name)
     ]  # fmt: skip
 
@@ -153,10 +166,17 @@ def rates(rows: Sequence[Row], contestant: str) -> list[float]:
     return [row.result["env_steps_per_second"] for row in rows if row.case["contestant"] == contestant]
 
 
+def peers(rows: Sequence[Row]) -> str:
+    """Return the versions of the other libraries in the part suite, in parentheses."""
+    found = {row.result.get("versions") for row in rows if row.case["part"] == "suite"} - {None}
+    return f" ({'; '.join(sorted(found))})" * bool(found)
+
+
 def tables(rows: Sequence[Row]) -> list[Table]:
     made = []
     for part, by, title in (
         ("sampling", ("task",), "Environment steps per second, and their ratio to native C's."),
+        ("suite", ("task", "worlds"), f"dm_control's suite{peers(rows)}: steps/s, and their ratio to dm_control's."),
         ("single", ("task",), "One world on one thread: environment steps per second, and their ratio to Gymnasium's."),
         ("cores", ("task", "threads"), "Environment steps per second by cores, and their ratio to native C's."),
         ("worlds", ("task", "worlds"), "Environment steps per second by worlds."),

@@ -31,3 +31,10 @@ def test_a_task_with_suggested_physics_is_also_planned_with_its_exact_physics() 
     assert most == {"fast": 1024, "exact": 64}
     named = latency.cases(latency.Options(tasks=("humanoid", "cartpole"), physics=("fast",), samples=(4096,)))
     assert {(case.task, case.samples) for case in named} == {("humanoid", 4096)}
+
+
+def test_own_plans_with_the_samples_and_the_horizon_of_the_task() -> None:
+    (case,) = latency.cases(latency.Options(tasks=("reach",), own=True))
+    assert (case.samples, case.horizon) == (30, 16)
+    with pytest.raises(ValueError, match="omit --samples and --horizons"):
+        latency.cases(latency.Options(tasks=("reach",), own=True, samples=(8,)))

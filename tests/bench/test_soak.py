@@ -90,3 +90,10 @@ def test_a_killed_training_ends_like_an_uninterrupted_one(work: Path, tmp_path: 
 
 def test_growth_is_measured_without_the_first_sample() -> None:
     assert soak.slope([[100, 9**9], [200, 3000], [300, 5000], [400, 7000]], 1) == pytest.approx(20.0)
+
+
+def test_random_actions_are_counted_without_injected_faults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("--short", "--parts", "random", "--threads", "1", "--nworld", "16", "--steps", "1600")
+    (result,) = run(tmp_path / "soak.jsonl", *words)
+    assert result["steps"] == 1600 and result["first"] is None and not any(result["faults"].values())
+    assert "| point_mass | auto, cpu | 16 | 1,600 | " in capsys.readouterr().out

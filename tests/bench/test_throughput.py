@@ -5,6 +5,7 @@ from typing import Any
 import experiment
 import plot
 import pytest
+import throughput
 
 BENCH = Path(__file__).parents[2] / "bench"
 
@@ -51,6 +52,14 @@ def test_rates_are_measured_by_cores_and_worlds(tmp_path: Path, capsys: pytest.C
     assert "| task | threads | native C | lyceum_warp, C engine |" in printed and "| cartpole | 8 |" in printed
     native, ours = (row["result"]["env_steps_per_second"] for row in lines(out)[:2])
     assert f"| {ours:,.0f}; {ours / native:.2f} |" in printed
+
+
+def test_the_suite_is_measured_beside_dm_control_with_equal_numbers_of_worlds() -> None:
+    options = throughput.Options(parts=("suite",), tasks=("dm/cheetah_run", "dm/quadruped_walk"), threads=2, repeats=1)
+    found = [(case.task, case.worlds, case.contestant) for case in throughput.cases(options)]
+    assert found.count(("dm/cheetah_run", 16, "envpool")) == 1 and len(found) == 3 * (3 + 2)
+    assert ("dm/quadruped_walk", 16, "envpool") not in found  # EnvPool's has more observations
+    assert {case.threads for case in throughput.cases(options)} == {2}
 
 
 @pytest.mark.parametrize("task", ["cartpole", "herb_reach"])

@@ -1,6 +1,6 @@
 """Define tasks for Gymnasium and dm_control with the formulas and models of lyceum_warp's tasks.
 
-Gymnasium has all tasks except cartpole and herb_reach, and dm_control has cartpole. This file defines the other tasks
+Gymnasium has all tasks except cartpole and herb_reach, and dm_control has cartpole and its suite. This file defines the other tasks
 in NumPy, as a user of the libraries would. This file runs in peers' virtual environments and does not import
 lyceum_warp.
 """
@@ -117,13 +117,15 @@ POSITIONS = {
 
 
 def dm_control_env(task: str, seed: int) -> Any:
-    """Make a dm_control environment: its own cartpole, or Gymnasium's formulas on dm_control's physics."""
+    """Make a dm_control environment: a task of its suite, or Gymnasium's formulas on dm_control's physics."""
     from dm_control import mujoco as dm_mujoco
     from dm_control import suite
     from dm_control.rl import control
 
-    if task == "cartpole":
-        return suite.load("cartpole", "balance", task_kwargs={"random": seed})
+    own = "dm/cartpole_balance" if task == "cartpole" else task
+    for domain, name in suite.ALL_TASKS:
+        if own == f"dm/{domain}_{name}":
+            return suite.load(domain, name, task_kwargs={"random": seed})
 
     class FromGymnasium(control.Task):
         """A dm_control task with the observation, reward and end of a Gymnasium environment, on dm_control's model and

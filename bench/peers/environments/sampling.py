@@ -10,6 +10,7 @@ import multiprocessing
 import sys
 import time
 from collections.abc import Callable
+from importlib.metadata import version
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -31,6 +32,10 @@ ENVPOOL = {
     "inverted_pendulum": "InvertedPendulum-v5",
     "inverted_double_pendulum": "InvertedDoublePendulum-v5",
     "cartpole": "CartpoleBalance-v1",
+    "dm/cartpole_swingup": "CartpoleSwingup-v1",
+    "dm/cheetah_run": "CheetahRun-v1",
+    "dm/walker_walk": "WalkerWalk-v1",
+    "dm/humanoid_walk": "HumanoidWalk-v1",
 }
 """EnvPool's names of the tasks."""
 
@@ -188,6 +193,9 @@ CONTESTANTS: dict[str, Callable[..., Any]] = {
     "envpool": EnvPool,
 }
 
+PACKAGES = {Gymnasium: ("gymnasium", "mujoco"), DmControl: ("dm_control", "mujoco"), EnvPool: ("envpool",)}
+"""Packages whose versions matter to the result; EnvPool contains its MuJoCo."""
+
 
 def timed(
     step: Callable[[int], None], period: int, warm: int, seconds: float, wait: Callable[[], None] = lambda: None
@@ -226,7 +234,9 @@ def main() -> None:
     share = made.transition_share() if isinstance(made, EnvPool) else 1.0
     width = made.actions.shape[1]
     made.close()
-    print(json.dumps({"env_steps_per_second": steps * width * share / seconds, "steps": steps}))
+    versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES[type(made)])
+    rate = steps * width * share / seconds
+    print(json.dumps({"env_steps_per_second": rate, "steps": steps, "versions": versions}))
 
 
 if __name__ == "__main__":

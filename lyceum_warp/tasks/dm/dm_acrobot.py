@@ -45,6 +45,12 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class AcrobotSwingup(lw.Task):
     model, frame_skip = suite.model("acrobot"), 1
     obs = {"orientations": 4, "velocity": 2}
+    # the planner sees a wider target, and coarser physics
+    planning = lw.Planning(
+        settings={"horizon": 75, "samples": 64, "noise": 1.0},
+        options={"timestep": 0.02, "integrator": "euler"},
+        params={"margin": 4.0},
+    )
 
 
 @wp.struct

@@ -55,5 +55,10 @@ class BallInCupCatch(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Count contacts, so that no episode starts with one."""
+        """Count contacts, so that no episode starts with one.
+
+        A keyframe with the ball in the cup is for the probe of MuJoCo Warp's capacities, which finds too few
+        constraints from the model's initial state alone.
+        """
         suite.count_contacts(spec)
+        spec.add_key(name="caught", qpos=[0.0, 0.0, 0.0, 0.333])

@@ -76,6 +76,7 @@ class CartpoleSwingup(CartpoleBalance):
     """Swing up a pole on a cart, and balance it."""
 
     Params = SwingupParams
+    planning = lw.Planning(settings={"horizon": 50}, options={"timestep": 0.02, "integrator": "euler"})
 
 
 @wp.struct

@@ -119,8 +119,13 @@ class ManipulatorBringBall(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Count contacts, so that no episode starts with one; give each world a target of its own; remove props."""
+        """Count contacts, so that no episode starts with one; give each world a target of its own; remove props.
+
+        A keyframe with the ball in the hand is for the probe of MuJoCo Warp's capacities, which finds too few
+        constraints from the model's initial state alone.
+        """
         suite.count_contacts(spec)
         for name in ("peg", "target_peg", "cup", "slot"):
             spec.delete(spec.body(name))
         spec.body("target_ball").mocap = True
+        spec.add_key(name="grasped", qpos=[2.66, -0.56, 1.58, -1.56, 0.61, -0.29, 0.6, -0.32, -0.14, 0.02, 0.0])
