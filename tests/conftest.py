@@ -123,8 +123,11 @@ def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
     return made
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest deselects by marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip tests marked ``gpu`` without a GPU, and tests of tasks whose model is not installed."""
+    """Mark the rest of a matrix ``long``, skip tests marked ``gpu`` without a GPU, and tests of models that are not
+    installed."""
+    _mark_long(items)
     for item in items:
         if (missing := _missing_model(_task(item))) is not None:
             item.add_marker(pytest.mark.skip(reason=missing))
@@ -135,6 +138,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "gpu" in item.keywords:
             item.add_marker(skip)
+
+
+def _mark_long(items: list[pytest.Item]) -> None:
+    """Mark the cases ``long`` that their test's mark ``quick`` does not name."""
+    cases: dict[tuple[str, ...], set[str]] = {}
+    for item in items:
+        if (mark := item.get_closest_marker("quick")) is not None:
+            case = item.callspec.id  # type: ignore[attr-defined]
+            cases.setdefault((item.nodeid.partition("[")[0], *mark.args), set()).add(case)
+            if case not in mark.args:
+                item.add_marker(pytest.mark.long)
+    for (test, *quick), found in cases.items():
+        # a command line may select single cases
+        if len(found) > len(quick) and (unknown := set(quick) - found):
+            raise pytest.UsageError(f"{test} has no cases {sorted(unknown)}: name some of {sorted(found)}")
 
 
 def _task(item: pytest.Item) -> str | None:

@@ -65,6 +65,7 @@ def test_random_search_gets_a_complete_run_folder(run, tmp_path: Path) -> None:
     assert cli.main(["train", "--resume", "twice", "--iterations", "9"]) == 2  # the class is defined in a script
 
 
+@pytest.mark.long  # tests of SAC and of random_search.py cover its parts
 def test_td3_learns_and_resumes_with_its_replay_buffer(run, tmp_path: Path) -> None:
     ended = numbers(r": (\d+) episodes", run("td3.py", "--out", "once", "--iterations", "4"))
     assert ended[0] > 50 > 25 > ended[-1]  # the policy keeps the pole up for longer

@@ -10,8 +10,6 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 import lyceum_warp as lw
 
 ROOT = Path(lw.__file__).parent
@@ -249,10 +247,9 @@ def test_importing_the_package_loads_neither_torch_nor_warp_nor_mujoco() -> None
     assert in_new_process(program) == "[]\n"
 
 
-@pytest.mark.parametrize("first", ["import warp as wp", "from lyceum_warp import Row"])
-def test_warp_prints_nothing_for_any_import_order_of_a_task_file(first: str) -> None:
-    program = f"""
-        {first}
+def test_warp_prints_nothing_if_a_task_file_imports_it_first() -> None:
+    """``tests/support/test_warp_log.py`` imports the package first."""
+    program = """
         import warp as wp
         import lyceum_warp as lw
         print(lw.make("point_mass", nworld=1).nworld)

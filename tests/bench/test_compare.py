@@ -82,6 +82,7 @@ def test_a_working_tree_equals_itself(capsys: pytest.CaptureFixture[str]) -> Non
     assert lines[-1].startswith("no difference: ") and " arrays in 2 units" in lines[-1]
 
 
+@pytest.mark.long
 def test_a_package_that_cannot_be_imported_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy = copied(tmp_path, {"__init__.py": ("import importlib\n", "raise RuntimeError('no package')\n")})
     assert compare.run(compare.Options(str(ROOT), str(copy), tasks=("point_mass",), **QUICK)) == 1

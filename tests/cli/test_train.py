@@ -178,8 +178,8 @@ def test_physics_by_name_are_saved_as_options_and_eval_replaces_them(
 ) -> None:
     line = "    physics = {'fast': lw.PhysicsOptions(integrator='euler', timestep=0.004, frame_skip=2)}\n"
     task = task_file("fast.py", tiny_task.changed(("    model", f"{line}    model")))
-    out = tmp_path / "run"
-    assert train(out, "--iterations", "1", "--physics", "fast", "--cone", "elliptic", task=str(task)) == 0
+    out, short = tmp_path / "run", ("--horizon", "40", "--no-transfer")
+    assert train(out, "--iterations", "1", "--physics", "fast", "--cone", "elliptic", *short, task=str(task)) == 0
     given = {"integrator": "euler", "timestep": 0.004, "frame_skip": 2, "cone": "elliptic"}
     assert Run.open(out).config["physics"] == given
     for flags, timestep in (([], 0.004), (["--physics", "exact"], 0.002)):
@@ -285,6 +285,7 @@ def test_resume_refuses_broken_checkpoints(trained: Path, tmp_path: Path, capsys
         assert (tmp_path / folder / "metrics.csv").read_bytes() == (trained / "metrics.csv").read_bytes()
 
 
+@pytest.mark.quick("a flipped bit")
 @pytest.mark.parametrize("damage", ["cut off", "a flipped bit"])
 def test_resume_falls_back_from_a_broken_checkpoint_to_the_previous_one(
     damage: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -388,6 +389,7 @@ def assert_continues(out: Path, output: str, trained: Path) -> None:
     assert len(metrics(out)) == done + 1
 
 
+@pytest.mark.quick("step", "save")
 @pytest.mark.parametrize("moment", ["step", "move", "state_dict", "save"])
 def test_an_interrupted_run_ends_after_the_iteration_and_continues(
     moment: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -91,6 +91,7 @@ def contents(*owners: object) -> dict[str, np.ndarray]:
     return {f.name: getattr(o, f.name).numpy().copy() for o in owners for f in dataclasses.fields(o)}
 
 
+@pytest.mark.quick("sparse")
 def test_shuffled_contacts_are_sorted_into_the_same_order(forwarded: tuple[WarpEngine, CanonicalOrder]) -> None:
     engine, _ = forwarded
     m, d = engine.m, engine.d

@@ -155,6 +155,10 @@ CHANGES: Mapping[str, float] = {
 }  # fmt: skip
 
 
+@pytest.mark.quick(
+    *(f"MujocoEngine-{name}" for name in CHANGES),
+    *(f"WarpEngine-{name}" for name in ("wind", "tendon_frictionloss", "body_gravcomp", "geom_quat", "jnt_pos")),
+)  # fmt: skip
 @pytest.mark.parametrize("name", CHANGES)
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
 def test_a_field_that_is_zero_in_the_model_can_act_in_a_single_world(engine: type[Engine], name: str) -> None:

@@ -22,6 +22,8 @@ from lyceum_warp.tasks.velocity import TASKS as VELOCITY
 
 NWORLD = 32
 TASKS = [name for name in package_task_names() if not name.startswith("dm/")]  # models like those of others
+LARGE = ("adroit_pen", "ant", "g1_velocity", "go1_rough_velocity", "humanoid", "humanoid_stand")
+"""Tasks whose models take seconds to simulate on the Warp engine; with others they are left to make test-all."""
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 FORCE_PARTS = ("contact_force",)
@@ -138,7 +140,7 @@ def device(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-@pytest.fixture(scope="module", params=long_if_alike(TASKS, *SAME_MODELS, "g1_velocity"))
+@pytest.fixture(scope="module", params=long_if_alike(TASKS, *SAME_MODELS, *LARGE))
 def engines(request: pytest.FixtureRequest, device: str, shared_env: SharedEnv) -> Iterator[Engines]:
     task = request.param
     options = {"nworld": NWORLD, "cone": "elliptic", "frame_skip": 1, "autoreset": False, "horizon": 0}

@@ -6,6 +6,8 @@ import sys
 import pytest
 import warp as wp
 
+from lyceum_warp.cli import main
+
 WITHOUT_GPU = pytest.mark.skipif(wp.is_cuda_available(), reason="needs a machine without a GPU")
 
 
@@ -16,7 +18,8 @@ def printed(program: str) -> tuple[str, str]:
 
 @WITHOUT_GPU
 def test_an_environment_on_the_cpu_prints_nothing() -> None:
-    assert printed("import lyceum_warp as lw; lw.make('point_mass').step()") == ("", "")
+    program = "from lyceum_warp import Row; import lyceum_warp as lw; lw.make('point_mass').step()"
+    assert printed(program) == ("", "")
 
 
 @WITHOUT_GPU
@@ -51,8 +54,9 @@ def test_warp_starts_with_a_closed_stderr() -> None:
 
 
 @WITHOUT_GPU
-def test_a_cuda_device_without_a_driver_is_one_line_with_the_cause() -> None:
-    out, error = printed("import sys; from lyceum_warp.cli import main; main(['check', 'hopper', '--device', 'cuda'])")
+def test_a_cuda_device_without_a_driver_is_one_line_with_the_cause(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "hopper", "--device", "cuda"]) == 2
+    out, error = capfd.readouterr()
     assert out == "" and error.count("\n") == 1
     assert error.startswith("lyceum-warp: there is no device 'cuda' on this machine; it has 'cpu' (")
     assert "NVIDIA CUDA driver" in error

@@ -45,6 +45,7 @@ def put(env: lw.Env, world: int, x: float, y: float) -> None:
     env.set_state(state)
 
 
+@pytest.mark.quick("go1_rough_velocity")
 @pytest.mark.parametrize("task", TASKS)
 def test_heights_contacts_and_scans_on_every_kind_of_patch_equal_mujocos(task: str, env: lw.Env) -> None:
     env.reset()
