@@ -2,10 +2,13 @@
 
 import functools
 import gc
+import hashlib
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import pytest
 import torch
 import warp as wp
@@ -49,6 +52,23 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         folder = tmp_path_factory.mktemp("state")
         patched.setenv("XDG_STATE_HOME", str(folder))
         yield folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def known_sizes(pytestconfig: pytest.Config) -> Iterator[None]:
+    """Keep the probed sizes of contact buffers between runs of the tests, as Warp keeps kernels.
+
+    A probe takes seconds for a large model. Another release of MuJoCo or another probe begins without sizes.
+    """
+    sizes, cache = sys.modules.get("lyceum_warp.engines.warp.sizes"), getattr(pytestconfig, "cache", None)
+    if sizes is None or cache is None:
+        yield
+        return
+    source = hashlib.sha256(Path(str(sizes.__file__)).read_bytes()).hexdigest()[:16]
+    key = f"lyceum_warp/sizes-{mujoco.__version__}-{source}"
+    sizes._known.update({model: tuple(found) for model, found in cache.get(key, {}).items()})
+    yield
+    cache.set(key, cache.get(key, {}) | sizes._known)  # another process may have stored some
 
 
 @pytest.fixture(scope="module")
