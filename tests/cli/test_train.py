@@ -150,7 +150,10 @@ def physics(env: lw.Env) -> tuple[int, int, int, bool]:
     return opt.integrator, opt.iterations, opt.ls_iterations, env.options.physics.deterministic
 
 
-def test_a_run_keeps_its_physics(tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_keeps_its_physics(
+    tmp_path: Path, made_envs: list[lw.Env], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(display, "write_video", lambda env, states, path, **options: path)
     out = tmp_path / "run"
     options = ["--integrator", "euler", "--solver", "iterations=7", "--solver", "ls_iterations=9", "--deterministic"]
     assert train(out, "--iterations", "1", "--no-transfer", *options, task="hopper") == 0  # its own integrator is RK4
