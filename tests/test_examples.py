@@ -109,6 +109,7 @@ def test_commanded_speed_keeps_the_rules_on_both_engines() -> None:
     assert float(reward) == pytest.approx(sum(terms.values()) - terms["difficulty"], abs=1e-5)
 
 
+@pytest.mark.long
 def test_commanded_speed_trains_with_its_terms_as_curves(tmp_path: Path) -> None:
     options = ["--iterations", "2", "--samples", "8000", "--nworld", "16"]
     assert train(tmp_path / "run", *options, task=str(EXAMPLES / "commanded_speed.py")) == 0

@@ -10,6 +10,8 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 import lyceum_warp as lw
 
 ROOT = Path(lw.__file__).parent
@@ -248,6 +250,7 @@ def test_importing_the_package_loads_neither_torch_nor_warp_nor_mujoco() -> None
     assert in_new_process(program) == "[]\n"
 
 
+@pytest.mark.long
 def test_warp_prints_nothing_if_a_task_file_imports_it_first() -> None:
     """``tests/support/test_warp_log.py`` imports the package first."""
     program = """

@@ -248,7 +248,7 @@ def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.mark.quick(
     "memory-mujoco", "worlds-mujoco", "one_substep-mujoco", "rk4-mujoco", "keepsake-mujoco", "control-mujoco",
-    "control_worlds-mujoco", "sensors-mujoco", "memory-warp", "control_worlds-warp", "sensors-warp",
+    "control_worlds-mujoco", "sensors-mujoco", "memory-warp", "sensors-warp",
 )  # fmt: skip
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(

@@ -129,6 +129,7 @@ def test_bad_environments_and_actions_are_refused(env: lw.Env, shared_env: Share
         endless.episode_length_buf = torch.zeros(2, dtype=torch.long)
 
 
+@pytest.mark.long
 def test_rsl_rls_own_runner_learns(tmp_path: Path) -> None:
     """The best possible return is about 250; an untrained policy has a negative mean return."""
     from rsl_rl.runners import OnPolicyRunner  # the import takes a second

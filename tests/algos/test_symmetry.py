@@ -119,7 +119,7 @@ def test_a_task_without_a_mirror_image_is_refused(shared_env: SharedEnv) -> None
 @pytest.mark.parametrize("symmetry", ["exact", "loss", "augment"])
 def test_sac_learns_symmetric_policies_and_keeps_them(symmetry: str, env: lw.Env, tmp_path: Path) -> None:
     config = lw.SACConfig(
-        hidden=(16,), value_hidden=(16,), batch=64, warmup=64, num_steps=40, updates=2, mean_every=0, symmetry=symmetry
+        hidden=(16,), value_hidden=(16,), batch=64, warmup=64, num_steps=40, updates=4, mean_every=0, symmetry=symmetry
     )
     env.rand_reset(1)
     sac = lw.SAC(env, config=config, seed=1)

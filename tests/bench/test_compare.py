@@ -48,6 +48,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return json.loads(out.read_text())
 
 
+@pytest.mark.long
 def test_a_changed_reward_is_reported_with_its_numbers_and_nothing_else(report: dict[str, Any]) -> None:
     (unit,) = (unit for unit in report["units"] if unit["name"] == "env/point_mass/mujoco")
     found = {each["name"].removeprefix("env/point_mass/mujoco/"): each for each in unit["differences"]}
@@ -64,6 +65,7 @@ def test_a_changed_reward_is_reported_with_its_numbers_and_nothing_else(report: 
     assert old == new
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "task, text",
     [("cartpole", "RuntimeError: broken on purpose"), ("cartpole_swingup", "the process ended with 3")],

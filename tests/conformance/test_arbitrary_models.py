@@ -102,7 +102,9 @@ def sensing(model: str) -> type[lw.Task]:
     return type("Sensing", (Sensing,), {"model": spec, "obs": obs, **own})
 
 
-@pytest.mark.quick("flex-warp", "sleep-mujoco", "mocap-warp", "keyframes-mujoco", "delays-warp", "equalities-mujoco")
+@pytest.mark.quick(
+    "flex-warp", "flex-mujoco", "sleep-mujoco", "mocap-warp", "keyframes-mujoco", "delays-warp", "equalities-mujoco"
+)
 @pytest.mark.parametrize("engine", OPTIONS)
 @pytest.mark.parametrize("model", MOVING.values(), ids=MOVING)
 def test_a_model_keeps_the_rules(model: str, engine: str) -> None:

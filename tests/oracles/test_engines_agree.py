@@ -22,7 +22,7 @@ from lyceum_warp.tasks.velocity import TASKS as VELOCITY
 
 NWORLD = 32
 TASKS = [name for name in package_task_names() if not name.startswith("dm/")]  # models like those of others
-LARGE = ("adroit_pen", "ant", "g1_velocity", "go1_rough_velocity", "humanoid", "humanoid_stand")
+LARGE = ("adroit_pen", "ant", "g1_velocity", "go1_rough_velocity", "humanoid", "humanoid_stand", "panda_lift")
 """Tasks whose models take seconds to simulate on the Warp engine; with others they are left to make test-all."""
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 

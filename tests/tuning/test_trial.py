@@ -65,6 +65,7 @@ def test_a_setting_that_mujoco_refuses_has_its_reason() -> None:
     assert "flex elasticity" in refused["refused"] and verdict(refused, "strict") == "refused"
 
 
+@pytest.mark.long
 def test_too_little_room_on_the_warp_engine_shows_as_faults() -> None:
     own = trials("hopper", engine="warp", nworld=8, nconmax=16, njmax=64)
     assert own.measure(SAME)["divergence"] == [0.0, 0.0, 0.0]

@@ -132,6 +132,7 @@ def test_train_shows_its_run_on_request(tmp_path: Path, monkeypatch: pytest.Monk
     assert made == [((tmp_path / "run",), {"port": 8123})]
 
 
+@pytest.mark.long
 def test_a_viewer_of_a_task_that_is_not_found_ends_with_one_line(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
