@@ -43,6 +43,7 @@ def test_train_improves_and_saves_the_policy(run, tmp_path: Path) -> None:
     assert (tmp_path / "policy.pt").is_file()
 
 
+@pytest.mark.long
 def test_own_policy_improves(run) -> None:
     lines = run("own_policy.py", "--iterations", "8")
     returns = numbers(r"return +(-?[\d.]+)", lines)
@@ -82,6 +83,7 @@ def test_plan_reaches_the_target_in_each_episode(run) -> None:
     assert 0 < numbers(r"median ([\d.]+) ms", lines)[0] < 1000
 
 
+@pytest.mark.long
 def test_own_task_keeps_the_rules_and_steps() -> None:
     # in a subprocess, because the task is registered and its module is __main__
     command = [sys.executable, str(EXAMPLES / "own_task.py")]

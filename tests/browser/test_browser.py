@@ -322,6 +322,7 @@ def test_a_body_is_pushed_by_dragging(tab: Tab) -> None:
     tab.wait(lambda: not viewer.window.given[-1].forces.any())  # type: ignore[union-attr]
 
 
+@pytest.mark.long
 def test_an_episode_is_scrubbed_and_played(tab: Tab) -> None:
     viewer = tab.viewer
     viewer.window.extra += [SetMode("playback"), Seek(0), SetBackwards(False)]

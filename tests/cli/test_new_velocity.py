@@ -66,6 +66,7 @@ def new(*words: str) -> int:
     return cli.main(["new", *words, "--template", "velocity"])
 
 
+@pytest.mark.long
 def test_the_file_of_a_robot_is_short_and_its_task_keeps_the_rules(folder: Path) -> None:
     assert new("ant_walk", "--model", "gymnasium:ant.xml") == 0
     text = Path("ant_walk.py").read_text()

@@ -47,9 +47,9 @@ def options(task: str, engine: str) -> dict[str, int]:
     return {"steps": 100 if every else 40, "frame_skip": min(2, find_task(task).frame_skip)}
 
 
-# contacts; rough terrain, events and drawn dynamics; no contacts; a planner's task; the same on the Warp engine
+# contacts; a robot with events and drawn dynamics; no contacts; a planner's task; the same on the Warp engine
 @pytest.mark.quick(
-    "mujoco-hopper", "mujoco-go1_rough_velocity", "mujoco-cartpole_swingup", "mujoco-reach",
+    "mujoco-hopper", "mujoco-go1_velocity", "mujoco-cartpole_swingup", "mujoco-reach",
     "warp-go1_velocity", "warp-half_cheetah", "warp-point_mass",
 )  # fmt: skip
 @pytest.mark.parametrize(("engine", "task"), [(engine, task) for engine in EVERY_RULE for task in PACKAGE])
