@@ -2,10 +2,13 @@
 
 import functools
 import gc
+import hashlib
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import pytest
 import torch
 import warp as wp
@@ -49,6 +52,23 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         folder = tmp_path_factory.mktemp("state")
         patched.setenv("XDG_STATE_HOME", str(folder))
         yield folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def known_sizes(pytestconfig: pytest.Config) -> Iterator[None]:
+    """Keep the probed sizes of contact buffers between runs of the tests, as Warp keeps kernels.
+
+    A probe takes seconds for a large model. Another release of MuJoCo or another probe begins without sizes.
+    """
+    sizes, cache = sys.modules.get("lyceum_warp.engines.warp.sizes"), getattr(pytestconfig, "cache", None)
+    if sizes is None or cache is None:
+        yield
+        return
+    source = hashlib.sha256(Path(str(sizes.__file__)).read_bytes()).hexdigest()[:16]
+    key = f"lyceum_warp/sizes-{mujoco.__version__}-{source}"
+    sizes._known.update({model: tuple(found) for model, found in cache.get(key, {}).items()})
+    yield
+    cache.set(key, cache.get(key, {}) | sizes._known)  # another process may have stored some
 
 
 @pytest.fixture(scope="module")
@@ -123,8 +143,11 @@ def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
     return made
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest deselects by marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip tests marked ``gpu`` without a GPU, and tests of tasks whose model is not installed."""
+    """Mark the rest of a matrix ``long``, skip tests marked ``gpu`` without a GPU, and tests of models that are not
+    installed."""
+    _mark_long(items)
     for item in items:
         if (missing := _missing_model(_task(item))) is not None:
             item.add_marker(pytest.mark.skip(reason=missing))
@@ -135,6 +158,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "gpu" in item.keywords:
             item.add_marker(skip)
+
+
+def _mark_long(items: list[pytest.Item]) -> None:
+    """Mark the cases ``long`` that their test's mark ``quick`` does not name."""
+    cases: dict[tuple[str, ...], set[str]] = {}
+    for item in items:
+        if (mark := item.get_closest_marker("quick")) is not None:
+            case = item.callspec.id  # type: ignore[attr-defined]
+            cases.setdefault((item.nodeid.partition("[")[0], *mark.args), set()).add(case)
+            if case not in mark.args:
+                item.add_marker(pytest.mark.long)
+    for (test, *quick), found in cases.items():
+        # a command line may select single cases
+        if len(found) > len(quick) and (unknown := set(quick) - found):
+            raise pytest.UsageError(f"{test} has no cases {sorted(unknown)}: name some of {sorted(found)}")
 
 
 def _task(item: pytest.Item) -> str | None:

@@ -49,7 +49,12 @@ PROGRAMS = [page for page in PAGES if page not in WALKTHROUGHS and python_of(pag
 """Pages with Python and without commands."""
 
 
-@pytest.mark.parametrize("page", PROGRAMS, ids=name_of)
+def quickly(pages: list[Path], *long: str) -> list[object]:
+    """Return test parameters; pages whose programs other tests cover are marked long."""
+    return [pytest.param(page, marks=pytest.mark.long if page.stem in long else (), id=name_of(page)) for page in pages]
+
+
+@pytest.mark.parametrize("page", quickly(PROGRAMS, "terrain"))
 def test_python_of_a_page_runs_in_order(page: Path, task_file: TaskFile) -> None:
     if page.stem == "dm_suite":
         pytest.importorskip("dm_control", reason="dm_control brings the models")
@@ -158,7 +163,7 @@ def empty_folder(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("page", WALKTHROUGHS, ids=name_of)
+@pytest.mark.parametrize("page", quickly(WALKTHROUGHS, "policies", "physics", "sac", "deployment", "viewer"))
 def test_commands_and_python_of_a_page_run_in_order(
     page: Path, empty_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

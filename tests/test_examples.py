@@ -43,6 +43,7 @@ def test_train_improves_and_saves_the_policy(run, tmp_path: Path) -> None:
     assert (tmp_path / "policy.pt").is_file()
 
 
+@pytest.mark.long
 def test_own_policy_improves(run) -> None:
     lines = run("own_policy.py", "--iterations", "8")
     returns = numbers(r"return +(-?[\d.]+)", lines)
@@ -65,6 +66,7 @@ def test_random_search_gets_a_complete_run_folder(run, tmp_path: Path) -> None:
     assert cli.main(["train", "--resume", "twice", "--iterations", "9"]) == 2  # the class is defined in a script
 
 
+@pytest.mark.long  # tests of SAC and of random_search.py cover its parts
 def test_td3_learns_and_resumes_with_its_replay_buffer(run, tmp_path: Path) -> None:
     ended = numbers(r": (\d+) episodes", run("td3.py", "--out", "once", "--iterations", "4"))
     assert ended[0] > 50 > 25 > ended[-1]  # the policy keeps the pole up for longer
@@ -81,6 +83,7 @@ def test_plan_reaches_the_target_in_each_episode(run) -> None:
     assert 0 < numbers(r"median ([\d.]+) ms", lines)[0] < 1000
 
 
+@pytest.mark.long
 def test_own_task_keeps_the_rules_and_steps() -> None:
     # in a subprocess, because the task is registered and its module is __main__
     command = [sys.executable, str(EXAMPLES / "own_task.py")]
@@ -108,6 +111,7 @@ def test_commanded_speed_keeps_the_rules_on_both_engines() -> None:
     assert float(reward) == pytest.approx(sum(terms.values()) - terms["difficulty"], abs=1e-5)
 
 
+@pytest.mark.long
 def test_commanded_speed_trains_with_its_terms_as_curves(tmp_path: Path) -> None:
     options = ["--iterations", "2", "--samples", "8000", "--nworld", "16"]
     assert train(tmp_path / "run", *options, task=str(EXAMPLES / "commanded_speed.py")) == 0

@@ -161,33 +161,26 @@ def defined_names(tree: ast.AST) -> Iterator[str]:
             yield node.attr
 
 
-PRIVATE = defaultdict(set)
-for module, tree in trees().items():
-    for defined in filter(is_private, defined_names(tree)):
-        PRIVATE[defined].add(module)
+@functools.cache
+def private_names() -> dict[str, set[str]]:
+    """Return the private names of the package, with the modules that define them."""
+    found = defaultdict(set)
+    for module, tree in trees().items():
+        for defined in filter(is_private, defined_names(tree)):
+            found[defined].add(module)
+    return found
 
 
 def test_no_module_uses_private_names_of_another_module() -> None:
     """Attributes are matched by name only, so private names of Warp, MuJoCo and torch do not count."""
-    found = []
+    found, private = [], private_names()
     for name, tree in trees().items():
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("lyceum_warp"):
                 found += [f"{name} imports {alias.name}" for alias in node.names if alias.name.startswith("_")]
-            elif isinstance(node, ast.Attribute) and not is_own(node) and (others := PRIVATE[node.attr] - {name}):
+            elif isinstance(node, ast.Attribute) and not is_own(node) and (others := private[node.attr] - {name}):
                 found.append(f"{name}:{node.lineno}: {ast.unparse(node)}, of {', '.join(sorted(others))}")
     assert not found, "\n".join(found)
-
-
-PUBLIC = {
-    alias.name: str(node.module)
-    for block in trees()["lyceum_warp"].body
-    if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
-    for node in ast.walk(block)
-    if isinstance(node, ast.ImportFrom)
-    for alias in node.names
-}
-"""The public names and their modules, as type checkers see them."""
 
 
 UPSTREAM = "lyceum_warp.support.upstream"
@@ -224,8 +217,16 @@ def test_only_upstream_uses_private_names_of_other_packages() -> None:
 
 
 def test_public_names_are_the_same_for_type_checkers_and_at_run_time() -> None:
-    assert sorted(lw.__all__) == sorted(PUBLIC)
-    for name, module in PUBLIC.items():
+    public = {
+        alias.name: str(node.module)
+        for block in trees()["lyceum_warp"].body
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
+        for node in ast.walk(block)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert sorted(lw.__all__) == sorted(public)
+    for name, module in public.items():
         assert getattr(lw, name) is getattr(importlib.import_module(module), name)
 
 
@@ -249,10 +250,10 @@ def test_importing_the_package_loads_neither_torch_nor_warp_nor_mujoco() -> None
     assert in_new_process(program) == "[]\n"
 
 
-@pytest.mark.parametrize("first", ["import warp as wp", "from lyceum_warp import Row"])
-def test_warp_prints_nothing_for_any_import_order_of_a_task_file(first: str) -> None:
-    program = f"""
-        {first}
+@pytest.mark.long
+def test_warp_prints_nothing_if_a_task_file_imports_it_first() -> None:
+    """``tests/support/test_warp_log.py`` imports the package first."""
+    program = """
         import warp as wp
         import lyceum_warp as lw
         print(lw.make("point_mass", nworld=1).nworld)

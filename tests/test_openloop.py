@@ -216,11 +216,11 @@ def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None
 
 
 def on_engines(task: str) -> list[object]:
-    """Return a task's cases on both engines; on the Warp engine a few tasks cover most elements of a model."""
-    few = task in ("hopper", "humanoid", "adroit_pen", "soft_ball", "reach")
+    """Return a task's cases on both engines, most of them long."""
+    alike = task.startswith("dm/") or (task.endswith("_velocity") and task != "go1_velocity")
     return [
-        pytest.param(task, "mujoco", marks=[pytest.mark.long] if task.startswith("dm/") else []),
-        pytest.param(task, "warp", marks=[] if few else [pytest.mark.long]),
+        pytest.param(task, "mujoco", marks=[pytest.mark.long] if alike else []),
+        pytest.param(task, "warp", marks=[pytest.mark.long] if task != "reach" else []),
     ]
 
 
@@ -246,6 +246,10 @@ def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return calls
 
 
+@pytest.mark.quick(
+    "memory-mujoco", "worlds-mujoco", "one_substep-mujoco", "rk4-mujoco", "keepsake-mujoco", "control-mujoco",
+    "control_worlds-mujoco", "sensors-mujoco", "memory-warp", "sensors-warp",
+)  # fmt: skip
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(
     ("task", "native", "options"),
@@ -281,6 +285,7 @@ def test_parameters_may_change_between_rollouts(engine: str) -> None:
         check_against_stepping(loop, env)
 
 
+@pytest.mark.quick("Forgetful-mujoco", "Servo-warp")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Forgetful, Servo])
 def test_worlds_draw_from_the_given_keys(task: type[lw.Task], engine: str) -> None:
@@ -309,6 +314,7 @@ def test_keys_that_do_not_fit_are_refused(shared_env: SharedEnv) -> None:
             OpenLoop(env, 3, keys=wrong)
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_terminated_is_judged_for_each_state_separately(engine: str) -> None:
     """The arm swings out and back in; only the states outside are terminal."""
@@ -326,6 +332,7 @@ def test_terminated_is_judged_for_each_state_separately(engine: str) -> None:
 BAD = 1
 
 
+@pytest.mark.quick("nan-Servo-warp", "nan-Forgetful-mujoco", "inf-Servo-mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Forgetful, Servo])
 @pytest.mark.parametrize("number", [np.nan, np.inf])
@@ -406,6 +413,10 @@ class PushedRunaway(Runaway):
     control = push_ball
 
 
+@pytest.mark.quick(
+    "1000000000.0-5-control-warp", "1000000000.0-5-native-mujoco", "1000000000.0-1-rk4-mujoco",
+    "10000000000000.0-1-native-mujoco",
+)  # fmt: skip
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("how", ["native", "rk4", "control"])
 @pytest.mark.parametrize("size, step", [(1e9, 1), (1e9, 5), (1e13, 1)])  # MuJoCo ignores controls beyond 1e10
@@ -437,6 +448,7 @@ def test_a_world_that_diverges_has_a_fault_and_changes_no_other(size: float, how
             assert torch.equal(again[name], value), f"{name} of a rollout after one that diverged"
 
 
+@pytest.mark.quick("PushedRunaway")
 @pytest.mark.parametrize("task", [Runaway, PushedRunaway])
 def test_a_fault_in_the_middle_is_reported_at_the_end(task: type[lw.Task]) -> None:
     """A ball is pushed into the floor, which overflows the constraint buffer, and then flies up again."""
@@ -461,6 +473,7 @@ def test_automatic_resets_and_bad_horizons_are_refused(shared_env: SharedEnv) ->
             OpenLoop(env, horizon)  # type: ignore[arg-type]
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_several_states_divide_the_worlds_evenly(engine: str) -> None:
     env = lw.make("hopper", engine=engine, nworld=6, autoreset=False, seed=1)

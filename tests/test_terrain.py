@@ -218,6 +218,7 @@ def test_walking_far_raises_a_worlds_level_and_standing_lowers_it(shared_env: Sh
     assert (episode(0.0, 0.0)[easy] == 1.0).all()
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_a_task_on_terrain_keeps_all_rules(engine: str) -> None:
     check_task(OnTerrain, engine=engine, steps=20)

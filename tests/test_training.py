@@ -156,6 +156,7 @@ def test_an_error_in_the_callback_leaves_a_complete_run(six: Path, tmp_path: Pat
     assert metrics(folder) == metrics(six)
 
 
+@pytest.mark.quick("KeyboardInterrupt")
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, FloatingPointError])
 def test_an_interrupted_iteration_leaves_the_last_save(
     error: type[BaseException], six: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -97,8 +97,11 @@ def found_in(text: str, exempt: tuple[str, ...] = ()) -> list[str]:
     for line in text.splitlines():
         starts.append(len(flat))
         flat += re.sub(r"^\s*(#:?\s+)?", "", line).replace("_", " ") + " "
-    found = []
+    found, lower = [], flat.lower()
     for pattern, replacement in SETTLED.items():
+        # a search without cases and from a letter, not from a boundary, is ten times as fast and excludes most texts
+        if re.search(pattern.removeprefix(r"\b"), lower) is None:
+            continue
         for match in re.finditer(pattern, flat, re.IGNORECASE):
             found.append((bisect.bisect_right(starts, match.start()), match.group(), replacement))
     return [f"{line}: {phrase!r} (write: {replacement})" for line, phrase, replacement in sorted(found)]

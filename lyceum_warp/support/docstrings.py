@@ -8,23 +8,31 @@ from the source and appends them to the docstring of the class. An overloaded Wa
 import ast
 import dataclasses
 import enum
+import functools
 import inspect
 import itertools
-import textwrap
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
 Class = TypeVar("Class", bound=type)
 
 
+@functools.lru_cache(maxsize=1)
+def _statements(source: str) -> list[ast.stmt]:
+    """Parse a module, whose classes are usually documented one after another."""
+    return ast.parse(source).body
+
+
 def attribute_docs(cls: type) -> dict[str, str]:
     """The docstrings of a class's attributes by name, in source order; empty if there is no source."""
     try:
-        tree = ast.parse(textwrap.dedent(inspect.getsource(cls)))
-    except (OSError, TypeError, SyntaxError):
+        lines, _ = inspect.findsource(inspect.getmodule(cls) or cls)
+        body: list[ast.stmt] = _statements("".join(lines))
+        for name in cls.__qualname__.split("."):
+            body = next(each.body for each in body if isinstance(each, ast.ClassDef) and each.name == name)
+    except (OSError, TypeError, SyntaxError, StopIteration):
         return {}
     docs: dict[str, str] = {}
-    body = tree.body[0].body if isinstance(tree.body[0], ast.ClassDef) else []
     for statement, following in itertools.pairwise(body):
         text = following.value if isinstance(following, ast.Expr) else None
         if not (isinstance(text, ast.Constant) and isinstance(text.value, str)):

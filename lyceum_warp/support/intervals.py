@@ -1,11 +1,16 @@
 """Compute confidence intervals of means and of differences between paired proportions."""
 
+import functools
 import math
 from collections.abc import Sequence
 
 import numpy as np
 
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
+
+# a figure has intervals at hundreds of points, most of them of equally many values
+@functools.lru_cache(maxsize=256)
 def student_quantile(probability: float, freedom: float) -> float:
     """Compute a quantile of Student's t distribution, by bisection on the integral of its density.
 
@@ -14,13 +19,12 @@ def student_quantile(probability: float, freedom: float) -> float:
         freedom: Degrees of freedom.
     """
     log_factor = math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2) - 0.5 * math.log(freedom * math.pi)
-    # x = sqrt(freedom) tan(angle) turns the integral into one over a finite interval, with a smooth integrand
-    nodes, weights = np.polynomial.legendre.leggauss(64)
 
+    # with x = sqrt(freedom) tan(angle) the integral is over a finite interval and its integrand is smooth
     def beyond_half(angle: float) -> float:
-        at = 0.5 * angle * (nodes + 1.0)
+        at = 0.5 * angle * (_NODES + 1.0)
         density = math.sqrt(freedom) * np.exp(log_factor) * np.cos(at) ** (freedom - 1)
-        return 0.5 * angle * float(weights @ density)
+        return 0.5 * angle * float(_WEIGHTS @ density)
 
     low, high = 0.0, 0.5 * math.pi
     for _ in range(100):

@@ -6,7 +6,6 @@ import pytest
 import torch
 from conftest import SharedEnv
 from metered_task import Metered
-from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
 import lyceum_warp as lw
@@ -130,8 +129,11 @@ def test_bad_environments_and_actions_are_refused(env: lw.Env, shared_env: Share
         endless.episode_length_buf = torch.zeros(2, dtype=torch.long)
 
 
+@pytest.mark.long
 def test_rsl_rls_own_runner_learns(tmp_path: Path) -> None:
     """The best possible return is about 250; an untrained policy has a negative mean return."""
+    from rsl_rl.runners import OnPolicyRunner  # the import takes a second
+
     env = lw.make("point_mass", nworld=32)
     few = env.replicate(nworld=16)
     config = runner_config(env, lw.PPOConfig(hidden=(32, 32), value_hidden=(32, 32)))
@@ -150,6 +152,7 @@ def test_rsl_rls_own_runner_learns(tmp_path: Path) -> None:
 
 
 def test_rsl_rls_writer_gets_the_metrics(env: lw.Env, tmp_path: Path) -> None:
+    from rsl_rl.runners import OnPolicyRunner
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     config = runner_config(env, lw.PPOConfig(hidden=(8,), value_hidden=(8,), num_steps=10))

@@ -3,11 +3,6 @@ from typing import Any
 import pytest
 import torch
 from full_task import Full
-from tensordict.nn import TensorDictModule
-from torchrl.collectors import Collector
-from torchrl.envs.libs.gym import GymWrapper
-from torchrl.envs.utils import check_env_specs
-from torchrl.objectives.value import GAE
 
 import lyceum_warp as lw
 from lyceum_warp.gym import GymnasiumVectorEnv
@@ -26,12 +21,16 @@ CASES = [
 
 
 def wrapped(mode: str, *, tensors: bool, task: Any) -> Any:
+    from torchrl.envs.libs.gym import GymWrapper  # the import takes a second
+
     env = GymnasiumVectorEnv(task, N, autoreset_mode=mode, torch=tensors)
     return GymWrapper(env, convert_actions_to_numpy=not tensors)
 
 
 @pytest.mark.parametrize("mode, tensors, task", CASES)
 def test_a_rollout_returns_the_numbers_of_the_wrapped_environment(mode: str, tensors: bool, task: Any) -> None:
+    from torchrl.envs.utils import check_env_specs
+
     env, twin = wrapped(mode, tensors=tensors, task=task), lw.make(task, nworld=N)
     check_env_specs(env)
     key, group = ("critic", "critic") if task is Full else ("observation", "policy")
@@ -54,6 +53,10 @@ def test_a_rollout_returns_the_numbers_of_the_wrapped_environment(mode: str, ten
 
 
 def test_a_collector_and_advantages_work() -> None:
+    from tensordict.nn import TensorDictModule
+    from torchrl.collectors import Collector
+    from torchrl.objectives.value import GAE
+
     env = wrapped("SameStep", tensors=True, task="hopper")
     policy = TensorDictModule(torch.nn.Linear(11, 3), in_keys=["observation"], out_keys=["action"])
     value = TensorDictModule(torch.nn.Linear(11, 1), in_keys=["observation"], out_keys=["state_value"])

@@ -99,15 +99,12 @@ CASES: dict[str, dict[str, Any]] = {
 }
 ON_WARP = ("reach", "stop", "value", "covariance", "model", "cem_smoothed", "linear", "cubic_cem")
 """Cases that run each kernel once on the Warp engine."""
+LIKE_OTHERS = ("negative", "mppi_without_plan", "without_plan", "cem_of_one", "zero", "knot_for_each_step", "one_knot")
+"""Cases that are left to make test-all."""
 
 
-@pytest.mark.parametrize(
-    "case, engine",
-    [
-        *((case, "mujoco") for case in CASES),
-        *(pytest.param(case, "warp", marks=pytest.mark.long if case in ("reach", "model") else ()) for case in ON_WARP),
-    ],
-)
+@pytest.mark.quick(*(f"{case}-mujoco" for case in CASES if case not in LIKE_OTHERS), "cubic_cem-warp")
+@pytest.mark.parametrize("case, engine", [*((case, "mujoco") for case in CASES), *((case, "warp") for case in ON_WARP)])
 def test_plans_equal_the_plain_versions(case: str, engine: str) -> None:
     check_against(Plain, engine, **CASES[case])
 
@@ -204,6 +201,7 @@ def test_equal_seeds_give_equal_plans_and_a_reset_restarts_the_noise(update: str
     assert plan.seeds == [5] and same(numbers(plan, state), different)
 
 
+@pytest.mark.quick("mean-mujoco", "worst-mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("risk", ["mean", "worst"])
 def test_plans_in_several_models_equal_the_plain_versions(risk: Any, engine: str) -> None:
@@ -375,6 +373,7 @@ def place_in_warp(obs: Row[float]) -> float:
     return -2.0 * wp.abs(obs[0] - obs[4]) - 0.1 * obs[2] * obs[3]
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_equal_values_in_torch_and_in_warp_give_equal_plans(engine: str) -> None:
     settings = POINT | dict(engine=engine, noise=0.5, discount=0.9, iterations=2)
@@ -392,6 +391,7 @@ def test_equal_values_in_torch_and_in_warp_give_equal_plans(engine: str) -> None
         assert not torch.allclose(without.returns, in_torch.returns, atol=0.01)
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_value_function_gets_the_step_at_the_end_of_the_plan(engine: str) -> None:
     value = lw.ValueFunction(6, (16,), scale=50.0, time_orders=2, generator=torch.Generator().manual_seed(0))
@@ -441,6 +441,10 @@ def test_a_value_that_does_not_fit_is_refused_when_the_planner_is_made(value: An
         MPPI("point_mass", horizon=3, samples=7, value=value)
 
 
+@pytest.mark.quick(
+    "torch-mujoco", "cem with knots-warp", "warp-mujoco", "mppi with knots-mujoco", "cem-mujoco",
+    "predictive sampling-mujoco",
+)  # fmt: skip
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("words", [
     *(dict(value=value, iterations=3) for value in (None, place, place_in_warp)), *UPDATES.values(),
@@ -466,6 +470,7 @@ def drive(task: str, steps: int, seed: int, **settings: Any) -> tuple[lw.Env, np
     return plant, np.array(rewards), np.array(evals)
 
 
+@pytest.mark.quick("0")
 @pytest.mark.parametrize("seed", range(3))
 def test_reach_succeeds(seed: int) -> None:
     plant, rewards, evals = drive("reach", 75, seed)
@@ -515,6 +520,7 @@ def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
     return total / runs, squares**0.5 / runs
 
 
+@pytest.mark.quick("TossedAfter")
 @pytest.mark.parametrize("task", [TossedAfter, TossedAfterWithControl])
 def test_a_planner_cannot_exploit_a_coin_tossed_after_the_action(task: type[lw.Task]) -> None:
     mean, deviation = earned(task)
@@ -523,7 +529,7 @@ def test_a_planner_cannot_exploit_a_coin_tossed_after_the_action(task: type[lw.T
 
 
 def test_a_planner_exploits_a_coin_tossed_before_the_action() -> None:
-    mean, _ = earned(TossedBefore)
+    mean, _ = earned(TossedBefore, runs=5)
     assert mean > 80
 
 

@@ -42,6 +42,7 @@ def states_of(task: Any, count: int) -> torch.Tensor:
     return lw.make(task, nworld=count, autoreset=False, seed=3).get_state()
 
 
+@pytest.mark.quick(*(f"{case}-mujoco" for case in CASES))
 @pytest.mark.parametrize("case, engine", [*((c, "mujoco") for c in CASES), *((c, "warp") for c in ON_WARP)])
 def test_plans_for_several_plants_equal_single_planners(case: str, engine: str) -> None:
     settings = dict(horizon=6, samples=8, temperature=0.5, engine=engine) | CASES[case]

@@ -81,6 +81,7 @@ class Own(nn.Module):
 
 
 @RUNS
+@pytest.mark.quick("policy.pt2-run_torch")
 def test_a_users_network_is_exported(name: str, run: Run, tmp_path: Path) -> None:
     policy = trained(network=Own(), normalize=True)
     before, modes = [p.clone() for p in policy.parameters()], [m.training for m in policy.modules()]

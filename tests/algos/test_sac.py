@@ -17,8 +17,9 @@ from lyceum_warp.algos.networks import Normalizer
 from lyceum_warp.algos.sac import SACIteration
 
 SMALL = lw.SACConfig(
-    hidden=(8,), value_hidden=(8, 8), num_steps=12, warmup=60, batch=16, replay=80, mean_every=2, mean_episodes=2
-)
+    hidden=(8,), value_hidden=(8, 8), num_steps=12, warmup=60, updates=2, batch=16, replay=80, mean_every=2,
+    mean_episodes=2,
+)  # fmt: skip
 
 
 @pytest.fixture

@@ -68,18 +68,18 @@ def test_standard_deviations_of_a_walking_robot_are_symmetric(shared_env: Shared
     assert next(augmented).kl > 0.0 and augmented.value.group == "critic"
 
 
-@pytest.mark.parametrize("symmetry", ["loss", "augment"])
-def test_losses_and_mirrored_samples_make_a_policy_more_symmetric(symmetry: str, env: lw.Env) -> None:
+def test_losses_and_mirrored_samples_make_a_policy_more_symmetric(env: lw.Env) -> None:
     found = {}
-    for name in ("none", symmetry):
+    for name in ("none", "loss", "augment"):
         ppo = learner(env, name, schedule="fixed", learning_rate=3e-3)
         before = asymmetry(ppo.policy, env)
         for _ in range(15):
             next(ppo)
         found[name] = asymmetry(ppo.policy, env) / before
-    assert found[symmetry] < 0.6 * found["none"]
+    assert max(found["loss"], found["augment"]) < 0.6 * found["none"]
 
 
+@pytest.mark.quick("exact")
 @pytest.mark.parametrize("symmetry", ["exact", "loss", "augment"])
 def test_a_symmetric_run_resumes_bit_for_bit(symmetry: str, tmp_path: Path) -> None:
     def made() -> lw.PPO:
@@ -119,7 +119,7 @@ def test_a_task_without_a_mirror_image_is_refused(shared_env: SharedEnv) -> None
 @pytest.mark.parametrize("symmetry", ["exact", "loss", "augment"])
 def test_sac_learns_symmetric_policies_and_keeps_them(symmetry: str, env: lw.Env, tmp_path: Path) -> None:
     config = lw.SACConfig(
-        hidden=(16,), value_hidden=(16,), batch=64, warmup=64, num_steps=40, mean_every=0, symmetry=symmetry
+        hidden=(16,), value_hidden=(16,), batch=64, warmup=64, num_steps=40, updates=4, mean_every=0, symmetry=symmetry
     )
     env.rand_reset(1)
     sac = lw.SAC(env, config=config, seed=1)

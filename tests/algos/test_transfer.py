@@ -18,11 +18,11 @@ def still(obs: torch.Tensor) -> torch.Tensor:
 def test_both_engines_play_the_same_episodes(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", horizon=200)
     before, shown = env.get_state(), []
-    found = lw.transfer(env, still, 24, seed=3, physics=False, progress=lambda *now: shown.append(now))
+    found = lw.transfer(env, still, 12, seed=3, physics=False, progress=lambda *now: shown.append(now))
     (engines,) = found.comparisons
     assert (engines.first, engines.second, engines.faults) == ("C engine", "Warp engine on cpu", (0, 0))
     returns, lengths, falls = engines.differences
-    own = lw.evaluate(env.replicate(nworld=24), still, 24, seed=3)
+    own = lw.evaluate(env.replicate(nworld=12), still, 12, seed=3)
     assert returns.first == pytest.approx(own.returns.mean().item())
     assert lengths.first == pytest.approx(own.lengths.mean().item())
     assert falls.first == pytest.approx(own.terminated.mean().item())

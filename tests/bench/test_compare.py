@@ -48,6 +48,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return json.loads(out.read_text())
 
 
+@pytest.mark.long
 def test_a_changed_reward_is_reported_with_its_numbers_and_nothing_else(report: dict[str, Any]) -> None:
     (unit,) = (unit for unit in report["units"] if unit["name"] == "env/point_mass/mujoco")
     found = {each["name"].removeprefix("env/point_mass/mujoco/"): each for each in unit["differences"]}
@@ -64,6 +65,7 @@ def test_a_changed_reward_is_reported_with_its_numbers_and_nothing_else(report: 
     assert old == new
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "task, text",
     [("cartpole", "RuntimeError: broken on purpose"), ("cartpole_swingup", "the process ended with 3")],
@@ -82,6 +84,7 @@ def test_a_working_tree_equals_itself(capsys: pytest.CaptureFixture[str]) -> Non
     assert lines[-1].startswith("no difference: ") and " arrays in 2 units" in lines[-1]
 
 
+@pytest.mark.long
 def test_a_package_that_cannot_be_imported_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy = copied(tmp_path, {"__init__.py": ("import importlib\n", "raise RuntimeError('no package')\n")})
     assert compare.run(compare.Options(str(ROOT), str(copy), tasks=("point_mass",), **QUICK)) == 1

@@ -27,13 +27,13 @@ def test_equivalence_needs_a_small_difference_and_enough_seeds() -> None:
     random = np.random.default_rng(0)
     for difference, seeds, verdict in ((0.0, 20, "equivalent"), (0.0, 4, "not shown"), (1.0, 20, "not shown"),
                                        (2.0, 20, "different")):  # fmt: skip
-        a, b = random.normal(size=(2, 100, seeds))
+        a, b = random.normal(size=(2, 40, seeds))
         found = [equivalence.equivalence(one, other + difference)["verdict"] for one, other in zip(a, b, strict=True)]
-        assert found.count(verdict) > 70
+        assert found.count(verdict) > 28
 
 
 def test_different_engines_are_seldom_called_equivalent() -> None:
     random = np.random.default_rng(1)
-    a, b = random.normal(size=(2, 400, 20))
+    a, b = random.normal(size=(2, 100, 20))
     wrong = sum(equivalence.equivalence(x, y + 1.0)["verdict"] == "equivalent" for x, y in zip(a, b, strict=True))
-    assert wrong <= 30  # 5 % of 400 are 20; the margin is only an estimate
+    assert wrong <= 10  # 5 % of 100 are 5; the margin is only an estimate

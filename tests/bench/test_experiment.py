@@ -223,6 +223,7 @@ def measure(case, options):
 """
 
 
+@pytest.mark.long
 def test_cases_run_in_subprocesses_on_separate_cores(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

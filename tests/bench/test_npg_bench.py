@@ -69,6 +69,7 @@ def test_gymnasiums_first_episodes_are_as_short_as_ours(mode: str) -> None:
     assert fed.step[:, 0].tolist() == [995, 996, 997, 998, 999, 0, 1, 2]
 
 
+@pytest.mark.quick("npg")
 @pytest.mark.parametrize("contestant", ["npg", "npg_gymnasium"])
 def test_a_run_yields_a_curve(contestant: str) -> None:
     result = npg.measure(case(contestant), npg.Options(short=True))

@@ -283,11 +283,9 @@ def tab(shared_tab: Tab) -> Tab:
     return shared_tab
 
 
+@pytest.mark.long
 def test_keys_and_buttons_pause_step_and_choose_a_controller(tab: Tab) -> None:
     viewer = tab.viewer
-    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{43}/", tab.page.url)  # without the token
-    assert tab.page.evaluate("document.cookie") == ""
-    assert not [line for line in tab.log if line.startswith("error")]
     before = viewer.session.stage.env.get_state()
     tab.press("Shift+ArrowRight", lambda: viewer.status.step >= 50)
     tab.press("ArrowRight", lambda: viewer.status.step >= 51)
@@ -301,6 +299,7 @@ def test_keys_and_buttons_pause_step_and_choose_a_controller(tab: Tab) -> None:
     tab.click_near(*LEFT, lambda: viewer.status.controller == "left")
 
 
+@pytest.mark.long  # a double click needs frames within 0.3 s, so without a GPU it needs many attempts
 def test_a_body_is_pushed_by_dragging(tab: Tab) -> None:
     viewer = tab.viewer
     middle = tab.place()
@@ -323,6 +322,7 @@ def test_a_body_is_pushed_by_dragging(tab: Tab) -> None:
     tab.wait(lambda: not viewer.window.given[-1].forces.any())  # type: ignore[union-attr]
 
 
+@pytest.mark.long
 def test_an_episode_is_scrubbed_and_played(tab: Tab) -> None:
     viewer = tab.viewer
     viewer.window.extra += [SetMode("playback"), Seek(0), SetBackwards(False)]
@@ -339,6 +339,9 @@ def test_an_episode_is_scrubbed_and_played(tab: Tab) -> None:
 
 def test_the_page_has_a_title_and_links_to_new_files(tab: Tab, tmp_path: Path) -> None:
     assert tab.page.title() == "block"
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{43}/", tab.page.url)  # without the token
+    assert tab.page.evaluate("document.cookie") == ""
+    assert not [line for line in tab.log if line.startswith("error")]
     file = tmp_path / "recorded.html"
     file.write_text("<p>recorded")
     tab.viewer.session.stage.videos.files.append(file)

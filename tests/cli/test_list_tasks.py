@@ -122,6 +122,7 @@ def test_a_broken_task_is_listed_with_its_mistake(
     assert shown in out
 
 
+@pytest.mark.long
 def test_a_closed_pipe_ends_the_list_quietly() -> None:
     """The reader closes the pipe before the first line."""
     command = f"{sys.executable} -m lyceum_warp.cli tasks hopper | true"

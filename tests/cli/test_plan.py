@@ -3,8 +3,6 @@ import inspect
 import json
 import re
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +21,6 @@ from lyceum_warp.cli import plan as plan_command
 from lyceum_warp.cli.display import PlanDisplay
 from lyceum_warp.cli.plan import Settings
 
-# tests may run in the background, where a shell makes its children ignore SIGINT
-TAKE_SIGINT = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
 SMALL = ["--horizon", "10", "--samples", "8", "--temperature", "0.01", "--noise", "0.3", "--steps", "40"]
 
 
@@ -276,24 +272,24 @@ def test_a_folder_that_is_not_empty_is_refused(tmp_path: Path, capsys: pytest.Ca
     assert "--resume" not in (error := capsys.readouterr().err) and "holds a run: give another folder" in error
 
 
-def test_an_interrupt_keeps_complete_episodes(tmp_path: Path) -> None:
+def test_an_interrupt_keeps_complete_episodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    steps = []
+
+    def seventh_of_the_third(display: PlanDisplay, now: lw.ControlProgress) -> None:
+        steps.append(now.step)
+        if len(steps) == 2 * 40 + 7:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(PlanDisplay, "__call__", seventh_of_the_third)
     out = tmp_path / "run"
-    argv = ["plan", "point_mass", "--out", str(out), *SMALL, *QUIET, "--episodes", "100000"]
-    program = f"{TAKE_SIGINT}import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"
-    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if "episode 2/" in line:
-                process.send_signal(signal.SIGINT)
-                break
-        rest = process.stdout.read()
-    assert process.returncode == 130
+    assert interrupted(["plan", "point_mass", "--out", str(out), *SMALL, *QUIET, "--episodes", "100000"]) == 130
+    shown = capsys.readouterr().out
     files = sorted(out.glob("episode-*.npz"))
-    part = f"the interrupted episode is in {files[-1].name}" in rest
-    whole = len(files) - part
-    assert f"after {whole} episodes" in rest and whole >= 2
-    assert all(Trajectory.load(path).steps == 40 for path in files[:whole])
-    assert json.loads((out / "report.json").read_text())["episodes"] == whole
+    assert "after 2 episodes" in shown and f"the interrupted episode is in {files[-1].name}" in shown
+    assert [Trajectory.load(path).steps for path in files] == [40, 40, 7]
+    assert json.loads((out / "report.json").read_text())["episodes"] == 2
 
 
 @pytest.mark.parametrize("mode", [[], ["--real-time"]])

@@ -150,7 +150,10 @@ def physics(env: lw.Env) -> tuple[int, int, int, bool]:
     return opt.integrator, opt.iterations, opt.ls_iterations, env.options.physics.deterministic
 
 
-def test_a_run_keeps_its_physics(tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_keeps_its_physics(
+    tmp_path: Path, made_envs: list[lw.Env], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(display, "write_video", lambda env, states, path, **options: path)
     out = tmp_path / "run"
     options = ["--integrator", "euler", "--solver", "iterations=7", "--solver", "ls_iterations=9", "--deterministic"]
     assert train(out, "--iterations", "1", "--no-transfer", *options, task="hopper") == 0  # its own integrator is RK4
@@ -178,8 +181,8 @@ def test_physics_by_name_are_saved_as_options_and_eval_replaces_them(
 ) -> None:
     line = "    physics = {'fast': lw.PhysicsOptions(integrator='euler', timestep=0.004, frame_skip=2)}\n"
     task = task_file("fast.py", tiny_task.changed(("    model", f"{line}    model")))
-    out = tmp_path / "run"
-    assert train(out, "--iterations", "1", "--physics", "fast", "--cone", "elliptic", task=str(task)) == 0
+    out, short = tmp_path / "run", ("--horizon", "40", "--no-transfer")
+    assert train(out, "--iterations", "1", "--physics", "fast", "--cone", "elliptic", *short, task=str(task)) == 0
     given = {"integrator": "euler", "timestep": 0.004, "frame_skip": 2, "cone": "elliptic"}
     assert Run.open(out).config["physics"] == given
     for flags, timestep in (([], 0.004), (["--physics", "exact"], 0.002)):
@@ -285,6 +288,7 @@ def test_resume_refuses_broken_checkpoints(trained: Path, tmp_path: Path, capsys
         assert (tmp_path / folder / "metrics.csv").read_bytes() == (trained / "metrics.csv").read_bytes()
 
 
+@pytest.mark.quick("a flipped bit")
 @pytest.mark.parametrize("damage", ["cut off", "a flipped bit"])
 def test_resume_falls_back_from_a_broken_checkpoint_to_the_previous_one(
     damage: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -388,6 +392,7 @@ def assert_continues(out: Path, output: str, trained: Path) -> None:
     assert len(metrics(out)) == done + 1
 
 
+@pytest.mark.quick("step", "save")
 @pytest.mark.parametrize("moment", ["step", "move", "state_dict", "save"])
 def test_an_interrupted_run_ends_after_the_iteration_and_continues(
     moment: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -435,6 +440,7 @@ def test_a_second_interrupt_ends_a_run_at_once_and_it_continues_from_its_last_sa
     assert metrics(out) == metrics(trained)
 
 
+@pytest.mark.long
 def test_a_killed_run_continues(trained: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "100000"]

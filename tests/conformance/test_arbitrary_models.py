@@ -102,12 +102,16 @@ def sensing(model: str) -> type[lw.Task]:
     return type("Sensing", (Sensing,), {"model": spec, "obs": obs, **own})
 
 
+@pytest.mark.quick(
+    "flex-warp", "flex-mujoco", "sleep-mujoco", "mocap-warp", "keyframes-mujoco", "delays-warp", "equalities-mujoco"
+)
 @pytest.mark.parametrize("engine", OPTIONS)
 @pytest.mark.parametrize("model", MOVING.values(), ids=MOVING)
 def test_a_model_keeps_the_rules(model: str, engine: str) -> None:
     check_task(moving(model), engine=engine, **OPTIONS[engine])
 
 
+@pytest.mark.quick("delayed sensors-warp", "welds and sensors-mujoco")
 @pytest.mark.parametrize("engine", OPTIONS)
 @pytest.mark.parametrize("model", SENSING.values(), ids=SENSING)
 def test_a_model_with_sensors_keeps_the_rules(model: str, engine: str) -> None:
@@ -117,6 +121,7 @@ def test_a_model_with_sensors_keeps_the_rules(model: str, engine: str) -> None:
 # plugins, and other features that MuJoCo Warp lacks
 
 
+@pytest.mark.quick("'mjTRN_SO3'] not supported", "Actuator plugins not supported")
 @pytest.mark.parametrize("model", PLUGINS.values(), ids=PLUGINS)
 def test_a_model_that_only_the_mujoco_engine_supports_keeps_the_rules(model: str) -> None:
     check_task(moving(model), engine="mujoco", nworld=2, steps=20, frame_skip=2, checks=MODEL_CHECKS)
@@ -240,6 +245,7 @@ class Pushed(lw.Task):
     horizon = 15
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", OPTIONS)
 def test_a_model_without_actuators_keeps_the_rules(engine: str) -> None:
     check_task(Pushed, engine=engine, **OPTIONS[engine])

@@ -1,7 +1,7 @@
 """Check the rules for every task of the package on both engines, and for some tasks on a toy engine."""
 
 import pytest
-from conftest import SAME_FUNCTIONS, SAME_MODELS, settle
+from conftest import settle
 from toy_engine import ToyEngine
 
 import lyceum_warp as lw
@@ -47,14 +47,12 @@ def options(task: str, engine: str) -> dict[str, int]:
     return {"steps": 100 if every else 40, "frame_skip": min(2, find_task(task).frame_skip)}
 
 
-@pytest.mark.parametrize(
-    ("engine", "task"),
-    [
-        pytest.param(engine, task, marks=pytest.mark.long if task in alike else ())
-        for engine, alike in (("mujoco", (*SAME_FUNCTIONS, "g1_velocity")), ("warp", (*SAME_FUNCTIONS, *SAME_MODELS)))
-        for task in PACKAGE
-    ],
-)
+# contacts; a robot with events and drawn dynamics; no contacts; a planner's task; the same on the Warp engine
+@pytest.mark.quick(
+    "mujoco-hopper", "mujoco-go1_velocity", "mujoco-cartpole_swingup", "mujoco-reach",
+    "warp-go1_velocity", "warp-half_cheetah", "warp-point_mass",
+)  # fmt: skip
+@pytest.mark.parametrize(("engine", "task"), [(engine, task) for engine in EVERY_RULE for task in PACKAGE])
 def test_a_task_keeps_the_rules(task: str, engine: str) -> None:
     checks = CHECKS if task in EVERY_RULE[engine] else OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
     report = check_task(task, engine=engine, checks=checks, **options(task, engine))
@@ -74,6 +72,7 @@ def test_a_task_keeps_the_other_rules(task: str, engine: str) -> None:
     check_task(task, engine=engine, checks=checks, **options(task, engine))
 
 
+@pytest.mark.quick("point_mass")
 @pytest.mark.parametrize("task", ["hopper", "point_mass"])
 def test_a_task_keeps_the_rules_on_a_third_engine(task: str) -> None:
     assert f"{task} on the toy engine" in str(check_task(task, engine=ToyEngine, steps=200))

@@ -206,11 +206,13 @@ def test_a_broken_rule_is_reported(
         check_task(task, engine="mujoco", steps=100, checks=[check])
 
 
+@pytest.mark.quick("Full")
 @pytest.mark.parametrize("task", [Full, Settled])
 def test_a_task_with_every_feature_keeps_the_rules(task: type[lw.Task]) -> None:
     check_task(task, engine="mujoco", steps=60)
 
 
+@pytest.mark.quick("Weighed-warp", "Practiced-warp", "Gifted-mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("task", [Weighed, Practiced, Gifted])
 def test_a_task_that_observes_lasting_values_keeps_the_rules(task: type[lw.Task], engine: str) -> None:

@@ -168,6 +168,7 @@ def test_an_exception_does_not_wait_for_an_unfinished_plan(env: lw.Env) -> None:
     assert took < 5
 
 
+@pytest.mark.long
 def test_a_program_ends_normally_while_mppi_plans() -> None:
     program = """
 import threading, time, torch, lyceum_warp as lw

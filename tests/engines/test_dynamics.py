@@ -155,6 +155,10 @@ CHANGES: Mapping[str, float] = {
 }  # fmt: skip
 
 
+@pytest.mark.quick(
+    *(f"MujocoEngine-{name}" for name in CHANGES),
+    *(f"WarpEngine-{name}" for name in ("wind", "tendon_frictionloss", "body_gravcomp", "geom_quat", "jnt_pos")),
+)  # fmt: skip
 @pytest.mark.parametrize("name", CHANGES)
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
 def test_a_field_that_is_zero_in_the_model_can_act_in_a_single_world(engine: type[Engine], name: str) -> None:
@@ -229,6 +233,12 @@ def test_a_model_that_becomes_nominal_again_runs_as_before(engine: type[Engine])
     np.testing.assert_array_equal(run(made), run(untouched))
 
 
+@pytest.mark.quick(
+    "MujocoEngine-implicitfast-current0",
+    "MujocoEngine-RK4-current1",
+    "ToyEngine-implicitfast-current0",
+    "WarpEngine-implicitfast-current0",
+)
 @pytest.mark.parametrize(("integrator", "current"), [("implicitfast", ()), ("RK4", ("xpos",))])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_rollout_honours_the_model_of_each_state(engine: type[Engine], integrator: str, current: tuple[str]) -> None:

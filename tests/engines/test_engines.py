@@ -205,6 +205,7 @@ def test_integrator_and_solver_options_reach_the_engine(engine: str) -> None:
     assert lw.make("point_mass", engine=engine).model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_fields_that_the_task_does_not_read_are_kept_if_listed(engine: str) -> None:
     """A sensor is enabled only if a listed field needs it."""

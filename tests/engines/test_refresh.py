@@ -171,6 +171,10 @@ def make(kind: type[Engine], sensors: str, equality: str = "") -> Engine:
     return engine
 
 
+@pytest.mark.quick(
+    "mujoco-cheap", "mujoco-velocities of tendons", "mujoco-limits", "mujoco-mixed", "mujoco-histories",
+    "warp-mixed", "warp-histories",
+)  # fmt: skip
 @pytest.mark.parametrize("sensors", SENSORS)
 def test_a_refresh_equals_a_full_forward_pass(kind: type[Engine], sensors: str) -> None:
     """Check restarts, steps, restored states and changed states, including sensor histories."""

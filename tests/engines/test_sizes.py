@@ -6,7 +6,15 @@ import pytest
 from conftest import TaskFile
 
 import lyceum_warp as lw
+from lyceum_warp.engines.warp import sizes
 from lyceum_warp.engines.warp.sizes import probe_sizes
+
+
+@pytest.fixture(autouse=True)
+def unknown_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Probe every model, also those of earlier runs of the tests."""
+    monkeypatch.setattr(sizes, "_known", {})
+
 
 WELDS = "".join(f'<weld body1="b{i}" active="false"/>' for i in range(8))
 BALLS = "".join(f'<body name="b{i}" pos="{i} 0 1"><freejoint/><geom size=".1"/></body>' for i in range(8))

@@ -186,6 +186,10 @@ def drawn_fields() -> list[Any]:
     return [name if constants else pytest.param(name, marks=pytest.mark.long) for name, constants in _FIELDS.items()]
 
 
+@pytest.mark.quick(
+    "cpu-body_mass", "cpu-body_inertia", "cpu-body_ipos", "cpu-qpos0", "cpu-dof_armature", "cpu-actuator_gear",
+    "cpu-geom_size", "cpu-geom_gap", "cpu-cam_pos", "cpu-tendon_armature",
+)  # fmt: skip
 @pytest.mark.parametrize("name", drawn_fields())
 def test_a_drawn_field_acts_as_in_an_edited_model(name: str, device: wp.Device) -> None:
     """Some fields are zero in the model. Results are bitwise equal if no constants are derived."""

@@ -15,9 +15,9 @@ from minimal_cases import COMMANDS, FILES, KEYWORDS
 
 FEW = {
     "file_attacks.py": {
-        "config.json": 2, "kept config.json": 1, "versions.json": 2, "metrics.csv": 2, "policy.pt": 2, "best.pt": 1,
-        "checkpoint.pt": 2, "previous.pt": 1, "episode.npz": 3, "kept model": 1, "kept table": 1, "model.xml": 2,
-        "table.npy": 2,
+        "config.json": 1, "kept config.json": 1, "versions.json": 1, "metrics.csv": 1, "policy.pt": 1, "best.pt": 1,
+        "checkpoint.pt": 1, "previous.pt": 1, "episode.npz": 1, "kept model": 1, "kept table": 1, "model.xml": 1,
+        "table.npy": 1,
     },
     "keyword_attacks.py": {
         "EnvOptions": 15, "PhysicsOptions": 15, "MPPIConfig": 15, "NPGConfig": 15, "make": 4, "MPPI": 4, "CEM": 2,
@@ -25,8 +25,8 @@ FEW = {
         "load_value": 6, "GaussianPolicy": 20, "ValueFunction": 20,
     },
     "command_attacks.py": {
-        "tasks": 1, "new": 2, "check": 2, "train": 2, "train --resume good": 1, "train --from good": 1, "eval": 2,
-        "export": 2, "plan": 2, "view": 2, "bench": 1,
+        "tasks": 1, "new": 1, "check": 1, "train": 1, "train --resume good": 1, "train --from good": 1, "eval": 1,
+        "export": 1, "plan": 1, "view": 1, "bench": 1,
     },
 }  # fmt: skip
 """Numbers of cases of each kind, by attack program."""

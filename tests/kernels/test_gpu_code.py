@@ -38,9 +38,8 @@ def test_shared_kernels_compile_for_a_gpu(made: list[wp.Kernel], tmp_path: Path)
     assert entries(compiled(made[0].module, tmp_path)) == len(made)
 
 
-@pytest.mark.parametrize(
-    "task", [Full, Variant, *(pytest.param(name, marks=pytest.mark.long) for name in lw.task_names())]
-)
+@pytest.mark.quick("Variant")
+@pytest.mark.parametrize("task", [Full, Variant, *lw.task_names()])
 def test_kernels_of_a_task_compile_for_a_gpu(task: type[lw.Task] | str, tmp_path: Path) -> None:
     made = kernels_of(lw.make(task, engine="mujoco").task.kernels)
     assert entries(compiled(made[0].module, tmp_path)) == len(made)

@@ -287,6 +287,7 @@ def test_a_cylinder_is_pushed_as_in_gymnasium() -> None:
     assert min(moved) > 5e-4  # m; an untouched cylinder does not move
 
 
+@pytest.mark.quick("ant")
 @pytest.mark.parametrize("task", WITH_FORCES)
 def test_gymnasiums_unchanged_class_differs_only_in_contact_forces(task: str) -> None:
     """With the Newton solver and without contact costs, everything except the contact forces agrees."""
@@ -355,7 +356,7 @@ def test_the_first_observation_equals_gymnasiums_in_the_same_state(task: str) ->
 
 
 RESETS = [
-    (task, times)
+    pytest.param(task, times, marks=() if times == 1.0 else pytest.mark.long)
     for task in TASKS
     for times in (1.0, 3.0)
     if times == 1.0 or "reset_noise_scale" in inspect.signature(unchanged(task)).parameters
@@ -438,15 +439,17 @@ def variants(default: Any) -> list[Any]:
 
 
 def cases() -> list[Any]:
-    """Return (task, parameter, variant) for every parameter. All variants after the first are marked long, except for
-    ranges."""
+    """Return (task, parameter, variant) for every parameter.
+
+    All variants after the first are marked long, and the humanoids, whose parameters are similar to the ant's.
+    """
     found = []
     for task in TASKS:
         for name, default in keywords(task).items():
             if name == "reset_noise_scale":
                 continue  # the tests of distributions above cover this parameter
             for i, variant in enumerate(variants(default)):
-                marks = pytest.mark.long if i and not isinstance(default, tuple) else ()
+                marks = pytest.mark.long if i or task.startswith("humanoid") else ()
                 found.append(pytest.param(task, name, variant, marks=marks))
     return found
 

@@ -229,6 +229,7 @@ def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
     return make
 
 
+@pytest.mark.quick("adroit_pen", "adroit_hammer")
 def test_random_actions_lead_to_the_same_numbers(make_pair: MakePair) -> None:
     """Run five episodes of 200 steps from random initial states; a quarter of the actions is out of range."""
     pair = make_pair()

@@ -46,7 +46,11 @@ def walking_policy(env: lw.Env) -> lw.GaussianPolicy:
 
 @pytest.mark.parametrize(
     ("task", "steps"),
-    [("go1_velocity", 25), ("spot_velocity", 25), pytest.param("g1_velocity", 10, marks=pytest.mark.long)],
+    [
+        ("go1_velocity", 25),
+        pytest.param("spot_velocity", 25, marks=pytest.mark.long),
+        pytest.param("g1_velocity", 10, marks=pytest.mark.long),
+    ],
 )
 def test_the_pages_loop_does_what_the_environment_does(
     page: dict[str, Any], task: str, steps: int, tmp_path: Path

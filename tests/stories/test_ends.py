@@ -106,6 +106,7 @@ def test_a_reset_clears_the_end_of_the_previous_episode() -> None:
         assert terminated == bool(env.env.get_terminated(env.env.get_state())[0]) and not truncated
 
 
+@pytest.mark.quick("0")
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_rule_gives_the_same_result_alone_and_after_the_other_rules(seed: int) -> None:
     rule = next(check for check in CHECKS if check.__name__ == "check_set_state_shows")

@@ -170,6 +170,7 @@ def test_getters_judge_states_with_the_dynamics_of_the_state() -> None:
     assert torch.equal(obs[:, 4], mass(env, after).float())
 
 
+@pytest.mark.quick("cost-128-mujoco", "noise-256-mujoco", "noise-256-warp")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(("name", "reason"), [("cost", lw.Done.REWARD), ("noise", lw.Done.OBSERVATION)])
 def test_a_number_that_is_not_finite_is_a_fault_of_its_world(name: str, reason: lw.Done, engine: str) -> None:
@@ -237,6 +238,7 @@ def test_model_fields_that_events_change_are_nominal_again_after_a_reset(engine:
     assert (damping == np.float32(0.2)).all()
 
 
+@pytest.mark.quick("Drawn-mujoco", "DrawnWithControl-mujoco", "DrawnWithControl-warp")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Drawn, DrawnWithControl])
 def test_a_rollout_uses_the_model_in_the_state_or_the_nominal_model(task: type[lw.Task], engine: str) -> None:
@@ -271,6 +273,7 @@ def test_a_rollout_uses_the_model_in_the_state_or_the_nominal_model(task: type[l
     assert not torch.equal(stepped(plain), stepped(state))
 
 
+@pytest.mark.quick("Drawn-mujoco", "DrawnWithControl-mujoco", "Drawn-warp")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Drawn, DrawnWithControl])
 def test_a_planner_uses_the_model_in_the_state_unless_nominal_model_is_set(task: type[lw.Task], engine: str) -> None:
@@ -307,6 +310,7 @@ def test_inputs_that_a_reset_draws_act_in_steps_and_in_rollouts(engine: str) -> 
     assert (env.obs[:, 0] > 1e-4).all() and (env.obs[:, 1] >= 5.0).all()
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_rollout_equals_steps_without_events(engine: str) -> None:
     env = lw.make(Full, nworld=3, engine=engine, autoreset=False, horizon=0)
@@ -332,6 +336,7 @@ def test_a_rollout_equals_steps_without_events(engine: str) -> None:
     assert changed.any(), "there were no events to leave out"
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_planner_plans_for_a_task_with_every_feature(engine: str) -> None:
     env = lw.make(Full, nworld=2, engine=engine)

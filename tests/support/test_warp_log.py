@@ -15,8 +15,18 @@ def printed(program: str) -> tuple[str, str]:
 
 
 @WITHOUT_GPU
-def test_an_environment_on_the_cpu_prints_nothing() -> None:
-    assert printed("import lyceum_warp as lw; lw.make('point_mass').step()") == ("", "")
+def test_an_environment_on_the_cpu_prints_nothing_and_a_missing_driver_is_one_line_with_the_cause() -> None:
+    program = """
+from lyceum_warp import Row
+import lyceum_warp as lw
+from lyceum_warp.cli import main
+lw.make("point_mass").step()
+main(["check", "hopper", "--device", "cuda"])
+"""
+    out, error = printed(program)
+    assert out == "" and error.count("\n") == 1
+    assert error.startswith("lyceum-warp: there is no device 'cuda' on this machine; it has 'cpu' (")
+    assert "NVIDIA CUDA driver" in error
 
 
 @WITHOUT_GPU
@@ -48,11 +58,3 @@ assert warp_log.start_warp() == warp_log.start_warp()
 def test_warp_starts_with_a_closed_stderr() -> None:
     program = "import os; os.close(2); from lyceum_warp.support import warp_log; print(warp_log.start_warp())"
     assert printed(program) == ("[]\n", "")
-
-
-@WITHOUT_GPU
-def test_a_cuda_device_without_a_driver_is_one_line_with_the_cause() -> None:
-    out, error = printed("import sys; from lyceum_warp.cli import main; main(['check', 'hopper', '--device', 'cuda'])")
-    assert out == "" and error.count("\n") == 1
-    assert error.startswith("lyceum-warp: there is no device 'cuda' on this machine; it has 'cpu' (")
-    assert "NVIDIA CUDA driver" in error

@@ -45,6 +45,7 @@ def put(env: lw.Env, world: int, x: float, y: float) -> None:
     env.set_state(state)
 
 
+@pytest.mark.quick("go1_rough_velocity")
 @pytest.mark.parametrize("task", TASKS)
 def test_heights_contacts_and_scans_on_every_kind_of_patch_equal_mujocos(task: str, env: lw.Env) -> None:
     env.reset()
@@ -78,6 +79,7 @@ def test_heights_contacts_and_scans_on_every_kind_of_patch_equal_mujocos(task: s
     assert noise.max() <= 0.1 + 1e-5 and noise.mean() > 0.03
 
 
+@pytest.mark.quick("go1_rough_velocity")
 @pytest.mark.parametrize("task", TASKS)
 def test_robots_begin_on_the_patch_of_their_level_and_climb_by_walking(task: str, env: lw.Env) -> None:
     def memory(name: str) -> torch.Tensor:
@@ -109,6 +111,7 @@ def test_an_episode_ends_outside_the_field(task: str, env: lw.Env) -> None:
     assert env.metrics["left_field"].tolist() == [1.0] + (NWORLD - 1) * [0.0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", long_if_alike(TASKS))
 def test_a_robot_that_falls_on_rough_ground_is_not_thrown_away_by_mujoco_warp(task: str, shared_env: SharedEnv) -> None:
     """The G1's own soles are boxes, for which MuJoCo Warp finds contacts with normals that point down."""

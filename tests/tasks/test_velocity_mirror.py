@@ -105,7 +105,7 @@ MEMORY = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("task", long_if_alike(ROBOTS))
+@pytest.mark.parametrize("task", long_if_alike(ROBOTS, "g1_velocity"))
 def test_observations_of_mirrored_states_are_mirrored(task: str, shared_env: SharedEnv) -> None:
     bound(task)
     noises = ("linear_velocity", "angular_velocity", "gravity", "joint_position", "joint_velocity")

@@ -53,6 +53,7 @@ def test_a_form_of_the_jacobian_changes_results_only_by_rounding() -> None:
     assert 0.0 < own.in_contact < 1.0  # some are in the air
 
 
+@pytest.mark.long
 def test_the_spread_determines_the_number_of_episodes_within_the_time_limit() -> None:
     own = trials("hopper", episodes=None, nworld=8)
     coarse = Setting("", "", {"integrator": "implicitfast", "frame_skip": 2, "timestep": 0.004})
@@ -65,6 +66,7 @@ def test_a_setting_that_mujoco_refuses_has_its_reason() -> None:
     assert "flex elasticity" in refused["refused"] and verdict(refused, "strict") == "refused"
 
 
+@pytest.mark.long
 def test_too_little_room_on_the_warp_engine_shows_as_faults() -> None:
     own = trials("hopper", engine="warp", nworld=8, nconmax=16, njmax=64)
     assert own.measure(SAME)["divergence"] == [0.0, 0.0, 0.0]

@@ -92,8 +92,7 @@ import sys, time
 import lyceum_warp as lw
 viewer = lw.RunViewer(sys.argv[1])
 print(viewer._process.pid, flush=True)
-time.sleep({seconds})
-viewer.close()
+time.sleep(60)
 """
 
 
@@ -104,20 +103,23 @@ def runs(process: int) -> bool:
     return False
 
 
-@pytest.mark.parametrize("kill", [pytest.param(True, marks=pytest.mark.long), False])
-def test_a_viewer_ends_with_its_program_also_while_it_waits_for_the_run(kill: bool, tmp_path: Path) -> None:
-    """Test a program that is killed, and a program that closes the viewer at once."""
-    command = [sys.executable, "-c", PROGRAM.format(seconds=60 if kill else 0), str(tmp_path / "run")]
+@pytest.mark.long
+def test_a_viewer_ends_with_its_program_also_while_it_waits_for_the_run(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", PROGRAM, str(tmp_path / "run")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None
         viewer = int(program.stdout.readline())
-        if kill:
-            program.send_signal(signal.SIGKILL)
+        program.send_signal(signal.SIGKILL)
     end = time.monotonic() + 60
     while runs(viewer) and time.monotonic() < end:
         time.sleep(0.05)
     assert not runs(viewer)
-    assert kill or program.returncode == 0
+
+
+def test_a_viewer_that_is_closed_at_once_ends(tmp_path: Path) -> None:
+    with lw.RunViewer(tmp_path / "run") as viewer:
+        assert viewer.is_open and runs(viewer._process.pid)
+    assert not viewer.is_open and not runs(viewer._process.pid)
 
 
 def test_train_shows_its_run_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,6 +132,7 @@ def test_train_shows_its_run_on_request(tmp_path: Path, monkeypatch: pytest.Monk
     assert made == [((tmp_path / "run",), {"port": 8123})]
 
 
+@pytest.mark.long
 def test_a_viewer_of_a_task_that_is_not_found_ends_with_one_line(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

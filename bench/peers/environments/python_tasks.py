@@ -1,8 +1,8 @@
 """Define tasks for Gymnasium and dm_control with the formulas and models of lyceum_warp's tasks.
 
-Gymnasium has all tasks except cartpole and herb_reach, and dm_control has cartpole and its suite. This file defines the other tasks
-in NumPy, as a user of the libraries would. This file runs in peers' virtual environments and does not import
-lyceum_warp.
+Gymnasium has all tasks except cartpole and herb_reach, and dm_control has cartpole and its suite. This file defines the
+other tasks in NumPy, as a user of the libraries would. This file runs in peers' virtual environments and does not
+import lyceum_warp.
 """
 
 from pathlib import Path

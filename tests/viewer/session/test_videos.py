@@ -15,6 +15,7 @@ from memory_window import MemoryWindow
 from lyceum_warp.support.interrupts import Interrupted, signals
 from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import Command, Frame
+from lyceum_warp.viewer.session import videos
 from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viewer.session.videos import VideoTaker
 from lyceum_warp.viz import drawing
@@ -72,6 +73,7 @@ def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> No
         time.sleep(0.5)
 
     monkeypatch.setattr(drawing.Drawing, "draw", slow)
+    monkeypatch.setattr(videos, "FPS", 5)  # few poses, which are drawn without a GPU
     try:
         taker.begin(CAMERA)
         while not drawn.is_set():

@@ -191,6 +191,7 @@ time.sleep(60)
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("number", "fork"), [(signal.SIGKILL, True), (signal.SIGINT, False)])
 def test_window_ends_with_the_session(number: int, fork: bool, tmp_path: Path) -> None:
     """A fork of the session keeps the connection open."""
