@@ -142,7 +142,7 @@ def test_a_file_without_results_is_refused(toy: Any, tmp_path: Path, capsys: pyt
     ("name", "words", "message"),
     [
         ("throughput", "--tasks hoper", "there is no task 'hoper': did you mean hopper?"),
-        ("throughput", "--parts one", "there is no part 'one': there are sampling, single, cores, worlds, kept"),
+        ("throughput", "--parts one", "there is no part 'one': there are sampling, suite, single, cores, worlds, kept"),
         ("throughput", "--device cuda:99", "there is no GPU for --device cuda:99"),
         ("mppi", "--jobs 2", "plans and a GPU are timed alone: give --jobs 1, or --parts episodes"),
         ("mppi", "--block 0", "episodes, block and repeats must be at least 1"),

@@ -6,7 +6,7 @@ import tyro
 from conftest import SharedEnv
 
 import lyceum_warp as lw
-from lyceum_warp.cli.arguments import Physics
+from lyceum_warp.cli.arguments import Physics, given
 from lyceum_warp.tuning.candidates import Setting, candidates, combined, flags, not_tried, task_line
 
 
@@ -65,8 +65,8 @@ def test_printed_flags_and_the_printed_task_line_select_the_setting() -> None:
     both = combined([COARSE, LIMITED, SEARCH])
     assert both is not None
     wanted = lw.PhysicsOptions(**both.physics)
-    given = tyro.cli(tyro.conf.OmitArgPrefixes[Physics], args=flags(both.physics).split()).given()
-    assert lw.PhysicsOptions(**given) == wanted
+    words = given(tyro.cli(tyro.conf.OmitArgPrefixes[Physics], args=flags(both.physics).split()))
+    assert lw.PhysicsOptions(**words) == wanted
     scope = {"lw": lw}
     exec(task_line(both.physics), scope)
     assert scope["physics"]["fast"] == wanted  # type: ignore[index]
