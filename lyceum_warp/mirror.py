@@ -46,7 +46,7 @@ class Mirror:
         """Combine the reflections of the parts into the reflection of a row.
 
         Args:
-            parts: The columns of each part, as ``Space.parts``.
+            parts: The columns of each part, in the format of ``Space.parts``.
             task: Name of the task, for messages.
             whole: Name of a reflection of the whole row, if there is one.
 

@@ -171,7 +171,8 @@ class EnvOptions:
     horizon: int | None = None
     """Steps after which an episode is truncated, or 0 for never; by default the task's horizon."""
     graphs: bool = True
-    """Whether launches are captured as graphs and replayed. False is for debugging and changes no numbers."""
+    """Whether launches are captured as graphs and replayed. False is for debugging, and gives the same
+    results."""
     model: ModelSource | None = None
     """A model that replaces the task's: a file or an MjSpec."""
     fields: Collection[str] = ()

@@ -60,7 +60,7 @@ def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
     return found
 
 
-def test_too_little_memory_of_the_c_engine_is_a_fault() -> None:
+def test_exhausted_memory_of_the_c_engine_is_reported_as_a_fault() -> None:
     """As memory shrinks, MuJoCo drops constraints, then contacts; in between it raises an error.
 
     Which size causes which fault depends on the MuJoCo version; all three must occur and be reported.

@@ -86,7 +86,7 @@ def _block(device: wp.Device | None) -> int:
 
 
 def launch_worlds(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device | None) -> None:
-    """Launch a kernel with one thread per world or row; the kernel's last argument is the index of the first one."""
+    """Launch a kernel with one thread per world or row; the kernel's last argument is the index of the first row."""
     _launch(kernel, (nworld,), 0, args, device, block_dim=_block(device))
 
 

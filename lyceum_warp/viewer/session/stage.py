@@ -81,7 +81,7 @@ class Stage:
         self.steps = 0
         """Steps since the session began, for the measured speed."""
         self.progress: deque[tuple[float, int]] = deque(maxlen=64)
-        """Times of the last frames, each with the number of steps until then."""
+        """For each recent frame, its time and the total number of steps at that time."""
         self.select(modes[0], next(iter(self.controllers), None))
 
     @property

@@ -16,7 +16,7 @@ def bench() -> Bench:
 
 
 def drag(bench: Bench, body: str, *, paused: bool) -> list[Perturb]:
-    """Drag a body by half a metre, as studio reports it; return the messages to the session."""
+    """Imitate studio's report of a drag by half a metre; return the messages that are sent to the session."""
     perturb, data = bench.viewer.perturb, bench.viewer.data
     perturb.select = bench.model.body(body).id
     perturb.flexselect = perturb.skinselect = -1
