@@ -21,6 +21,7 @@ def test_every_task_of_the_package_has_an_id() -> None:
     assert tasks >= set(package_task_names()) and "lyceum/HalfCheetah-v0" in OURS and "lyceum/Walker2d-v0" in OURS
 
 
+@pytest.mark.long
 def test_registering_imports_no_task_and_gives_no_warning() -> None:
     program = """
 import sys, warnings

@@ -168,6 +168,7 @@ def test_an_error_in_a_copy_names_the_line_of_its_original(tmp_path: Path) -> No
         lw.make(file)
 
 
+@pytest.mark.long
 def test_the_module_of_a_variant_has_the_same_hash_in_every_process() -> None:
     program = (
         f"import sys; sys.path[:0] = {[str(Path(terms_task.__file__).parent)]}\n"

@@ -337,6 +337,7 @@ def test_an_episode_is_scrubbed_and_played(tab: Tab) -> None:
     tab.press("Space", lambda: viewer.status.step < STEPS / 2)
 
 
+@pytest.mark.long
 def test_the_page_has_a_title_and_links_to_new_files(tab: Tab, tmp_path: Path) -> None:
     assert tab.page.title() == "block"
     assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{43}/", tab.page.url)  # without the token

@@ -64,6 +64,7 @@ def test_compiling_is_reported_and_done_once(
     assert (said.out.strip(), said.err) == ("0 2", "")
 
 
+@pytest.mark.long
 def test_kernels_of_a_new_task_are_reported_on_the_c_engine_too(
     shared_env: SharedEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

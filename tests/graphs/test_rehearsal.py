@@ -139,6 +139,7 @@ def test_warp_has_the_internals_that_compiling_ahead_reads(arrays: tuple[wp.arra
     assert Path(wp.config.kernel_cache_dir, name, output).exists()
 
 
+@pytest.mark.long
 def test_a_rehearsal_finds_every_module_that_a_step_loads() -> None:
     """Runs in a subprocess: MuJoCo Warp launches kernels only through the patched functions."""
     done = subprocess.run([sys.executable, "-c", WHOLE_STEP], capture_output=True, text=True)

@@ -67,6 +67,7 @@ def trained(folder: Path, callback: Callable[[lw.Iteration], object] | None = No
     return [list(map(str, row.items())) for row in rows], list(lw.load(run).state_dict().values())
 
 
+@pytest.mark.long
 def test_a_viewer_does_not_change_a_runs_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     alone = trained(tmp_path / "alone")
     begun, printed = time.monotonic(), ""

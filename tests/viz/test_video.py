@@ -222,6 +222,7 @@ def test_a_cancelled_or_empty_video_leaves_the_old_file(model: mujoco.MjModel, t
     assert out.read_text() == "old" and [file.name for file in tmp_path.iterdir()] == ["video.mp4"]
 
 
+@pytest.mark.long
 def test_a_killed_program_leaves_no_file(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     program = f"""

@@ -86,6 +86,7 @@ def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> No
         pytest.skip(str(error))
 
 
+@pytest.mark.long
 def test_an_interrupted_viewer_completes_its_video(
     taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
