@@ -52,6 +52,7 @@ def test_own_policy_improves(run) -> None:
     assert lines[-1].endswith("370 parameters")
 
 
+@pytest.mark.long
 def test_random_search_gets_a_complete_run_folder(run, tmp_path: Path) -> None:
     """The run has a folder, resumes bit for bit, and can be evaluated and exported."""
     once = numbers(r"return (-?[\d.]+)", run("random_search.py", "--out", "once", "--iterations", "6"))

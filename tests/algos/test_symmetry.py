@@ -68,6 +68,7 @@ def test_standard_deviations_of_a_walking_robot_are_symmetric(shared_env: Shared
     assert next(augmented).kl > 0.0 and augmented.value.group == "critic"
 
 
+@pytest.mark.long
 def test_losses_and_mirrored_samples_make_a_policy_more_symmetric(env: lw.Env) -> None:
     found = {}
     for name in ("none", "loss", "augment"):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 
+@pytest.mark.long
 def test_a_short_experiment_continues_and_ends_with_a_verdict(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

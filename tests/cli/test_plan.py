@@ -83,6 +83,7 @@ def test_a_planner_uses_the_suggested_physics_unless_others_are_given(
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.long
 def test_a_video_is_made_of_the_first_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(tmp_path / "run", "--no-plot", "--steps", "12", "--camera", "azimuth=20", "--camera", "track=1") == 0
     lines = capsys.readouterr().out.splitlines()

@@ -49,7 +49,7 @@ def options(task: str, engine: str) -> dict[str, int]:
 
 # contacts; a robot with events and drawn dynamics; no contacts; a planner's task; the same on the Warp engine
 @pytest.mark.quick(
-    "mujoco-hopper", "mujoco-go1_velocity", "mujoco-cartpole_swingup", "mujoco-reach",
+    "mujoco-half_cheetah", "mujoco-go1_velocity", "mujoco-cartpole_swingup", "mujoco-reach",
     "warp-go1_velocity", "warp-half_cheetah", "warp-point_mass",
 )  # fmt: skip
 @pytest.mark.parametrize(("engine", "task"), [(engine, task) for engine in EVERY_RULE for task in PACKAGE])

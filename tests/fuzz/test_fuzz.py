@@ -38,6 +38,12 @@ MINIMAL: dict[str, Mapping[str, Any]] = {
 }  # fmt: skip
 
 
+def each(names: Mapping[str, Mapping[str, Any]]) -> list[Any]:
+    """Every program with each of its names; make test-all tries the command lines, which take longest."""
+    slow = {"command_attacks.py": pytest.mark.long}
+    return [pytest.param(program, name, marks=slow.get(program, ())) for program in names for name in names[program]]
+
+
 def cases(counts: Mapping[str, int], first: int) -> list[str]:
     return [f"{kind} {seed}" for kind, count in counts.items() for seed in range(first, first + count)]
 
@@ -63,7 +69,7 @@ def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFacto
 
 
 @pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.long)], ids=["few", "many"])
-@pytest.mark.parametrize(("program", "kind"), [(program, kind) for program in FEW for kind in FEW[program]])
+@pytest.mark.parametrize(("program", "kind"), each(FEW))
 def test_random_cases_work_or_are_refused_in_one_line(outcomes: Any, program: str, kind: str, many: bool) -> None:
     count = (MANY if many else FEW)[program][kind]
     found = {case: o for case, o in outcomes(program, many).items() if case.rpartition(" ")[0] == kind}
@@ -76,7 +82,7 @@ def test_random_cases_work_or_are_refused_in_one_line(outcomes: Any, program: st
     assert not bad, "\n".join([f"{len(bad)} of {count} cases", *bad])
 
 
-@pytest.mark.parametrize(("program", "name"), [(program, name) for program in MINIMAL for name in MINIMAL[program]])
+@pytest.mark.parametrize(("program", "name"), each(MINIMAL))
 def test_minimal_case_is_refused(outcomes: Any, program: str, name: str) -> None:
     outcome = outcomes(program, False)[name]
     assert not outcome.problem, f"{outcome.problem}\n    {replay(program, name)}\n{outcome.trace}"

@@ -203,6 +203,7 @@ def random_steps(env: lw.Env, n: int, seed: int = 0) -> None:
         env.step(2 * torch.rand(env.action.shape, generator=generator) - 1)
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_the_task_keeps_the_rules(module: ModuleType, engine: str) -> None:
     check_task("follow_target", engine=engine, steps=100, frame_skip=2, gain=np.array([0.5, 1.0, 1.5, 2.0]))
