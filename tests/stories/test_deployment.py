@@ -77,7 +77,8 @@ def test_the_pages_loop_does_what_the_environment_does(
         env.step(policy(env.obs))
         mujoco.mj_step(model, data, robot.substeps)
         np.testing.assert_allclose(robot.action, env.action[0], atol=1e-5)
-        np.testing.assert_allclose(robot.observation(data, command), env.obs[0], atol=1e-5, rtol=1e-5)
+        # contacts amplify the rounding of actions, up to 2e-5 within ten steps of a G1
+        np.testing.assert_allclose(robot.observation(data, command), env.obs[0], atol=1e-4, rtol=1e-4)
         moved = max(moved, np.abs(robot.action).max())
     assert moved > 0.3 and not env.done.any()
 
