@@ -83,7 +83,8 @@ class PPOConfig:
     normalize: bool = True
     """Whether to normalise observations by their running mean and variance, updated in every step."""
     stagger: bool = True
-    """Whether the first episodes start at random steps, so that time limits are spread over time."""
+    """Whether the first episodes start at random steps, so that time limits are spread over time. On the Warp engine,
+    worlds whose initial states settle always start together."""
     tf32: bool = True
     """Whether matrix products on a GPU use TensorFloat-32."""
     mean_every: int = 20

@@ -47,7 +47,7 @@ def control(
             Ctrl-C, ends the run. The trajectory's ``done_reason`` is 0. The exception is raised afterwards.
 
     Returns:
-        The episode. The trajectory's ``period`` is the plant's time step.
+        The trajectory of the episode; its ``period`` is the plant's time step.
 
     Raises:
         ValueError: The environment has several worlds or automatic resets, the episode is over or may never end, an

@@ -45,14 +45,20 @@ def read_metrics(path: Path, *, lines: list[str] | None = None) -> list[dict[str
     Raises:
         ValueError: A cell is not a number, or the rows differ in length.
     """
-    if lines is None:
-        with path.open(newline="", errors="replace") as file:  # a replaced character is not part of a number
-            lines = file.readlines()
-    reader = csv.DictReader(lines, strict=True)
+    reader = csv.DictReader(_lines(path) if lines is None else lines, strict=True)
     try:
         return [{key: float(cell) if cell else None for key, cell in row.items()} for row in reader]
     except (ValueError, TypeError, csv.Error) as error:
         raise ValueError(f"{path} is not a table of metrics: line {reader.line_num}: {error}") from error
+
+
+def _lines(path: Path) -> list[str]:
+    """The lines of the table, with their ends."""
+    try:
+        with path.open(newline="") as file:
+            return file.readlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not a table of metrics: {error}") from error
 
 
 def cut_rows(path: Path, iteration: int) -> None:
@@ -67,8 +73,7 @@ def cut_rows(path: Path, iteration: int) -> None:
     """
     if not path.exists():
         return
-    with path.open(newline="", errors="replace") as file:
-        lines = file.readlines()
+    lines = _lines(path)
     header = next(csv.reader(lines[:1]), [])
     column = header.index("iteration") if "iteration" in header else None
     kept = []

@@ -440,7 +440,6 @@ def test_a_second_interrupt_ends_a_run_at_once_and_it_continues_from_its_last_sa
     assert metrics(out) == metrics(trained)
 
 
-@pytest.mark.long
 def test_a_killed_run_continues(trained: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "100000"]

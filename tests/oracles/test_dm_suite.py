@@ -207,3 +207,8 @@ def test_episodes_start_as_dm_controls(shared_env: SharedEnv, task: str) -> None
             both = np.concatenate([a, b])
             gap = np.abs(np.searchsorted(a, both, "right") / len(a) - np.searchsorted(b, both, "right") / len(b)).max()
             assert gap < 2.2 * np.sqrt(1 / len(a) + 1 / len(b)), f"{name} {column}"
+
+
+def test_the_margin_of_point_mass_is_the_size_of_its_target() -> None:
+    env = lw.make("dm/point_mass_easy", target_size=0.1)
+    assert env.task.params["margin"] == env.task.params["target_size"] == pytest.approx(0.1)

@@ -24,7 +24,7 @@ from lyceum_warp.tasks.velocity import TASKS as VELOCITY
 NWORLD = 32
 TASKS = package_task_names()
 LARGE = ("adroit_pen", "ant", "g1_velocity", "go1_rough_velocity", "humanoid", "humanoid_stand", "panda_lift")
-"""Tasks whose models take seconds to simulate on the Warp engine; make test-all runs them and dm_control's suite."""
+"""Tasks whose models take seconds to simulate on the Warp engine; make test-all runs them."""
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 FORCE_PARTS = ("contact_force", "touch", "imu", "force_torque")
@@ -112,7 +112,7 @@ SUITE_ONE_STEP = {
     "swimmer": Bounds(9e-7, 3e-6, 4e-4, 1.5e-3),  # with 15 links: 2.5e-7, 8.5e-7; 1.2e-4, 4.3e-4
     "walker": Bounds(2e-7, 4e-7, 9e-6, 4e-5),  # 5.9e-8, 1.1e-7; 2.6e-6, 1.1e-5
 }
-"""The same by domain of dm_control's suite."""
+"""The bounds of dm_control's suite, by domain."""
 ONE_STEP |= {name: SUITE_ONE_STEP[module.removeprefix("dm_")] for name, module in SUITE.items()}
 
 
@@ -160,7 +160,7 @@ def device(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-@pytest.fixture(scope="module", params=long_if_alike(TASKS, *SAME_MODELS, *LARGE, *SUITE))
+@pytest.fixture(scope="module", params=long_if_alike(TASKS, *SAME_MODELS, *LARGE))
 def engines(request: pytest.FixtureRequest, device: str, shared_env: SharedEnv) -> Iterator[Engines]:
     task = request.param
     options = {"nworld": NWORLD, "cone": "elliptic", "frame_skip": 1, "autoreset": False, "horizon": 0}

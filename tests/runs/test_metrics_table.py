@@ -60,3 +60,14 @@ def test_a_table_of_another_kind_is_refused(table: Path) -> None:
     table.write_text("iteration,value\n1,2,3\n")
     with pytest.raises(ValueError, match="line 2"):
         read_metrics(table)
+
+
+@pytest.mark.parametrize("place", [0, 12, 16])  # two names and a number
+def test_a_byte_that_is_not_text_is_refused_and_stays(place: int, table: Path) -> None:
+    damaged = bytearray(b"iteration,value\n1,2\n2,3\n")
+    damaged[place] = 0xFF
+    table.write_bytes(damaged)
+    for read in (lambda: read_metrics(table), lambda: cut_rows(table, 1)):
+        with pytest.raises(ValueError, match=r"metrics\.csv is not a table of metrics"):
+            read()
+    assert table.read_bytes() == damaged

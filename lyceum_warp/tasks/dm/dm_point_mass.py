@@ -19,7 +19,7 @@ class Params(suite.RandomJoints):
     mass: int = lw.geom("pointmass")
     target: int = lw.geom("target")
     target_size: float = lw.from_model(lambda model, p: model.geom_size[p.target, 0])
-    margin: float = lw.from_model(lambda model, p: model.geom_size[p.target, 0])  # m
+    margin: float = lw.from_model(lambda model, p: p.target_size)  # m
 
 
 @wp.func
