@@ -40,7 +40,8 @@ def _for_engine(default: Any) -> Any:
     return dataclasses.field(default=default, metadata={"engine": True})
 
 
-def _given(options: Any) -> dict[str, Any]:
+def given_values(options: Any) -> dict[str, Any]:
+    """The fields of a dataclass that differ from their defaults, by name."""
     values = {field.name: (getattr(options, field.name), field.default) for field in dataclasses.fields(options)}
     return {name: value for name, (value, default) in values.items() if value is not default and value != default}
 
@@ -123,7 +124,7 @@ class PhysicsOptions:
 
     def given(self) -> dict[str, Any]:
         """The options that differ from their defaults, by name."""
-        return _given(self)
+        return given_values(self)
 
     def resolved(self, named: Mapping[str, "PhysicsOptions"]) -> "PhysicsOptions":
         """Replace ``base`` by the options that it names.
@@ -227,7 +228,7 @@ class EnvOptions:
 
     def given(self) -> dict[str, Any]:
         """The options that differ from their defaults, by name, including physics options."""
-        own = _given(self)
+        own = given_values(self)
         own.pop("physics", None)
         return own | self.physics.given()
 

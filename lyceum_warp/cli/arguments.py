@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from lyceum_warp.options import OPTIONS, EnvOptions, PhysicsOptions
+from lyceum_warp.options import OPTIONS, EnvOptions, PhysicsOptions, given_values
 from lyceum_warp.support.docstrings import attribute_docs
 
 Repeated = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")]
@@ -108,8 +108,7 @@ def given(flags: Any) -> dict[str, Any]:
     Raises:
         ValueError: A limit of the solver is not of the form NAME=VALUE.
     """
-    fields = flags.__dataclass_fields__
-    found = {name: value for name, value in vars(flags).items() if value != fields[name].default}
+    found = given_values(flags)
     if "solver" in found:
         found["solver"] = dict(map(parameter, found["solver"]))
     return found
