@@ -1,7 +1,7 @@
 """Configure the site that ``make docs`` builds from the pages in docs/, CONTRIBUTING.md, CHANGELOG.md and bench/.
 
-The sources lie in the root of the repository, so relative links lead to the same file there and on the site. A comment
-``<!-- KIND: words -->`` in a page is replaced by generated text; ``PLACES`` lists the kinds.
+The source folder is the repository's root, so relative links lead to the same file in the repository and on the site.
+The build replaces comments ``<!-- KIND: words -->`` by generated text. ``PLACES`` lists the kinds of comments.
 """
 
 import logging
@@ -21,7 +21,7 @@ import lyceum_warp as lw
 
 for each in ("lyceum_warp", "traitlets"):
     logging.getLogger(each).setLevel(logging.WARNING)
-sys.modules["lw"] = lw  # so that names are documented as they are written: lw.make
+sys.modules["lw"] = lw  # documents names as they are written: lw.make
 
 project, version, author = "lyceum_warp", lw.__version__, "The lyceum_warp authors"
 extensions = ["myst_nb", "sphinx.ext.autodoc"]
@@ -39,9 +39,9 @@ highlight_language = "none"  # blocks without a language are output and formulas
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 nb_execution_mode, nb_execution_raise_on_error = "force", True
-nb_execution_timeout = 900  # seconds of a cell, which may compile kernels for minutes
+nb_execution_timeout = 900  # seconds for each cell; compiling kernels may take minutes
 nb_merge_streams = nb_execution_in_temp = True
-KernelManager.transport_encryption.default_value = "auto"  # without it, kernels warn
+KernelManager.transport_encryption.default_value = "auto"  # other values make Jupyter kernels warn
 
 add_module_names, python_use_unqualified_type_names, python_maximum_signature_line_length = True, True, 100
 autodoc_member_order, autodoc_typehints = "bysource", "none"
@@ -61,7 +61,7 @@ CONTENTS = {
 
 
 def contents(_: str) -> str:
-    """The tables of contents in the margin."""
+    """Return the tables of contents for the margin."""
     return "\n".join(
         "\n".join(["```{toctree}", ":hidden:", f":caption: {caption}", *pages.split(), "```", ""])
         for caption, pages in CONTENTS.items()
@@ -83,7 +83,7 @@ def fill(app: Any, docname: str, source: list[str]) -> None:
 
 
 def link_names(app: Any, doctree: nodes.document) -> None:
-    """Let inline code such as ``lw.make`` lead to the reference."""
+    """Link inline code such as ``lw.make`` to the reference."""
     for literal in list(doctree.findall(nodes.literal)):
         found = re.fullmatch(r"(lw\.\w+)(\(.*\))?", literal.astext())
         if found and not isinstance(literal.parent, nodes.reference | pending_xref):
@@ -95,12 +95,12 @@ def link_names(app: Any, doctree: nodes.document) -> None:
 
 
 def redirect(app: Any, error: Exception | None) -> None:
-    """Lead from the site's address to its first page."""
+    """Redirect from the site's address to its first page."""
     Path(app.outdir, "index.html").write_text('<meta http-equiv="refresh" content="0; url=docs/index.html">\n')
 
 
 def setup(app: Any) -> None:
-    """Connect the functions above to the build."""
+    """Connect this module's functions to the build."""
     app.connect("source-read", fill)
     app.connect("autodoc-process-docstring", reference.convert)
     app.connect("autodoc-process-signature", reference.short_signature)

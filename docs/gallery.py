@@ -1,8 +1,8 @@
 """Draw the gallery: MUJOCO_GL=egl python docs/gallery.py [--runs FOLDER] [TASK ...].
 
-Each task is shown by the policy of its run in FOLDER, if there is one, and otherwise by MPPI; by default FOLDER holds
-the pretrained policies. The program writes a moving picture of each task, its command and its result into
-docs/images/gallery/, and the page gallery.md from these files. Without tasks it draws all.
+If FOLDER contains a run of a task, the run's policy controls the task. MPPI controls the other tasks. By default FOLDER
+contains the pretrained policies. The program writes a moving picture of each task, its command and its result into
+docs/images/gallery/, and then the page gallery.md. Without the argument TASK, it draws all tasks.
 """
 
 import argparse
@@ -30,21 +30,21 @@ FOLDER = DOCS / "images" / "gallery"
 RESULTS = FOLDER / "results.json"
 PRETRAINED = Path(lw.__file__).parent / "pretrained"
 
-SIZE, SCALE = (208, 156), 2  # pixels; drawn larger and reduced, for smooth edges
+SIZE, SCALE = (208, 156), 2  # pixels; pictures are drawn larger and reduced, for smooth edges
 RATE = 12.5  # frames per second
 LARGEST = 80_000  # bytes of a picture
 
 
 @dataclasses.dataclass(frozen=True)
 class Show:
-    """How a task is shown."""
+    """Settings for the picture of a task."""
 
     settings: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Settings of MPPI and options of its worlds that differ from the task's."""
     replan_every: int = 1
-    """Steps of MPPI from one plan to the next."""
+    """Number of steps from one MPPI plan to the next."""
     seconds: float = 4.0
-    """Simulated seconds of the picture; shorter if the episode ends earlier."""
+    """Simulated seconds in the picture, or fewer if the episode ends earlier."""
     start: float = 0.0
     """Simulated seconds before the picture begins."""
     seed: int = 0
@@ -95,7 +95,7 @@ SHOWS = {
        for robot, distance in (("go1", 1.7), ("go1_rough", 2.2), ("spot", 2.6), ("g1", 2.8), ("g1_full", 2.8),
                                ("g1_rough", 3.2), ("h1", 3.6), ("t1", 2.8))},
 }  # fmt: skip
-"""Tasks that are not shown as the defaults of Show say."""
+"""Settings of tasks that differ from the defaults of Show."""
 
 
 def draw(name: str, run: Path | None) -> dict[str, str]:
@@ -126,7 +126,7 @@ def draw(name: str, run: Path | None) -> dict[str, str]:
 
 
 def planned(env: lw.Env, show: Show, steps: int) -> tuple[torch.Tensor, str]:
-    """The states of an episode under MPPI, and its result."""
+    """Control an episode by MPPI, and return its states and its result."""
     plan = lw.MPPI(env.task.name, seed=show.seed, **show.settings)
     trajectory = lw.control(env, plan, steps=steps, seed=show.seed, replan_every=show.replan_every)
     seconds = trajectory.steps * env.timestep
@@ -137,7 +137,7 @@ def planned(env: lw.Env, show: Show, steps: int) -> tuple[torch.Tensor, str]:
 
 @torch.no_grad()
 def acted(env: lw.Env, policy: Any, show: Show, steps: int) -> torch.Tensor:
-    """The states of an episode under a policy. A robot that follows commands walks straight ahead, without pushes."""
+    """Return an episode's states under a policy. A robot that follows commands walks straight ahead, without pushes."""
     env.rand_reset(seed=show.seed)
     state = env.get_state()
     parts = env.state_space.split(state)
@@ -157,7 +157,7 @@ def acted(env: lw.Env, policy: Any, show: Show, steps: int) -> torch.Tensor:
 
 
 def pictures(env: lw.Env, states: torch.Tensor, show: Show) -> list[Image.Image]:
-    """The pictures of states, at the rate of the gallery."""
+    """Draw states at the gallery's frame rate."""
     model = copy.copy(env.model)  # the painter sets each world's model fields
     size = (SCALE * SIZE[0], SCALE * SIZE[1])
     painter = Painter(mujoco, model, size, camera_values(find_camera(model, show.camera)))
@@ -167,7 +167,7 @@ def pictures(env: lw.Env, states: torch.Tensor, show: Show) -> list[Image.Image]
 
 
 def save(images: list[Image.Image], path: Path) -> None:
-    """Write a moving picture, as finely as its size allows."""
+    """Write a moving picture in the best quality that the size limit allows."""
     path.parent.mkdir(parents=True, exist_ok=True)
     for quality in (80, 65, 50, 35, 20):
         file = io.BytesIO()
@@ -180,12 +180,12 @@ def save(images: list[Image.Image], path: Path) -> None:
 
 
 def number(value: float) -> str:
-    """A number with three digits, and thousands with a comma."""
+    """Format a number with three digits, and thousands with a comma."""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
 def families() -> dict[str, tuple[str, list[str]]]:
-    """The titles of the pages of tasks and the names of their tasks, by page."""
+    """Return the title and the task names of each page in docs/tasks/, by page."""
     found = {}
     for path in sorted((DOCS / "tasks").glob("*.md")):
         text = path.read_text()
@@ -195,10 +195,10 @@ def families() -> dict[str, tuple[str, list[str]]]:
 
 
 def page(results: dict[str, dict[str, str]]) -> str:
-    """The page of the gallery."""
-    lines = ["# Gallery", "", "Tasks of the package under a policy or a planner, with the result and a command that "
-             "shows or trains it. The return of a", "policy is the mean over whole episodes; the return of a planner "
-             "covers the seconds shown. A name leads to the task's", "details.", ""]  # fmt: skip
+    """Return the gallery's page."""
+    lines = ["# Gallery", "", "Each picture shows a task under a policy or a planner, with the result and a command "
+             "that shows or trains it. The", "return of a policy is the mean over whole episodes. The return of a "
+             "planner covers the seconds in the picture. Each name", "links to the task's details.", ""]  # fmt: skip
     for stem, (title, names) in families().items():
         cells = []
         for name in names:
@@ -217,7 +217,8 @@ def page(results: dict[str, dict[str, str]]) -> str:
         f"[{name}](tasks/{stem}.md#{name.replace('/', '')})," for stem, (_, names) in families().items()
         for name in names if name not in results
     )  # fmt: skip
-    lines += textwrap.wrap(f"Without a picture: {missing.rstrip(',')}.", 120, break_long_words=False) if missing else []
+    if missing:
+        lines += textwrap.wrap(f"These tasks have no picture: {missing.rstrip(',')}.", 120, break_long_words=False)
     return "\n".join(lines).rstrip("\n") + "\n"
 
 
@@ -230,7 +231,8 @@ def main() -> None:
     runs = {json.loads(path.read_text())["task"]: path.parent for path in sorted(words.runs.glob("*/config.json"))}
     for name in words.tasks or [name for _, names in families().values() for name in names]:
         result = draw(name, runs.get(name))
-        results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}  # another process may draw other tasks
+        # another process may have drawn other tasks
+        results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
         results[name] = result
         RESULTS.write_text(json.dumps(results, indent=1, sort_keys=True) + "\n")
         (DOCS / "gallery.md").write_text(page(results))

@@ -1,4 +1,4 @@
-"""Write the reference of the site from the package: public names, and tables of tasks.
+"""Generate the site's reference from the package: public names, and tables of tasks.
 
 ``names`` and ``tasks`` return MyST Markdown for conf.py. Every public name and every task must be on one page, which
 tests/test_docs.py checks.
@@ -32,11 +32,11 @@ ALIASES = {
     "quat": ("class", "A quaternion in MuJoCo's order w, x, y, z: ``wp.vec4``."),
     "vec10": ("class", "The ten numbers of a contact's or a geom's row that Warp has no name for."),
 }
-"""Names whose objects belong to Warp, with their kinds and meanings."""
+"""Public names of Warp's objects, with their kinds and meanings."""
 
 TYPES = {"float32": "float", "int32": "int", "vec2f": "wp.vec2", "vec3f": "wp.vec3", "vec4f": "lw.quat",
          "mat33f": "wp.mat33", "spatial_vectorf": "wp.spatial_vector", "Any": "Any"}  # fmt: skip
-"""Warp's types as a task's file spells them."""
+"""Names of Warp's types in task files."""
 
 METHODS = (types.FunctionType, property, classmethod, staticmethod)
 
@@ -47,16 +47,16 @@ SECTIONS = Config(napoleon_custom_sections=["Functions"], napoleon_use_rtype=Fal
 
 
 def names(words: str) -> str:
-    """The documentation of public names of the package.
+    """Return the documentation of public names of the package.
 
     Args:
-        words: The names, between spaces.
+        words: Names, separated by spaces.
     """
     return "\n".join(["```{eval-rst}", *(line for name in words.split() for line in entry(lw, name)), "```"])
 
 
 def modules(words: str) -> str:
-    """The documentation of modules that are public names themselves, such as ``lw.walkers``."""
+    """Return the documentation of public modules, such as ``lw.walkers``."""
     lines = ["```{eval-rst}"]
     for word in words.split():
         module = importlib.import_module(f"lyceum_warp.{word}")
@@ -70,7 +70,7 @@ def modules(words: str) -> str:
 
 
 def entry(module: Any, name: str, prefix: str = "lw") -> list[str]:
-    """The lines of a name in reStructuredText."""
+    """Return a name's documentation as lines of reStructuredText."""
     value = getattr(module, name)
     if name in ALIASES:
         kind, text = ALIASES[name]
@@ -87,12 +87,12 @@ def entry(module: Any, name: str, prefix: str = "lw") -> list[str]:
 
 
 def is_public(cls: type) -> bool:
-    """Whether a class is one of the package's public names."""
+    """Return whether a class is a public name of the package."""
     return cls.__module__.startswith("lyceum_warp.") and cls.__name__ in lw.__all__
 
 
 def members(cls: type) -> list[str]:
-    """The public members of a class that have a docstring, including members of base classes without a public name."""
+    """Return a class's public members with docstrings, including members of base classes without a public name."""
     found: dict[str, None] = {}
     for base in reversed(cls.__mro__):
         if base is cls or (base.__module__.startswith("lyceum_warp.") and not is_public(base)):
@@ -102,27 +102,27 @@ def members(cls: type) -> list[str]:
 
 
 def convert(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Convert a docstring to reStructuredText, without the list of attributes, which follow as members."""
+    """Convert a docstring to reStructuredText, without the list of attributes, which are documented as members."""
     if what == "class" and "Attributes:" in lines:
         del lines[lines.index("Attributes:") :]
     lines[:] = converted("\n".join(lines))
 
 
 def converted(text: str) -> list[str]:
-    """The lines of a docstring in reStructuredText; bars outside of code are no substitutions."""
+    """Convert a docstring to lines of reStructuredText, and escape bars outside of code."""
     text = re.sub(r"``.*?``|\|", lambda found: "\\|" if found[0] == "|" else found[0], text, flags=re.DOTALL)
     return str(GoogleDocstring(text, SECTIONS)).splitlines()
 
 
 def short_signature(app: Any, what: str, name: str, obj: Any, options: Any, signature: str, result: str) -> Any:
-    """Remove a dataclass's fields, which are documented as members, and the fields of objects that are defaults."""
+    """Remove a dataclass's fields, which are documented as members, and the fields of default objects."""
     if what == "class" and dataclasses.is_dataclass(obj):
         return "", result
     return signature and re.sub(r"(PhysicsOptions)\(.*?\)", r"\1()", signature), result
 
 
 def warp_function(function: Any, name: str) -> list[str]:
-    """The lines of a Warp function: its signatures, the types of all overloads together, and its docstring."""
+    """Return a Warp function's documentation: signatures with the types of all overloads, and the docstring."""
     found: dict[tuple[str, ...], dict[str, dict[str, None]]] = {}
     for overload in dict.fromkeys(each.func for each in (*function.user_overloads.values(),
                                                          *function.user_templates.values())):  # fmt: skip
@@ -137,14 +137,14 @@ def warp_function(function: Any, name: str) -> list[str]:
         result = f" -> {spelled['return']}" if spelled["return"] else ""
         heads.append(f"{name}({', '.join(f'{each}: {spelled[each]}' for each in arguments)}){result}")
     text = inspect.getdoc(function) or ""
-    if text.startswith(f"{function.key}("):  # one line for each overload
+    if text.startswith(f"{function.key}("):  # the text begins with one line for each overload
         text = text.partition("\n\n")[2]
     lines = [f".. py:function:: {heads[0]}", *(f"                 {head}" for head in heads[1:]), ""]
     return [*lines, *(f"   {line}" for line in converted(text)), ""]
 
 
 def type_name(annotation: Any) -> str:
-    """A type as a task's file spells it; "" without one."""
+    """Return the name of a type in task files, or "" for a missing annotation."""
     if annotation is inspect.Signature.empty or annotation is None:
         return ""
     text = annotation.__name__ if isinstance(annotation, type) else repr(annotation)
@@ -156,16 +156,16 @@ def type_name(annotation: Any) -> str:
 
 
 def tasks(words: str) -> str:
-    """A section for each task: what it does, its observations, actions, parameters and metrics.
+    """Return a section for each task: a description, observations, actions, parameters and metrics.
 
     Args:
-        words: The names of the tasks, between spaces.
+        words: Names of tasks, separated by spaces.
     """
     return "\n\n".join(map(task_section, words.split()))
 
 
 def task_section(name: str) -> str:
-    """The section of a task."""
+    """Return the section of a task."""
     task = BoundTask(find_task(name))
     cls = task.task
     text = vars(cls).get("__doc__") or inspect.getdoc(sys.modules[cls.__module__]) or ""
@@ -195,7 +195,7 @@ def task_section(name: str) -> str:
 
 
 def facts(task: BoundTask) -> list[str]:
-    """A table of lengths, physics and settings of a planner."""
+    """Return a table of a task's lengths, physics and planner settings."""
     cls, seconds = task.task, task.timestep
     rows = [
         ("step", f"{seconds:g} s, {count(task.frame_skip, 'substep')} of {1000 * task.model.opt.timestep:g} ms"),
@@ -214,12 +214,12 @@ def facts(task: BoundTask) -> list[str]:
 
 
 def shortened(value: Any) -> str:
-    """A setting; a long list by its length."""
+    """Format a setting, and a long list by its length."""
     return f"({len(value)} numbers)" if isinstance(value, list | tuple) and len(value) > 3 else f"{value}"
 
 
 def actions(task: BoundTask) -> list[str]:
-    """A table of the actions and their bounds; neighbours with the same bounds share a row."""
+    """Return a table of actions and bounds. Successive actions with equal bounds share a row."""
     space = action_space(task.model, task.task.action_range, task.actions)
     assert space.low is not None and space.high is not None
     rows: list[tuple[list[str], int, str]] = []
@@ -235,7 +235,7 @@ def actions(task: BoundTask) -> list[str]:
 
 
 def metrics(task: BoundTask) -> list[str]:
-    """The metrics, with the weights of those that are terms of the reward."""
+    """Return a table of the metrics, with the weights of reward terms."""
     weights, ends = task.task.rewards, task.task.terminations
     if not weights and not ends:
         return [f"Metrics: {', '.join(f'`{name}`' for name in task.metrics)}.", ""] if task.metrics else []
@@ -245,7 +245,7 @@ def metrics(task: BoundTask) -> list[str]:
 
 
 def parameters(task: BoundTask) -> list[tuple[Any, ...]]:
-    """The parameters, their defaults and the comments on them in the task's files."""
+    """Return the parameters with their defaults, and their comments from the task's files."""
     meanings = comments(task.task)
     rows = []
     for name in task.source.params.vars:
@@ -273,7 +273,7 @@ def spelled(default: Any, value: Any) -> str:
 
 
 def comments(task: type) -> dict[str, str]:
-    """The comments behind the fields of ``Params``, in the files of a task and of its base classes."""
+    """Return the comments behind the fields of ``Params``, from the files of a task and of its base classes."""
     found: dict[str, str] = {}
     for cls in reversed(task.__mro__[:-1]):
         lines = inspect.getsource(sys.modules[cls.__module__]).splitlines()
@@ -297,21 +297,21 @@ def table(headings: tuple[str, ...], rows: list[tuple[Any, ...]]) -> list[str]:
 
 
 def count(number: int, noun: str) -> str:
-    """A number of things."""
+    """Format a number with its noun."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def folded(title: str, lines: list[str]) -> list[str]:
-    """Lines that a reader unfolds."""
+    """Return lines that a reader can unfold."""
     return [f"<details><summary>{title}</summary>", "", *lines, "", "</details>", ""]
 
 
 def markdown(text: str) -> str:
-    """A docstring as Markdown."""
+    """Convert a docstring to Markdown."""
     return re.sub(r"``(.+?)``", r"`\1`", text)
 
 
 def sentence(text: str) -> str:
-    """A description that begins with a capital and ends with a full stop."""
+    """Format a description as a sentence with a capital and a full stop."""
     text = " ".join(text.split())
     return f"{text[0].upper()}{text[1:].rstrip('.')}."
