@@ -1,4 +1,4 @@
-"""Write the map of rooms in architecture.md from the docstrings of modules: python docs/rooms.py."""
+"""Write the map of modules in architecture.md from the docstrings of modules: python docs/rooms.py."""
 
 import ast
 import re
