@@ -133,7 +133,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 EXPERIMENT = Experiment(
     name="equivalence", summary="Equivalence of NPG's learning curves on the two engines (TOST).",
-    cases=cases, estimate=estimate, measure=measure, tables=tables, parallel=True,
+    cases=cases, estimate=estimate, measure=measure, tables=tables, parallel=True, pooled=True,
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -132,6 +132,8 @@ class Experiment:
     """Whether each case runs in a subprocess."""
     parallel: bool = False
     """Whether cases run in subprocesses if there are several jobs."""
+    pooled: bool = False
+    """Whether results do not depend on the machine, so that the tables combine all machines."""
 
 
 def load(name: str) -> Experiment:

@@ -96,7 +96,7 @@ def cases(options: Options) -> list[Case]:
     for folder in options.policy:
         run = Run.open(folder)
         task = options.task or run.task_name
-        gate = "nanoG1" if task.startswith("g1_") else "walks"
+        gate = "nanoG1" if Path(task).name.startswith("g1_") else "walks"
         starts = 1 if options.short else NOISY_STARTS if gate == "nanoG1" else STARTS
         steps = 50 if options.short else STEPS
         found.append(Case(task, gate, folder.name, digest(folder, options), starts, steps))

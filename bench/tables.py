@@ -24,9 +24,14 @@ def main(options: Options) -> int:
     for name, path in experiment.stored(options.names, options.results).items():
         found = experiment.load(name)
         parts = [f"# {name}", f"{found.summary} Written by `lyceum-warp bench tables {name}` from `{path.name}`."]
-        for machine, rows in experiment.by_machine(experiment.read(path)).items():
+        machines = experiment.by_machine(experiment.read(path))
+        for machine, rows in machines.items():
             parts += [f"## {machine}", experiment.described(rows)]
-            parts += [table.markdown() for table in found.tables(rows)]
+            if not found.pooled:
+                parts += [table.markdown() for table in found.tables(rows)]
+        if found.pooled:
+            rows = list({experiment.key(row.case): row for rows in machines.values() for row in rows}.values())
+            parts += ["## All machines", *(table.markdown() for table in found.tables(rows))]
         page = path.with_suffix(".md")
         with replaced(page) as temporary:
             temporary.write_text("\n\n".join(parts) + "\n")

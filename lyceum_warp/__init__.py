@@ -60,9 +60,9 @@ if TYPE_CHECKING:
     from lyceum_warp.runs.folder import load, load_value
     from lyceum_warp.runs.pretrained_runs import pretrained_run
     from lyceum_warp.task import (
-        Planning, Row, Task, act, actuator, actuators, bodies, body, camera, ctrl, dof, dofs, equality, from_model,
-        geom, geoms, joint, joints, lasting_memory, memory, mocap, part, qpos, qposes, sensor, sensors, site, sites,
-        tendon)
+        Planning, Row, Task, Training, act, actuator, actuators, bodies, body, camera, ctrl, dof, dofs, equality,
+        from_model, geom, geoms, joint, joints, lasting_memory, memory, mocap, part, qpos, qposes, sensor, sensors,
+        site, sites, tendon)
     from lyceum_warp.terrain import Terrain, height_field, scan_grid
     from lyceum_warp.training import train
     from lyceum_warp.tuning.search import Tuning, tune
@@ -74,8 +74,8 @@ __all__ = [
     "Episodes", "GaussianPolicy", "Iteration", "Learner", "MPPIConfig", "Mirror", "ModelFile", "NPGConfig", "OpenLoop",
     "PPOConfig", "PhysicsOptions", "PlanSamples", "PlanUpdate", "Planner", "Planning", "PlanningController",
     "PredictiveSampling", "Replay", "Rollout", "Row", "RunViewer", "SACConfig", "Sigmoid", "SquashedPolicy", "Task",
-    "Terrain", "Trajectory", "Transfer", "Transitions", "Tuning", "TwinCritic", "ValueFunction", "act", "actuator",
-    "actuators", "all_inside", "angle_between", "bodies", "body", "body_velocity", "camera", "control",
+    "Terrain", "Training", "Trajectory", "Transfer", "Transitions", "Tuning", "TwinCritic", "ValueFunction", "act",
+    "actuator", "actuators", "all_inside", "angle_between", "bodies", "body", "body_velocity", "camera", "control",
     "control_async", "control_report", "ctrl", "dof", "dofs", "equality", "evaluate", "export_policy",
     "follow_velocity", "follow_walk", "from_model", "geom", "geoms", "grasp_terms", "ground_distance", "ground_height",
     "ground_normal", "gymnasium_model", "gymnasium_robotics_model", "height_field", "height_scan", "inside", "joint",
@@ -137,8 +137,8 @@ _NAMES = {
     "runs.folder": "load load_value",
     "runs.pretrained_runs": "pretrained_run",
     "task":
-        "Planning Row Task act actuator actuators bodies body camera ctrl dof dofs equality from_model geom geoms "
-        "joint joints lasting_memory memory mocap part qpos qposes sensor sensors site sites tendon",
+        "Planning Row Task Training act actuator actuators bodies body camera ctrl dof dofs equality from_model geom "
+        "geoms joint joints lasting_memory memory mocap part qpos qposes sensor sensors site sites tendon",
     "terrain": "Terrain height_field scan_grid",
     "training": "train",
     "tuning.search": "Tuning tune",

@@ -367,6 +367,29 @@ class Planning:
                 raise ValueError(f"{field.name} of lw.Planning must be a dict, not {part!r}")
 
 
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Training:
+    """A task's settings for ``lyceum-warp train``, which flags override.
+
+    Raises:
+        ValueError: ``settings`` is not a dict.
+    """
+
+    algorithm: str = "npg"
+    """Name of the algorithm: npg, ppo or sac."""
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Hyperparameters of the algorithm, by the names of ``lw.NPGConfig``, ``lw.PPOConfig`` or ``lw.SACConfig``. They do
+    not apply if a flag chooses another algorithm."""
+    iterations: int = 100
+    """Number of iterations."""
+
+    def __post_init__(self) -> None:
+        """Check the type of ``settings``."""
+        if not isinstance(self.settings, Mapping):
+            raise ValueError(f"settings of lw.Training must be a dict, not {self.settings!r}")
+
+
 @_document_functions
 @document_attributes
 class Task:
@@ -481,6 +504,8 @@ class Task:
     ``lw.make(task, physics="fast")``. The default, "exact", is the physics of the model and ``frame_skip``."""
     planning: ClassVar[Planning] = Planning()
     """The task's settings for MPPI, such as ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
+    training: ClassVar[Training] = Training()
+    """The task's settings for ``lyceum-warp train``, such as ``lw.Training(algorithm="ppo", settings={...})``."""
 
     # World, Params and Warp functions of the module when the class was defined
     scope: ClassVar[dict[str, Any]]

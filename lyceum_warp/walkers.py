@@ -116,7 +116,8 @@ def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
     # the joint's own damping, which adds to the servo's
     damping = model.dof_damping[joint_dof(model, p)].reshape(len(actuators), -1)[:, 0]
     yaw, lateral = float(stages[:, 3].max()), float(np.max(p.lateral_velocity))
-    return {
+    clock = {"gait_frequency": float(p.gait_frequency)} if hasattr(p, "gait_frequency") else {}  # Hz
+    return clock | {
         "base": model.body(base(model)).name,
         "velocimeter": np.asarray(p.imu).tolist(),  # position on the base, m
         "joints": [model.joint(joint).name for joint in p.joints],
@@ -173,6 +174,7 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
     found: dict[str, Any] = {
         "linear_velocity": flip, "angular_velocity": spin, "gravity": flip, "command": (1.0, -1.0, -1.0),
         **dict.fromkeys(("joint_position", "joint_velocity", "last_action"), joints),
+        "clock": (-1.0, -1.0),  # the feet are half a cycle apart
         **dict.fromkeys(("foot_height", "foot_air_time", "foot_contact"), feet), "foot_force": vectors,
         # these state fields also contain joints that the task does not use
         "qpos": ([*range(7), *(partner[hinges] + 6)], [*flip, 1.0, *spin, *sign[hinges]]),

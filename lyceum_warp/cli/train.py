@@ -33,6 +33,7 @@ from lyceum_warp.runs.configuration import ALGORITHMS, Configuration, saved_netw
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.task_copy import note_changes
 from lyceum_warp.support.interrupts import Interrupted, obeyed
+from lyceum_warp.task import Training
 from lyceum_warp.training import train
 from lyceum_warp.viewer.follow import RunViewer
 from lyceum_warp.viz.cameras import parsed_camera
@@ -84,9 +85,10 @@ class Train:
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
     algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac")] = None
-    """npg (the default), the natural policy gradient; ppo; or sac, soft actor-critic with a replay buffer."""
-    iterations: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 100)")] = None
-    """Iterations in total, including those before --resume."""
+    """npg, the natural policy gradient; ppo; or sac, soft actor-critic with a replay buffer. By default the algorithm
+    that the task suggests, with its hyperparameters: ppo for walking robots, npg for others."""
+    iterations: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Iterations in total, including those before --resume; by default those that the task suggests, or 100."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Seed of the networks, the noise and the worlds' initial states."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -165,8 +167,8 @@ class Train:
             raise ValueError(f"--port {self.port} has no effect without --view: omit it")
         source = None if folder is None else Run.open(folder)
         saved = {} if source is None else source.config
-        settings = {}
-        for name, default in _SETTINGS.items():
+        settings, defaults = {}, _SETTINGS if source else _SETTINGS | {"iterations": self._suggestion().iterations}
+        for name, default in defaults.items():
             settings[name] = saved.get(name, default) if (value := getattr(self, name)) is None else value
         if self.resume is None:
             settings["target_return"] = self.target_return
@@ -206,6 +208,14 @@ class Train:
                 console.print(text, soft_wrap=True, markup=False)
             return self._report(run, learner, console)
 
+    def _suggestion(self) -> Training:
+        """The task's settings for training; only the algorithm of the flag if that is another one."""
+        assert self.task is not None
+        suggestion = find_task(self.task).training
+        if self.algorithm in (None, suggestion.algorithm):
+            return suggestion
+        return Training(algorithm=self.algorithm)
+
     def configuration(self, source: Run | None, team: Team) -> Configuration:
         """The configuration of the source run, or the defaults, overridden by the given flags."""
         words = given(self.env) | given(self.physics)
@@ -213,10 +223,19 @@ class Train:
             if value is not None:
                 words[name] = value
         if source is None:
-            few = 8 if self.algorithm == "sac" else 64  # each of SAC's worlds has an update per step
+            suggestion = self._suggestion()
+            few = 8 if suggestion.algorithm == "sac" else 64  # each of SAC's worlds has an update per step
             nworld = 4096 * team.size if (self.env.device or "cpu").startswith("cuda") else few
             options = EnvOptions(nworld=nworld, device="cpu")
-            base = Configuration(task=self.task, options=options, algorithm="npg", hyperparameters=None)
+            base = Configuration(
+                task=self.task, options=options, algorithm=suggestion.algorithm, hyperparameters=None
+            )  # fmt: skip
+            if suggestion.settings:
+                try:
+                    suggested = ALGORITHMS[suggestion.algorithm][1](**suggestion.settings)
+                except (KeyError, TypeError, ValueError) as error:
+                    raise ValueError(f"training of the task {self.task} is not valid: {error}") from error
+                base = dataclasses.replace(base, hyperparameters=suggested)
         else:
             base = Configuration.of(source)
         solver = base.options.physics.solver

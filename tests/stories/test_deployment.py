@@ -2,6 +2,7 @@
 
 import copy
 import json
+import math
 import re
 import runpy
 from pathlib import Path
@@ -69,6 +70,9 @@ def test_the_pages_loop_does_what_the_environment_does(
     mujoco.mj_setConst(model, data)
     parts = env.state_space.split(env.get_state()[0])
     data.qpos[:], data.qvel[:], data.ctrl[:] = parts["qpos"], parts["qvel"], parts["ctrl"]
+    if task == "g1_velocity":
+        sine, cosine = parts["clock"].tolist()
+        data.time = math.atan2(sine, cosine) / (2.0 * math.pi * env.task.params["gait_frequency"])
     robot, command = page["Policy"](str(file), model), parts["drawn_velocity"].numpy()
     moved = 0.0
     for _ in range(steps):

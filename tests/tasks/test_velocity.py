@@ -106,11 +106,11 @@ def test_resets_put_the_robot_above_the_ground(task: str, env: lw.Env) -> None:
     assert (critic[:, -6 * n : -5 * n] < 0.15).all(), "feet are near the ground"
 
 
-@pytest.mark.parametrize("task", ["g1_velocity"])
+@pytest.mark.parametrize("task", ["go1_velocity"])
 def test_robots_with_equal_sizes_share_their_kernels(task: str, shared_env: SharedEnv) -> None:
-    g1, t1 = (shared_env(name, nworld=NWORLD, autoreset=False, push_seconds=(1e6, 1e6)) for name in
-              (task, "t1_velocity"))  # fmt: skip
-    assert g1.task.kernels is t1.task.kernels
+    go1, spot = (shared_env(name, nworld=NWORLD, autoreset=False, push_seconds=(1e6, 1e6)) for name in
+              (task, "spot_velocity"))  # fmt: skip
+    assert go1.task.kernels is spot.task.kernels
 
 
 def test_tasks_lists_exactly_the_tasks_of_the_familys_modules() -> None:

@@ -1,11 +1,14 @@
-"""G1Velocity: a Unitree G1 walks at a commanded velocity with its twelve leg joints; waist and arms keep their pose."""
+"""G1Velocity: a Unitree G1 walks at a commanded velocity with its twelve leg joints; waist and arms keep their pose.
+
+Of the robot's tasks, only this one has a gait clock.
+"""
 
 import mujoco
 import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp import walkers
-from lyceum_warp.tasks.velocity import walking
+from lyceum_warp.tasks.velocity import gait, walking
 
 SIDES, FEET = ("left", "right"), ("left_foot", "right_foot")
 LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
@@ -35,8 +38,12 @@ class FullParams(Params):
     action_scale: wp.array[float] = [*12 * [0.5], *17 * [0.25]]
 
 
-@lw.register
-class G1Velocity(walking.Biped):
+@wp.struct
+class GaitParams(gait.Params, Params):
+    walking_pose_std: wp.array[float] = 2 * [0.4, 0.15, 0.15, 0.6, 0.35, 0.15]
+
+
+class G1(walking.Biped):
     model = lw.playground_model("locomotion/g1/xmls/scene_mjx_feetonly_flat_terrain.xml")
 
     @staticmethod
@@ -46,7 +53,12 @@ class G1Velocity(walking.Biped):
 
 
 @lw.register
-class G1FullVelocity(G1Velocity):
+class G1Velocity(gait.Gait, G1):
+    Params = GaitParams
+
+
+@lw.register
+class G1FullVelocity(G1):
     """A Unitree G1 walks at a commanded velocity with all 29 joints."""
 
     Params = FullParams

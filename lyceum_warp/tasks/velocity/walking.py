@@ -391,6 +391,7 @@ class Velocity(lw.Task):
     """A robot that follows velocity commands, with any number of legs."""
 
     frame_skip, horizon = 4, 1000
+    training = lw.Training(algorithm="ppo", iterations=400)
     actions = {"joint_position": "joints"}
     rewards = {
         "track_linear_velocity": 2.0,
@@ -422,4 +423,5 @@ class Biped(Velocity):
     """A robot with two legs, which is rewarded for steps and for a calm trunk. Two sites mark the feet."""
 
     frame_skip, keyframe = 5, "home"
+    training = lw.Training(algorithm="ppo", settings={"log_std": -0.7}, iterations=800)
     rewards = Velocity.rewards | {"action_rate_l2": -0.05, "single_stance": 2.0, "roll_pitch_rate_l2": -0.05}
