@@ -47,12 +47,12 @@ def test_heights_and_contacts_of_feet_equal_mujocos(task: str, env: lw.Env) -> N
     touched = 0
     for _ in range(5):
         random_steps(env, 6, 1.0)
-        critic = env.obs_groups["critic"].numpy()[:, -6 * n :]
+        critic = env.obs_spaces["critic"].split(env.obs_groups["critic"])
         for world in range(NWORLD):
             data, touching = feet(env, world)
             heights = np.clip([data.site_xpos[foot][2] for foot in env.task.params["feet"]], 0.0, 1.0)
-            np.testing.assert_allclose(critic[world, :n], heights, atol=2e-6)
-            np.testing.assert_array_equal(critic[world, 2 * n : 3 * n] > 0, touching)
+            np.testing.assert_allclose(critic["foot_height"][world], heights, atol=2e-6)
+            np.testing.assert_array_equal(critic["foot_contact"][world] > 0, touching)
             touched += sum(touching)
     assert 0.1 < touched / (5 * NWORLD * n) < 0.99
 
@@ -99,11 +99,10 @@ def test_a_standing_robots_feet_carry_its_weight(task: str, env: lw.Env) -> None
 @pytest.mark.parametrize("task", long_if_alike(ROBOTS))
 def test_resets_put_the_robot_above_the_ground(task: str, env: lw.Env) -> None:
     env.reset()
-    critic = env.obs_groups["critic"].numpy()
-    n = len(env.task.params["feet"])
+    critic = env.obs_spaces["critic"].split(env.obs_groups["critic"])
     qpos = env.field("qpos").numpy()
     np.testing.assert_allclose(qpos, np.tile(env.model.key("home").qpos, (NWORLD, 1)), atol=1e-6)
-    assert (critic[:, -6 * n : -5 * n] < 0.15).all(), "feet are near the ground"
+    assert (critic["foot_height"] < 0.15).all(), "feet are near the ground"
 
 
 @pytest.mark.parametrize("task", ["go1_velocity"])
