@@ -23,7 +23,7 @@ from lyceum_warp.cli import display
 from lyceum_warp.cli.algorithms import Hyperparameters
 from lyceum_warp.cli.arguments import given
 from lyceum_warp.cli.train import EnvFlags, Train
-from lyceum_warp.runs.configuration import ALGORITHMS
+from lyceum_warp.runs.configuration import ALGORITHMS, Configuration
 from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.viz import drawing
 
@@ -375,6 +375,36 @@ def test_the_default_number_of_worlds_depends_on_the_device_and_the_algorithm() 
     for device, nworld in (("cpu", 8), ("cuda", 4096)):
         options = Train(task="hopper", algorithm="sac", env=EnvFlags(device=device))
         assert options.configuration(None, Team()).options.nworld == nworld
+
+
+def suggesting(folder: Path, training: str) -> str:
+    return str(
+        tiny_task.write(folder, tiny_task.changed(('obs = {"x": 1}', f'obs = {{"x": 1}}\n    training = {training}')))
+    )
+
+
+def test_flags_override_the_training_that_a_task_suggests(tmp_path: Path) -> None:
+    task = suggesting(tmp_path, 'lw.Training(algorithm="ppo", settings={"lam": 0.5, "gamma": 0.9}, iterations=2)')
+
+    def chosen(**flags: Any) -> Configuration:
+        return Train(task=task, **flags).configuration(None, Team())
+
+    found = chosen(), chosen(algorithm="ppo", hyperparameters=Hyperparameters(lam=0.7)), chosen(algorithm="npg")
+    assert [one.algorithm for one in found] == ["ppo", "ppo", "npg"]
+    assert found[0].hyperparameters == lw.PPOConfig(lam=0.5, gamma=0.9)
+    assert found[1].hyperparameters == lw.PPOConfig(lam=0.7, gamma=0.9) and found[2].hyperparameters == lw.NPGConfig()
+    out = tmp_path / "run"
+    assert cli.main(["train", task, "--nworld", "2", "--horizon", "5", "--out", str(out), *QUIET]) == 0
+    assert len(metrics(out)) == Run.open(out).config["iterations"] == 2
+
+
+@pytest.mark.parametrize("training", ['lw.Training(algorithm="ppo", settings={"lamda": 0.5})',
+                                      'lw.Training(algorithm="ddpg", settings={"lam": 0.5})'])  # fmt: skip
+def test_training_of_a_task_that_is_not_valid_is_refused(
+    training: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["train", suggesting(tmp_path, training), "--out", str(tmp_path / "run")]) == 2
+    assert "training of the task" in capsys.readouterr().err and not (tmp_path / "run").exists()
 
 
 # interruptions
