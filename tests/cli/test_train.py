@@ -384,7 +384,7 @@ def suggesting(folder: Path, training: str) -> str:
 
 
 def test_flags_override_the_training_that_a_task_suggests(tmp_path: Path) -> None:
-    task = suggesting(tmp_path, 'lw.Training(algorithm="ppo", settings={"lam": 0.5, "gamma": 0.9}, iterations=2)')
+    task = suggesting(tmp_path, 'lw.Training(algorithm="ppo", settings={"lam": 0.5, "gamma": 0.9})')
 
     def chosen(**flags: Any) -> Configuration:
         return Train(task=task, **flags).configuration(None, Team())
@@ -393,8 +393,14 @@ def test_flags_override_the_training_that_a_task_suggests(tmp_path: Path) -> Non
     assert [one.algorithm for one in found] == ["ppo", "ppo", "npg"]
     assert found[0].hyperparameters == lw.PPOConfig(lam=0.5, gamma=0.9)
     assert found[1].hyperparameters == lw.PPOConfig(lam=0.7, gamma=0.9) and found[2].hyperparameters == lw.NPGConfig()
-    out = tmp_path / "run"
-    assert cli.main(["train", task, "--nworld", "2", "--horizon", "5", "--out", str(out), *QUIET]) == 0
+
+
+@pytest.mark.long
+def test_a_run_has_the_iterations_that_its_task_suggests(tmp_path: Path) -> None:
+    task, out = suggesting(tmp_path, "lw.Training(iterations=2)"), tmp_path / "run"
+    assert (
+        cli.main(["train", task, "--nworld", "2", "--samples", "20", "--horizon", "5", "--out", str(out), *QUIET]) == 0
+    )
     assert len(metrics(out)) == Run.open(out).config["iterations"] == 2
 
 
