@@ -1,14 +1,14 @@
 """Update plans by the cross-entropy method (CEM): fit a normal distribution to the best samples.
 
-The planner's noise (``planner.py``) then has a standard deviation s_t for each element of the plan. The n best samples
-(the elites) u_t^1, ..., u_t^n determine the next plan and its noise:
+In CEM, the planner's noise (``planner.py``) has a standard deviation s_t for each element of the plan. The n best
+samples (the elites) u_t^1, ..., u_t^n determine the next plan and its noise:
 
     u_t = 1/n sum_k u_t^k,    s_t = max(sqrt(1/n sum_k (u_t^k - u_t)^2), min_noise)
 
-This is the method of Rubinstein (1999, "The cross-entropy method for combinatorial and continuous optimization") with a
-diagonal covariance, as in hydrax, judo and MuJoCo MPC. The standard deviations are shifted in time with the plan, and
-the end is filled with their initial values. If the noise is smoothed over time, s_t is the standard deviation before
-smoothing: the elites' standard deviation, divided by the standard deviation of smoothed standard normal noise.
+CEM was proposed by Rubinstein (1999, "The cross-entropy method for combinatorial and continuous optimization") and has
+a diagonal covariance here, as in hydrax, judo and MuJoCo MPC. The planner shifts the standard deviations in time with
+the plan, and fills their end with the initial values. If the noise is smoothed over time, s_t is the standard deviation
+before smoothing: the elites' standard deviation, divided by the standard deviation of smoothed standard normal noise.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from lyceum_warp.kernels import planning
 
 
 class EliteWeights(PlanUpdate):
-    """Equal weights for the best samples, zero for the others.
+    """Give the best samples equal weights, and all other samples the weight 0.
 
     Args:
         elites: Number of samples with non-zero weight.
@@ -47,10 +47,10 @@ class EliteWeights(PlanUpdate):
 
 
 class CrossEntropy(EliteWeights):
-    """The update of CEM.
+    """Update plans by CEM.
 
     Args:
-        elites: Number of samples in the fit.
+        elites: Number of best samples to which the update fits.
         min_noise: Lower limit of the standard deviations, one number or one for each action.
         smoothing: Weights (b0, b1, b2) that smooth the noise over time.
     """
@@ -71,7 +71,10 @@ class CrossEntropy(EliteWeights):
         count, _, nact = samples.plan.shape
         smallest = np.asarray(self.min_noise)
         if smallest.shape not in ((), (nact,)):
-            raise ValueError(f"min_noise must be a standard deviation or {nact} of them, not {self.min_noise!r}")
+            raise ValueError(
+                f"min_noise must be one standard deviation, or one for each of the {nact} actions, not "
+                f"{self.min_noise!r}"
+            )
         self._smallest, self._spread = (
             torch.as_tensor(row, dtype=torch.float32, device=samples.plan.device)
             for row in (np.full(nact, smallest), spread(self.smoothing, count))
@@ -87,10 +90,10 @@ class CrossEntropy(EliteWeights):
 
 
 def spread(smoothing: tuple[float, float, float], count: int) -> np.ndarray:
-    """Standard deviations of smoothed standard normal noise, (count,).
+    """Compute the standard deviations of smoothed standard normal noise, (count,).
 
-    With e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) the variances v_t and the covariances c_t of e_t and e_(t-1) follow
-    v_t = b0^2 + b1^2 v_(t-1) + b2^2 v_(t-2) + 2 b1 b2 c_(t-1) and c_t = b1 v_(t-1) + b2 c_(t-1).
+    For e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2), the variance v_t and the covariance c_t of e_t and e_(t-1) satisfy v_t =
+    b0^2 + b1^2 v_(t-1) + b2^2 v_(t-2) + 2 b1 b2 c_(t-1) and c_t = b1 v_(t-1) + b2 c_(t-1).
     """
     b0, b1, b2 = smoothing
     variance, covariance = [1.0, 1.0], 0.0
@@ -98,5 +101,5 @@ def spread(smoothing: tuple[float, float, float], count: int) -> np.ndarray:
         new = b0 * b0 + b1 * b1 * variance[-1] + b2 * b2 * variance[-2] + 2 * b1 * b2 * covariance
         covariance = b1 * variance[-1] + b2 * covariance
         variance.append(new)
-    # the result is a divisor
+    # standard deviations must be positive, because ``fit`` divides by them
     return np.sqrt(np.maximum(variance[:count], np.finfo(np.float32).tiny))

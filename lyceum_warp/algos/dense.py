@@ -1,7 +1,7 @@
 """Evaluate and differentiate small fully connected networks on the CPU without autograd.
 
-With a hundred units per layer, the overhead of modules and autograd exceeds the arithmetic. Here a pass is one matrix
-product per layer, into preallocated buffers. Other networks and devices use torch's modules and autograd.
+With a hundred units per layer, the overhead of modules and autograd exceeds the arithmetic. This module computes one
+matrix product per layer, into preallocated buffers. Other networks and devices use torch's modules and autograd.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -32,17 +32,17 @@ _ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[[tor
     nn.ReLU: (lambda x: np.maximum(x, 0.0, out=x), lambda d, y: _relu_slope(d, y, 0.0, grad_input=d)),
     nn.ELU: (_elu_, lambda d, y: _elu_slope(d, 1.0, 1.0, 1.0, True, y, grad_input=d)),
 }
-"""For each supported activation: a function that applies it in place, and a function that multiplies by its slope in
-place. The slope is computed from the activation's output."""
+"""Map each supported activation to two in-place functions: one applies it, the other multiplies by its slope. The slope
+is computed from the activation's output."""
 
 _FEW = 2**18
-"""Maximum size of a product, as rows times weights of the largest layer, that NumPy computes; torch computes larger
-ones. With cold caches, as between two steps of the worlds, a NumPy call has less overhead; larger products run faster
-in torch."""
+"""Largest matrix product (rows times weights of the largest layer) that NumPy computes; torch computes larger products.
+NumPy calls have less overhead with cold caches, as between two steps of the worlds. Large products run faster in
+torch."""
 
 
 class DensePasses:
-    """Forward passes y = f(x), and products with the Jacobian J = dy / dparameters.
+    """Computes forward passes y = f(x), and products with the Jacobian J = dy / dparameters.
 
     Results are buffers that the next call overwrites.
 
@@ -88,7 +88,7 @@ class DensePasses:
         self._buffers = [[torch.empty(rows, n) for n in widths] for _ in range(2)]
 
     def _resize(self, rows: int) -> None:
-        """Use the first rows of the buffers; allocate larger ones if necessary."""
+        """Use the first rows of the buffers; allocate larger buffers if necessary."""
         if rows > len(self._buffers[0][0]):
             self._allocate(rows)
         self._rows, self._few = rows, rows * max(weight.numel() for weight in self.weights) <= _FEW
@@ -96,7 +96,7 @@ class DensePasses:
         self._arrays = [result.numpy() for result in self.results]
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
-        """Compute outputs, (rows, outputs), from inputs, (rows, inputs), which ``push`` and ``pull`` read again."""
+        """Compute outputs, (rows, outputs), from inputs, (rows, inputs); ``push`` and ``pull`` use the same inputs."""
         if len(x) != self._rows:
             self._resize(len(x))
         self._inputs = [x, *self.results[:-1]]
@@ -128,7 +128,8 @@ class DensePasses:
         """Compute J^T u at the last inputs, from u, (rows, outputs), into tensors of the parameters' shapes."""
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
-            if x.shape[1] < u.shape[1]:  # the faster of two equal products: its result has the longer rows
+            # compute the transposed product, which is faster, because its result has longer rows
+            if x.shape[1] < u.shape[1]:
                 out[2 * i].copy_((x.t() @ u).t())
             else:
                 torch.mm(u.t(), x, out=out[2 * i])
@@ -140,7 +141,7 @@ class DensePasses:
 
 
 class DensePolicy:
-    """A ``GaussianPolicy`` whose network is a ``DensePasses``; both share their parameters."""
+    """Evaluates a ``GaussianPolicy`` with ``DensePasses``, which shares the policy's parameters."""
 
     def __init__(self, policy: GaussianPolicy, passes: DensePasses) -> None:
         self.policy, self.passes = policy, passes
@@ -194,7 +195,7 @@ class DensePolicy:
 
 
 class DenseValue:
-    """A ``ValueFunction`` whose network is a ``DensePasses``; both share their parameters."""
+    """Evaluates a ``ValueFunction`` with ``DensePasses``, which shares the value function's parameters."""
 
     def __init__(self, value: ValueFunction, passes: DensePasses) -> None:
         self.value, self.passes = value, passes
@@ -215,5 +216,5 @@ class DenseValue:
 
 
 def _hooked(module: nn.Module) -> bool:
-    """Whether a module has forward hooks."""
+    """Check whether a module has forward hooks."""
     return any(getattr(module, f"_forward{kind}_hooks") for kind in ("", "_pre"))

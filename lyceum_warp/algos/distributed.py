@@ -1,8 +1,8 @@
-"""Distribute learning over processes: each steps its share of the worlds, and all apply the same update.
+"""Distribute learning over processes, each of which steps its own worlds and applies the same update.
 
 Sums over worlds are computed in each process and then reduced over the processes. Every process draws the random
-numbers of all worlds from the same stream and uses its own part. So the number of processes affects only how sums are
-rounded.
+numbers of all worlds from the same stream and uses its own part. The number of processes therefore affects only the
+rounding of sums.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ from lyceum_warp.graphs.capture import capturing
 
 
 class Team:
-    """The processes that learn together, and their communication; a team of one process does not communicate.
+    """Processes that learn together, and their communication; a team of one process does not communicate.
 
     Except for ``share`` and ``locate``, all processes must call the methods in the same order.
 
@@ -43,7 +43,7 @@ class Team:
         return self.size == 1 or distributed.get_backend() == "nccl"
 
     def capture(self, function: Callable[[], object]) -> torch.cuda.CUDAGraph:
-        """Capture torch operations and communication in a CUDA graph, and register it for ``release``."""
+        """Capture torch operations and communication in a CUDA graph, and register the graph for ``release``."""
         graph = torch.cuda.CUDAGraph()
         # other threads, such as NCCL's, call CUDA during the capture
         with capturing(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
@@ -73,15 +73,15 @@ class Team:
         return nworld // self.size
 
     def locate(self, index: torch.Tensor, nworld: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Convert indices of samples of all worlds to indices of this process's samples.
+        """Convert sample indices over all worlds to sample indices of this process.
 
         Args:
-            index: Indices into the flattened (steps, worlds of all processes).
+            index: Indices into a flattened array (steps, worlds of all processes).
             nworld: Number of this process's worlds.
 
         Returns:
-            Indices into the flattened (steps, nworld), 0 for samples of other processes, and a mask of this process's
-            samples.
+            Indices into a flattened array (steps, nworld), 0 for samples of other processes, and a mask of this
+            process's samples.
         """
         step, world = index // (nworld * self.size), index % (nworld * self.size) - self.rank * nworld
         own = (world >= 0) & (world < nworld)
@@ -94,7 +94,7 @@ class Team:
         return tensor
 
     def largest(self, *numbers: int) -> tuple[int, ...]:
-        """Elementwise maximum over the processes; with several processes, this waits for the device."""
+        """Compute the elementwise maximum over the processes. With several processes, the host waits for the device."""
         if self.size == 1:
             return numbers
         whole = torch.tensor(numbers, device=self.device)
@@ -113,8 +113,8 @@ class Team:
     def copy_leader(self, tensors: Iterable[torch.Tensor]) -> None:
         """Broadcast tensors from rank 0, in place.
 
-        Parameters updated in each process are already equal on equal hardware. On different hardware, this prevents
-        rounding errors from accumulating.
+        On different hardware, broadcasting the parameters prevents rounding errors from accumulating. On equal
+        hardware, all processes compute equal parameters.
         """
         if self.size > 1:
             tensors = list(tensors)
@@ -125,12 +125,12 @@ class Team:
 
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
-        """End all processes if the block fails in one of them; only that process reports the error.
+        """End all processes if the with block fails in one; only the failing process reports the error.
 
-        The block must not communicate, because a failed process would not take part.
+        The with block must not communicate, because a failed process would not take part.
 
         Raises:
-            SystemExit: The block failed in another process.
+            SystemExit: The with block failed in another process.
         """
         if self.size == 1:
             yield
@@ -146,10 +146,10 @@ class Team:
 
 
 class Captured:
-    """Calls a function that consists of torch operations and communication; on a GPU as a CUDA graph.
+    """Calls a function of torch operations and communication; on a GPU, replays it as a CUDA graph.
 
-    The first call runs the function directly, so that it allocates its buffers. The second call captures a graph, which
-    it and all later calls replay. A graph stores addresses, so the function must update tensors in place.
+    The first call runs the function directly, so that it allocates its buffers. The second call captures and replays a
+    graph; all later calls replay it. A graph stores addresses, so the function must update tensors in place.
 
     Args:
         function: The function.
@@ -163,7 +163,7 @@ class Captured:
         self.forget()
 
     def forget(self) -> None:
-        """Discard the graph; required after one of its tensors was replaced."""
+        """Discard the graph, as required after replacing one of the graph's tensors."""
         self._warm = False
         self.graph: torch.cuda.CUDAGraph | None = None
 
@@ -195,10 +195,10 @@ def side_stream() -> Iterator[None]:
 
 @contextlib.contextmanager
 def join(device: str = "cpu") -> Iterator[Team]:
-    """Join the processes that ``torchrun`` started; without torchrun, yield a team of one process.
+    """Join the processes that ``torchrun`` started, or yield a team of one process without torchrun.
 
     Args:
-        device: "cpu", or a CUDA device. With several processes, each uses the GPU of its local rank.
+        device: "cpu", or a CUDA device. Each of several processes uses the GPU of its local rank.
 
     Raises:
         ValueError: There are fewer GPUs than processes on this machine.
@@ -207,14 +207,15 @@ def join(device: str = "cpu") -> Iterator[Team]:
     if size == 1 or "MASTER_ADDR" not in os.environ:
         yield Team(device=device)
         return
-    # The first optimizer imports torch's compiler. If that happens while a process group exists, the compiler keeps the
+    # The first optimizer imports torch's compiler. If a process group exists during this import, the compiler keeps the
     # group and its threads alive until Python exits, which sometimes aborts the process.
     torch.optim.SGD([torch.zeros(1)])
     place, neighbours = int(os.environ.get("LOCAL_RANK", "0")), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     if device.startswith("cuda"):
         if neighbours > torch.cuda.device_count():
             raise ValueError(
-                f"{neighbours} processes on this machine need a GPU each, and it has {torch.cuda.device_count()}: "
+                f"{neighbours} processes on this machine need one GPU each, but the machine has "
+                f"{torch.cuda.device_count()}: "
                 "start fewer (torchrun --nproc-per-node), or use --device cpu"
             )
         device = f"cuda:{place}"
@@ -228,7 +229,7 @@ def join(device: str = "cpu") -> Iterator[Team]:
         clean = True
     finally:
         team.release()
-        # After an error NCCL might wait for processes that have already exited, so its group is not destroyed. Gloo
-        # does not wait, and its threads must end before Python exits.
+        # After an error, do not destroy NCCL's group, because NCCL might wait for processes that have exited. Gloo does
+        # not wait. Gloo's threads must end before Python exits.
         if clean or distributed.get_backend() == "gloo":
             distributed.destroy_process_group()

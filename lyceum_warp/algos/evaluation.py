@@ -20,7 +20,7 @@ MEAN_SEED = 2**31 - 1
 
 
 def evaluation_seed(seed: int) -> int:
-    """Derive an evaluation's seed, one-to-one, so that training with the same seed draws different initial states."""
+    """Derive an evaluation's seed, so that training with the same seed draws different initial states."""
     return whole_number("seed", seed, low=0) ^ 0x5A17C3E9
 
 
@@ -38,11 +38,11 @@ class Episodes:
     evals: torch.Tensor
     """The evaluation metric at the end of each episode."""
     success: torch.Tensor
-    """Whether the goal was met at the end of each episode: 1.0 or 0.0."""
+    """1.0 for each episode that ended with the goal met, otherwise 0.0."""
     terminated: torch.Tensor
-    """Whether the task ended each episode, not the time limit or a fault: 1.0 or 0.0."""
+    """1.0 for each episode that the task ended, 0.0 for each episode that the time limit or a fault ended."""
     metrics: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
-    """Sums of the task's metrics, by name."""
+    """Sum of each task metric over each episode, by the metric's name."""
 
     def first(self, count: int) -> "Episodes":
         """Select the first ``count`` episodes."""
@@ -62,21 +62,20 @@ def evaluate(
 ) -> Episodes:
     """Run a policy without noise for whole episodes from random initial states.
 
-    Every world contributes the same number of episodes. If all finished episodes counted, short episodes would be too
-    frequent.
+    Every world contributes the same number of episodes. Counting all finished episodes would favour short episodes.
 
     Args:
         env: The environment; its worlds are reset.
-        policy: A module with a method ``act``, or a function; maps observations (nworld, nobs) to actions
-            (nworld, nact).
+        policy: A module with a method ``act``, or a function, that maps observations (nworld, nobs) to actions (nworld,
+            nact).
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
-        seed: Seed of the initial states; an environment made with the same seed draws different ones. By default the
-            worlds continue their random streams.
+        seed: Seed of the initial states; an environment made with the same seed draws different initial states. Without
+            a seed, the worlds continue their random streams.
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:
         ValueError: The task has no horizon, the environment was made with ``autoreset=False``, or the policy does not
-            fit its observations and actions.
+            fit the environment's observations and actions.
     """
     check_kind("env of evaluate", env, Env, "as lw.make(...) makes it")
     if not callable(policy):
@@ -86,7 +85,9 @@ def evaluate(
     if env.horizon == 0:
         raise ValueError(f"episodes of {env.task.name!r} never end without a horizon: give make() a horizon")
     if not env.autoreset:
-        raise ValueError("evaluate needs an environment that resets automatically: make it with autoreset=True")
+        raise ValueError(
+            "evaluate needs an environment that resets automatically: make the environment with autoreset=True"
+        )
     act, each = acting(policy), -(-episodes // env.nworld)
     check_fit(8 * (6 + len(env.episode_metrics)) * each, env.nworld, env.device, model=f"{each} episodes")
     env.rand_reset(None if seed is None else evaluation_seed(seed))
@@ -118,7 +119,7 @@ def evaluate(
 
 
 def _first_actions(act: Callable[[torch.Tensor], torch.Tensor], env: Env) -> torch.Tensor:
-    """Get a policy's first actions and check them; later actions are only copied."""
+    """Compute a policy's first actions, and check them; later actions are not checked."""
     try:
         action = act(env.obs)
     except RuntimeError as error:
@@ -130,11 +131,11 @@ def _first_actions(act: Callable[[torch.Tensor], torch.Tensor], env: Env) -> tor
 
 
 ENDLESS_STEPS = 1000
-"""Steps of an episode in evaluations of a task without a horizon."""
+"""Length of an episode, in steps, in evaluations of a task without a horizon."""
 
 
 def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
-    """Make a few worlds of the same task that play whole episodes. Tasks without a horizon get one of 1,000 steps.
+    """Make a few worlds of the same task, with a horizon of 1,000 steps if the task has none.
 
     Args:
         env: The environment.
@@ -148,8 +149,8 @@ def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
 class MeanPolicyEvaluation:
     """Evaluates the mean policy during training in a separate environment with few worlds.
 
-    The initial states are the same each time and are not used for training, so that evaluations differ only in the
-    policy. Rank 0 evaluates; all processes get its results.
+    All evaluations start from the same initial states, so that they differ only in the policy. Training uses different
+    initial states. Rank 0 evaluates; all processes get its results.
 
     Args:
         env: The training environment; each evaluation uses its current parameters.
@@ -162,7 +163,7 @@ class MeanPolicyEvaluation:
         self._few: Env | None = None
 
     def __call__(self, policy: torch.nn.Module) -> dict[str, float]:
-        """Run the evaluation, and return means over the episodes by their names in ``Iteration``."""
+        """Evaluate the policy, and return means over the episodes by their names in ``Iteration``."""
         means = torch.zeros(len(MEAN_STATISTICS), dtype=torch.float64, device=self.env.obs.device)
         if self.team.leads:
             if self._few is None:
@@ -175,11 +176,11 @@ class MeanPolicyEvaluation:
         return dict(zip(MEAN_STATISTICS, means.tolist(), strict=True))
 
     def added(self, statistics: Mapping[str, Any], policy: torch.nn.Module, *, due: bool) -> dict[str, Any]:
-        """Add the results of an evaluation to the samples' statistics; they are None if no evaluation is due."""
+        """Add an evaluation's results to the samples' statistics, or None for each result if no evaluation is due."""
         mean: dict[str, Any] = self(policy) if due else dict.fromkeys(MEAN_STATISTICS)
         success = self.env.task.functions["success"] is not None
         return {**statistics, **mean} | ({} if success else {"success": math.nan, "mean_success": None})
 
 
 MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")
-"""The attributes of ``Iteration`` that are set by an evaluation of the mean policy."""
+"""Attributes of ``Iteration`` that an evaluation of the mean policy sets."""

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from lyceum_warp.support.validate import check_flag, check_word, finite_number, layer_sizes, whole_number
 
 LEAST = -math.inf
-"""The lower bound of numbers that have no limit."""
+"""Lower bound of a number without a lower limit."""
 
 
 def check_fields(config: Any, bounds: Mapping[str, float | tuple[float, float]]) -> None:
@@ -20,8 +20,8 @@ def check_fields(config: Any, bounds: Mapping[str, float | tuple[float, float]])
     a group of observations (``str | None``). None is valid if the annotation includes it.
 
     Args:
-        config: The dataclass, in its ``__post_init__``.
-        bounds: Lower bound of each number, or lower and upper bound.
+        config: The dataclass, which calls this function in ``__post_init__``.
+        bounds: Lower bound, or lower and upper bound, of each number.
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.

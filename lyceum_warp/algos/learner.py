@@ -15,7 +15,7 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
 
 METRIC_COLUMN, STEP_METRIC_COLUMN = "metrics/", "step_metrics/"
-"""Prefixes of the columns of task metrics: sums over an episode, and means per step."""
+"""Column prefixes of task metrics, for sums over an episode and for means per step."""
 
 NESTED = ("metrics", "step_metrics", "numbers")
 """Fields of ``Iteration`` that are dicts."""
@@ -32,17 +32,17 @@ class Iteration:
     iteration: int
     """Number of the iteration, from 1."""
     samples: int
-    """Samples in all iterations so far."""
+    """Number of samples in all iterations so far."""
     reward_mean: float | None = None
     """Mean reward of a step, over all samples."""
     return_mean: float | None = None
     """Mean return (sum of rewards) of the episodes that ended during sampling; NaN if no episode ended."""
     return_std: float | None = None
-    """Standard deviation of these returns."""
+    """Standard deviation of the returns of the episodes that ended during sampling."""
     return_min: float | None = None
-    """Smallest of these returns."""
+    """Smallest return of the episodes that ended during sampling."""
     return_max: float | None = None
-    """Largest of these returns."""
+    """Largest return of the episodes that ended during sampling."""
     length_mean: float | None = None
     """Mean number of steps in an episode."""
     terminal_reward: float | None = None
@@ -52,9 +52,9 @@ class Iteration:
     success: float | None = None
     """Fraction of episodes that ended with the goal met; NaN for tasks without ``success``."""
     mean_return: float | None = None
-    """Mean return of the policy without noise, evaluated after the iteration; None if it was not evaluated."""
+    """Mean return of the policy without noise, evaluated after the iteration; None without an evaluation."""
     mean_length: float | None = None
-    """Mean length of the evaluated episodes, steps."""
+    """Mean length of the evaluated episodes, in steps."""
     mean_terminal_reward: float | None = None
     """Mean reward of the last step of the evaluated episodes."""
     mean_eval: float | None = None
@@ -64,12 +64,12 @@ class Iteration:
     metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """The task's metrics by name, summed over each episode and averaged over episodes."""
     step_metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """The task's metrics by name, averaged over all samples; independent of episode length."""
+    """The task's metrics by name, averaged over all samples."""
     numbers: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Additional numbers of the algorithm, by column name."""
 
     def row(self) -> dict[str, Any]:
-        """Convert to a row of metrics.csv: numbers by column, without None.
+        """Convert the statistics to a row of metrics.csv, without columns whose value is None.
 
         The metric ``x`` has the columns ``metrics/x`` and ``step_metrics/x``.
         """
@@ -81,16 +81,16 @@ class Iteration:
 
 @document_attributes
 class Learner(abc.ABC):
-    """Base class of learning algorithms: an infinite iterator of ``Iteration``, which ``lw.train`` runs.
+    """Base class of learning algorithms, which are infinite iterators of ``Iteration``.
 
-    A subclass sets ``algorithm``, ``policy`` and ``config``, and implements ``__next__``, which counts ``iteration``
+    A subclass sets ``algorithm``, ``policy`` and ``config``, and implements ``__next__``, which increases ``iteration``
     and ``samples``. If the algorithm has more state, the subclass extends ``state_dict`` and ``load_state_dict``.
     docs/learners.md has an example.
 
     Args:
-        env: The environment; do not step it between iterations.
+        env: The environment, which must not be stepped between iterations.
         seed: Seed of new networks and of the noise.
-        team: The processes that learn together, each with its share of the worlds; by default only this process.
+        team: The processes that learn together, each with some of the worlds; by default only this process.
 
     Raises:
         ValueError: The environment does not reset automatically, ``first_world`` does not match this process's rank, or
@@ -98,12 +98,12 @@ class Learner(abc.ABC):
     """
 
     algorithm: str
-    """The name of the algorithm; the key of the hyperparameters in a run's config.json."""
+    """The name of the algorithm, which is the key of its hyperparameters in a run's config.json."""
     env: Env
     """The environment that provides the samples."""
     policy: torch.nn.Module
-    """The policy after the last iteration. Its method ``act`` maps observations, (..., nobs), to actions without noise,
-    (..., nact), and normalises observations itself. It has the attributes ``nobs`` and ``nact``."""
+    """The policy after the last iteration. The method ``act`` maps observations, (..., nobs), to actions without noise,
+    (..., nact), and normalises observations itself. The policy has the attributes ``nobs`` and ``nact``."""
     value: torch.nn.Module | None = None
     """The value function after the last iteration; None for algorithms without one."""
     config: Any
@@ -115,14 +115,14 @@ class Learner(abc.ABC):
     generator: torch.Generator | None = None
     """The random generator, if the algorithm has one."""
     replay: Replay | None = None
-    """The replay buffer, if the algorithm has one. ``state_dict`` does not contain it, because it may be large: a run
-    keeps it in separate files, which are updated incrementally."""
+    """The replay buffer, if the algorithm has one. ``state_dict`` does not contain the replay buffer, because of its
+    size; a run updates separate files incrementally."""
     own_worlds: slice
-    """Range of this process's worlds among the worlds of all processes."""
+    """Indices of this process's worlds among the worlds of all processes."""
     iteration: int
     """Number of complete iterations."""
     samples: int
-    """Samples in all iterations so far."""
+    """Number of samples in all iterations so far."""
 
     def __init__(self, env: Env, *, seed: int = 0, team: Team | None = None) -> None:
         self.env, self.seed = env, whole_number("seed", seed, low=0)
@@ -137,7 +137,8 @@ class Learner(abc.ABC):
             )
         if not env.autoreset:
             raise ValueError(
-                f"{type(self).__name__} needs an environment that resets automatically: make it with autoreset=True"
+                f"{type(self).__name__} needs an environment that resets automatically: make the environment with "
+                "autoreset=True"
             )
 
     def __iter__(self) -> Iterator[Iteration]:
@@ -145,7 +146,7 @@ class Learner(abc.ABC):
 
     @abc.abstractmethod
     def __next__(self) -> Iteration:
-        """Run one iteration: sample, update the policy, and evaluate it if due.
+        """Run one iteration: sample, update the policy, and evaluate the policy if due.
 
         Raises:
             FloatingPointError: An update is not finite, so learning cannot continue.
@@ -153,24 +154,24 @@ class Learner(abc.ABC):
 
     @property
     def best_by(self) -> str:
-        """Which return selects the best policy and is compared with the target: "mean_return" or "return_mean".
+        """Name of the return that selects the best policy and is compared with the target.
 
-        "mean_return" describes the policy after the iteration, "return_mean" the policy before it. The default is
-        "mean_return", or "return_mean" if the configuration has ``mean_every=0``.
+        "mean_return" describes the policy after the iteration, "return_mean" the policy before the iteration. The
+        default is "mean_return", or "return_mean" if the configuration has ``mean_every=0``.
         """
         return "return_mean" if getattr(self.config, "mean_every", None) == 0 else "mean_return"
 
     @property
     def title(self) -> str:
-        """The algorithm's name for messages, with details such as the size of the replay buffer."""
+        """Name of the algorithm in messages, with details such as the size of the replay buffer."""
         return self.algorithm
 
     def settings(self) -> dict[str, Any]:
-        """The hyperparameters for a run's config.json."""
+        """Return the hyperparameters for a run's config.json."""
         return dataclasses.asdict(self.config)
 
     def state_dict(self) -> dict[str, Any]:
-        """Copy the complete state except ``replay``, including the worlds of all processes, to resume from.
+        """Copy the complete state, including the worlds of all processes but not ``replay``.
 
         The state consists of tensors, numbers, strings, dicts and lists. All processes must call this method. Any
         number of processes can resume from the state.
@@ -188,13 +189,13 @@ class Learner(abc.ABC):
             state["generator"] = self.generator.get_state()
         if self.replay is not None:
             state["stored"] = self.replay.stored
-        return copy.deepcopy(state)  # a module's state_dict shares memory with its parameters
+        return copy.deepcopy(state)  # copy, because a module's state_dict shares memory with the parameters
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from a state of ``state_dict``; the following iterations are identical bit for bit.
+        """Resume from a state of ``state_dict``; later iterations equal an uninterrupted run's bit for bit.
 
         Raises:
-            ValueError: The state has a different number of worlds, or its counters are not whole numbers.
+            ValueError: The state has a different number of worlds, or a counter is not a whole number.
         """
         nworld = self.env.nworld * self.team.size
         if len(state["env"]) != nworld:
@@ -204,7 +205,7 @@ class Learner(abc.ABC):
             self.value.load_state_dict(state["value"])
         if self.generator is not None:
             self.generator.set_state(state["generator"].cpu())
-        if "shared" in state:  # earlier releases had none
+        if "shared" in state:  # checkpoints of earlier releases lack the entry "shared"
             self.env.set_shared(state["shared"].to(self.env.obs.device))
         self.env.set_state(state["env"][self.own_worlds].to(self.env.obs.device))
         self.iteration = whole_number("iteration", state["iteration"], low=0)

@@ -9,14 +9,14 @@ import torch
 from lyceum_warp.algos.distributed import Captured, Team
 
 Samples = Mapping[str, torch.Tensor]
-"""Tensors by name, each with one row per sample."""
+"""Map names to tensors with one row per sample."""
 
 _SURE = 6.0
-"""A process's mini-batches have room for the mean number of its samples plus this number of standard deviations."""
+"""Number of standard deviations by which a mini-batch's size exceeds a process's mean number of samples."""
 
 
 def room(batch: int, team: Team) -> int:
-    """Number of rows that a process reserves in a mini-batch of ``batch`` samples of all processes."""
+    """Compute the number of rows per process for a mini-batch of ``batch`` samples of all processes."""
     share = batch / team.size
     return min(batch, math.ceil(share + _SURE * math.sqrt(share)))
 
@@ -24,17 +24,17 @@ def room(batch: int, team: Team) -> int:
 class Minibatches:
     """Shuffles a rollout's samples once, and learns from the same mini-batches in every epoch.
 
-    The mini-batches do not depend on the number of processes: each process uses the samples of its own worlds, in a
+    The mini-batches do not depend on the number of processes. Each process uses the samples of its own worlds, in a
     tensor of fixed size that is padded with rows of weight 0. The tensor has room for the mean number of samples plus
     six standard deviations; further samples are dropped.
 
-    On a GPU an epoch is ``Captured``, so ``learn`` must update tensors in place.
+    On a GPU, an epoch runs as a CUDA graph, so ``learn`` must update tensors in place.
 
     Args:
-        learn: Called with the process's samples of a mini-batch and their weights, (samples,), which sum to 1 over all
+        learn: Function of the process's samples of a mini-batch and their weights, (samples,), which sum to 1 over all
             processes.
-        steps: Number of steps of every world.
-        nworld: Worlds of this process.
+        steps: Steps per world in a rollout.
+        nworld: Number of this process's worlds.
         count: Number of mini-batches.
         team: The processes.
         device: Device of the samples.
@@ -66,7 +66,7 @@ class Minibatches:
         """
         order = torch.randperm(self.samples, generator=generator, device=self.weight.device)
         places, own = self.team.locate(order[: self.count * self.batch].view(self.count, self.batch), self.nworld)
-        if self.room < self.batch:  # move own samples to the front
+        if self.room < self.batch:  # move this process's samples to the front
             first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self.room]
             places, own = places.gather(1, first), own.gather(1, first)
         self.order.copy_(places.flatten())
@@ -90,7 +90,7 @@ class Minibatches:
 
 @contextlib.contextmanager
 def precision(*, tf32: bool) -> Iterator[None]:
-    """Context in which matrix products on a GPU may use TensorFloat-32."""
+    """Make a context in which matrix products on a GPU may use TensorFloat-32."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if tf32 else before)
     try:

@@ -1,10 +1,10 @@
 """Update plans by model predictive path integral control (MPPI): weight samples by the exponential of their returns.
 
-The planner's sample k (``planner.py``), with return R_k, has the weight
+In MPPI, a sample k of the planner (``planner.py``) with the return R_k has the weight
 
     w_k = exp((R_k - max R) / temperature) / sum_j exp((R_j - max R) / temperature),
 
-as in Williams et al. (2017, "Information theoretic MPC for model-based reinforcement learning"), without a cost on the
+as in Williams et al., 2017 ("Information theoretic MPC for model-based reinforcement learning"), without a cost on the
 controls. A failed sample has the weight 0.
 """
 
@@ -15,7 +15,7 @@ from lyceum_warp.kernels import planning
 
 
 class ExponentialWeights(PlanUpdate):
-    """The update of MPPI.
+    """Update plans by MPPI.
 
     Args:
         temperature: Temperature of the weights, in units of reward.

@@ -1,4 +1,4 @@
-"""Divide a planner's arguments into settings, options and parameters, with defaults from the task's ``planning``."""
+"""Divide a planner's arguments into settings, options and parameters; their defaults are the task's ``planning``."""
 
 import contextlib
 import dataclasses
@@ -24,11 +24,11 @@ from lyceum_warp.task import Planning, Task
 
 
 def task_config(task: type[Task], value: object = None) -> MPPIConfig:
-    """Make the settings from a task's ``planning``.
+    """Make a planner's settings from a task's ``planning``.
 
     Args:
         task: The task.
-        value: The planner's value function; its ``discount``, if it has one, replaces the task's.
+        value: The planner's value function; its ``discount``, if it has one, replaces the task's discount.
 
     Raises:
         ValueError: The task's ``planning`` is not valid.
@@ -49,20 +49,20 @@ def planner_arguments(
     value: object,
     plants: int = 1,
 ) -> tuple[MPPIConfig, EnvOptions, dict[str, Any]]:
-    """Sort a planner's arguments, with defaults from the task's ``planning``.
+    """Divide a planner's arguments into settings, options and parameters; defaults come from ``planning``.
 
     Args:
         task: The task.
-        config: Settings that replace the task's.
-        words: The flat keyword arguments: individual settings, options of the worlds, parameters of the task. A setting
-            of None is ignored.
+        config: Settings that replace the task's settings.
+        words: Keyword arguments, which are settings, options of the worlds or parameters of the task. A setting of None
+            is ignored.
         params: Parameters of the task.
-        value: The value function. If there is one, the parameters in ``planning`` are ignored.
+        value: The value function. With a value function, the parameters in ``planning`` are ignored.
         plants: Number of plants to plan for.
 
     Returns:
-        The settings; the options of the planner's worlds, with an engine and a device for this number of samples; and
-        the parameters of the planner's worlds.
+        The settings, and the options and the parameters of the planner's worlds. The options include an engine and a
+        device that suit the number of samples.
 
     Raises:
         ValueError: A keyword is unknown or ambiguous, or a value is not valid.
@@ -72,7 +72,7 @@ def planner_arguments(
     name, planning, known = task_name(task), _planning(task), _parameter_names(task)
     if both := [word for word in words if word in SETTINGS and word in known]:
         raise ValueError(
-            f"{both[0]!r} is a setting of MPPI and a parameter of the task {name!r}: give the setting as "
+            f"{both[0]!r} is a setting of MPPI and a parameter of the task {name!r}: pass the setting as "
             f"config=lw.MPPIConfig({both[0]}=...), or the parameter as params={{{both[0]!r}: ...}}"
         )
     config = config or task_config(task, value)
@@ -98,14 +98,16 @@ def plant_seeds(seed: int | Sequence[int], plants: int) -> Sequence[int]:
     """Derive each plant's seed from the first plant's seed, or check a list of seeds.
 
     Raises:
-        ValueError: A seed is not a non-negative whole number, or there are too few or too many.
+        ValueError: A seed is not a non-negative whole number, or the number of seeds is not ``plants``.
     """
     given: Any = seed
     if isinstance(given, (np.ndarray, torch.Tensor)):
         given = given.tolist()
     if isinstance(given, Sequence) and not isinstance(given, str):
         if len(given) != plants:
-            raise ValueError(f"seed must be a number, or a list with one for each of {plants} plants, not {given!r}")
+            raise ValueError(
+                f"seed must be a number, or a list with a number for each of {plants} plants, not {given!r}"
+            )
         return [whole_number("seed", one, low=0) for one in given]
     first = whole_number("seed", given, low=0, high=2**31 - plants)
     return range(first, first + plants)
@@ -113,10 +115,10 @@ def plant_seeds(seed: int | Sequence[int], plants: int) -> Sequence[int]:
 
 @contextlib.contextmanager
 def explained_worlds(config: MPPIConfig, plants: int) -> Iterator[None]:
-    """Add the settings that determine the number of worlds to a NotEnoughMemoryError of the block.
+    """Name the settings that determine the number of worlds in a NotEnoughMemoryError of the with block.
 
     Raises:
-        NotEnoughMemoryError: The worlds do not fit.
+        NotEnoughMemoryError: The worlds do not fit into memory.
     """
     try:
         yield
@@ -149,7 +151,7 @@ _OWN_OPTIONS = {
     "seed": "every sample starts from the state to plan from",
     "first_world": "no other process has samples",
 }
-"""Options that the planner sets itself, each with the reason."""
+"""Options that the planner sets itself, each with the reason for refusing a value."""
 
 
 def _check_options(options: Mapping[str, Any]) -> None:
@@ -172,7 +174,7 @@ def _parameter_names(task: type[Task]) -> list[str]:
 
 
 def _planning(task: type[Task]) -> Planning:
-    """A task's ``planning``, checked: every name in it is known."""
+    """Return a task's ``planning`` after checking that every name in it is known."""
     planning, name = task.planning, task_name(task)
     if not isinstance(planning, Planning):
         raise ValueError(

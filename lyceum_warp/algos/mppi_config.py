@@ -23,7 +23,7 @@ _SMALLEST = float(np.finfo(np.float32).tiny)
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MPPIConfig:
-    """Settings of MPPI, CEM and predictive sampling. Arrays and tensors are converted to tuples of floats.
+    """Settings of the planners MPPI, CEM and predictive sampling. Arrays and tensors are converted to tuples of floats.
 
     Raises:
         ValueError: A value is of the wrong type or out of range.
@@ -32,58 +32,58 @@ class MPPIConfig:
     horizon: int = 32
     """Number of steps in a plan."""
     samples: int = 64
-    """Number of samples per improvement of the plan. Each sample is rolled out in one world per model."""
+    """Number of samples per improvement of the plan. The planner rolls out each sample in one world per model."""
     update: Literal["mppi", "cem", "predictive_sampling"] | PlanUpdate = "mppi"
-    """How samples determine the new plan: their mean with weights exp(return / temperature) ("mppi"), the mean of the
-    best samples ("cem", the cross-entropy method), the best sample ("predictive_sampling"), or a ``PlanUpdate``."""
+    """Method that computes the new plan: the mean of the samples with weights exp(return / temperature) ("mppi"), the
+    mean of the best samples ("cem", the cross-entropy method), the best sample ("predictive_sampling"), or a
+    ``PlanUpdate``."""
     temperature: float = 0.1
     """Temperature of MPPI's weights, in units of reward. Low temperatures follow the best sample; high temperatures
     average all samples."""
     elites: int | None = None
     """Number of best samples that CEM fits. None means a tenth of the samples, but at least two."""
     noise: Numbers = 0.5
-    """Noise that is added to the plan, in units of the action: a standard deviation, one for each action, or a
-    covariance, (nact, nact). CEM starts from these standard deviations and adapts them."""
+    """Noise that is added to the plan, in units of the action: a standard deviation, a standard deviation for each
+    action, or a covariance, (nact, nact). CEM adapts the noise, starting from the standard deviations in ``noise``."""
     min_noise: float | Sequence[float] | None = None
     """Lower limit of CEM's adapted standard deviations, one number or one for each action. None means a tenth of
     ``noise``."""
     include_plan: bool | None = None
-    """Whether the first sample is the plan itself, without noise. None means True, except with a single sample or an
-    update that adapts the noise, as CEM does."""
+    """Whether the first sample is the plan itself, without noise. None means True, but False with a single sample or
+    with an update that adapts the noise, as CEM does."""
     smoothing: tuple[float, float, float] = (0.25, 0.8, 0.0)
     """Weights (b0, b1, b2) that smooth the noise n over time: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) from the third
     step on. (1, 0, 0) is white noise. The noise of knots is not smoothed."""
     knots: int | None = None
-    """Number of spline knots over the horizon: noise is added to the knots, and the actions are interpolated between
+    """Number of spline knots over the horizon. The planner adds noise to the knots, and interpolates actions between
     them. None means a separate action for each step."""
     spline: Literal["zero", "linear", "cubic"] = "cubic"
-    """Interpolation between knots: piecewise constant ("zero"), piecewise linear ("linear"), or cubic Hermite
-    ("cubic")."""
+    """Interpolation of actions between knots: piecewise constant ("zero"), piecewise linear ("linear"), or cubic
+    Hermite ("cubic")."""
     between: Literal["hold", "linear"] = "hold"
-    """Actions between two actions of the plan, if the planner's time step is a multiple of the plant's time step: the
-    earlier action ("hold"), or linear interpolation ("linear")."""
+    """Action between two actions of the plan: the earlier action ("hold"), or their linear interpolation ("linear").
+    The setting ``between`` applies if the planner's time step is a multiple of the plant's time step."""
     discount: float | None = None
-    """Discount factor of rewards and of the terminal value. None means the value function's discount, or 1 without
-    one."""
+    """Discount factor of rewards and of the terminal value. None means the value function's discount, or 1 without a
+    value function."""
     iterations: int = 1
-    """Number of improvements of the plan in each call."""
+    """Number of improvements of the plan per call of the planner."""
     fill: str | Numbers = "zero"
-    """Actions that fill the end of a shifted plan: "zero" (the action nearest to zero), "repeat" (the last action), or
-    a given action, as one number or one per element."""
+    """Action that fills the end of a shifted plan: "zero" (the action nearest to zero), "repeat" (the last action), or
+    a given action (one number, or one per element of the action)."""
     termination: Literal["stop", "ignore"] = "stop"
-    """Whether a sample's return ends with its episode ("stop"), or continues to the horizon ("ignore", as in Lyceum and
-    trajopt)."""
+    """Whether a sample's return stops at the end of its episode ("stop") or continues to the horizon ("ignore", as in
+    Lyceum and trajopt)."""
     nominal_model: bool = False
-    """Whether samples use the nominal values of per-world model fields; by default they use the values in the given
-    state."""
+    """Whether samples use the nominal values of per-world model fields instead of the values in the given state."""
     models: int = 1
     """Number of models in which each sample is rolled out. With several models, the planner randomizes their model
     fields with the task's ``startup``, ``initialize`` and ``randomize``, and ignores the values in the state."""
     risk: Literal["mean", "worst"] = "mean"
-    """How the returns of a sample in several models are combined: their mean or the smallest."""
+    """Combination of a sample's returns in several models: their mean or the smallest."""
 
     def __post_init__(self) -> None:
-        """Check the settings independently of a task."""
+        """Check the settings that do not depend on a task."""
         checked: dict[str, Any] = {
             name: whole_number(name, getattr(self, name), low=1) for name in ("horizon", "samples", "models")
         }
@@ -112,18 +112,21 @@ class MPPIConfig:
                 if checked[name] > checked[most]:
                     raise ValueError(f"{name}={checked[name]} must be at most {most}, which is {checked[most]}")
         if self.spline != "cubic" and self.knots is None:
-            raise ValueError(f"spline={self.spline!r} interpolates between knots: give their number, as knots=4")
+            raise ValueError(
+                f"spline={self.spline!r} interpolates between knots: give the number of knots, such as knots=4"
+            )
         if checked["models"] == 1 and self.risk != "mean":
-            raise ValueError(f"risk={self.risk!r} compares models: give their number, as models=4")
+            raise ValueError(f"risk={self.risk!r} compares models: give the number of models, such as models=4")
         if checked["models"] > 1 and self.nominal_model:
             raise ValueError(
-                f"models={checked['models']} draws model fields, and nominal_model=True does not: omit one of them"
+                f"models={checked['models']} draws model fields, but nominal_model=True does not: omit one of the "
+                "two settings"
             )
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 
     def changed(self, settings: Mapping[str, Any]) -> "MPPIConfig":
-        """Copy with changed settings. Changing the update resets settings specific to the old update to their defaults.
+        """Return a copy with changed settings; a new ``update`` resets the old update's settings to defaults.
 
         Raises:
             ValueError: A value is of the wrong type or out of range.
@@ -133,10 +136,10 @@ class MPPIConfig:
         return dataclasses.replace(self, **words)
 
     def completed(self, value: object = None) -> "MPPIConfig":
-        """Copy with None replaced by defaults, except in ``knots`` and in settings that the update ignores.
+        """Replace None by defaults, except in ``knots`` and in settings that the update ignores.
 
         Args:
-            value: The planner's value function; its ``discount``, if it has one, is the default.
+            value: The planner's value function; its ``discount``, if it has one, is the default discount.
 
         Raises:
             ValueError: A setting does not apply to the update.
@@ -157,16 +160,16 @@ class MPPIConfig:
         else:
             for name in _OF_CEM:
                 if (given := getattr(self, name)) is not None:
-                    raise ValueError(f"{name}={given!r} is a setting of update='cem', not of {self.update!r}")
+                    raise ValueError(f"{name}={given!r} is a setting of update='cem', not of update={self.update!r}")
         return dataclasses.replace(
             self, **{name: default for name, default in chosen.items() if getattr(self, name) is None}
         )
 
     def noise_factor(self, nact: int) -> np.ndarray:
-        """Lower Cholesky factor of the noise's covariance, (nact, nact).
+        """Compute the lower Cholesky factor of the noise's covariance, (nact, nact).
 
         Raises:
-            ValueError: The size of ``noise`` does not match.
+            ValueError: The size of ``noise`` does not match the actions.
         """
         noise = np.asarray(self.noise)
         if noise.shape in ((), (nact,)):
@@ -174,36 +177,36 @@ class MPPIConfig:
         if noise.shape == (nact, nact):
             return np.linalg.cholesky(noise)
         raise ValueError(
-            f"noise must be a standard deviation, {nact} of them, or a positive definite covariance ({nact}, {nact}), "
-            f"not {self.noise!r}"
+            f"noise must be a standard deviation, {nact} standard deviations, or a positive definite covariance "
+            f"({nact}, {nact}), not {self.noise!r}"
         )
 
     @property
     def noise_smoothing(self) -> tuple[float, float, float]:
-        """The effective ``smoothing``: white noise for knots."""
+        """Return the effective ``smoothing``, which is none for knots."""
         return self.smoothing if self.knots is None else (1.0, 0.0, 0.0)
 
     def fill_action(self, space: Space) -> np.ndarray:
-        """The action that fills the end of a plan and the whole initial plan, clipped to the bounds, (nact,).
+        """Return the action that fills the initial plan and the end of shifted plans, clipped to the bounds, (nact,).
 
         Raises:
-            ValueError: The size of ``fill`` does not match.
+            ValueError: The size of ``fill`` does not match the actions.
         """
         fill = np.asarray(0.0 if isinstance(self.fill, str) else self.fill)
         if fill.shape not in ((), (space.size,)):
-            raise ValueError(f"fill must be 'zero', 'repeat', a number or {space.size} of them, not {self.fill!r}")
+            raise ValueError(f"fill must be 'zero', 'repeat', a number or {space.size} numbers, not {self.fill!r}")
         return np.clip(np.broadcast_to(fill, space.size), space.low, space.high)
 
 
 _OF_CEM = ("elites", "min_noise")
-"""Settings that only CEM has."""
+"""Settings that only CEM uses."""
 
 SETTINGS = tuple(field.name for field in dataclasses.fields(MPPIConfig))
 """Names of the settings."""
 
 
 def _array(value: Any) -> np.ndarray | None:
-    """Convert finite numbers to float64; None for anything else."""
+    """Convert finite numbers to float64; return None for anything else."""
     try:
         array = np.asarray(value.detach().cpu() if isinstance(value, torch.Tensor) else value)
         array = array.astype(np.float64) if array.dtype.kind in "iuf" else np.array(math.nan)
@@ -213,7 +216,7 @@ def _array(value: Any) -> np.ndarray | None:
 
 
 def _tuples(array: np.ndarray) -> Any:
-    """Convert an array to a float or to tuples, which can be compared and hashed."""
+    """Convert an array to a float or to tuples, which are hashable."""
     return array.item() if array.ndim == 0 else tuple(map(_tuples, array))
 
 
@@ -236,7 +239,8 @@ def _noise(noise: Any) -> Any:
             except np.linalg.LinAlgError:
                 pass
     raise ValueError(
-        f"noise must be a standard deviation, one for each action, or a positive definite covariance, not {noise!r}"
+        "noise must be a standard deviation, a standard deviation for each action, or a positive definite "
+        f"covariance, not {noise!r}"
     )
 
 
@@ -245,7 +249,7 @@ def _smoothing(smoothing: Any) -> Any:
     if array is None or array.shape != (3,):
         raise ValueError(f"smoothing must be 3 finite numbers, not {smoothing!r}")
     b0, b1, b2 = array.tolist()
-    # the stability triangle of a second-order filter; its poles are the roots of z^2 - b1 z - b2
+    # check the stability triangle of a second-order filter, which has the roots of z^2 - b1 z - b2 as poles
     if not (abs(b2) < 1 and abs(b1) < 1 - b2):
         raise ValueError(
             f"smoothing {(b0, b1, b2)} is unstable: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) must have its poles inside "

@@ -17,14 +17,14 @@ def score_gradient(
     *,
     dense: DensePolicy | None = None,
 ) -> torch.Tensor:
-    """Gradient of sum(weight * log pi(action | obs)) with respect to the trainable parameters, (parameters,).
+    """Compute the gradient of sum(weight * log pi(action | obs)) in the trainable parameters, (parameters,).
 
     Args:
         policy: The policy.
         obs: Observations, (samples, nobs).
         action: Actions, (samples, nact).
         weight: Weights, (samples,).
-        dense: The same policy without autograd, if it is available.
+        dense: The policy's evaluation without autograd, if available.
     """
     parameters = [p for p in policy.parameters() if p.requires_grad]
     if dense is None:
@@ -38,19 +38,19 @@ def score_gradient(
 
 
 class FisherProduct:
-    """Products with the Fisher information of a Gaussian policy, averaged over observations.
+    """Compute products with the Fisher information of a Gaussian policy, averaged over observations.
 
-    For N(mean(s; theta), diag(sigma^2)) the Fisher information is E[J^T diag(1 / sigma^2) J] for the parameters of the
-    mean, with J = d mean / d theta, and 2 for each log sigma.
+    The Fisher information of N(mean(s; theta), diag(sigma^2)) is E[J^T diag(1 / sigma^2) J] for theta, with J = d mean
+    / d theta, and 2 for each log sigma.
 
     Args:
         policy: The policy.
         obs: Observations, (samples, nobs).
-        damping: Added to the diagonal.
+        damping: Damping that is added to the diagonal.
         count: Number of observations of all processes; ``len(obs)`` by default.
         weight: Weights of the observations, (samples,): 0 for observations of other processes, otherwise 1.
         team: The processes.
-        dense: The same policy without autograd, if it is available.
+        dense: The policy's evaluation without autograd, if available.
     """
 
     def __init__(
@@ -75,20 +75,22 @@ class FisherProduct:
         self.jacobian = dense or AutogradJacobian(self.mean, network)
 
     def __call__(self, vector: torch.Tensor) -> torch.Tensor:
-        """(F + damping) vector, both (parameters,)."""
+        """Compute (F + damping) vector, (parameters,), from a vector, (parameters,)."""
         parts = [
             part.view_as(p)
             for part, p in zip(vector.split([p.numel() for p in self.parameters]), self.parameters, strict=True)
         ]
         log_std_part = vector if self.log_std_at is None else parts.pop(self.log_std_at)
         pulled = self.jacobian.pull(self.jacobian.push(parts) * self.precision)
-        if self.log_std_at is not None:  # this part is not a sum over samples, so each process adds an equal share
+        if (
+            self.log_std_at is not None
+        ):  # log_std's part is not a sum over samples, so each process adds an equal fraction
             pulled.insert(self.log_std_at, 2.0 / self.team.size * log_std_part)
         return self.team.sum(flatten(pulled)) + self.damping * vector
 
 
 class AutogradJacobian:
-    """Products with the Jacobian J = d mean / d parameters of any network, by autograd.
+    """Compute products with the Jacobian J = d mean / d parameters of any network by autograd.
 
     J v is the derivative of u^T J v with respect to u, so both products are backward passes through graphs that are
     built once.
@@ -104,11 +106,11 @@ class AutogradJacobian:
         self.pulled = torch.autograd.grad(mean, parameters, self.probe, create_graph=True)
 
     def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
-        """J v, (samples, nact), from v in tensors of the parameters' shapes."""
+        """Compute J v, (samples, nact), from v in tensors of the parameters' shapes."""
         return torch.autograd.grad(self.pulled, self.probe, parts, retain_graph=True)[0]
 
     def pull(self, u: torch.Tensor) -> list[torch.Tensor]:
-        """J^T u, in tensors of the parameters' shapes, from u, (samples, nact)."""
+        """Compute J^T u in tensors of the parameters' shapes from u, (samples, nact)."""
         return list(torch.autograd.grad(self.mean, self.parameters, u, retain_graph=True))
 
 
@@ -118,7 +120,7 @@ def conjugate_gradient(
     """Solve product(x) = target for a symmetric positive definite product, from x = 0.
 
     The number of iterations is fixed and no branch depends on values, so the host never waits for the device. Steps are
-    zero once the residual vanishes.
+    zero after the residual has vanished.
     """
     x = torch.zeros_like(target)
     residual = target.clone()

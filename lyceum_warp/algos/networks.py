@@ -24,23 +24,23 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
     "tanh": nn.Tanh, "relu": nn.ReLU, "leaky_relu": nn.LeakyReLU, "elu": nn.ELU, "selu": nn.SELU, "gelu": nn.GELU,
     "silu": nn.SiLU, "softplus": nn.Softplus,
 }  # fmt: skip
-"""Modules of the activations, by name."""
+"""Map names of activations to torch modules."""
 
 
 def check_memory(sizes: Sequence[int], **arguments: Any) -> None:
-    """Check that the weights of a fully connected network fit into memory.
+    """Check that a fully connected network fits into memory.
 
     Args:
         sizes: Widths of all layers, including input and output.
-        arguments: The arguments that determine the sizes, for the message.
+        arguments: The arguments that determine the sizes, which an error message names.
 
     Raises:
-        ValueError: The weights do not fit.
+        ValueError: The weights do not fit into memory.
     """
     needed, free = 4 * sum(n * m + m for n, m in itertools.pairwise(sizes)), free_memory(wp.get_device("cpu"))
     if free is not None and needed > free:
         given = ", ".join(f"{name}={value}" for name, value in arguments.items())
-        raise ValueError(f"a network of {given} needs {needed / 1e9:.3g} GB, and {free / 1e9:.3g} GB are free")
+        raise ValueError(f"a network of {given} needs {needed / 1e9:.3g} GB, but only {free / 1e9:.3g} GB are free")
 
 
 def mlp(
@@ -59,7 +59,7 @@ def mlp(
         generator: Draws the initial weights.
 
     Raises:
-        ValueError: The activation is not one of the known names.
+        ValueError: The name of the activation is unknown.
     """
     check_word("activation", activation, get_args(Activation))
     check_kind("generator", generator, torch.Generator | None, "as torch.Generator()")
@@ -79,7 +79,7 @@ def mlp(
 
 @torch.no_grad()
 def initialize_as_torch(network: nn.Module, generator: torch.Generator | None) -> None:
-    """Draw the weights of all linear layers as ``nn.Linear`` does by default: uniform in +-1 / sqrt(inputs)."""
+    """Draw the weights of all linear layers as ``nn.Linear`` does by default, uniformly in +-1 / sqrt(inputs)."""
     for layer in network.modules():
         if isinstance(layer, nn.Linear):
             bound = 1.0 / math.sqrt(layer.in_features)
@@ -94,11 +94,11 @@ _Applied: TypeAlias = tuple[torch.Tensor, torch.Tensor]
 
 
 class Normalizer(nn.Module):
-    """Normalises observations by their running mean and variance; the identity before the first update.
+    """Normalises observations by their running mean and variance; does nothing before the first update.
 
     Args:
         size: Length of an observation.
-        limit: Normalised values are clipped to [-limit, limit]; inf for no limit.
+        limit: Limit of normalised values, which are clipped to [-limit, limit]; inf means no limit.
     """
 
     count: torch.Tensor
@@ -123,7 +123,7 @@ class Normalizer(nn.Module):
         Args:
             obs: Observations, (..., size).
             team: The processes; each contributes the same number of observations.
-            eps: Added to the standard deviations.
+            eps: Constant that is added to the standard deviations.
         """
         team = team or Team()
         obs = obs.reshape(-1, obs.shape[-1]).double()
@@ -139,12 +139,12 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def interpolate(self, before: _Applied, after: _Applied, part: torch.Tensor) -> None:
-        """Apply a fraction of an update to ``shift`` and ``scale``; mean and variance include the whole update.
+        """Apply a fraction of an update to ``shift`` and ``scale``, but keep the whole update in mean and variance.
 
         Args:
             before: ``shift`` and ``scale`` before the update.
-            after: ``shift`` and ``scale`` after it.
-            part: The fraction, from 0 to 1.
+            after: ``shift`` and ``scale`` after the update.
+            part: The fraction of the update, from 0 to 1.
         """
         self.shift.copy_(torch.lerp(before[0], after[0], part))
         self.scale.copy_(torch.lerp(before[1].log(), after[1].log(), part).exp())
@@ -164,16 +164,16 @@ class Normalized(nn.Module):
         super().__init__()
         check_flag("normalize", normalize)
         if not isinstance(limit, (int, float)) or not limit > 0:
-            raise ValueError(f"limit must be a positive number, or inf for none, not {described(limit)}")
+            raise ValueError(f"limit must be a positive number, or inf for no limit, not {described(limit)}")
         self.normalizer = Normalizer(nobs, limit) if normalize else nn.Identity()
 
     def observe(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
-        """Update the normaliser, if there is one; this changes the module's outputs.
+        """Update the normaliser, if there is one, which changes the module's outputs.
 
         Args:
             obs: Observations, (..., nobs).
             team: The processes; each contributes the same number of observations.
-            eps: Added to the standard deviations.
+            eps: Constant that is added to the standard deviations.
         """
         if isinstance(self.normalizer, Normalizer):
             self.normalizer.update(obs, team, eps=eps)
@@ -188,7 +188,7 @@ def moved(module: Module, env: Env) -> Module:
 
 
 def trainable(module: Module) -> Module:
-    """Unfreeze a module if all its parameters are frozen, as after ``lw.load``; returns the module."""
+    """Unfreeze a module if all its parameters are frozen, as after ``lw.load``, and return the module."""
     if isinstance(module, nn.Module) and not any(parameter.requires_grad for parameter in module.parameters()):
         module.requires_grad_(True)
     return module

@@ -1,8 +1,8 @@
 """Learn policies by natural policy gradient (NPG).
 
-The algorithm of Kakade (2002), as in Rajeswaran et al. (2017, "Towards Generalization and Simplicity in Continuous
-Control"): generalised advantages, the vanilla policy gradient, conjugate gradient on the Fisher information, and a step
-of fixed length in the Fisher metric.
+NPG was proposed by Kakade (2002), and follows Rajeswaran et al., 2017 ("Towards Generalization and Simplicity in
+Continuous Control"): generalised advantages, the vanilla policy gradient, conjugate gradient on the Fisher information,
+and a step of fixed length in the Fisher metric.
 """
 
 import copy
@@ -46,31 +46,31 @@ _PATIENCE = 10
 """Learning ends after this number of consecutive iterations with a non-finite update."""
 
 _DRIFT = 0.2
-"""Maximum KL divergence caused by an update of the normaliser, as a fraction of the desired KL divergence."""
+"""Maximum KL divergence due to an update of the normaliser, as a fraction of the desired KL divergence."""
 
 
 @document_attributes
 class NPG(OnPolicyLearner):
-    """Learns a policy by NPG; an infinite iterator of ``NPGIteration``.
+    """Learns a policy by NPG, as an infinite iterator of ``NPGIteration``.
 
     Example:
         >>> for it in NPG(env):
         ...     print(it.return_mean)
 
     Args:
-        env: The environment; do not step it between iterations.
-        policy: The policy; a new one by default. ``GaussianPolicy(nobs, nact, network=...)`` wraps any network.
-        value: The value function; a new one by default.
+        env: The environment, which must not be stepped between iterations.
+        policy: The policy; by default a new policy. ``GaussianPolicy(nobs, nact, network=...)`` wraps any network.
+        value: The value function; by default a new value function.
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
-        team: The processes that learn together, each with its share of the worlds. All processes must make the same
-            calls with the same arguments, and get the same statistics.
+        team: The processes that learn together, each with some of the worlds. All processes must make the same calls
+            with the same arguments, and get the same statistics.
 
     Raises:
         ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy is not
             trainable (``lyceum_warp.algos.policy_check``).
         FloatingPointError: The policy's step or the value function's fit was not finite in 10 consecutive iterations.
-            Such updates are skipped and counted in ``NPGIteration.skipped_updates``.
+            Non-finite updates are skipped and counted in ``NPGIteration.skipped_updates``.
     """
 
     algorithm = "npg"
@@ -97,7 +97,7 @@ class NPG(OnPolicyLearner):
         scale = 1.0 / max(1.0 - config.gamma, 1e-3)
         self._make_networks(policy, value, scale=scale, time_orders=config.time_orders)
 
-        # on the CPU with one process, branching on a tensor needs no synchronisation
+        # branching on a tensor needs no synchronisation with one process on the CPU
         self._reads_numbers = device.type == "cpu" and team.size == 1
 
         # samples
@@ -108,7 +108,8 @@ class NPG(OnPolicyLearner):
         self._make_rollout(steps, first_only=not self.segments)
         if not self.segments and not whole and team.leads:
             log.warning(
-                "%d samples of %d worlds are %d steps: no episode will reach its horizon of %d; use fewer worlds, "
+                "%d samples in %d worlds are only %d steps per world, so no episode reaches its horizon of %d: use "
+                "fewer worlds, "
                 "more samples, or rollout='segments'", samples, nworld, self.rollout.steps, env.horizon,
             )  # fmt: skip
         self._least_restarts = least_restarts(config, nworld, steps, env.horizon) if self.segments else 0
@@ -142,7 +143,7 @@ class NPG(OnPolicyLearner):
         obs, value_obs = rollout.obs.flatten(0, 1), rollout.obs_groups[self.value.group].flatten(0, 1)
         old_mean = self.observe(obs)
 
-        # 3. Compute advantages with the value function before it is fitted to these samples.
+        # 3. Compute advantages with the value function before its fit to the new samples.
         advantage, target, prediction, outliers = self.advantages()
 
         # 4. Compute the vanilla gradient of E[log pi(a|s) A(s, a)].
@@ -154,8 +155,8 @@ class NPG(OnPolicyLearner):
         # 5. Compute the natural gradient x = F^-1 g, and the step x sqrt(delta / (g.x)), so that step.F.step = delta.
         fisher = self.fisher(obs)
 
-        # 6. Fit the value function to the returns of these samples; with two CPU threads, in parallel with 5. Its
-        # normaliser is updated just before, so that the fit corrects the effect on its predictions.
+        # 6. Fit the value function to the samples' returns; with two CPU threads, the fit runs in parallel with step 5.
+        # Update the value function's normaliser first, so that the fit corrects the change of the predictions.
         self.value.observe(value_obs, team)
         fit = functools.partial(self.fit, value_obs, rollout.step.flatten(), target.flatten(), self.generator)
         with beside(fit, allowed=self._reads_numbers) as fit_result:
@@ -203,8 +204,8 @@ class NPG(OnPolicyLearner):
         if self._skipping >= _PATIENCE:
             last, self._skipping = self.iteration + 1, 0
             raise FloatingPointError(
-                f"{' and '.join(skipped)} in iteration {last} {'are' if len(skipped) > 1 else 'is'} not finite, as in "
-                f"the {_PATIENCE - 1} iterations before it, whose updates were skipped. "
+                f"{' and '.join(skipped)} in iteration {last} {'are' if len(skipped) > 1 else 'is'} not finite, as "
+                f"in the {_PATIENCE - 1} iterations before, and non-finite updates are skipped. "
                 f"{self.rollout.explain_not_finite()}"
             )
 
@@ -221,9 +222,9 @@ class NPG(OnPolicyLearner):
         """Compute generalised advantages and discounted returns of the rollout.
 
         The returns bootstrap from the value function at time limits and at the end of the rollout. Terminal states have
-        value 0 (as in mjrl; Lyceum also bootstraps there). The returns determine the value function's scale, and
-        advantages are clipped to ten times this scale, so that a single extreme reward dominates neither the gradient
-        nor the fit.
+        the value 0, as in mjrl; Lyceum bootstraps at terminal states too. The returns determine the value function's
+        scale. Clipping advantages to ten times this scale keeps a single extreme reward from dominating the gradient or
+        the fit.
 
         Returns:
             Advantages, (steps, nworld), divided by a power of two close to the value function's scale; returns, (steps,
@@ -236,7 +237,7 @@ class NPG(OnPolicyLearner):
         advantage, target = self._estimate(reward, value, next_value)
         prediction = prediction_sums(target, value)
         self.value.rescale(target, first=self._value_is_new and self.iteration == 0, team=team)
-        # the step is invariant to the scale of the advantages; dividing by a power of two is exact
+        # the step does not depend on the scale of the advantages, and division by a power of two is exact
         unit = torch.exp2(torch.floor(torch.log2(self.value.scale)))
         advantage, scale = advantage / unit.float(), (self.value.scale / unit).float()
         bound = BOUND * scale
@@ -249,7 +250,7 @@ class NPG(OnPolicyLearner):
         return advantage, target, prediction, outliers
 
     def predict(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Predict returns, (...,); non-finite predictions are replaced by the mean of the last returns.
+        """Predict returns, (...,), and replace non-finite predictions by the mean of the last returns.
 
         Args:
             obs: Observations, (..., nobs).
@@ -260,10 +261,10 @@ class NPG(OnPolicyLearner):
 
     @torch.no_grad()
     def observe(self, obs: torch.Tensor) -> torch.Tensor:
-        """Update the normaliser of the policy's observations, but limit the change of the policy.
+        """Update the normaliser of the policy's observations, and limit the resulting change of the policy.
 
-        An update that would change the policy by more than a fifth of the desired KL divergence is applied in part;
-        later iterations apply the rest. The iteration's KL divergence includes this change.
+        If an update would change the policy by more than a fifth of the desired KL divergence, only a fraction is
+        applied; later iterations apply the rest. The iteration's KL divergence includes the normaliser's change.
 
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
@@ -283,14 +284,14 @@ class NPG(OnPolicyLearner):
                 square = (old_mean - mean(obs)).square()
                 kl = 0.5 * (square * torch.exp(-2 * self.policy.log_std)).sum(-1).mean()
                 kl = self.team.sum(kl) / self.team.size
-                if self._reads_numbers and kl <= limit:  # further rounds would not change it
+                if self._reads_numbers and kl <= limit:  # more iterations would change nothing
                     break
                 part = torch.where(kl <= limit, part, part * (limit / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5))
             normalizer.interpolate(before, after, part)
         return old_mean
 
     def fisher(self, obs: torch.Tensor) -> FisherProduct:
-        """Products with the Fisher information, averaged over a random subset of the samples.
+        """Make the products with the Fisher information, averaged over a random subset of the samples.
 
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
@@ -300,7 +301,7 @@ class NPG(OnPolicyLearner):
             subset = torch.randperm(self.count, generator=self.generator, device=obs.device)[: self._fisher_count]
             if self.team.size == 1:
                 obs = obs[subset]
-            else:  # selecting own samples would synchronise with the device, so other samples get weight 0
+            else:  # weights of 0 exclude other processes' samples, because selecting would synchronise with the device
                 places, own = self.team.locate(subset, self.env.nworld)
                 obs, weight = obs[places], own.float()
         return FisherProduct(
@@ -312,17 +313,17 @@ class NPG(OnPolicyLearner):
     def move(
         self, step: torch.Tensor, obs: torch.Tensor, old_mean: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Add a step to the policy's parameters, or a fraction of the step that obeys the limit of the KL divergence.
+        """Add a step to the policy's parameters, or a fraction of the step within the limit of the KL divergence.
 
-        The Fisher information approximates the KL divergence only to second order and on a subset of the samples. If
-        the measured divergence exceeds its limit, the step is shortened to the second-order estimate, but at least by
-        half. This is repeated up to four times. If that is not enough, or if the step is not finite, the policy does
+        The Fisher information approximates the KL divergence only to second order and on a subset of the samples. While
+        the measured divergence exceeds its limit, up to four times, the step is shortened to the second-order estimate,
+        but at least by half. If the divergence still exceeds the limit, or if the step is not finite, the policy does
         not change. The host does not wait for the device.
 
         Args:
             step: The step, (parameters,).
             obs: Observations, (samples, nobs).
-            old_mean: The mean actions of the policy that sampled, (samples, nact).
+            old_mean: Mean actions of the policy that drew the samples, (samples, nact).
 
         Returns:
             Whether the step and the divergence are finite; the fraction of the step that was applied; and the KL
@@ -350,7 +351,7 @@ class NPG(OnPolicyLearner):
         fraction = finite.float()
         for _ in range(_SHORTER):
             kl = measured(fraction)
-            if self._reads_numbers and kl <= limit:  # further rounds would not change it
+            if self._reads_numbers and kl <= limit:  # more iterations would change nothing
                 break
             factor = (wanted / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5)
             fraction = torch.where(kl <= limit, fraction, fraction * factor)
@@ -362,7 +363,7 @@ class NPG(OnPolicyLearner):
         return finite & kl.isfinite(), fraction, kl
 
     def settings(self) -> dict[str, Any]:
-        """The hyperparameters with the sizes of the networks, for a run's config.json."""
+        """Return the hyperparameters and the networks' sizes for a run's config.json."""
         samples = enough_samples(self.config, self.env.nworld * self.team.size)
         return super().settings() | {"samples": samples}
 

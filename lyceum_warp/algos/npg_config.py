@@ -15,7 +15,7 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 _LONG_EPISODE = 20
-"""If an episode spans more iterations than this, restarts are on by default. On hopper with some seeds, NPG's return
+"""Number of iterations per episode above which NPG restarts worlds by default. On hopper with some seeds, NPG's return
 stayed low for a long time with 63 and 31 iterations per episode, but not with 16 (bench/README.md, "NPG's learning
 curves")."""
 
@@ -23,7 +23,7 @@ curves")."""
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NPGConfig:
-    """Hyperparameters of NPG. The defaults follow Rajeswaran et al. (2017), except as noted.
+    """Hyperparameters of NPG. The defaults follow Rajeswaran et al., 2017, except as noted.
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.
@@ -34,21 +34,20 @@ class NPGConfig:
     every world if that is more."""
     rollout: Literal["auto", "episodes", "segments"] = "auto"
     """"episodes" starts new episodes in every iteration, as in the paper; "segments" continues the last iteration's
-    episodes, for many worlds with few steps each; "auto" selects "episodes" if samples / worlds >= horizon."""
+    episodes, which suits many worlds with few steps each; "auto" selects "episodes" if samples / worlds >= horizon."""
     min_restarts: float | None = None
-    """Minimum number of worlds that start an episode in each iteration, divided by samples / horizon, the average
-    number if no episode ends early. Applies to segments with a time limit. If fewer worlds started an episode in the
-    last iteration, random worlds are restarted. Without restarts, worlds that started together reach the time limit
-    together, and in between few samples come from the start of an episode. Interrupted episodes are not counted in the
-    statistics, so values well above 1 bias ``return_mean`` towards short episodes. 0 turns restarts off. The default is
-    0.5 if an episode lasts longer than 20 iterations (as with 205 or more worlds, 1,000 steps and the default samples),
-    and 0 otherwise."""
+    """Minimum number of worlds that start an episode in each iteration, as a multiple of samples / horizon. If fewer
+    worlds started an episode in the last iteration, random worlds are restarted. Restarts apply only to segments with a
+    time limit. Without restarts, worlds that started together reach the time limit together, so that few samples in
+    between come from the start of an episode. The statistics do not count interrupted episodes, so values well above 1
+    bias ``return_mean`` towards short episodes. 0 turns restarts off. The default is 0.5 if an episode lasts longer
+    than 20 iterations (as with 205 or more worlds, 1,000 steps and the default samples), and 0 otherwise."""
     gamma: float = 0.995
     """Discount factor."""
     lam: float = 0.97
     """Lambda of the generalised advantage estimate."""
     delta: float = 0.1
-    """Squared step length in the Fisher metric: twice the KL divergence between the old and the new policy."""
+    """Squared step length in the Fisher metric, which is twice the KL divergence between the old and the new policy."""
     whiten: bool = True
     """Whether to normalise advantages to mean 0 and standard deviation 1 (as in mjrl, unlike Lyceum)."""
     cg_iterations: int = 10
@@ -58,8 +57,8 @@ class NPGConfig:
     fisher_fraction: float = 1.0
     """Fraction of the samples used for the Fisher information, drawn at random in each iteration."""
     kl_limit: float = 1.5
-    """Maximum KL divergence of a step, as a multiple of its second-order value delta / 2. Larger steps are
-    shortened."""
+    """Maximum KL divergence of a step, as a multiple of its second-order value delta / 2. NPG shortens steps with a
+    larger KL divergence."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the policy's hidden layers."""
     activation: Activation = "tanh"
@@ -73,22 +72,21 @@ class NPGConfig:
     value_activation: Activation = "tanh"
     """Activation of the value function's hidden layers."""
     value_group: str | None = None
-    """Group of observations for the value function; by default "critic" if the task has this group, else "policy"."""
+    """Group of observations for the value function; by default "critic" if the task has such a group, else "policy"."""
     value_epochs: int = 2
     """Epochs of the value function's fit."""
     value_batch: int | None = None
-    """Mini-batch size of the value function's fit; by default 1/256 of all samples, which bounds the number of steps,
-    but at least the paper's 64."""
+    """Mini-batch size of the value function's fit; by default 1/256 of all samples, but at least the paper's 64."""
     value_rate: float = 1e-3
     """Learning rate of the value function's fit (Adam)."""
     time_orders: int = 0
-    """Highest power of the value function's time feature; 0 for none."""
+    """Highest power of the value function's time feature; 0 means no time feature."""
     normalize: bool = True
     """Whether to normalise observations by their running mean and variance (unlike the paper)."""
     mean_every: int = 10
-    """Iterations between evaluations of the mean policy; 0 for none."""
+    """Iterations between evaluations of the mean policy; 0 means no evaluations."""
     mean_episodes: int = 16
-    """Episodes in an evaluation of the mean policy."""
+    """Number of episodes in an evaluation of the mean policy."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -96,22 +94,22 @@ class NPGConfig:
         if self.fisher_fraction == 0.0:
             raise ValueError("fisher_fraction must be greater than 0, such as 0.1 for every tenth sample")
         if self.log_std < self.min_log_std:
-            raise ValueError(f"log_std must not be below min_log_std, which is {self.min_log_std}, not {self.log_std}")
+            raise ValueError(f"log_std={self.log_std} must not be below min_log_std, which is {self.min_log_std}")
 
 
 def enough_samples(config: NPGConfig, nworld: int) -> int:
-    """Samples per iteration; ``nworld`` counts the worlds of all processes."""
+    """Compute the samples per iteration; ``nworld`` counts the worlds of all processes."""
     return max(10_000, 16 * nworld) if config.samples is None else config.samples
 
 
 def least_restarts(config: NPGConfig, nworld: int, steps: int, horizon: int) -> int:
-    """Minimum number of worlds, over all processes, that start an episode in an iteration.
+    """Compute the minimum number of worlds of all processes that start an episode in an iteration.
 
     Args:
         config: The hyperparameters.
-        nworld: Worlds of all processes.
+        nworld: Number of worlds of all processes.
         steps: Steps of each world in an iteration.
-        horizon: Time limit of an episode in steps; 0 for none.
+        horizon: Time limit of an episode, in steps; 0 means no limit.
     """
     if horizon == 0:
         return 0

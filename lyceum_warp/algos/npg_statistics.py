@@ -39,37 +39,37 @@ class NPGIteration(OnPolicyIteration):
     explained_variance: float
     """Fraction of the returns' variance that the value function explained before the fit."""
     outliers: int
-    """Number of samples whose advantage was clipped to ten standard deviations of the returns."""
+    """Number of samples with an advantage that was clipped to ten standard deviations of the returns."""
     skipped_updates: int
-    """Number of updates that were skipped because they were not finite (policy step, value function fit), 0 to 2."""
+    """Number of non-finite updates (policy step, value function fit) that were skipped, 0 to 2."""
     time_gradient: float
     """Seconds for advantages and the vanilla gradient."""
     time_solve: float
     """Seconds for conjugate gradient and the step."""
     time_value: float
-    """Seconds for the value function's fit; with two CPU threads, without the time that overlaps ``time_solve``."""
+    """Seconds for the value function's fit, without time that overlaps ``time_solve`` with two CPU threads."""
 
 
 class UpdateNumbers(NamedTuple):
-    """Statistics of the update, with the names of ``NPGIteration``."""
+    """Statistics of one update of the policy, by their names in ``NPGIteration``."""
 
-    # equal in all processes
+    # statistics that are equal in all processes
     finite: Scalar  # whether the step is finite
     kl: Scalar
     step_norm: Scalar
     step_fraction: Scalar
     gradient_norm: Scalar
     std_mean: Scalar
-    # over the process's own samples
+    # statistics of the process's own samples
     reward: Scalar
     faults: Scalar
     outliers: Scalar
-    # equal in all processes
+    # statistics that are equal in all processes
     fitted: Scalar  # whether the value function's fit is finite
 
 
 class ValueSums(NamedTuple):
-    """Moments of a process's discounted returns, and of the errors (return minus prediction) of a value function."""
+    """Moments of a process's discounted returns and of a value function's errors (return minus prediction)."""
 
     return_mean: Scalar
     return_square: Scalar  # sum of the squared deviations from the mean
@@ -78,7 +78,7 @@ class ValueSums(NamedTuple):
 
 
 class ProcessNumbers(NamedTuple):
-    """One process's contribution to the statistics of an iteration."""
+    """Contribution of one process to the statistics of an iteration."""
 
     update: UpdateNumbers
     values: ValueSums
@@ -87,12 +87,12 @@ class ProcessNumbers(NamedTuple):
     """The result of ``metric_sums``."""
 
     def pack(self) -> torch.Tensor:
-        """Pack all numbers into one float64 tensor, to transfer them in one copy to other processes and to the host."""
+        """Pack all numbers into one float64 tensor, which needs one copy to other processes and to the host."""
         return torch.stack([number.double() for part in self for number in part])
 
     @classmethod
     def unpack(cls, numbers: Iterable[float]) -> "ProcessNumbers":
-        """Unpack the result of ``pack``, as floats on the host."""
+        """Unpack the result of ``pack`` into floats on the host."""
         rest = iter(numbers)
         return cls(
             update=UpdateNumbers(*itertools.islice(rest, len(UpdateNumbers._fields))),
@@ -117,8 +117,8 @@ def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence
     """Summarise the numbers of all processes, by their names in ``NPGIteration``.
 
     Args:
-        processes: Each process's numbers, as floats.
-        samples: Samples of each process.
+        processes: Numbers of each process, as floats.
+        samples: Number of samples of each process.
         metrics: Names of the task's metrics.
     """
     update = processes[0].update

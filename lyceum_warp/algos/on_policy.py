@@ -38,7 +38,7 @@ class OnPolicyLearner(Learner):
     value: ValueFunction
     """The value function."""
     generator: torch.Generator
-    """The random generator for the noise and the order of samples."""
+    """Random generator for the noise and the order of samples."""
     rollout: Rollout
     """The samples of the last iteration."""
     count: int
@@ -76,7 +76,7 @@ class OnPolicyLearner(Learner):
         limit: float = LIMIT,
         as_torch: bool = False,
     ) -> None:
-        """Set the networks, given or new, and the generator."""
+        """Set the given networks, or make new networks, and seed the generator."""
         env, config, device = self.env, self.config, self.env.obs.device
         nobs, nact = env.obs_space.size, env.action_space.size
         group = value_group(env, config.value_group) if value is None else value.group
@@ -95,7 +95,7 @@ class OnPolicyLearner(Learner):
         self.value.discount = config.gamma
         self.policy.to(device)
         self.value.to(device)
-        # a separate seed, so that weights and noise are independent
+        # draw a separate seed, so that weights and noise are independent
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
 
     def _make_rollout(self, steps: int, *, first_only: bool = False) -> None:
@@ -108,7 +108,7 @@ class OnPolicyLearner(Learner):
     def _estimate(
         self, reward: torch.Tensor, value: torch.Tensor, next_value: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Compute generalised advantages and discounted returns, (steps, nworld), by ``kernels/returns.py``."""
+        """Compute generalised advantages and discounted returns, (steps, nworld), with ``kernels/returns.py``."""
         arrays = (reward, value, next_value, self.rollout.terminated, self.rollout.done)
         outputs = [wp.from_torch(self._advantage), wp.from_torch(self._return)]
         args = [*map(wp.from_torch, arrays), self.config.gamma, self.config.lam, *outputs]
@@ -121,7 +121,7 @@ class OnPolicyLearner(Learner):
         return self._evaluate_mean.added(statistics, self.policy, due=every > 0 and self.iteration % every == 0)
 
     def settings(self) -> dict[str, Any]:
-        """The hyperparameters with the sizes of the networks, for a run's config.json."""
+        """Return the hyperparameters and the networks' sizes for a run's config.json."""
         policy, value = self.policy.shape, self.value.shape
         found = {name: policy.get(name) for name in ("hidden", "activation", "normalize")}
         found |= {f"value_{name}": value[name] for name in ("hidden", "activation")}

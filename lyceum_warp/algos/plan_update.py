@@ -1,7 +1,7 @@
 """Define the interface of plan updates, which weight the samples and may fit parameters to them.
 
-The planner (``planner.py``) rolls out the samples and computes their weighted mean. ``mppi.py``, ``cem.py`` and
-``predictive_sampling.py`` implement three updates.
+The planner (``planner.py``) rolls out the samples and computes their weighted mean. The modules ``mppi.py``, ``cem.py``
+and ``predictive_sampling.py`` implement three updates.
 """
 
 import abc
@@ -18,20 +18,20 @@ from lyceum_warp.support.docstrings import document_attributes
 @document_attributes
 @dataclasses.dataclass(frozen=True)
 class PlanSamples:
-    """The samples of one improvement of the plans, which an update reads and writes.
+    """Samples of one improvement of the plans, which an update reads and writes.
 
-    Plans and samples have one row per step of the horizon or, with knots, per knot. All tensors are float32 on the
-    device of the planner's worlds, with fixed addresses: write into them.
+    Plans and samples have one row per step of the horizon or, with knots, per knot. All tensors are float32, on the
+    device of the planner's worlds, at fixed addresses: write into the tensors.
     """
 
     returns: torch.Tensor
     """The samples' returns, (plants, samples); minus infinity for failed samples."""
     weights: torch.Tensor
-    """The samples' weights, (plants, samples), written by ``weigh``; they sum to 1 for each plant."""
+    """The samples' weights, (plants, samples), which ``weigh`` writes and which sum to 1 for each plant."""
     actions: torch.Tensor
     """The samples, (rows, plants, samples, nact)."""
     nominal: torch.Tensor
-    """The plans around which the samples were drawn, (rows, plants, nact)."""
+    """The plans around which the planner drew the samples, (rows, plants, nact)."""
     plan: torch.Tensor
     """The new plans, (rows, plants, nact): before ``fit``, the weighted means of the samples."""
     nominal_deviation: torch.Tensor | None
@@ -41,12 +41,12 @@ class PlanSamples:
     """Standard deviations for the next improvement, written by ``fit``."""
     summary: torch.Tensor
     """Best return, mean return, effective number of samples and number of failed samples, (plants, 4). A capturable
-    update writes it in ``weigh``. If the best return is minus infinity, the plan does not change."""
+    update writes this tensor in ``weigh``. If the best return is minus infinity, the plan does not change."""
 
 
 @document_attributes
 class PlanUpdate(abc.ABC):
-    """Base class of updates, which turn samples into the next plan: ``lw.Planner(task, update=MyUpdate(...))``.
+    """Base class of plan updates, which turn samples into the next plan: ``lw.Planner(task, update=MyUpdate(...))``.
 
     A subclass implements ``weigh``; the new plan is the weighted mean of the samples. A subclass may also implement
     ``fit``, for example to adapt the noise. Each planner uses a shallow copy of the given object, so ``prepare`` may
@@ -54,11 +54,11 @@ class PlanUpdate(abc.ABC):
     """
 
     capturable: ClassVar[bool] = False
-    """Whether ``weigh`` and ``fit`` consist of Warp launches on arrays at fixed addresses, so that they can be part of
-    the planner's graph. If False, the methods may use torch, and run between two graphs."""
+    """Whether ``weigh`` and ``fit`` consist of Warp launches on arrays at fixed addresses, so that the planner's graph
+    can include both. If False, ``weigh`` and ``fit`` may use torch, and run between two graphs."""
     adapts_noise: ClassVar[bool] = False
-    """Whether the noise has a standard deviation for each element of a plan, which is shifted in time with the plan and
-    adapted by ``fit``. If False, the planner's setting ``noise`` applies."""
+    """Whether each element of a plan has its own standard deviation of the noise, which ``fit`` adapts and the planner
+    shifts in time. If False, the planner's setting ``noise`` applies."""
 
     def prepare(self, samples: PlanSamples) -> None:
         """Check sizes and allocate buffers; called once, when the planner is made."""
@@ -69,14 +69,11 @@ class PlanUpdate(abc.ABC):
         """Write ``samples.weights`` from ``samples.returns``."""
 
     def fit(self, samples: PlanSamples) -> None:
-        """Adapt ``samples.deviation``, or change ``samples.plan`` within the actions' bounds.
-
-        Does nothing by default.
-        """
+        """Adapt ``samples.deviation``, or change ``samples.plan`` within the actions' bounds; do nothing by default."""
         return
 
     def __repr__(self) -> str:
-        """Show the public attributes, for the planner's ``settings``."""
+        """Format the public attributes, for the planner's ``settings``."""
         given = (f"{name}={value!r}" for name, value in vars(self).items() if not name.startswith("_"))
         return f"{type(self).__name__}({', '.join(given)})"
 

@@ -2,25 +2,26 @@
 
 Each call improves a plan, a sequence of actions u_t, from a given state:
 
-1. shift: move the last call's plan forward in time, and fill its end;
+1. shift: move the last call's plan forward in time, and fill the end of the plan;
 2. perturb: sample k is the plan plus smoothed noise e_t^k, clipped to the actions' bounds. Each sample has its own
-   random stream, from which the task's functions draw;
-3. roll out: the return R_k of sample k is the sum of its discounted rewards plus the value of its final state; in
-   several models, the mean or the smallest of its returns;
+   random stream for the task's functions;
+3. roll out: the return R_k of sample k is the sum of its discounted rewards plus the value of its final state. With
+   several models, R_k is the mean or the smallest of the returns in all models;
 4. weight: w_k = exp((R_k - max R) / temperature), normalised to sum to 1;
 5. average: the new plan is u_t = sum_k w_k u_t^k.
 
-This is the formulation of Williams et al. (2017, "Information theoretic MPC for model-based reinforcement learning")
-without a cost on the controls, as in Lyceum (Summers et al. 2020) and in trajopt, which is also the source of the
-smoothing. Returns are divided by the temperature. Summers et al. give inverse temperatures: their 5 is 0.2 here.
+The formulation follows Williams et al., 2017 ("Information theoretic MPC for model-based reinforcement learning"),
+without a cost on the controls, as in Lyceum (Summers et al. 2020) and in trajopt. The smoothing comes from trajopt.
+Returns are divided by the temperature. Summers et al. give inverse temperatures; for example, their 5 corresponds to a
+temperature of 0.2.
 
-With several plants, each plant has its own plan, and the samples of all plans are rolled out together: the samples of a
-single plan may leave most of a GPU, or most threads, idle.
+With several plants, each plant has its own plan, and the planner rolls out the samples of all plans together. The
+samples of a single plan may leave most of a GPU, or most threads, idle.
 
-``update`` selects the weights of step 4; the formula above is MPPI's (``mppi.py``). CEM (``cem.py``) weights the best
-samples equally and then fits the noise to them. Predictive sampling (``predictive_sampling.py``) takes the best sample.
-A custom update (``plan_update.py``) also weights the samples and may fit. With knots, all steps apply to the knots of a
-spline, from which the actions of steps 3 and 5 are interpolated (``kernels/knots.py``).
+``update`` selects how samples are weighted; the formula of step 4 is MPPI's (``mppi.py``). CEM (``cem.py``) weights the
+best samples equally and then fits the noise to them. Predictive sampling (``predictive_sampling.py``) takes the best
+sample. A custom update (``plan_update.py``) weights the samples, and may also fit parameters. With knots, the planner
+shifts, perturbs and averages the knots of a spline, and interpolates actions from them (``kernels/knots.py``).
 """
 
 import copy
@@ -58,9 +59,9 @@ _BUFFERS = (
     "actions", "nominal", "knot_actions", "standard_noise", "adapted_noise", "sampled", "model_returns", "returns",
     "weights", "model_fields",
 )  # fmt: skip
-_MODELS = 0x6D6F64656C73  # "models" in ASCII; with the planner's seed, it gives the seeds of the models
+_MODELS = 0x6D6F64656C73  # the word "models" in ASCII, which with the planner's seed seeds the draws of models
 _DRAWING = ("startup", "initialize", "randomize")
-"""The task functions that can randomize a planner's model fields."""
+"""Task functions that can randomize a planner's model fields."""
 
 Value: TypeAlias = ValueFunction | wp.Function | Callable[[torch.Tensor], torch.Tensor]
 
@@ -69,37 +70,38 @@ Value: TypeAlias = ValueFunction | wp.Function | Callable[[torch.Tensor], torch.
 class Planner:
     """A controller that replans at every step: ``action = plan(state)``.
 
-    The planner simulates in its own worlds, one per sample. The controlled world is called the plant: an environment,
-    with ``plan(env.get_state()[0])``, or a robot, with ``plan(plan.state_of(qpos=..., qvel=..., time=...))``. The
-    plant's model, physics, time step and parameters may differ from the planner's. If the planner's time step is a
-    multiple of the plant's, ``lw.control`` and ``lw.control_async`` apply the plan as ``between`` says. Random streams
-    are counter-based: a plan depends on the seed, on the number of plans before it, and on the plan it starts from. In
-    each sample, the task's functions draw from a separate stream seeded by the planner, so a plan cannot anticipate the
-    plant's random numbers.
+    The planner simulates in its own worlds, one per sample. The controlled world is called the plant. The plant is an
+    environment, as in ``plan(env.get_state()[0])``, or a robot, as in ``plan(plan.state_of(qpos=..., qvel=...,
+    time=...))``. The plant's model, physics, time step and parameters may differ from the planner's. If the planner's
+    time step is a multiple of the plant's, ``lw.control`` and ``lw.control_async`` apply the plan according to the
+    setting ``between``. Random streams are counter-based: a plan depends on the seed, on the number of earlier plans,
+    and on the plan from which it starts. In each sample, the task's functions draw from a separate stream seeded by the
+    planner, so a plan cannot anticipate the plant's random numbers.
 
     ``plants=n`` plans for n plants at a time, as in ``env.step(plan(env.get_state()))`` with n worlds. Plant i uses the
     seed ``seed + i`` for its noise, so its plan equals the plan of a single-plant planner with this seed on the same
-    engine. With ``models``, all plants use the models of the first seed. All buffers except ``model_fields`` then have
-    an axis for the plants. It comes after an axis for steps or knots, and otherwise first.
+    engine. With ``models``, all plants use the models of the first seed. With several plants, all buffers except
+    ``model_fields`` have an axis for the plants, after the axis for steps or knots if there is one.
 
     A task's ``planning`` (see ``lw.Planning``) provides default settings of the planner, and options and parameters of
     its worlds. Arguments override them.
 
     Args:
-        task: Name of a task, a file with one, or its class.
-        config: Settings that replace the task's.
-        value: Terminal value, added to each sample's return: a ``ValueFunction``, a function from (nworld, nobs)
+        task: Name of a task, path of a task file, or a task class.
+        config: Settings that replace the task's settings.
+        value: Terminal value that is added to each sample's return: a ``ValueFunction``, a function from (nworld, nobs)
             observations to (nworld,) values, or a Warp function of one observation, ``value(obs: Row[float]) ->
             float``, which becomes part of the graph on the Warp engine. If a value is given, the parameters in
             ``planning`` do not apply, because the value function was fitted to the task's own rewards.
-        seed: Seed of the noise. With several plants, the seed of the first plant, or a list with one seed per plant.
+        seed: Seed of the noise. With several plants, ``seed`` is the seed of the first plant, or a list with one seed
+            per plant.
         plants: Number of plants to plan for.
-        params: Parameters of the task; required for names that are also settings.
+        params: Parameters of the task; required for parameters with the name of a setting.
         words: Individual settings by their names in ``lw.MPPIConfig`` (None keeps the default; ``update`` may be a
             custom ``lw.PlanUpdate``), options of the planner's worlds as for ``lw.make``, and parameters of the task.
-            (Order of per-world parameters: plants, then samples, then models, with models varying fastest.) With a CUDA
-            device, engine="auto" and few samples, the C engine rolls them out on the CPU, where it is faster; plans are
-            then on the CPU.
+            Parameters with one value per world are ordered by plant, then by sample, then by model. With a CUDA device,
+            engine="auto" and few samples, the C engine rolls out the samples, because it is faster for few samples, and
+            plans are on the CPU.
 
     Raises:
         ValueError: An argument is unknown, ambiguous or invalid, or the samples do not fit into memory.
@@ -114,20 +116,20 @@ class Planner:
     """The settings, and the options and parameters of the planner's worlds, as JSON values."""
     actions: torch.Tensor
     """The plan, (horizon, nact); the first row is the action returned by the last call. To start from a different plan,
-    write into this buffer, or with knots into ``knot_actions``."""
+    write into ``actions``, or with knots into ``knot_actions``."""
     nominal: torch.Tensor
     """The plan from which the last improvement started, (horizon, nact)."""
     knot_actions: torch.Tensor
-    """The plan's knots, (nknot, nact), some of which lie beyond the horizon; the same as ``actions`` without knots."""
+    """The plan's knots, (nknot, nact), some of which lie beyond the horizon; equals ``actions`` without knots."""
     standard_noise: torch.Tensor
     """The last improvement's standard normal noise, (horizon, samples, nact) or (nknot, samples, nact)."""
     adapted_noise: torch.Tensor | None
-    """The adapted standard deviations for the next improvement, before smoothing, (horizon, nact) or (nknot, nact);
+    """The adapted standard deviations for the next improvement, before smoothing, (horizon, nact) or (nknot, nact).
     None for updates that do not adapt noise."""
     sampled: torch.Tensor
     """The last improvement's actions, (horizon, samples, nact)."""
     model_fields: dict[str, torch.Tensor]
-    """The model fields of each model, (models, size) float64, read by each call; empty with one model."""
+    """The model fields of each model, (models, size) float64, which each call reads; empty with one model."""
     model_returns: torch.Tensor
     """The samples' returns in each model, (samples, models); minus infinity for failed samples."""
     returns: torch.Tensor
@@ -135,7 +137,7 @@ class Planner:
     weights: torch.Tensor
     """The samples' weights, (samples,)."""
 
-    _only_update: str | None = None  # the update of a subclass that has only one
+    _only_update: str | None = None  # the update of a subclass that fixes ``update``
 
     def __init__(
         self,
@@ -154,7 +156,9 @@ class Planner:
         seeds = plant_seeds(seed, self.plants)
         task = find_task(task)
         if (only := self._only_update) is not None and words.setdefault("update", only) != only:
-            raise ValueError(f"update={words['update']!r} is another planner than {only!r}: call lw.MPPI with it")
+            raise ValueError(
+                f"update={words['update']!r} is not the update of this planner, {only!r}: use lw.MPPI for other updates"
+            )
         self.config, options, own_params = planner_arguments(task, config, words, params, value, self.plants)
         self.horizon, self.samples = self.config.horizon, self.config.samples
         self.settings = plain(options.given() | own_params | vars(self.config))
@@ -165,7 +169,8 @@ class Planner:
         self.env.reset()
         self.timestep, self.between = self.env.timestep, self.config.between
         self._initial = self.env.get_state()[0]
-        for name, row in self.env.engine.nominal.items():  # for a robot, not what startup drew
+        # use nominal values for a robot, not values that startup drew
+        for name, row in self.env.engine.nominal.items():
             self._initial[self.env.state_space.parts[name]] = torch_view(flat(row))[0].double()
         if "lasting_memory" in self.env.task.writes.get("startup", ()):
             self._initial[memory_columns(self.env.task, self.env.state_space)["lasting_memory"]] = 0.0
@@ -191,15 +196,16 @@ class Planner:
         self._made = True
 
     def _drawn_fields(self) -> list[str]:
-        """Names of the model fields that differ between the planner's models."""
+        """Return the names of the model fields that differ between the planner's models."""
         if self.config.models == 1:
             return []
         bound = self.env.task
         written = frozenset().union(*(bound.writes.get(name, frozenset()) for name in _DRAWING))
         if not (drawn := [field.name for field in bound.dynamics if field.name in written]):
             raise ValueError(
-                f"models={self.config.models} needs a task that draws model fields, and {bound.name!r} draws none: "
-                "write them in its startup or randomize, as s.body_mass[1] = s.body_mass[1] * lw.uniform(rng, 0.8, 1.2)"
+                f"models={self.config.models} needs a task that draws model fields, but {bound.name!r} draws none: "
+                "write model fields in its startup or randomize, as s.body_mass[1] = s.body_mass[1] * "
+                "lw.uniform(rng, 0.8, 1.2)"
             )
         return drawn
 
@@ -217,7 +223,7 @@ class Planner:
             self._value_in_torch = True
             try:
                 self._torch_values()
-            # for example, weights are missing, the input size differs, or critics also take actions
+            # reasons are missing weights, a different input size, or critics that also take actions
             except (RuntimeError, TypeError) as error:
                 observations = described(self._value_obs)
                 raise ValueError(f"value cannot take observations {observations}: {error}") from error
@@ -226,10 +232,12 @@ class Planner:
         made = "_made" in self.__dict__
         if made and name in (*SETTINGS, "config", "value", "seed", "plants"):
             raise AttributeError(
-                f"{name} is part of the planner's graphs: make another {type(self).__name__} with {name}={value!r}"
+                f"{name} is part of the planner's graphs: make a new {type(self).__name__} with {name}={value!r}"
             )
         if made and name in _BUFFERS:
-            raise AttributeError(f"plan.{name} is a buffer of fixed address: write into it, as plan.{name}.copy_(...)")
+            raise AttributeError(
+                f"plan.{name} is a buffer at a fixed address: write into the buffer, as plan.{name}.copy_(...)"
+            )
         super().__setattr__(name, value)
 
     def _allocate(self) -> None:
@@ -299,13 +307,13 @@ class Planner:
 
     @torch.no_grad()
     def __call__(self, state: torch.Tensor, obs: torch.Tensor | None = None, *, shift: int = 1) -> torch.Tensor:
-        """Improve the plan from a state, or with several plants each plan from its own state.
+        """Improve the plan from a state; with several plants, improve each plan from its own state.
 
         Args:
             state: A state from ``state_of`` or from ``get_state`` of an environment of the same task, on either engine:
                 (state_space.size,) or (1, state_space.size) float64; with several plants (plants, state_space.size).
-            obs: Not used; present because controllers are called with observations.
-            shift: Number of steps since the last call.
+            obs: Not used; present because control loops call controllers with observations.
+            shift: Number of the planner's steps since the last call, by which the last plan is shifted.
 
         Returns:
             The action to apply now, (nu,), or with several plants (plants, nu), on the state's device.
@@ -321,7 +329,7 @@ class Planner:
         return self._action.to(state.device, copy=True)
 
     def _program(self, *, first: bool) -> Calls:
-        """The calls of one improvement; the first improvement also shifts the plan in time."""
+        """Make the calls of one improvement; the first improvement also shifts the plan in time."""
         parts: list[Phase | Callable[[], None]] = [Phase("perturb", partial(self._perturb, first)), *self._loop.phases]
         if self._value_in_torch:
             parts.append(self._evaluate)
@@ -335,7 +343,7 @@ class Planner:
         return self._sequence(parts)
 
     def _sequence(self, parts: Iterable[Phase | Callable[[], None]]) -> Calls:
-        """Turn phases into calls, in as few graphs as possible, with torch functions between them."""
+        """Turn phases into as few graphs as possible, with torch functions between the graphs."""
         calls: list[Any] = []
         for is_phase, group in itertools.groupby(parts, lambda part: isinstance(part, Phase)):
             some: Any = list(group)
@@ -343,7 +351,7 @@ class Planner:
         return tuple(calls)
 
     def _perturb(self, first: bool) -> None:
-        """Compute the plans to start from, and the samples around them."""
+        """Shift the plans, and draw samples around the plans."""
         device = self.env.device
         if first and self._passed is not self._shift:
             passed = [self._shift, self.horizon, self._spline[0], self._phase, self._passed]
@@ -365,7 +373,7 @@ class Planner:
         self._interpolate(self._samples, self._world_actions)
 
     def _shifted(self, first: bool, rows: wp.array, fill: wp.array, repeat: bool, target: wp.array) -> None:
-        """Copy the rows of a plan; the first improvement also shifts them in time."""
+        """Copy the rows of a plan; the first improvement also shifts the rows in time."""
         if first:
             shifted = [rows, self._passed, fill, repeat, target]
             wp.launch(planning.shift_plan, rows.shape, shifted, device=self.env.device)
@@ -373,7 +381,7 @@ class Planner:
             wp.copy(target, rows)
 
     def _interpolate(self, rows: wp.array, actions: wp.array) -> None:
-        """Compute actions from the rows of plans or samples, unless both are the same array."""
+        """Compute actions from the rows of plans or samples, unless rows and actions are the same array."""
         if rows is not actions:
             args = [rows, self._phase, *self._spline, self._low, self._high, actions]
             wp.launch(knots.interpolate, actions.shape, args, device=self.env.device)
@@ -401,13 +409,13 @@ class Planner:
         launch_blocks(planning.average, self._plan.size, plan)
 
     def _average(self) -> None:
-        """Compute the new plan, and let the update fit."""
+        """Compute the new plan, and call the update's ``fit``."""
         self._average_samples()
         self._update.fit(self._arrays)
         self._interpolate(self._plan, self._actions)
 
     def _weigh_in_torch(self) -> None:
-        """Compute weights with an update that is not capturable, and the summary."""
+        """Compute an improvement's weights with a torch update, and the summary of the improvement."""
         arrays = self._arrays
         if (returned := self._update.weigh(arrays)) is not None:
             raise ValueError(
@@ -428,7 +436,7 @@ class Planner:
         self._terminal_view.copy_(self._torch_values())
 
     def _torch_values(self) -> torch.Tensor:
-        """Values of the samples' final states, (nworld,)."""
+        """Compute the values of the samples' final states, (nworld,)."""
         obs, nworld = self._value_obs, self.env.nworld
         if isinstance(self.value, ValueFunction):
             steps = self._loop.states[:, self.env.state_space.parts["step"]] + self.horizon
@@ -445,10 +453,10 @@ class Planner:
         """Reset the plan and the adapted noise, and restart the noise stream.
 
         Args:
-            seed: A new seed. With several plants, plant i gets the seed ``seed + i``, or pass a list with one seed per
-                plant. The planner's models are redrawn with the first seed.
-            where: Mask of the plants to reset, (plants,) bool; by default all. With a mask, the other plants keep their
-                seeds, and the planner keeps its models.
+            seed: A new seed. With several plants, plant i gets the seed ``seed + i``; a list gives one seed per plant.
+                The planner draws new models with the first seed.
+            where: Mask of the plants to reset, (plants,) bool; by default all plants are reset. With a mask, the other
+                plants keep their seeds, and the planner keeps its models.
 
         Raises:
             ValueError: A seed is not a non-negative whole number, or ``where`` has the wrong shape or type.
@@ -472,29 +480,29 @@ class Planner:
 
     @property
     def seeds(self) -> list[int]:
-        """Seed of each plant's noise."""
+        """Return the seed of each plant's noise."""
         return [int(seed) for seed in self._seed.numpy()]
 
     def _draw_models(self, seed: int) -> None:
-        """Draw the planner's models with the task's functions, from streams that no plant with this seed uses."""
+        """Draw the planner's models with the task's functions, from random streams that no plant uses."""
         self.env.rand_reset(int(np.random.SeedSequence([seed, _MODELS]).generate_state(1)[0]) >> 1)
         states = self.env.get_state()[: self.config.models]
         for name, rows in self.model_fields.items():
             rows.copy_(states[:, self.env.state_space.parts[name]])
 
     def state_of(self, **parts: Any) -> torch.Tensor:
-        """Make a state from some of its parts, as measured on a robot; the rest is as after the task's fixed reset.
+        """Make a state from some of its parts, as measured on a robot; all other parts equal the task's fixed reset.
 
-        Model fields have their nominal values unless they are given, as ``body_mass=...``.
+        Model fields have nominal values unless given, as in ``body_mass=...``.
 
-        The rest includes fields left by the last substep: they affect only the first transition of a plan. ``time``
+        Fields that the last substep left, such as accelerations, affect only the first transition of a plan. ``time``
         also sets the step counter, unless ``step`` is given.
 
         Args:
             parts: Values for parts of ``env.state_space``: qpos, qvel, time, mocap_pos, ...
 
         Returns:
-            (state_space.size,) float64.
+            The state, (state_space.size,) float64.
 
         Raises:
             ValueError: A part is unknown, or its value has the wrong size or is not a number.
@@ -503,9 +511,11 @@ class Planner:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Best return, mean return, effective sample size and number of failed samples of the last improvement.
+        """Return statistics of the last improvement.
 
-        The values are numbers, or with several plants (plants,) float32 tensors on the CPU.
+        The names are ``best_return``, ``mean_return``, ``effective_samples`` (the effective sample size) and
+        ``failed_samples`` (the number of failed samples). The values are numbers, or with several plants (plants,)
+        float32 tensors on the CPU.
         """
         names = ("best_return", "mean_return", "effective_samples", "failed_samples")
         columns = self._summary.numpy().T
@@ -519,7 +529,7 @@ def _view(array: Any) -> torch.Tensor | None:
 
 
 def _put(target: torch.Tensor, values: torch.Tensor, where: torch.Tensor | None) -> None:
-    """Write values, broadcast if necessary, into the masked rows; without a mask, into all rows."""
+    """Write values into the masked rows, or into all rows without a mask, broadcasting if necessary."""
     target.copy_(values.expand_as(target) if where is None else torch.where(where, values, target))
 
 
@@ -540,7 +550,7 @@ class MPPI(Planner):  # noqa: D101
 class CEM(MPPI):
     """The cross-entropy method: ``lw.CEM(task, ...)`` is ``lw.MPPI(task, update="cem", ...)``.
 
-    The mean of the best samples is the new plan. The standard deviation of the best samples becomes the standard
+    The new plan is the mean of the best samples. The standard deviation of the best samples becomes the standard
     deviation of the noise and persists between calls; ``reset`` restores the initial value. Names in other packages:
 
     ============= =============== ========================
@@ -554,7 +564,7 @@ class CEM(MPPI):
     ``spline``    spline_type     spline_order
     ============= =============== ========================
 
-    It takes the arguments of ``lw.MPPI``, except ``update``.
+    All arguments of ``lw.MPPI`` except ``update`` are accepted.
     """
 
     _only_update = "cem"
@@ -563,8 +573,8 @@ class CEM(MPPI):
 class PredictiveSampling(MPPI):
     """Predictive sampling: ``lw.MPPI`` with ``update="predictive_sampling"``.
 
-    The best sample is the new plan. Howell et al. (2022), hydrax, judo and MuJoCo MPC plan with knots: to do the same,
-    set ``knots`` and ``spline``. It takes the arguments of ``lw.MPPI``, except ``update``.
+    The new plan is the best sample. Howell et al. 2022, hydrax, judo and MuJoCo MPC plan with knots; to plan with
+    knots, set ``knots`` and ``spline``. All arguments of ``lw.MPPI`` except ``update`` are accepted.
     """
 
     _only_update = "predictive_sampling"

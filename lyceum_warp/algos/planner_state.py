@@ -1,4 +1,4 @@
-"""Make and check the states from which a planner plans."""
+"""Make and check the initial states of plans."""
 
 import math
 from collections.abc import Mapping
@@ -31,12 +31,12 @@ def state_from_parts(env: Env, initial: torch.Tensor, parts: Mapping[str, Any]) 
 
 
 def checked_state(env: Env, state: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
-    """Check the state to plan from, or the states of all plants; a single row is unpacked.
+    """Check the state to plan from, or the states of all plants, and unpack a single row.
 
     Args:
-        env: The environment whose states these are.
+        env: The environment of the states.
         state: The state, (state_space.size,) float64, or the states, (plants, state_space.size).
-        like: The buffer that will receive it.
+        like: The buffer that will receive the state or states.
 
     Raises:
         ValueError: The state has the wrong shape or type, or is on the CPU and not finite.
@@ -51,18 +51,18 @@ def checked_state(env: Env, state: torch.Tensor, like: torch.Tensor) -> torch.Te
             which, hint = "the states", f"stack one {parts} for each plant"
         raise ValueError(
             f"{which} to plan from must be {described(like)}, not {described(state)}: call env.get_state() of the same "
-            f"task, or {hint}. (fields=[...] may make the states of an environment longer.)"
+            f"task, or {hint}. (With fields=[...], an environment's states may be longer.)"
         )
-    # on a GPU a check would wait for the device; without it, all samples fail and the plan does not change
+    # a check on a GPU would wait for the device; an unchecked non-finite state only makes all samples fail
     if state.device.type != "cpu":
         return state
     values = state.numpy().ravel()
-    # a single dot product is a fast check, because a plan may take only a millisecond; the slow check runs only if it
-    # fails
+    # a dot product is a fast check, as a plan may take only a millisecond; the slow check runs only if the dot product
+    # is not finite
     if not math.isfinite(values.dot(values)) and not (finite := np.isfinite(values)).all():
         where = int(np.flatnonzero(~finite)[0])
         plant, column = divmod(where, env.state_space.size)
         part = next(n for n, part in env.state_space.parts.items() if part.start <= column < part.stop)
         which = "the state" if like.ndim == 1 else f"the state of plant {plant}"
-        raise ValueError(f"{which} to plan from has {values[where]} in its {part!r}: it must be finite")
+        raise ValueError(f"{which} to plan from has {values[where]} in its {part!r}: states must be finite")
     return state

@@ -1,4 +1,4 @@
-"""Define Gaussian policies with a diagonal covariance, whose mean is computed by a network."""
+"""Define Gaussian policies with a diagonal covariance and a network that computes the mean."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -28,12 +28,12 @@ class GaussianPolicy(Normalized):
         nobs: Length of an observation.
         nact: Length of an action.
         hidden: Widths of the hidden layers.
-        network: A module that replaces the default network. The module maps (normalised) observations, (..., nobs), to
+        network: A module that replaces the default network. The network maps (normalised) observations, (..., nobs), to
             mean actions, (..., nact), independently for each row, in float32. NPG also requires second derivatives.
         activation: Activation of the hidden layers.
         log_std: Initial logarithm of the standard deviations.
         normalize: Whether to normalise observations by their running mean and variance.
-        limit: Normalised observations are clipped to [-limit, limit]; inf for no limit.
+        limit: Limit of normalised observations, which are clipped to [-limit, limit]; inf means no limit.
         generator: Draws the initial weights.
 
     Raises:
@@ -62,11 +62,11 @@ class GaussianPolicy(Normalized):
         super().__init__(nobs, normalize, limit)
         self.nobs, self.nact = nobs, nact
         self.shape = {"nobs": nobs, "nact": nact, "normalize": normalize}
-        if limit != LIMIT:  # files of earlier releases lack it
+        if limit != LIMIT:  # checkpoints of earlier releases lack a limit
             self.shape["limit"] = limit
         if network is None:
             self.shape |= {"hidden": layer_sizes(hidden), "activation": activation}
-            # with a last layer near zero, initial mean actions are near zero (as in mjrl)
+            # a last layer near zero makes initial mean actions near zero (as in mjrl)
             network = mlp([nobs, *hidden, nact], activation=activation, last_scale=1e-2, generator=generator)
         elif isinstance(network, nn.Module):
             self.shape["own"] = _class_name(network)
@@ -82,7 +82,7 @@ class GaussianPolicy(Normalized):
         self.mirror: PolicyMirror | None = None
 
     def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:
-        """From now on, average the mean actions with the mirror image of the policy.
+        """Make later calls average the mean actions with the policy's mirror image.
 
         Args:
             reflections: The reflections of ``obs`` and ``action`` (``algos.symmetry.reflections``).
@@ -100,7 +100,7 @@ class GaussianPolicy(Normalized):
         if (own := shape.get("own")) is not None:
             normalize = ", normalize=True" if shape["normalize"] else ""
             raise ValueError(
-                f"the policy has a custom class, {own}: pass one of this class, as in lw.load(run, "
+                f"the policy has the custom class {own}: pass a policy of this class, as in lw.load(run, "
                 f"policy=lw.GaussianPolicy({shape['nobs']}, {shape['nact']}, network=...{normalize}))"
             )
         policy = GaussianPolicy(**{name: value for name, value in shape.items() if name != "mirror"})
@@ -132,12 +132,12 @@ class GaussianPolicy(Normalized):
         return torch.addcmul(self(obs), noise, self.log_std.exp(), out=out)
 
     def log_prob(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Log-density of actions, (...,)."""
+        """Compute the log-density of actions, (...,)."""
         return log_density(action, self(obs), self.log_std)
 
 
 def log_density(action: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor) -> torch.Tensor:
-    """Log-density of actions under a diagonal Gaussian, (...,)."""
+    """Compute the log-density of actions under a diagonal Gaussian, (...,)."""
     z = (action - mean) * torch.exp(-log_std)
     return -0.5 * z.square().sum(-1) - log_std.sum() - 0.5 * action.shape[-1] * math.log(2 * math.pi)
 
@@ -145,13 +145,13 @@ def log_density(action: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor)
 def divergence(
     old_mean: torch.Tensor, old_log_std: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor
 ) -> torch.Tensor:
-    """KL divergence from one diagonal Gaussian to another, (...,)."""
+    """Compute the KL divergence from one diagonal Gaussian to another, (...,)."""
     square = (old_mean - mean).square() + torch.exp(2 * old_log_std)
     return (log_std - old_log_std + 0.5 * square * torch.exp(-2 * log_std) - 0.5).sum(-1)
 
 
 Policy: TypeAlias = nn.Module | Callable[[torch.Tensor], torch.Tensor]
-"""A module with ``act``, or a function from observations to actions."""
+"""A module with the method ``act``, or a function from observations to actions."""
 
 
 def acting(policy: Policy) -> Callable[[torch.Tensor], torch.Tensor]:

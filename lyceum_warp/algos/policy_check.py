@@ -16,7 +16,7 @@ _ROWS = 4
 def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
     """Check that an algorithm can train a policy in an environment.
 
-    The policy must be a ``GaussianPolicy``. The policy must map observations (..., nobs) to mean actions (..., nact)
+    The policy must be a ``GaussianPolicy``, and must map observations (..., nobs) to mean actions (..., nact)
     deterministically and independently for each row, and be differentiable with respect to its trainable parameters.
 
     Args:
@@ -25,7 +25,7 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
         twice: Whether the policy must be twice differentiable, as NPG requires.
 
     Raises:
-        ValueError: The policy violates one of these rules.
+        ValueError: The policy violates a rule.
     """
     if not isinstance(policy, GaussianPolicy):
         kind = getattr(policy, "__name__", None) or type(policy).__name__
@@ -36,12 +36,12 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
     if sizes != wanted:
         raise ValueError(
             f"the policy takes {sizes[0]} observations and gives {sizes[1]} actions, but the task {env.task.name!r} "
-            f"has {wanted[0]} and {wanted[1]}"
+            f"has {wanted[0]} observations and {wanted[1]} actions"
         )
     if not any(p.requires_grad for p in policy.parameters() if p is not policy.log_std):
         raise ValueError("the policy's network has no trainable parameter: use policy.requires_grad_(True)")
     obs = env.obs.repeat(-(-_ROWS // env.nworld), 1)[:_ROWS]
-    noise = torch.randn(obs.shape, generator=torch.Generator().manual_seed(0))  # make the rows differ
+    noise = torch.randn(obs.shape, generator=torch.Generator().manual_seed(0))  # make all rows different
     obs = obs + 0.1 * noise.to(obs.device)
     _check_output(policy, obs)
     _check_derivatives(policy, obs, twice=twice)
@@ -52,15 +52,15 @@ def _check_output(policy: GaussianPolicy, obs: torch.Tensor) -> None:
     mean, again = _called(policy, obs), _called(policy, obs)
     if mean.isfinite().all() and not torch.equal(mean, again):
         raise ValueError(
-            "the policy gives two different mean actions for the same observations: it must not draw random numbers "
-            "(dropout: call eval() on its network), or keep state between calls"
+            "the policy gives two different mean actions for the same observations: a policy must not draw random "
+            "numbers (for dropout, call eval() on its network) or keep state between calls"
         )
     if not mean.isfinite().all():
         raise ValueError("the policy's mean actions are not finite for finite observations")
     alone = torch.cat([_called(policy, row) for row in obs.split(1)])
     if not torch.allclose(mean, alone, rtol=0.0, atol=1e-2 * max(mean.abs().max().item(), 1e-6)):
         raise ValueError(
-            "the policy's mean action depends on the other rows of the batch (batch normalisation?): use "
+            "the policy's mean action depends on other rows of the batch, as with batch normalisation: use "
             "normalize=True, or LayerNorm"
         )
 
@@ -70,7 +70,7 @@ def _called(policy: GaussianPolicy, obs: torch.Tensor) -> torch.Tensor:
     shape = (len(obs), policy.nact)
     try:
         mean: object = policy(obs)
-    except Exception as error:  # the user's network may raise anything
+    except Exception as error:  # a user's network may raise any error
         reason = f"{type(error).__name__}: {_first_line(error)}"
         raise ValueError(f"the policy fails for observations of shape {tuple(obs.shape)} ({reason})") from error
     if not isinstance(mean, torch.Tensor) or mean.shape != shape or mean.dtype != obs.dtype:
@@ -90,8 +90,8 @@ def _check_derivatives(policy: GaussianPolicy, obs: torch.Tensor, *, twice: bool
         gradients = torch.autograd.grad(sums, [p for _, p in named], allow_unused=True)
         if unused := [name for (name, _), gradient in zip(named, gradients, strict=True) if gradient is None]:
             raise ValueError(
-                f"the policy's mean actions do not depend on its parameter {unused[0]!r}: use it, without detach() or "
-                "no_grad(), or freeze it with requires_grad_(False)"
+                f"the policy's mean actions do not depend on its parameter {unused[0]!r}: use the parameter, without "
+                "detach() or no_grad(), or freeze it with requires_grad_(False)"
             )
         if not twice:
             return
@@ -112,7 +112,7 @@ def check_value(value: ValueFunction, env: Env) -> None:
     """Check that a value function fits an environment's observations.
 
     Raises:
-        ValueError: The value function's group or input size does not fit, or a parameter is not finite.
+        ValueError: The value function's group or input size does not fit the environment, or a parameter is not finite.
     """
     name = env.task.name
     check_group(value.group, env.obs_groups, name)
@@ -120,11 +120,13 @@ def check_value(value: ValueFunction, env: Env) -> None:
     if size != wanted:
         raise ValueError(
             f"the value function takes {size} observations, but the group {value.group!r} of the task {name!r} has "
-            f"{wanted}"
+            f"{wanted} observations"
         )
     for part, numbers in value.state_dict().items():
         if not numbers.isfinite().all():
-            raise ValueError(f"the value function's {part!r} is not finite: omit it to get a new value function")
+            raise ValueError(
+                f"the value function's {part!r} is not finite: omit the value function to get a new value function"
+            )
 
 
 def _first_line(error: BaseException) -> str:

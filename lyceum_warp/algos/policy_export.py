@@ -27,8 +27,8 @@ _SUFFIXES = (".onnx", ".pt2")
 def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None = None) -> Path:
     """Export a policy's ``act`` to a file that runs without this package.
 
-    The file maps observations, (n, nobs) float32 for any n, to actions without noise, and includes the normaliser.
-    Environments also clip controls to the actuators' ranges; the file does not.
+    The exported file includes the normaliser, and maps observations, (n, nobs) float32 for any n, to actions without
+    noise. Environments also clip controls to the actuators' ranges; the exported file does not.
 
     ===========  ======================================================================================
     ``.onnx``    input ``obs``, output ``action``; for ONNX Runtime, TensorRT, OpenVINO, ...
@@ -42,18 +42,18 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
 
     Args:
         policy: The policy, on any device: a module with the method ``act`` and the attribute ``nobs``.
-        path: The file; an existing file is replaced.
-        env: An environment of the policy's task, whose ``deployment_metadata`` an ONNX file gets.
+        path: Path of the file, which replaces an existing file.
+        env: An environment of the policy's task; an ONNX file gets the task's ``deployment_metadata``.
 
     Returns:
         The file's path.
 
     Raises:
-        ImportError: The extra ``export`` is not installed, which ``.onnx`` requires.
+        ImportError: The extra ``export``, which ``.onnx`` requires, is not installed.
         ValueError: The file has an unsupported suffix, or the policy's network cannot be exported.
     """
     if not (isinstance(policy, torch.nn.Module) and hasattr(policy, "act") and hasattr(policy, "nobs")):
-        raise ValueError(f"policy must be a policy as lw.load(run) returns it, not {described(policy)}")
+        raise ValueError(f"policy must be a policy, as lw.load(run) returns one, not {described(policy)}")
     path = Path(path)
     check_export(path)
     nobs: Any = policy.nobs
@@ -83,7 +83,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
 
 
 def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
-    """Describe a policy's inputs, outputs and timing for a program that runs it on a robot or in another simulator.
+    """Describe a policy's inputs, outputs and timing, for running the policy on a robot or in another simulator.
 
     ================  ===================================================================================
     ``task``          name of the task
@@ -99,7 +99,7 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
 
     Args:
         policy: The policy.
-        env: An environment of its task.
+        env: An environment of the policy's task.
     """
     task, model = env.task, env.task.model
     parts = [{"name": name, "size": part.stop - part.start} for name, part in env.obs_space.parts.items()]
@@ -119,7 +119,7 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
 
 
 class _Acting(torch.nn.Module):
-    """Wraps a policy so that ``forward``, which torch exports, calls its ``act``."""
+    """Wraps a policy so that the exported ``forward`` calls the policy's ``act``."""
 
     def __init__(self, policy: Any) -> None:
         super().__init__()
@@ -131,7 +131,7 @@ class _Acting(torch.nn.Module):
 
 
 def check_export(path: Path) -> None:
-    """Check the suffix of a file, and that the packages for its format are installed; see ``export_policy``."""
+    """Check a file's suffix, and that the packages for the file's format are installed; see ``export_policy``."""
     if path.suffix not in _SUFFIXES:
         raise ValueError(f"{path} must end with {' or '.join(_SUFFIXES)}")
     missing = [name for name in ("onnx", "onnxscript") if importlib.util.find_spec(name) is None]

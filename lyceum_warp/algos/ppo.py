@@ -1,8 +1,8 @@
 """Learn policies by proximal policy optimisation (PPO).
 
-The algorithm of Schulman et al. (2017, "Proximal Policy Optimization Algorithms") as implemented in rsl_rl (Rudin et
-al. 2022, "Learning to Walk in Minutes Using Massively Parallel Deep Reinforcement Learning"): with a clipped value
-loss, a learning rate adapted to the KL divergence, and the same mini-batches in every epoch.
+PPO was proposed by Schulman et al., 2017 ("Proximal Policy Optimization Algorithms"), and is implemented as in rsl_rl
+(Rudin et al. 2022, "Learning to Walk in Minutes Using Massively Parallel Deep Reinforcement Learning"): with a clipped
+value loss, a learning rate adapted to the KL divergence, and the same mini-batches in every epoch.
 """
 
 import collections
@@ -38,12 +38,12 @@ RECENT = 100
 """Number of episodes in ``return_recent``."""
 
 _EPS = 1e-2
-"""Added to the normaliser's standard deviations, as in rsl_rl."""
+"""Constant that is added to the normaliser's standard deviations, as in rsl_rl."""
 
 _SMALLEST_STD = 1e-6
 
 _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
-"""Lower and upper limits of the adaptive learning rate, and the factor by which it changes."""
+"""Lower limit, upper limit and factor of change of the adaptive learning rate."""
 
 
 @document_attributes
@@ -51,12 +51,12 @@ _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
 class PPOIteration(OnPolicyIteration):
     """Statistics of one iteration of PPO.
 
-    Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended. The worlds'
-    first episodes are not counted if they started at a random step (``stagger``).
+    Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended. With
+    ``stagger``, the statistics exclude the worlds' first episodes, which start at a random step.
     """
 
     return_recent: float
-    """Mean return of the last 100 episodes, including earlier iterations."""
+    """Mean return of the last 100 episodes, including episodes of earlier iterations."""
     learning_rate: float
     """Learning rate after the iteration."""
     surrogate_loss: float
@@ -71,24 +71,24 @@ class PPOIteration(OnPolicyIteration):
 
 @document_attributes
 class PPO(OnPolicyLearner):
-    """Learns a policy by PPO; an infinite iterator of ``PPOIteration``.
+    """Learns a policy by PPO, as an infinite iterator of ``PPOIteration``.
 
     Example:
         >>> for it in PPO(env, config=PPOConfig(hidden=(64, 64))):
         ...     print(it.return_recent)
 
     Args:
-        env: The environment; do not step it between iterations.
-        policy: The policy; a new one by default. ``GaussianPolicy(nobs, nact, network=...)`` wraps any network.
-        value: The value function; a new one by default.
+        env: The environment, which must not be stepped between iterations.
+        policy: The policy; by default a new policy. ``GaussianPolicy(nobs, nact, network=...)`` wraps any network.
+        value: The value function; by default a new value function.
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
-        team: The processes that learn together, each with its share of the worlds. All processes must make the same
-            calls with the same arguments, and get the same statistics.
+        team: The processes that learn together, each with some of the worlds. All processes must make the same calls
+            with the same arguments, and get the same statistics.
 
     Raises:
-        ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy
-            cannot be learned (``lyceum_warp.algos.policy_check``).
+        ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy is not
+            trainable (``lyceum_warp.algos.policy_check``).
         FloatingPointError: A loss, or a parameter of a network, is not finite after an iteration.
     """
 
@@ -114,10 +114,11 @@ class PPO(OnPolicyLearner):
         config, team, device, steps = self.config, self.team, env.obs.device, self.config.num_steps
         if config.minibatches > (count := steps * env.nworld * team.size):
             raise ValueError(
-                f"{config.minibatches} mini-batches are more than the {count} samples: give more worlds, or make "
+                f"{config.minibatches} mini-batches need at least as many samples, not {count}: use more worlds, or "
+                "make "
                 "minibatches smaller"
             )
-        # with a last layer near zero, as in NPG, the adaptive learning rate would start much too high
+        # an initial last layer near zero, as in NPG, would start the adaptive learning rate much too high
         limit = math.inf if config.normalize else LIMIT
         self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)
         self._make_mirror()
@@ -135,7 +136,7 @@ class PPO(OnPolicyLearner):
         self.rate = torch.tensor(config.learning_rate, device=device)
         self._cuda = device.type == "cuda"
         self.optimizer = torch.optim.Adam(self._parameters, lr=self.rate, fused=True, capturable=self._cuda)
-        # gradients, KL divergence and losses are views of one tensor, for a single all-reduce
+        # store gradients, KL divergence and losses in one tensor, so that one all-reduce suffices
         sizes = [p.numel() for p in self._parameters]
         self._sums = self._parameters[0].new_zeros(sum(sizes) + 4)
         for parameter, part in zip(self._parameters, self._sums[:-4].split(sizes), strict=True):
@@ -152,9 +153,9 @@ class PPO(OnPolicyLearner):
             self.rollout.stagger(self.generator, team)
 
     def _make_mirror(self) -> None:
-        """Set the mirror images of observations and actions, if the policy is to be symmetric."""
+        """Make the mirror images of observations and actions, if the configuration asks for symmetry."""
         config, env = self.config, self.env
-        if self.policy.mirror is not None:  # the policy of another run is already mirrored
+        if self.policy.mirror is not None:  # a policy from another run may already be mirrored
             config = self.config = dataclasses.replace(config, symmetry="exact")
         self._mirror: PolicyMirror | None = None
         if config.symmetry == "none":
@@ -179,11 +180,12 @@ class PPO(OnPolicyLearner):
             samples = self.evaluated_samples()
             timer.mark()
 
-            # 3. Run epochs of mini-batches; each is a step on the clipped surrogate, the value loss and the entropy.
+            # 3. Run epochs of mini-batches, each a gradient step on the clipped surrogate, the value loss and the
+            # entropy.
             self.update(samples)
             kl = self.divergence()
 
-        # One copy transfers the statistics of all processes to the host, another copy the returns.
+        # One copy transfers the statistics of all processes to the host, and another copy transfers the returns.
         losses = self._losses / (config.epochs * config.minibatches)
         finite = torch.stack([numbers.isfinite().all() for numbers in (losses, *self._parameters)]).all()
         numbers = [
@@ -235,8 +237,8 @@ class PPO(OnPolicyLearner):
     def sample(self) -> None:
         """Fill the rollout buffer with the current policy and new noise.
 
-        Each step updates the normalisers with its observations. ``evaluated_samples`` computes values and densities for
-        all steps at once.
+        Each step of the worlds updates the normalisers with the step's observations. ``evaluated_samples`` computes
+        values and densities for all steps at once.
         """
         env, rollout, std = self.env, self.rollout, self.policy.log_std.exp()
         with one_thread():
@@ -256,10 +258,10 @@ class PPO(OnPolicyLearner):
     def evaluated_samples(self) -> dict[str, torch.Tensor]:
         """Compute the inputs of the update, each (steps, nworld, ...), from the samples and the old networks.
 
-        Every transition bootstraps from its next observation before any events of the task: a push or a new command
-        between two steps changes the value of the state, but no action caused that change, so advantages and targets
-        exclude it. Time limits, faults and the end of the rollout bootstrap in the same way. The value function's
-        targets are its predictions plus the advantages.
+        Every transition bootstraps from its next observation before any events of the task. A push or a new command
+        between two steps changes the value of the state, but no action caused this change, so advantages and targets
+        exclude the change. Time limits, faults and the end of the rollout also bootstrap from the next observation. The
+        value function's targets are its predictions plus the advantages.
         """
         rollout, config, team = self.rollout, self.config, self.team
         obs, final_obs = rollout.obs_groups[self.value.group], rollout.final_obs_groups[self.value.group]
@@ -278,7 +280,7 @@ class PPO(OnPolicyLearner):
         }  # fmt: skip
 
     def update(self, samples: Samples) -> None:
-        """Learn from the samples of ``evaluated_samples`` in epochs of mini-batches."""
+        """Learn from the results of ``evaluated_samples`` in epochs of mini-batches."""
         config, team = self.config, self.team
         parts = self.minibatches.shuffle(samples, self.generator)
         if config.whiten_minibatches:
@@ -319,7 +321,7 @@ class PPO(OnPolicyLearner):
             assert self._mirror is not None
             image = self._mirror.action(self.policy(self._mirror.obs(samples["obs"])))
             loss = loss + config.symmetry_coef * (weight * (mean - image).square().mean(-1)).sum()
-        # not backward(), which accumulates gradients on the stream of the first call
+        # do not use backward(), which accumulates gradients on the stream of its first call
         gradients = torch.autograd.grad(loss, self._parameters)
 
         with torch.no_grad():
@@ -336,7 +338,7 @@ class PPO(OnPolicyLearner):
     def _with_images(self, samples: Samples) -> dict[str, torch.Tensor]:
         """Append the mirror images of samples.
 
-        The mirror image of the sampling policy would draw a mirrored sample with the same density as the original.
+        Mirrored samples keep their density, because the mirrored policy draws a mirrored sample with the same density.
         """
         assert self._mirror is not None
         images = dict(samples)
@@ -353,7 +355,7 @@ class PPO(OnPolicyLearner):
         self.rate.copy_(torch.where(kl > wanted * 2.0, lower, raised))
 
     def _log_std(self) -> torch.Tensor:
-        """Logarithms of the standard deviations, (nact,)."""
+        """Return the logarithms of the standard deviations, (nact,)."""
         if self.config.std_type == "log":
             log_std = self.std.clamp_min(math.log(_SMALLEST_STD))
         else:
@@ -368,12 +370,12 @@ class PPO(OnPolicyLearner):
 
     @torch.no_grad()
     def divergence(self) -> torch.Tensor:
-        """KL divergence from the sampling policy to the current policy, averaged over the samples."""
+        """Compute the KL divergence from the sampling policy to the current policy, averaged over the samples."""
         kl = divergence(self._mean, self._old_log_std, self.policy(self.rollout.obs), self.policy.log_std).mean()
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
-        """Returns of the counted episodes that ended in the iteration in any process, in step order."""
+        """Get the returns of the counted episodes that ended in the iteration in any process, in step order."""
         ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
         ended = self.team.gather(ended.T).T
         found: list[float] = ended[~ended.isnan()].tolist()
@@ -399,4 +401,4 @@ class PPO(OnPolicyLearner):
             self.std.copy_(state["std"])
         self._recent.clear()
         self._recent.extend(state["recent"])
-        self.minibatches.epoch.forget()  # the graph stores the addresses of the old moments
+        self.minibatches.epoch.forget()  # discard the graph, which uses the addresses of Adam's old moments

@@ -25,35 +25,34 @@ class PPOConfig:
     """
 
     num_steps: int = 24
-    """Steps of every world per iteration."""
+    """Number of steps of every world per iteration."""
     epochs: int = 5
-    """Passes over an iteration's samples."""
+    """Number of passes over an iteration's samples."""
     minibatches: int = 4
-    """Number of equal mini-batches per epoch. Remaining samples are not used."""
+    """Number of equal mini-batches per epoch. Samples that do not divide evenly are not used."""
     gamma: float = 0.99
     """Discount factor."""
     lam: float = 0.95
     """Lambda of the generalised advantage estimate."""
     clip: float = 0.2
-    """Clipping range of the probability ratio around 1 and, with clip_value_loss, of the values around the old
-    values."""
+    """Clipping range of the probability ratio around 1, and with clip_value_loss of values around the old values."""
     clip_value_loss: bool = True
-    """Whether the value loss is the larger of two errors: the prediction's and the clipped prediction's."""
+    """Whether the value loss is the larger of the prediction's error and the clipped prediction's error."""
     value_coef: float = 1.0
     """Coefficient of the value loss."""
     entropy_coef: float = 0.01
     """Coefficient of the policy's entropy."""
     final_entropy_coef: float | None = None
-    """Entropy coefficient after entropy_decay; by default it stays constant."""
+    """Entropy coefficient after entropy_decay; by default the coefficient stays constant."""
     entropy_decay: tuple[int, int] = (150, 200)
     """First and last iteration of the linear change from entropy_coef to final_entropy_coef."""
     learning_rate: float = 1e-3
-    """Learning rate of Adam; the initial value if it is adaptive."""
+    """Learning rate of Adam, or the initial learning rate if schedule is "adaptive"."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """"adaptive" divides the learning rate by 1.5 if a mini-batch's KL divergence exceeds twice desired_kl, and
-    multiplies it by 1.5 if the divergence is below half of desired_kl, between 1e-5 and 1e-2."""
+    multiplies it by 1.5 if the divergence is below half of desired_kl, within the limits 1e-5 and 1e-2."""
     desired_kl: float = 0.02
-    """Target KL divergence of the adaptive learning rate. With 0.02, PPO learns go1_velocity faster than with mjlab's
+    """Target KL divergence of the adaptive learning rate. PPO learns go1_velocity faster with 0.02 than with mjlab's
     0.01 (bench/README.md)."""
     max_grad_norm: float = 1.0
     """Maximum Euclidean norm of the gradient, for the policy and the value function separately."""
@@ -73,24 +72,25 @@ class PPOConfig:
     value_activation: Activation = "elu"
     """Activation of the value function's hidden layers."""
     value_group: str | None = None
-    """Group of observations for the value function; by default "critic" if the task has this group, else "policy"."""
+    """Group of observations for the value function; by default "critic" if the task has such a group, else "policy"."""
     symmetry: Literal["none", "exact", "loss", "augment"] = "none"
-    """How to use the mirror image that a task declares (``lw.Mirror``): "exact" averages the policy with its mirror
-    image; "loss" adds symmetry_coef times the squared difference between both; "augment" learns from the mirror images
-    of all samples, too."""
+    """Use of the mirror image that a task declares (``lw.Mirror``): "exact" averages the policy with its mirror image;
+    "loss" adds symmetry_coef times the squared difference between both; "augment" also learns from the mirror images of
+    all samples."""
     symmetry_coef: float = 1.0
     """Coefficient of the symmetry loss, if symmetry is "loss"."""
     normalize: bool = True
     """Whether to normalise observations by their running mean and variance, updated in every step."""
     stagger: bool = True
     """Whether the first episodes start at random steps, so that time limits are spread over time. On the Warp engine,
-    worlds whose initial states settle always start together."""
+    worlds always start together if the task lets initial states settle."""
     tf32: bool = True
     """Whether matrix products on a GPU use TensorFloat-32."""
     mean_every: int = 20
-    """Iterations between evaluations of the mean policy; 0 for none. A run with fewer iterations has no best policy."""
+    """Iterations between evaluations of the mean policy; 0 means no evaluations. A run with fewer iterations than
+    ``mean_every`` has no best policy."""
     mean_episodes: int = 16
-    """Episodes in an evaluation of the mean policy."""
+    """Number of episodes in an evaluation of the mean policy."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -98,7 +98,7 @@ class PPOConfig:
         object.__setattr__(self, "entropy_decay", _iterations("entropy_decay", self.entropy_decay))
 
     def entropy_weight(self, iteration: int) -> float:
-        """Entropy coefficient in an iteration, counted from 1."""
+        """Compute the entropy coefficient of an iteration, counted from 1."""
         if self.final_entropy_coef is None:
             return self.entropy_coef
         first, last = self.entropy_decay
@@ -111,8 +111,8 @@ def _iterations(name: str, value: Any) -> tuple[int, int]:
     try:
         first, last = value
     except (TypeError, ValueError):
-        raise ValueError(f"{name} must be two numbers of iterations, as in (150, 200), not {value!r}") from None
+        raise ValueError(f"{name} must be a first and a last iteration, such as (150, 200), not {value!r}") from None
     pair = whole_number(name, first, low=0), whole_number(name, last, low=1)
     if pair[0] >= pair[1]:
-        raise ValueError(f"{name} must end after it begins, not {value!r}")
+        raise ValueError(f"{name} must have a last iteration after the first iteration, not {value!r}")
     return pair

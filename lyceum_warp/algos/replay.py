@@ -11,13 +11,13 @@ from lyceum_warp.support.machine import free_memory
 from lyceum_warp.support.validate import check_kind, finite_number, whole_number
 
 Rows: TypeAlias = dict[str, torch.Tensor]
-"""Contents of consecutive steps by name, each (steps, nworld, ...)."""
+"""Contents of consecutive steps by name, such as rewards; each tensor is (steps, nworld, ...)."""
 
 _TRANSITIONS, _STEPS = 1_000_000, 1_024
-"""Default capacity: a million transitions or 1,024 steps of every world, whichever is more."""
+"""Default capacity in transitions, and in steps of every world; the larger capacity applies."""
 
 _SHARE = 0.3
-"""The default capacity takes at most this share of the device's free memory."""
+"""Largest fraction of the device's free memory that the default capacity takes."""
 
 
 @document_attributes
@@ -38,12 +38,12 @@ class Transitions(NamedTuple):
 
 @document_attributes
 class Replay:
-    """A ring buffer of the transitions of every world, on the device of the environment's observations.
+    """Ring buffer of the transitions of every world, on the device of the environment's observations.
 
-    ``step`` steps the environment and stores its transitions; ``sample`` draws some of them. Nothing is allocated
-    between two samples, and the host does not wait for the device. A fault truncates an episode: its transition has
-    reward 0 and the last valid observations as ``next_obs``, and a non-finite action is stored as 0, so all contents
-    are finite.
+    ``step`` steps the environment and stores its transitions; ``sample`` draws some of the stored transitions. Sampling
+    allocates no lasting memory, and the host does not wait for the device. A fault truncates an episode: the transition
+    has the reward 0 and the last valid observations as ``next_obs``. Non-finite actions are stored as 0, so all
+    contents are finite.
 
     Example:
         >>> replay = Replay(env)
@@ -52,8 +52,8 @@ class Replay:
 
     Args:
         env: The environment.
-        capacity: Number of transitions, rounded up to whole steps of all worlds. The default is a million, or 1,024
-            steps of every world if that is more, but at most 30 % of the device's free memory.
+        capacity: Number of transitions, rounded up to whole steps of all worlds. The default is a million transitions,
+            or 1,024 steps of every world if that is more, but at most 30 % of the device's free memory.
 
     Raises:
         ValueError: An argument is not valid, or the buffer does not fit into memory.
@@ -66,9 +66,9 @@ class Replay:
     nbytes: int
     """Size of the full buffer in bytes."""
     stored: int
-    """Number of steps stored so far, including overwritten ones."""
+    """Number of steps stored so far, including overwritten steps."""
     obs: dict[str, torch.Tensor]
-    """Observations before each step by group, each (steps, nworld, size). Step t is in row ``t % steps``."""
+    """Observations before each step by group, each (steps, nworld, size). Row ``t % steps`` stores step t."""
     action: torch.Tensor
     """Actions, (steps, nworld, nact)."""
     reward: torch.Tensor
@@ -91,7 +91,7 @@ class Replay:
         self.steps = steps = -(-whole_number("capacity", capacity, low=1, high=2**62) // n)
         self.nbytes = each * steps * n
         check_fit(each * steps, n, env.device, model=f"{steps} steps in a replay buffer")
-        # two tensors for all observations, so that a sample takes few kernels
+        # store all observations in two tensors, so that sampling needs few kernels
         self._before = torch.zeros(steps, n, sum(sizes) + nact, device=device)
         self._after = torch.zeros(steps, n, sum(sizes), device=device)
         self.reward = torch.zeros(steps, n, device=device)
@@ -99,7 +99,7 @@ class Replay:
         self._sizes = sizes
         self.obs, self.next_obs = self._groups(self._before), self._groups(self._after)
         self.action = self._before[..., sum(sizes) :]
-        # the number of steps and the row of the oldest step, on the device so that sampling can be captured
+        # keep the number of steps and the row of the oldest step on the device, so that a graph can capture sampling
         self._count, self._oldest = torch.zeros(2, dtype=torch.long, device=device)
         self.stored = 0
 
@@ -117,7 +117,7 @@ class Replay:
         """Step the environment, and store the transition of every world.
 
         Args:
-            action: Copied into ``env.action`` first, if given; (nworld, nact).
+            action: Actions to copy into ``env.action`` before the step, (nworld, nact).
 
         Raises:
             ValueError: The action has the wrong shape or type.
@@ -140,7 +140,7 @@ class Replay:
 
         Args:
             batch: Number of transitions.
-            n_step: Maximum number of steps in a return; see ``at``.
+            n_step: Maximum number of rewards in a return; see ``at``.
             gamma: Discount factor.
             generator: Draws the transitions, on the buffer's device; by default torch's global generator.
 
@@ -156,15 +156,15 @@ class Replay:
 
     @torch.no_grad()
     def at(self, index: torch.Tensor, *, n_step: int, gamma: float) -> Transitions:
-        """Get transitions by number; can be captured in a CUDA graph.
+        """Get transitions by their numbers; a CUDA graph can capture this method.
 
-        A return ends at the end of the episode, and at the newest step. It then has fewer than ``n_step`` rewards, and
+        A return has fewer than ``n_step`` rewards if the episode or the stored steps end earlier. A shorter return
         bootstraps from the last observation, also after a time limit or a fault, but not after a termination.
 
         Args:
             index: Numbers of the transitions, (batch,) int64; the transition of world w in the k-th oldest step has
                 number k * nworld + w.
-            n_step: Maximum number of steps in a return.
+            n_step: Maximum number of rewards in a return.
             gamma: Discount factor.
         """
         n = self.env.nworld
@@ -185,19 +185,19 @@ class Replay:
         )  # fmt: skip
 
     def _groups(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Views of the observations of each group in the first columns."""
+        """Get views of each group's observations in the first columns."""
         parts = rows[..., : sum(self._sizes)].split(self._sizes, dim=-1)
         return dict(zip(self.env.obs_groups, parts, strict=True))
 
     # the state
 
     def rows(self, first: int, end: int) -> Rows:
-        """Copy the contents of steps ``first`` to ``end - 1``, counted from the beginning."""
+        """Copy the contents of steps ``first`` to ``end - 1``; the first step ever stored is step 0."""
         place = torch.arange(first, end, device=self.reward.device) % self.steps
         return {name: array[place] for name, array in self._arrays().items()}
 
     def set_rows(self, first: int, rows: Rows) -> None:
-        """Write the contents of steps from ``first`` on, which do not count as stored until ``restore``."""
+        """Write the contents of steps from ``first`` on; the steps count as stored after ``restore``."""
         place = torch.arange(first, first + len(rows["reward"]), device=self.reward.device) % self.steps
         for name, array in self._arrays().items():
             array[place] = rows[name].to(array.device)
@@ -211,10 +211,10 @@ class Replay:
         return {"stored": self.stored, "rows": self.rows(self.stored - self.count, self.stored)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of ``state_dict``; the same numbers then sample the same transitions.
+        """Restore a state of ``state_dict``; equal random numbers then sample equal transitions.
 
         Raises:
-            ValueError: The state belongs to a buffer of another size.
+            ValueError: The state belongs to a buffer of a different size.
         """
         rows, stored = state["rows"], state["stored"]
         sizes = {name: tuple(part.shape[1:]) for name, part in rows.items()}
@@ -222,7 +222,7 @@ class Replay:
         if sizes != own or len(rows["reward"]) != min(stored, self.steps):
             raise ValueError(
                 f"the state has {len(rows['reward'])} steps of the sizes {sizes}, but this replay buffer holds "
-                f"{min(stored, self.steps)} of them of the sizes {own}"
+                f"{min(stored, self.steps)} steps of the sizes {own}"
             )
         self.set_rows(stored - len(rows["reward"]), rows)
         self.restore(stored)
@@ -238,17 +238,17 @@ class Replay:
 
 
 def default_capacity(env: Env, processes: int = 1) -> int:
-    """The default capacity of a replay buffer in transitions.
+    """Compute the default capacity of a replay buffer, in transitions.
 
     Args:
         env: The environment.
-        processes: Number of processes with such an environment, which share the capacity.
+        processes: Number of processes, which share the capacity and have one environment each.
     """
     wanted, free = max(-(-_TRANSITIONS // processes), _STEPS * env.nworld), free_memory(env.device)
     return wanted if free is None else max(min(wanted, int(_SHARE * free) // _transition_bytes(env)), env.nworld)
 
 
 def _transition_bytes(env: Env) -> int:
-    """Bytes of one transition."""
+    """Compute the bytes of one transition."""
     nobs = sum(space.size for space in env.obs_spaces.values())
     return 4 * (2 * nobs + env.action_space.size + 1) + 2

@@ -21,7 +21,7 @@ _LARGE = 1e18
 
 
 class Sampler(Protocol):
-    """A policy with ``GaussianPolicy.sample``."""
+    """A policy with the method ``GaussianPolicy.sample``."""
 
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> Any:
         """Write actions, (nworld, nact), into ``out``."""
@@ -30,17 +30,17 @@ class Sampler(Protocol):
 
 @document_attributes
 class Rollout:
-    """A preallocated buffer for the samples of a fixed number of steps of every world.
+    """Preallocated buffer for the samples of a fixed number of steps of every world.
 
     Args:
         env: The environment.
         steps: Number of steps.
         groups: Groups of observations to store in addition to "policy", such as ``("critic",)``.
         first_only: Whether to count only each world's first episode since ``restart``. If all worlds start together,
-            counting all episodes that end would be biased towards short episodes.
+            counting all episodes that end would favour short episodes.
 
     Raises:
-        ValueError: The task has no such group of observations.
+        ValueError: The task has no group of observations of this name.
     """
 
     obs: torch.Tensor
@@ -48,7 +48,7 @@ class Rollout:
     action: torch.Tensor
     """Actions, (steps, nworld, nact)."""
     step: torch.Tensor
-    """Steps since the reset before each step, (steps, nworld)."""
+    """Number of steps between the reset and each step, (steps, nworld)."""
     final_obs: torch.Tensor
     """Observations after each step, before any reset, (steps, nworld, nobs)."""
     obs_groups: dict[str, torch.Tensor]
@@ -78,7 +78,7 @@ class Rollout:
     running_return: torch.Tensor
     """Sum of the rewards of each world's current episode, (nworld,); NaN in episodes that are not counted."""
     faults: torch.Tensor
-    """Number of faults of each world within these steps, (nworld,) int32."""
+    """Number of faults of each world within the buffer's steps, (nworld,) int32."""
 
     def __init__(self, env: Env, steps: int, *, groups: Collection[str] = (), first_only: bool = False) -> None:
         check_kind("env of Rollout", env, Env, "as lw.make(...) makes it")
@@ -127,13 +127,13 @@ class Rollout:
         self._after_step = graphs.sequence([Phase("store outputs", self._launch_outputs)])
 
     def _stored(self, source: torch.Tensor, into: list["_Rows"]) -> torch.Tensor:
-        """Allocate storage, (steps, nworld, size), to be filled before or after each step."""
+        """Allocate storage, (steps, nworld, size), to fill before or after each step."""
         into.append(_Rows(source, self.steps, self.env.device))
         return into[-1].stored
 
     @torch.no_grad()
     def collect(self, policy: Sampler, noise: torch.Tensor) -> None:
-        """Fill the buffer: run the policy for ``steps`` steps from the current states.
+        """Fill the buffer by running the policy for ``steps`` steps from the current states.
 
         Args:
             policy: The policy.
@@ -148,7 +148,7 @@ class Rollout:
             self.store_outputs()
 
     def begin(self) -> None:
-        """Start filling the buffer from the first step, for callers that step the environment themselves."""
+        """Start to fill the buffer from the first step, for callers that step the environment themselves."""
         self._index.zero_()
         self._fault.zero_()
 
@@ -170,12 +170,12 @@ class Rollout:
     def stagger(self, generator: torch.Generator, team: Team | None = None) -> None:
         """Set the worlds' step counters to random values, so that time limits are spread over time.
 
-        Otherwise worlds that start together and never terminate would all reach their time limits in the same rollout.
-        The returns of these shortened episodes are not counted. On the Warp engine, worlds whose initial states settle
-        (``lw.Task.settle``) keep starting together: all worlds wait while any of them settles.
+        Worlds that start together and never terminate would otherwise all reach their time limits in the same rollout.
+        The returns of the shortened episodes are not counted. With ``lw.Task.settle`` on the Warp engine, worlds keep
+        starting together, because all worlds wait while one of them settles.
 
         Args:
-            generator: Draws the values, identically in every process.
+            generator: Draws the values, which are equal in every process.
             team: The processes.
         """
         env, team = self.env, team or Team()
@@ -191,12 +191,12 @@ class Rollout:
     def restart_some(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
         """Restart random worlds so that at least ``least`` worlds started an episode within the last ``steps`` steps.
 
-        Interrupted episodes are not counted. Do not use this with ``first_only``, which would count restarted worlds
-        twice. The host does not wait for the device.
+        Interrupted episodes are not counted. Do not restart worlds with ``first_only``, which would count restarted
+        worlds twice. The host does not wait for the device.
 
         Args:
-            least: Minimum number of worlds, over all processes.
-            generator: Draws the worlds, identically in every process.
+            least: Minimum number of worlds in all processes.
+            generator: Draws the worlds, which are equal in every process.
             team: The processes.
         """
         env, team = self.env, team or Team()
@@ -209,10 +209,10 @@ class Rollout:
         self.running_return.masked_fill_(mask, 0.0)
 
     def explain_not_finite(self) -> str:
-        """Describe in one sentence the first number that is not finite or too large for float32, and how to fix it.
+        """Describe in one sentence the first number that is not finite or too large for float32, and the fix.
 
-        Waits for the device. Rewards and observations from a task are always finite, because non-finite values are
-        faults.
+        The host waits for the device. A task's rewards and observations are always finite, because non-finite values
+        are faults.
         """
         kinds: list[tuple[str, torch.Tensor, float, Mapping[str, slice]]] = [("reward", self.reward, torch.inf, {})]
         for groups in (self.obs_groups, self.final_obs_groups):
@@ -256,7 +256,7 @@ class Rollout:
 
 
 class _Rows:
-    """Storage, (steps, nworld, size), for one of an environment's buffers, (nworld, size)."""
+    """Storage, (steps, nworld, size), for one buffer of an environment, (nworld, size)."""
 
     def __init__(self, source: torch.Tensor, steps: int, device: wp.Device) -> None:
         self._source = wp.from_torch(source)
@@ -264,6 +264,6 @@ class _Rows:
         self.stored = torch_view(self._rows)
 
     def store(self, index: wp.array) -> None:
-        """Launch a copy of the buffer into the row given by the index."""
+        """Launch a copy of the buffer into the row with the given index."""
         args = [index, self._source, self._rows]
         wp.launch(collect.store_rows, self._source.shape, args, device=self._rows.device)

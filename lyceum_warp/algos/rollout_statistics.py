@@ -24,7 +24,7 @@ class SampledIteration(Iteration):
     """
 
     faults: int
-    """Number of faults in this iteration, over all worlds."""
+    """Number of faults in the iteration, over all worlds."""
     time_sample: float
     """Seconds for sampling."""
     time_mean: float
@@ -33,7 +33,7 @@ class SampledIteration(Iteration):
     """Samples divided by ``time_sample``."""
 
     def row(self) -> dict[str, Any]:
-        """Convert to a row of metrics.csv: numbers by column, including None."""
+        """Convert the statistics to a row of metrics.csv, including columns whose value is None."""
         names = [field.name for field in dataclasses.fields(self) if field.name not in NESTED]
         return {name: getattr(self, name) for name in names} | super().row()
 
@@ -73,7 +73,7 @@ class EpisodeSums(NamedTuple):
 
 
 class Moments(NamedTuple):
-    """Count, mean and sum of squared deviations from the mean of a set of numbers."""
+    """Moments of a set of numbers: count, mean, and sum of squared deviations from the mean."""
 
     n: float
     mean: float
@@ -81,7 +81,7 @@ class Moments(NamedTuple):
 
 
 def finished(rollout: Rollout) -> EpisodeSums:
-    """Compute sums over the episodes that ended in a rollout, as scalar tensors on its device."""
+    """Compute sums over the episodes that ended in a rollout, as scalar tensors on the rollout's device."""
     ended = _ended(rollout)
     returns = rollout.episode_return.double()
     infinity = torch.inf
@@ -105,10 +105,10 @@ def finished(rollout: Rollout) -> EpisodeSums:
 
 
 def metric_sums(rollout: Rollout) -> tuple[torch.Tensor, ...]:
-    """Sum the task's metrics over a rollout, as scalar tensors on its device.
+    """Sum the task's metrics over a rollout, as scalar tensors on the rollout's device.
 
-    The sums over the episodes that ended come first, then the means over all samples. Non-finite metrics count as 0 in
-    both.
+    The result has the sums over ended episodes first, and then the means over all samples. Non-finite metrics count as
+    zero.
     """
     ended = _ended(rollout)
     sums = [sums.double().masked_fill(~ended, 0.0).sum() for sums in rollout.episode_metrics.values()]
@@ -116,16 +116,16 @@ def metric_sums(rollout: Rollout) -> tuple[torch.Tensor, ...]:
 
 
 def _ended(rollout: Rollout) -> torch.Tensor:
-    """Mask of the last steps of counted episodes, (steps, nworld) bool."""
+    """Compute a mask of the last steps of counted episodes, (steps, nworld) bool."""
     return rollout.done & ~rollout.episode_return.isnan()
 
 
 def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Any]:
-    """Compute ``metrics``, means over the episodes that ended (NaN if no episode ended), and ``step_metrics``.
+    """Compute ``step_metrics``, and ``metrics`` as means over the episodes that ended (NaN if no episode ended).
 
     Args:
-        episodes: Number of episodes, over all processes.
-        sums: Each process's result of ``metric_sums``.
+        episodes: Number of ended episodes in all processes.
+        sums: The result of ``metric_sums`` in each process.
         names: Names of the metrics.
     """
     totals = [sum(parts) for parts in zip(*sums, strict=True)]

@@ -1,7 +1,7 @@
 """Learn policies by soft actor-critic (SAC).
 
-The algorithm of Haarnoja et al. (2018, "Soft Actor-Critic Algorithms and Applications"): twin critics, their slowly
-moving targets, and a temperature that is adapted to a wanted entropy. With many worlds and large batches it is close to
+SAC was proposed by Haarnoja et al., 2018 ("Soft Actor-Critic Algorithms and Applications"): twin critics, slowly moving
+target critics, and a temperature that adapts to a target entropy. With many worlds and large batches, SAC is close to
 FastSAC (Seo et al. 2025, "Learning Sim-to-Real Humanoid Locomotion in 15 Minutes").
 """
 
@@ -39,7 +39,7 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_kind
 
 _EPS = 1e-2
-"""Added to the normalisers' standard deviations, as in PPO."""
+"""Constant that is added to the normalisers' standard deviations, as in PPO."""
 
 
 @document_attributes
@@ -47,55 +47,55 @@ _EPS = 1e-2
 class SACIteration(SampledIteration):
     """Statistics of one iteration of SAC.
 
-    Losses, values and entropy are means over its updates, or NaN if it made no update.
+    Losses, values and entropy are means over the iteration's updates, or NaN without an update.
 
-    Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended. The worlds'
-    first episodes start at a random step and are not counted.
+    Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended. The statistics
+    exclude the worlds' first episodes, which start at a random step.
     """
 
     critic_loss: float
-    """Loss of the two critics: the sum of their mean squared errors."""
+    """Loss of the two critics, which is the sum of their mean squared errors."""
     q_mean: float
     """Mean of the critics' predictions."""
     actor_loss: float
     """Loss of the actor."""
     entropy: float
-    """Entropy of the policy, in unit actions."""
+    """Entropy of the policy for actions scaled to [-1, 1]."""
     temperature: float
-    """Weight of the entropy after the iteration."""
+    """Temperature, the weight of the entropy, after the iteration."""
     time_update: float
     """Seconds for the updates."""
 
 
 @document_attributes
 class SAC(Learner):
-    """Learns a policy by SAC; an infinite iterator of ``SACIteration``.
+    """Learns a policy by SAC, as an infinite iterator of ``SACIteration``.
 
-    An iteration makes ``num_steps`` steps of every world, each followed by ``updates`` updates. On a GPU all updates
-    after a step run as one CUDA graph, which also gathers their samples.
+    An iteration makes ``num_steps`` steps of every world, each followed by ``updates`` updates. On a GPU, all updates
+    after a step run as one CUDA graph, which also draws the updates' batches.
 
     Example:
         >>> for it in SAC(env):
         ...     print(it.return_mean)
 
     Args:
-        env: The environment; do not step it between iterations.
-        policy: The policy; a new one by default. A given policy also acts during the warm-up.
-        value: The critics; new ones by default.
+        env: The environment, which must not be stepped between iterations.
+        policy: The policy; by default a new policy. A given policy also acts during the warm-up.
+        value: The critics; by default new critics.
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
-        team: The processes that learn together, each with its share of the worlds and of the replay buffer. All
-            processes must make the same calls with the same arguments, and get the same statistics.
+        team: The processes that learn together, each with some of the worlds and of the replay buffer. All processes
+            must make the same calls with the same arguments, and get the same statistics.
 
     Raises:
-        ValueError: The environment does not reset automatically, or an argument does not fit.
+        ValueError: The environment does not reset automatically, or an argument does not fit the environment.
         FloatingPointError: A loss, or a parameter of a network, is not finite after an iteration.
     """
 
     algorithm = "sac"
     """The name of the algorithm in a run's config.json."""
     policy: SquashedPolicy
-    """The policy, or actor."""
+    """The policy (the actor)."""
     value: TwinCritic
     """The critics."""
     target: TwinCritic
@@ -103,11 +103,11 @@ class SAC(Learner):
     config: Any
     """Hyperparameters, an ``SACConfig`` without None."""
     replay: Replay
-    """The replay buffer, with the samples of this process's worlds."""
+    """Replay buffer with the samples of this process's worlds."""
     generator: torch.Generator
-    """The random generator for actions and updates."""
+    """Random generator for actions and updates."""
     rollout: Rollout
-    """The samples of the last iteration, for statistics."""
+    """Samples of the last iteration, for the iteration's statistics."""
     log_temperature: torch.Tensor
     """Logarithm of the temperature."""
 
@@ -154,7 +154,7 @@ class SAC(Learner):
         self.temperature_step = GradientStep([self.log_temperature], rate, team)
 
         # samples
-        (least,) = team.largest(-default_capacity(env, team.size))  # all processes have buffers of the same size
+        (least,) = team.largest(-default_capacity(env, team.size))  # the buffers of all processes have the same size
         self.replay = Replay(env, -least if given.replay is None else -(-given.replay // team.size))
         own, critics = self.policy.shape, self.value.shape
         self.config = dataclasses.replace(
@@ -164,7 +164,7 @@ class SAC(Learner):
         )  # fmt: skip
         self.rollout = Rollout(env, given.num_steps)
         self.count = given.num_steps * nworld
-        # a separate seed, so that weights and noise are independent
+        # draw a separate seed, so that weights and noise are independent
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
         self._all_worlds, self._act_noise = nworld, torch.empty(nworld, nact, device=device)
 
@@ -183,7 +183,7 @@ class SAC(Learner):
         self.rollout.stagger(self.generator, team)
 
     def _make_mirror(self, config: SACConfig) -> None:
-        """Set the mirror images of observations and actions, if the policy is to be symmetric."""
+        """Make the mirror images of observations and actions, if the configuration asks for symmetry."""
         self._mirror: PolicyMirror | None = None
         if config.symmetry == "none" or self.policy.mirror is not None:  # of another run
             return
@@ -196,7 +196,7 @@ class SAC(Learner):
 
     @property
     def title(self) -> str:
-        """The algorithm, with the size of its replay buffer."""
+        """Name of the algorithm, with the size of its replay buffer."""
         size = self.replay.nbytes * self.team.size / 1e9
         return f"{self.algorithm} with a replay buffer of {self.config.replay:,d} samples ({size:.2g} GB)"
 
@@ -287,13 +287,13 @@ class SAC(Learner):
 
     @torch.no_grad()
     def draw(self) -> None:
-        """Draw the samples and the noise of the updates after a step, for all processes; keep this process's part."""
+        """Draw samples and noise for the updates after a step, and keep this process's part."""
         team, nworld, batch = self.team, self.env.nworld, self.config.batch
         shape = len(self._index), batch
         random: dict[str, Any] = dict(generator=self.generator, device=self._index.device)
         index = torch.randint(self.replay.count * nworld * team.size, shape, **random)
         noise = torch.randn((*shape, self._noise.shape[-1]), **random)
-        if team.size > 1:  # as in Minibatches: move own samples to the front, and drop the few that exceed the capacity
+        if team.size > 1:  # move own samples to the front, and drop samples beyond the capacity, as in Minibatches
             index, own = team.locate(index, nworld)
             first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self._index.shape[1]]
             index, noise = index.gather(1, first), noise.gather(1, first[..., None].expand(-1, -1, noise.shape[-1]))
@@ -302,7 +302,7 @@ class SAC(Learner):
         self._noise.copy_(noise)
 
     def learn(self) -> None:
-        """Make the updates after a step, on the samples of ``draw``."""
+        """Make the updates after a step, with the samples that ``draw`` drew."""
         config, nact = self.config, self.policy.nact
         critic_loss, actor_loss = self._losses
         for i in range(config.updates):
@@ -346,7 +346,7 @@ class SAC(Learner):
     def critic_loss(
         self, batch: Transitions, weight: torch.Tensor, noise: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Compute the critics' squared errors, and the mean of their predictions.
+        """Compute the sum of the critics' squared errors, and the mean of the critics' predictions.
 
         Args:
             batch: Transitions.
@@ -365,12 +365,12 @@ class SAC(Learner):
     def actor_loss(
         self, batch: Transitions, weight: torch.Tensor, noise: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Compute the actor's loss, and its entropy.
+        """Compute the actor's loss, and the actor's entropy.
 
         Args:
-            batch: Transitions, of which only the observations are used.
-            weight: As in ``critic_loss``.
-            noise: Standard normal numbers for the actions of these observations, (batch, nact).
+            batch: Transitions, of which the loss uses only the observations.
+            weight: Weights of the transitions, as in ``critic_loss``.
+            noise: Standard normal numbers for the actions of the observations, (batch, nact).
         """
         action, log_prob = self.policy.sample(batch.obs["policy"], noise)
         value = self._bound(self.value(batch.obs[self.value.group], action))
@@ -384,7 +384,7 @@ class SAC(Learner):
         return (weight * loss).sum(), -(weight * log_prob.detach()).sum()
 
     def _bound(self, values: torch.Tensor) -> torch.Tensor:
-        """The value of an action, (rows,), from the two critics' predictions, (2, rows)."""
+        """Combine the two critics' predictions, (2, rows), into the value of an action, (rows,)."""
         return values.amin(0) if self.config.critic_bound == "min" else values.mean(0)
 
     def state_dict(self) -> dict[str, Any]:
@@ -406,7 +406,7 @@ class SAC(Learner):
         self.rollout.running_return.copy_(state["returns"][self.own_worlds])
         for step, saved in zip(self._steps, state["optimizers"], strict=True):
             step.optimizer.load_state_dict(saved)
-        self._learn.forget()  # the graph stores the addresses of the old moments
+        self._learn.forget()  # discard the graph, which uses the addresses of Adam's old moments
 
     @property
     def _steps(self) -> "tuple[GradientStep, ...]":
@@ -428,8 +428,8 @@ class GradientStep:
         self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=cuda)
 
     def __call__(self, loss: torch.Tensor, *numbers: torch.Tensor) -> torch.Tensor:
-        """Make a step; return the loss and the numbers, summed over all processes, (1 + len(numbers),)."""
-        # not backward(), which accumulates gradients on the stream of the first call
+        """Make a gradient step, and return the loss and the numbers summed over all processes, (1 + len(numbers),)."""
+        # do not use backward(), which accumulates gradients on the stream of its first call
         gradients = torch.autograd.grad(loss, self.parameters)
         parts = [*gradients, *(number.detach() for number in (loss, *numbers))]
         sums = self.team.sum(torch.cat([part.reshape(-1).float() for part in parts]))
@@ -441,7 +441,7 @@ class GradientStep:
 
 
 def action_bounds(env: Env, limit: float) -> tuple[list[float], list[float]]:
-    """Lower and upper bounds of actions, each (nact,); -limit and limit for actions that the task does not bound."""
+    """Get lower and upper bounds of actions, each (nact,); actions without bounds get -limit and limit."""
     space = env.action_space
     assert space.low is not None and space.high is not None
     return tuple(  # type: ignore[return-value]
@@ -458,10 +458,10 @@ def _check_sizes(policy: SquashedPolicy, value: TwinCritic, env: Env, low: list[
         if sizes != wanted:
             raise ValueError(
                 f"the {type(module).__name__} takes {sizes[0]} observations and {sizes[1]} actions, but the task "
-                f"{name!r} has {wanted[0]} and {wanted[1]}"
+                f"{name!r} has {wanted[0]} observations and {wanted[1]} actions"
             )
     if (policy.shape["low"], policy.shape["high"]) != (low, high):
         raise ValueError(
-            f"the policy's actions are from {policy.shape['low']} to {policy.shape['high']}, but those of the task "
-            f"{name!r} from {low} to {high}"
+            f"the policy's actions are from {policy.shape['low']} to {policy.shape['high']}, but actions of the task "
+            f"{name!r} are from {low} to {high}"
         )

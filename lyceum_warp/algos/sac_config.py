@@ -14,19 +14,19 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 MANY_WORLDS = 256
-"""With this number of worlds or more, the defaults for many worlds apply."""
+"""Number of worlds from which on the defaults for many worlds apply."""
 
 _FEW: dict[str, Any] = {
     "batch": 256, "actor_every": 1, "gamma": 0.99, "tau": 0.005, "temperature": 1.0, "target_entropy": -1.0,
     "critic_bound": "min", "hidden": (256, 256), "value_hidden": (256, 256),
 }  # fmt: skip
-"""Defaults for few worlds, from Haarnoja et al. (2018)."""
+"""Defaults for fewer than 256 worlds, from Haarnoja et al., 2018."""
 
 _MANY: dict[str, Any] = {
     "batch": 8192, "actor_every": 4, "gamma": 0.97, "tau": 0.125, "temperature": 1e-3, "target_entropy": 0.0,
     "critic_bound": "mean", "hidden": (512, 256, 128), "value_hidden": (512, 512, 512),
 }  # fmt: skip
-"""Defaults for many worlds, close to Seo et al. (2025) for humanoids."""
+"""Defaults for 256 worlds or more, close to Seo et al., 2025, for humanoids."""
 
 
 @document_attributes
@@ -34,64 +34,68 @@ _MANY: dict[str, Any] = {
 class SACConfig:
     """Hyperparameters of SAC.
 
-    A value of None is chosen by the number of worlds (``resolved``): below 256 worlds as in Haarnoja et al. (2018,
-    "Soft Actor-Critic Algorithms and Applications"), and with more worlds close to Seo et al. (2025, "Learning
-    Sim-to-Real Humanoid Locomotion in 15 Minutes").
+    The number of worlds determines values of None (``resolved``). Defaults for fewer than 256 worlds follow Haarnoja et
+    al., 2018 ("Soft Actor-Critic Algorithms and Applications"). Defaults for 256 worlds or more are close to Seo et
+    al., 2025 ("Learning Sim-to-Real Humanoid Locomotion in 15 Minutes").
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.
     """
 
     num_steps: int | None = None
-    """Steps of every world per iteration. The default is 50, or 1,000 samples if that is more."""
+    """Number of steps of every world per iteration. The default is 50 steps, or 1,000 samples if that is more."""
     replay: int | None = None
-    """Capacity of the replay buffer in samples. The default is a million, or 1,024 steps of every world if that is
-    more, but at most 30 % of the device's free memory."""
+    """Capacity of the replay buffer in samples. The default is a million samples, or 1,024 steps of every world if that
+    is more, but at most 30 % of the device's free memory."""
     warmup: int | None = None
-    """Samples with random actions before the first update. The default is 5,000, or 10 steps of every world if that is
-    more."""
+    """Number of samples with random actions before the first update. The default is 5,000 samples, or 10 steps of every
+    world if that is more."""
     updates: int | None = None
-    """Updates of the critics after each step of all worlds. The default is one for every world, but at most 8."""
+    """Number of updates of the critics after each step of all worlds. The default is one update for every world, but at
+    most 8."""
     actor_every: int | None = None
-    """Updates of the critics for each update of the actor; divides ``updates``. The default is 1, or 4 with many
-    worlds."""
+    """Number of updates of the critics for each update of the actor, which must divide ``updates``. The default is 1,
+    or 4 with 256 or more worlds."""
     batch: int | None = None
-    """Samples in an update. The default is 256, or 8,192 with many worlds."""
+    """Number of samples in an update. The default is 8,192 samples with 256 or more worlds, and otherwise 256."""
     n_step: int = 1
     """Maximum number of rewards in a target."""
     gamma: float | None = None
-    """Discount factor. The default is 0.99, or 0.97 with many worlds."""
+    """Discount factor. The default is 0.97 with 256 or more worlds, and otherwise 0.99."""
     tau: float | None = None
-    """Step size of the target critics: each update moves them by this fraction towards the critics (Polyak averaging).
-    The default is 0.005, or 0.125 with many worlds."""
+    """Step size of the target critics: each update moves the target critics by this fraction towards the critics
+    (Polyak averaging). The default is 0.125 with 256 or more worlds, and otherwise 0.005."""
     critic_bound: Literal["min", "mean"] | None = None
-    """Whether the value of an action is the minimum or the mean of the two critics. The default is "min", or "mean"
-    with many worlds."""
+    """Whether the value of an action is the minimum or the mean of the two critics' predictions. The default is "mean"
+    with 256 or more worlds, and otherwise "min"."""
     learning_rate: float = 3e-4
     """Learning rate of the actor, the critics and the temperature (Adam)."""
     temperature: float | None = None
-    """Initial weight of the entropy, which is then learned. The default is 1, or 0.001 with many worlds."""
+    """Initial temperature, the learned weight of the entropy. The default is 0.001 with 256 or more worlds, and
+    otherwise 1."""
     target_entropy: float | None = None
-    """Target entropy of the policy per unit action, which lies between -1 and 1; the temperature is adapted to it. The
-    default is -1, or 0 with many worlds."""
+    """Target entropy of the policy, per element of the action scaled to [-1, 1]. SAC adapts the temperature to the
+    target entropy. The default is 0 with 256 or more worlds, and otherwise -1."""
     action_limit: float = 1.0
-    """Bound of actions that the task does not bound."""
+    """Limit of actions that the task leaves unbounded."""
     hidden: tuple[int, ...] | None = None
-    """Widths of the policy's hidden layers. The default is 256 256, or 512 256 128 with many worlds."""
+    """Widths of the policy's hidden layers. The default widths are 512 256 128 with 256 or more worlds, and otherwise
+    256 256."""
     activation: Activation = "relu"
     """Activation of the policy's hidden layers."""
     value_hidden: tuple[int, ...] | None = None
-    """Widths of the critics' hidden layers. The default is 256 256, or 512 512 512 with many worlds."""
+    """Widths of the critics' hidden layers. The default widths are 512 512 512 with 256 or more worlds, and otherwise
+    256 256."""
     value_activation: Activation = "relu"
     """Activation of the critics' hidden layers."""
     value_group: str | None = None
-    """Group of observations for the critics; by default "critic" if the task has this group, else "policy"."""
+    """Group of observations for the critics; by default "critic" if the task has such a group, else "policy"."""
     layer_norm: bool = True
     """Whether to normalise the critics' hidden layers."""
     symmetry: Literal["none", "exact", "loss", "augment"] = "none"
-    """How to use the mirror image that a task declares (``lw.Mirror``): "exact" averages the policy with its mirror
-    image; "loss" adds symmetry_coef times the squared difference between both; "augment" learns from the mirror images
-    of all samples, too."""
+    """Use of the mirror image that a task declares (``lw.Mirror``): "exact" averages the policy with its mirror image;
+    "loss" adds symmetry_coef times the squared difference between both; "augment" also learns from the mirror images of
+    all samples."""
     symmetry_coef: float = 1.0
     """Coefficient of the symmetry loss, if symmetry is "loss"."""
     normalize: bool = True
@@ -99,23 +103,23 @@ class SACConfig:
     tf32: bool = True
     """Whether matrix products on a GPU use TensorFloat-32."""
     bf16: bool = False
-    """Whether the losses are computed in bfloat16 (torch.autocast)."""
+    """Whether SAC computes the losses in bfloat16 (torch.autocast)."""
     compiled: bool = False
-    """Whether the losses are compiled by torch.compile, which takes about half a minute."""
+    """Whether torch.compile compiles the losses, which takes about half a minute."""
     mean_every: int = 10
-    """Iterations between evaluations of the mean policy; 0 for none."""
+    """Iterations between evaluations of the mean policy; 0 means no evaluations."""
     mean_episodes: int = 16
-    """Episodes in an evaluation of the mean policy."""
+    """Number of episodes in an evaluation of the mean policy."""
 
     def __post_init__(self) -> None:
         """Check every value."""
         check_fields(self, _BOUNDS)
 
     def resolved(self, nworld: int) -> "SACConfig":
-        """Choose the values that are None, except ``replay`` and ``value_group``.
+        """Replace values of None by defaults, except ``replay`` and ``value_group``.
 
         Args:
-            nworld: Worlds of all processes.
+            nworld: Number of worlds of all processes.
 
         Raises:
             ValueError: ``actor_every`` does not divide ``updates``.
@@ -127,6 +131,6 @@ class SACConfig:
         assert config.updates is not None and config.actor_every is not None
         if config.updates % config.actor_every:
             raise ValueError(
-                f"updates must be a multiple of actor_every, which is {config.actor_every}, not {config.updates}"
+                f"updates={config.updates} must be a multiple of actor_every, which is {config.actor_every}"
             )
         return config

@@ -1,4 +1,4 @@
-"""Define SAC's policies, which draw bounded actions: the hyperbolic tangent of a Gaussian sample."""
+"""Define SAC's policies, which draw bounded actions as the hyperbolic tangent of a Gaussian sample."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ class SquashedPolicy(Normalized):
     """Draws actions between bounds: low + (high - low) (1 + tanh(u)) / 2 with u from N(mean(obs), std(obs)^2).
 
     A network computes the means and the logarithms of the standard deviations (Haarnoja et al. 2018, "Soft Actor-Critic
-    Algorithms and Applications", appendix C). Between the bounds, tanh(u) is the *unit action*.
+    Algorithms and Applications", appendix C). The *unit action* is tanh(u), between -1 and 1.
 
     Args:
         nobs: Length of an observation.
@@ -31,12 +31,12 @@ class SquashedPolicy(Normalized):
         high: Upper bounds of the actions, (nact,).
         activation: Activation of the hidden layers.
         normalize: Whether to normalise observations by their running mean and variance.
-        limit: Normalised observations are clipped to [-limit, limit]; inf for no limit.
+        limit: Limit of normalised observations, which are clipped to [-limit, limit]; inf means no limit.
         mirror: Reflections for ``use_mirror``.
         generator: Draws the initial weights.
 
     Raises:
-        ValueError: The mirror image of the actions has other bounds.
+        ValueError: The mirror image of an action has different bounds.
     """
 
     shape: dict[str, Any]
@@ -44,7 +44,7 @@ class SquashedPolicy(Normalized):
     low: torch.Tensor
     """Lower bounds of the actions, (nact,)."""
     width: torch.Tensor
-    """Differences between the bounds, (nact,)."""
+    """Differences between the upper and lower bounds, (nact,)."""
 
     def __init__(
         self,
@@ -78,13 +78,13 @@ class SquashedPolicy(Normalized):
             self.use_mirror(mirror)
 
     def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:
-        """From now on, average the Gaussian with its mirror image.
+        """Make later calls average the Gaussian with its mirror image.
 
         Args:
             reflections: The reflections of ``obs`` and ``action`` (``algos.symmetry.reflections``).
 
         Raises:
-            ValueError: The mirror image of the actions has other bounds.
+            ValueError: The mirror image of an action has different bounds.
         """
         low, high = self.shape["low"], self.shape["high"]
         bounds = list(zip(low, high, strict=True))
@@ -92,7 +92,7 @@ class SquashedPolicy(Normalized):
         images = [bounds[i] if sign > 0 else (-high[i], -low[i]) for i, sign in zip(order, signs, strict=True)]
         if images != bounds:
             raise ValueError(
-                f"the actions from {low} to {high} have other bounds than their mirror image: learn with "
+                f"the actions from {low} to {high} have different bounds than their mirror images: learn with "
                 'symmetry="none"'
             )
         self.mirror = PolicyMirror(reflections).to(self.low.device)
@@ -108,7 +108,7 @@ class SquashedPolicy(Normalized):
         return mean, _LOWEST + 0.5 * (_HIGHEST - _LOWEST) * (1.0 + torch.tanh(spread))
 
     def _outputs(self, obs: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        return self.network(self.normalizer(obs)).float().chunk(2, dim=-1)  # float32 also under autocast
+        return self.network(self.normalizer(obs)).float().chunk(2, dim=-1)  # compute in float32 even under autocast
 
     def act(self, obs: torch.Tensor) -> torch.Tensor:
         """Compute actions without noise, (..., nact)."""

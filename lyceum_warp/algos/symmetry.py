@@ -33,7 +33,7 @@ class Reflected(nn.Module):
 
 
 class PolicyMirror(nn.Module):
-    """The mirror images of a policy's observations and actions.
+    """Computes the mirror images of a policy's observations and actions.
 
     Args:
         reflections: The reflections of ``obs`` and ``action``.
@@ -45,7 +45,7 @@ class PolicyMirror(nn.Module):
         self.obs, self.action = Reflected(reflections["obs"]), Reflected(reflections["action"])
 
     def average(self, function: Callable[[torch.Tensor], torch.Tensor], obs: torch.Tensor) -> torch.Tensor:
-        """Make a function of observations symmetric: average actions with their mirror images.
+        """Make a function from observations to actions symmetric, by averaging actions with their mirror images.
 
         Mirrored observations then give exactly the mirrored actions, bit for bit.
         """
@@ -53,17 +53,19 @@ class PolicyMirror(nn.Module):
 
 
 def reflections(env: Env, *, group: str = "policy") -> dict[str, Reflection]:
-    """The reflections of an observation group (``obs``) and of the actions (``action``) of an environment's task.
+    """Get the reflections of an observation group (``obs``) and of the actions (``action``) of a task.
 
     Raises:
-        ValueError: The task declares no mirror, or a part has no mirror image.
+        ValueError: The task declares no mirror, or a part of the observation or action has no mirror image.
     """
     task: Any = env.task.task
     declared = task.mirror
     if callable(declared):
         declared = declared(env.task.model, SimpleNamespace(**env.task.params))
     if not isinstance(declared, Mirror):
-        raise ValueError(f"the task {env.task.name!r} declares no mirror image: give it mirror = lw.Mirror(...)")
+        raise ValueError(
+            f"the task {env.task.name!r} declares no mirror image: set mirror = lw.Mirror(...) in the task"
+        )
     return {
         "obs": declared.columns(env.obs_spaces[group].parts, task=env.task.name),
         "action": declared.columns(env.action_space.parts, task=env.task.name, whole="action"),

@@ -14,7 +14,7 @@ Result = TypeVar("Result")
 class PhaseTimer:
     """Measures the seconds between calls of ``mark``, starting at construction.
 
-    On a GPU a mark is an event in the current stream: only ``seconds`` waits for the device.
+    On a GPU, a mark is an event in the current stream, so that only ``seconds`` waits for the device.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -33,7 +33,7 @@ class PhaseTimer:
             self._times.append(time.perf_counter())
 
     def seconds(self) -> list[float]:
-        """Durations of the phases, seconds; waits for the device."""
+        """Return the durations of the phases in seconds, after waiting for the device."""
         if not self.cuda:
             return [end - start for start, end in zip(self._times, self._times[1:], strict=False)]
         self._events[-1].synchronize()
@@ -45,7 +45,7 @@ class PhaseTimer:
 def one_thread() -> Iterator[None]:
     """Limit torch to one CPU thread, for operations too small to parallelise.
 
-    On a busy machine torch's threads would spend more time waiting for each other than computing.
+    On a busy machine, torch's threads would spend more time waiting for each other than computing.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -57,20 +57,20 @@ def one_thread() -> Iterator[None]:
 
 @contextlib.contextmanager
 def beside(function: Callable[[], Result], *, allowed: bool) -> Iterator[Callable[[], Result]]:
-    """If torch has exactly two threads, run a function in parallel with the block, each on one thread.
+    """If torch has exactly two threads, run a function and the with block in parallel, on one thread each.
 
     Mini-batches do not benefit from a second thread, and large products speed up by less than a factor of two.
-    With any other number of threads, or if not allowed, the function is called when the block requests its result.
+    With any other number of threads, or without ``allowed``, the function runs when the with block asks for its result.
 
     Args:
-        function: The function; it must not share state with the block.
-        allowed: Whether both may run at the same time.
+        function: The function, which must not share state with the with block.
+        allowed: Whether the function and the with block may run at the same time.
 
     Yields:
-        A function that waits for the result and returns it.
+        A function that waits for the result and returns the result.
     """
     if not allowed or torch.get_num_threads() != 2:
         yield function
         return
-    with one_thread(), ThreadPoolExecutor(1) as pool:  # waits for the function even after an error
+    with one_thread(), ThreadPoolExecutor(1) as pool:  # the pool waits for the function even after an error
         yield pool.submit(function).result

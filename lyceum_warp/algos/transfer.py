@@ -1,4 +1,4 @@
-"""Compare a policy between engines and between physics, in pairs of episodes with equal initial states."""
+"""Compare a policy between engines and physics options, in pairs of episodes with equal initial states."""
 
 import dataclasses
 import functools
@@ -20,31 +20,31 @@ from lyceum_warp.support.intervals import mean_interval, share_interval
 from lyceum_warp.support.validate import check_kind, finite_number, whole_number
 
 EXACT = "exact"
-"""The name of a task's own physics."""
+"""Name of the exact physics of a task."""
 
 
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Difference:
-    """The difference of a mean over episodes between two simulations, with its 95 % confidence interval."""
+    """Difference of a mean over episodes between two simulations, with a 95 % confidence interval."""
 
     quantity: str
-    """Name of the quantity: return, length (steps) or terminated (share of episodes that the task ended, such as by a
-    fall)."""
+    """Name of the quantity: return, length (steps) or terminated (fraction of episodes that the task ended, for example
+    by a fall)."""
     first: float
     """The mean in the first simulation."""
     second: float
     """The mean in the second simulation."""
     low: float
-    """Lower end of the interval of second minus first."""
+    """Lower end of the interval of the second mean minus the first mean."""
     high: float
-    """Upper end of the interval."""
+    """Upper end of the interval of the second mean minus the first mean."""
     margin: float
     """Largest irrelevant difference."""
 
     @property
     def verdict(self) -> str:
-        """Whether the interval is within the margin ("same"), outside ("different") or neither ("not shown")."""
+        """Compare the interval with the margin: "same" inside, "different" outside, "not shown" if both overlap."""
         if -self.margin <= self.low and self.high <= self.margin:
             return "same"
         return "different" if self.low > self.margin or self.high < -self.margin else "not shown"
@@ -58,7 +58,7 @@ class Difference:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """The differences between two simulations of the same episodes."""
+    """Differences between two simulations of the same episodes."""
 
     first: str
     """The first simulation: "C engine", or "exact physics" on the C engine."""
@@ -67,11 +67,11 @@ class Comparison:
     faults: tuple[int, int]
     """Number of faults in each simulation."""
     differences: tuple[Difference, ...]
-    """Differences of returns, lengths and, if the task ends episodes, shares of terminated episodes."""
+    """Differences of returns, lengths and, if the task ends episodes, fractions of terminated episodes."""
 
     @property
     def verdict(self) -> str:
-        """Whether all differences are "same", any is "different", or neither ("not shown")."""
+        """Combine all differences: "different" if one is "different", "same" if all are "same", else "not shown"."""
         verdicts = {difference.verdict for difference in self.differences}
         return "different" if "different" in verdicts else "same" if verdicts == {"same"} else "not shown"
 
@@ -79,7 +79,7 @@ class Comparison:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Transfer:
-    """The verdict on a policy: whether its returns, lengths and falls depend on the engine or on the physics."""
+    """Verdict on whether a policy's returns, lengths and terminations depend on the engine or on physics options."""
 
     task: str
     """Name of the task."""
@@ -88,11 +88,11 @@ class Transfer:
     seed: int
     """Seed of the initial states."""
     comparisons: tuple[Comparison, ...]
-    """One comparison for each engine and each physics."""
+    """One comparison for each engine and each set of physics options."""
 
     @property
     def line(self) -> str:
-        """The verdicts in one line."""
+        """Format all verdicts in one line."""
         found = []
         for comparison in self.comparisons:
             shown = ", ".join(difference.text for difference in comparison.differences)
@@ -122,25 +122,26 @@ def transfer(
     physics: bool = True,
     progress: Callable[[int, int], object] | None = None,
 ) -> Transfer:
-    """Play the same episodes on both engines, and under each physics of the task, and compare them in pairs.
+    """Play and compare pairs of episodes, on both engines and with each of the task's physics options.
 
-    The Warp engine is compared with the C engine under the environment's physics. On the C engine, each physics of the
-    task and the environment's own physics are compared with the task's exact physics. The episodes of a pair have equal
-    random numbers: initial states, model fields, pushes and commands. The intervals of returns and lengths use
-    Student's t over the pairs; the interval of the terminated share uses Agresti and Min's method.
+    The Warp engine is compared with the C engine under the environment's physics options. On the C engine, each of the
+    task's physics options and the environment's options are compared with the task's exact physics. Both episodes of a
+    pair draw equal initial states, model fields, pushes and commands. The intervals of returns and lengths use
+    Student's t over the pairs; the interval of the terminated fraction uses Agresti and Min's method.
 
     Args:
         env: An environment of the task; its worlds do not change.
-        policy: A module with a method ``act``, or a function; maps observations to actions, without noise.
-        episodes: Number of pairs, each in a separate world.
+        policy: A module with a method ``act``, or a function from observations to actions, without noise.
+        episodes: Number of pairs of episodes, each in a separate world.
         seed: Seed of the initial states.
-        margin: Largest difference that counts as equal: for returns and lengths, a fraction of the mean absolute return
-            or mean length in the first simulation; for the terminated share, an absolute difference.
-        device: Device of the Warp engine; by default the environment's GPU, or else one of this machine, or else the
-            CPU, where its kernels may take minutes to compile.
+        margin: Largest difference that counts as equal. For returns and lengths, the margin is a fraction of the mean
+            absolute return or mean length in the first simulation; for terminations, it is an absolute difference of
+            fractions.
+        device: Device of the Warp engine; by default the environment's GPU, or else another GPU, or else the CPU, on
+            which Warp's kernels may take minutes to compile.
         warp: Whether to play on the Warp engine.
-        physics: Whether to play under each of the task's physics; otherwise only under the environment's physics and
-            the exact physics.
+        physics: Whether to play with each of the task's physics options, instead of only with the environment's options
+            and the exact physics.
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:
@@ -180,9 +181,9 @@ def _show(progress: Callable[[int, int], object] | None, play: int, plays: int, 
 
 
 def task_physics(env: Env) -> tuple[dict[str, PhysicsOptions], str]:
-    """The physics of a task by name, including the environment's physics, and the name of the environment's physics.
+    """Get the physics options of a task and its environment by name, and the name of the environment's options.
 
-    Options of the Warp engine alone are omitted.
+    Options that only the Warp engine has are omitted.
     """
     named = {EXACT: PhysicsOptions(), **env.task.task.physics}
     given = dataclasses.replace(env.options.physics, nconmax=None, njmax=None, deterministic=False)

@@ -1,4 +1,4 @@
-"""Define twin critics: two networks that predict the discounted return after an observation and an action."""
+"""Define twin critics, two networks that predict discounted returns from observations and actions."""
 
 import itertools
 import math
@@ -25,15 +25,15 @@ class TwinCritic(Normalized):
         layer_norm: Whether to normalise each hidden layer before its activation (Ba et al. 2016, "Layer
             Normalization").
         normalize: Whether to normalise observations by their running mean and variance.
-        limit: Normalised observations are clipped to [-limit, limit]; inf for no limit.
-        group: The group of observations that is the input.
+        limit: Limit of normalised observations, which are clipped to [-limit, limit]; inf means no limit.
+        group: The group of observations that the critics use.
         generator: Draws the initial weights.
     """
 
     shape: dict[str, Any]
     """Arguments that make critics with the same structure."""
     group: str
-    """The group of observations that is the input."""
+    """The group of observations that the critics use."""
 
     def __init__(
         self,
@@ -89,12 +89,12 @@ class TwinLinear(nn.Module):
         )
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Apply each layer to its rows."""
+        """Apply each of the two layers to its half of the input."""
         return torch.baddbmm(self.bias, x, self.weight)
 
 
 class TwinLayerNorm(nn.Module):
-    """Two layer normalisations of (2, rows, m)."""
+    """Two layer normalisations for the two halves of an input (2, rows, m)."""
 
     def __init__(self, m: int) -> None:
         super().__init__()

@@ -21,13 +21,13 @@ class ValueFunction(Normalized):
         nobs: Length of an observation.
         hidden: Widths of the hidden layers.
         activation: Activation of the hidden layers.
-        scale: Factor on the network's output until ``rescale`` fits it to returns.
-        time_orders: Highest power of the time features t, t^2, ... with t = step / 1000 (as in mjrl); 0 for none. Time
-            features help if the time limit is not observable, because returns then depend on the step.
+        scale: Factor on the network's output until ``rescale`` fits the factor to returns.
+        time_orders: Highest power of the time features t, t^2, ... with t = step / 1000 (as in mjrl); 0 means no time
+            features. Time features help if the time limit is not observable, because returns then depend on the step.
         normalize: Whether to normalise observations by their running mean and variance.
-        limit: Normalised observations are clipped to [-limit, limit]; inf for no limit.
+        limit: Limit of normalised observations, which are clipped to [-limit, limit]; inf means no limit.
         discount: Discount factor of the predicted returns, if known.
-        group: The group of observations that is the input.
+        group: The group of observations that the value function uses.
         generator: Draws the initial weights.
 
     Raises:
@@ -35,14 +35,14 @@ class ValueFunction(Normalized):
     """
 
     LATER = ("shift", "scale")
-    """Buffers that files of earlier releases lack; their initial values are used instead."""
+    """Buffers that keep their initial values if a checkpoint of an earlier release lacks them."""
 
     group: str
-    """The group of observations that is the input."""
+    """The group of observations that the value function uses."""
     shift: torch.Tensor
-    """Offset of the scaled output: the mean of the returns."""
+    """Offset of the scaled output, which is the mean of the returns."""
     scale: torch.Tensor
-    """Factor on the network's output: the standard deviation of the returns."""
+    """Factor on the network's output, which is the standard deviation of the returns."""
     discount: float | None
     """Discount factor of the predicted returns, if known."""
     orders: torch.Tensor
@@ -74,10 +74,10 @@ class ValueFunction(Normalized):
             "nobs": nobs, "hidden": layer_sizes(hidden), "activation": activation, "scale": scale,
             "time_orders": time_orders, "normalize": normalize, "group": group,
         }  # fmt: skip
-        if limit != LIMIT:  # files of earlier releases lack it
+        if limit != LIMIT:  # checkpoints of earlier releases lack a limit
             self._shape["limit"] = limit
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)
-        # with a last layer of zeros, the initial prediction is the mean return
+        # a last layer of zeros makes initial predictions equal to the mean return
         self.network = mlp(sizes, activation=activation, last_scale=0.0, generator=generator)
         self.register_buffer("shift", torch.zeros((), dtype=torch.float64))
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
@@ -109,13 +109,13 @@ class ValueFunction(Normalized):
         """Set shift and scale to the mean and standard deviation of returns, without changing the predictions.
 
         The last layer compensates for the change (Pop-Art; van Hasselt et al. 2016, "Learning values across many orders
-        of magnitude"). Returns are clipped to ``BOUND`` scales around the shift, and the scale changes at most by this
-        factor. If more than a quarter of the returns lie outside, as after a change of the task, they do not count as
-        outliers, and the bounds are computed from the quartiles. If all returns are equal, the scale does not change.
+        of magnitude"). Returns are clipped to ``BOUND`` scales around the shift, and the scale changes at most by the
+        factor ``BOUND``. If more than a quarter of the returns are outliers, as after a change of the task, the bounds
+        are computed from the quartiles instead. If all returns are equal, the scale does not change.
 
         Args:
             returns: Returns, of any shape.
-            first: Whether the value function has never been fitted, so that its scale is arbitrary.
+            first: Whether the value function was never fitted, so that the scale is arbitrary.
             team: The processes; each contributes the same number of returns.
         """
         team = team or Team()
@@ -127,7 +127,7 @@ class ValueFunction(Normalized):
         ordered = team.gather(returns).nan_to_num().sort().values
         quartile, median, other = (ordered[i * (len(ordered) - 1) // 4] for i in (1, 2, 3))
         width = 20.0 * (other - quartile)
-        width.masked_fill_(width == 0.0, torch.inf)  # for instance with sparse rewards
+        width.masked_fill_(width == 0.0, torch.inf)  # quartiles may be equal, for example with sparse rewards
         low, high = torch.where(new, median - width, low), torch.where(new, median + width, high)
         returns = torch.minimum(torch.maximum(returns, low), high).nan_to_num()
         mean = team.sum(returns.sum()) / count
@@ -150,14 +150,14 @@ class ValueFunction(Normalized):
 
 
 BOUND = 10.0
-"""Returns and advantages more than this number of scales from the mean are outliers."""
+"""Number of scales from the mean beyond which returns and advantages are outliers."""
 
 
 def value_group(env: Env, given: str | None) -> str:
-    """The observation group of a new value function: by default "critic" if the task has it, else "policy".
+    """Select a new value function's observation group, by default "critic" if the task has such a group, else "policy".
 
     Raises:
-        ValueError: The task has no such group.
+        ValueError: The task has no observation group of this name.
     """
     group = given or ("critic" if "critic" in env.obs_groups else "policy")
     check_group(group, env.obs_groups, env.task.name)

@@ -12,19 +12,19 @@ from lyceum_warp.algos.value import BOUND, ValueFunction
 
 
 class ValueFit:
-    """Fits a value function by Adam on the squared error, in random mini-batches.
+    """Fits a value function with Adam on squared errors in random mini-batches.
 
-    The mini-batches do not depend on the number of processes: each process uses the samples of its own worlds, and the
-    gradients are summed. On CUDA, a mini-batch step is one graph that replaces about 40 launches. On the CPU, a network
-    made by ``mlp`` is fitted without autograd.
+    The mini-batches do not depend on the number of processes. Each process uses the samples of its own worlds, and
+    gradients are summed over the processes. On a GPU, a mini-batch step is one graph in place of about 40 launches. On
+    the CPU, a network made by ``mlp`` is fitted without autograd.
 
     Args:
         value: The value function.
-        samples: Number of samples, over all processes.
-        nworld: Worlds of this process.
+        samples: Number of samples of all processes.
+        nworld: Number of this process's worlds.
         rate: Learning rate.
-        epochs: Passes over the samples.
-        batch: Samples in a mini-batch.
+        epochs: Number of passes over the samples.
+        batch: Number of samples in a mini-batch.
         team: The processes that fit together.
     """
 
@@ -36,7 +36,7 @@ class ValueFit:
         self.parameters = list(value.parameters())
         self.cuda = self.parameters[0].is_cuda
         self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=self.cuda)
-        # gradients are views of one tensor, for a single all-reduce
+        # store all gradients in one tensor, so that one all-reduce suffices
         self.gradient = torch.zeros(sum(p.numel() for p in self.parameters), device=self.parameters[0].device)
         for parameter, part in zip(self.parameters, self._split(self.gradient), strict=True):
             parameter.grad = part.view_as(parameter)
@@ -49,16 +49,17 @@ class ValueFit:
     def __call__(
         self, obs: torch.Tensor, step: torch.Tensor, target: torch.Tensor, generator: torch.Generator
     ) -> torch.Tensor:
-        """Fit to returns. If any parameter or moment of Adam becomes non-finite, all are restored.
+        """Fit to returns, and restore all parameters and moments of Adam if one becomes non-finite.
 
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
             step: Steps since the reset, (samples,).
-            target: Returns, (samples,); clipped to the value function's shift plus or minus ``BOUND`` times its scale.
+            target: Returns, (samples,), which are clipped to the value function's shift plus or minus ``BOUND`` times
+                its scale.
             generator: Draws the order of the samples of all processes.
 
         Returns:
-            Whether the fit is finite, a bool tensor.
+            Whether the fit is finite, as a bool tensor.
         """
         with torch.no_grad():
             features = self.value.features(obs, step)
@@ -87,15 +88,15 @@ class ValueFit:
         return finite
 
     def _numbers(self) -> list[torch.Tensor]:
-        """The parameters and, after the first step, Adam's moments."""
+        """Get the parameters and, after the first step, Adam's moments."""
         moments = [moment for p in self.parameters for moment in self.optimizer.state.get(p, {}).values()]
         return [*self.parameters, *moments]
 
     @torch.no_grad()
     def _keep_if_finite(self) -> torch.Tensor:
-        """Back up parameters and moments unless one is not finite; the host does not wait for the device."""
+        """Back up the parameters and moments if all are finite; the host does not wait for the device."""
         present = torch.cat([numbers.reshape(-1) for numbers in self._numbers()])
-        # initial moments are zero
+        # Adam's initial moments are zero
         good = torch.nn.functional.pad(self._good, (0, len(present) - len(self._good)))
         finite = self.team.sum((~present.isfinite()).any().float()) == 0
         self._good = torch.where(finite, present, good)
@@ -109,11 +110,12 @@ class ValueFit:
             tensor.copy_(part.view_as(tensor))
 
     def _own(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | float]:
-        """Select this process's samples of a mini-batch, and their weights in the mean over the mini-batch."""
+        """Select this process's samples of a mini-batch, and compute their weights in the mini-batch's mean."""
         if self.team.size == 1:
             return index, 1.0 / len(index)
         places, own = self.team.locate(index, self.nworld)
-        if self.cuda:  # selecting own samples would synchronise with the device, so other samples get weight 0
+        # weights of 0 exclude other processes' samples, because selecting would synchronise with the device
+        if self.cuda:
             return places, own.unsqueeze(-1) / len(index)
         return places[own], 1.0 / len(index)
 
@@ -134,11 +136,11 @@ class ValueFit:
         self.optimizer.load_state_dict(state)
         for group in self.optimizer.param_groups:
             group["capturable"] = self.cuda
-        self.captured = None  # the graph stores the addresses of the old moments
+        self.captured = None  # discard the graph, which uses the addresses of Adam's old moments
 
 
 class DenseSteps:
-    """Mini-batch steps of a ``ValueFit`` on the CPU, without autograd or torch's Adam.
+    """Makes the mini-batch steps of a ``ValueFit`` on the CPU, without autograd or torch's Adam.
 
     Parameters and moments are flat copies, which ``store`` writes back into the value function and the optimizer.
     """
@@ -189,7 +191,7 @@ class DenseSteps:
         self.count += 1
         self.first.lerp_(self.gradient, 1.0 - decay)
         self.second.mul_(slow).addcmul_(self.gradient, self.gradient, value=1.0 - slow)
-        # the factor includes the bias corrections of both moments
+        # the factor on the step includes the bias corrections of both moments
         unbias = math.sqrt(1.0 - slow**self.count)
         torch.sqrt(self.second, out=self.root).add_(group["eps"] * unbias)
         factor = group["lr"] * unbias / (1.0 - decay**self.count)
@@ -207,7 +209,7 @@ class DenseSteps:
 
 
 class CapturedStep:
-    """Mini-batch steps of a ``ValueFit`` as a CUDA graph; a counter on the device selects the mini-batch.
+    """Makes the mini-batch steps of a ``ValueFit`` as a CUDA graph. A counter on the device selects the mini-batch.
 
     The constructor uses only the shapes and the device of ``features`` and ``target``.
     """
@@ -220,14 +222,14 @@ class CapturedStep:
         self.places = torch.zeros(self.count, fit.batch, dtype=torch.long, device=device)
         self.weight = torch.zeros(self.count, fit.batch, device=device)
         self.at = torch.zeros(1, dtype=torch.long, device=device)
-        # a smaller last mini-batch is padded with samples of weight 0
+        # pad a smaller last mini-batch with samples of weight 0
         place = torch.arange(self.count * fit.batch, device=device).view(self.count, fit.batch)
         self.inside = (place < fit.samples).float()
         self.inside /= self.inside.sum(1, keepdim=True)
         self.graph: Any = None
 
     def __call__(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
-        """Run an epoch; arguments as for ``DenseSteps``."""
+        """Run an epoch, with the arguments of ``DenseSteps``."""
         self.load(features, target, order)
         done = 0
         if self.graph is None:
@@ -238,7 +240,7 @@ class CapturedStep:
             self.graph.replay()
 
     def load(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
-        """Start an epoch: copy the samples, and the indices and weights of its mini-batches."""
+        """Start an epoch by copying the samples, and the indices and weights of its mini-batches."""
         self.features.copy_(features)
         self.target.copy_(target)
         filled = torch.nn.functional.pad(order, (0, self.places.numel() - len(order))).view_as(self.places)

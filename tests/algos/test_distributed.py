@@ -244,7 +244,7 @@ def test_an_error_in_one_process_ends_all_and_two_processes_continue_the_run_of_
     refused, resumed = ended(processes)
     code, out, error = refused
     assert code != 0 and out == "", refused
-    assert error.count(f"lyceum-warp: {run} holds a run") == 1
+    assert error.count(f"lyceum-warp: {run} contains a run") == 1
     assert "lyceum_warp/algos" not in error  # no traceback of the other rank
     code, out, error = resumed
     assert code == 0 and out.count("iteration    2/2") == 1, resumed
@@ -261,6 +261,6 @@ def test_fewer_gpus_than_processes_are_refused(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     for name, value in {"WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1"}.items():
         monkeypatch.setenv(name, value)
-    refused = pytest.raises(ValueError, match="2 processes on this machine need a GPU each, and it has 1")
+    refused = pytest.raises(ValueError, match="2 processes on this machine need one GPU each, but the machine has 1")
     with refused, distributed.join("cuda"):
         pass

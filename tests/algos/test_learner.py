@@ -82,7 +82,7 @@ def test_a_policy_that_is_not_gaussian_is_saved_and_exported(env: lw.Env, tmp_pa
     path = lw.export_policy(drift.policy, tmp_path / "policy.pt2")
     exported = torch.export.load(path).module()(torch.zeros(3, 6))
     torch.testing.assert_close(exported, drift.policy.act(torch.zeros(3, 6)))
-    with pytest.raises(ValueError, match="policy must be a policy as lw.load"):
+    with pytest.raises(ValueError, match="policy must be a policy, as lw.load"):
         lw.export_policy(nn.Linear(6, 2), tmp_path / "policy.pt2")
 
 
@@ -98,7 +98,7 @@ def test_the_best_policy_has_the_largest_return_that_the_learner_reports(
 
 
 def test_environments_that_do_not_fit_are_refused(shared_env: SharedEnv) -> None:
-    with pytest.raises(ValueError, match="Drift needs an environment that resets automatically: make it with auto"):
+    with pytest.raises(ValueError, match="Drift needs an environment that resets automatically: make the"):
         Drift(shared_env("point_mass", nworld=2, autoreset=False))
     with pytest.raises(ValueError, match="process 1 of 2 with 2 worlds needs an environment with first_world=2, not 0"):
         lw.PPO(shared_env("point_mass", nworld=2), team=Team(1, 2))

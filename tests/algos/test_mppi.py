@@ -559,10 +559,10 @@ def test_every_sample_of_every_iteration_has_its_own_draws(task: type[lw.Task], 
 def test_settings_and_buffers_cannot_be_assigned() -> None:
     plan = MPPI("point_mass", horizon=3, samples=2)
     for name in (*SETTINGS, "config", "value", "seed"):
-        with pytest.raises(AttributeError, match=rf"make another MPPI with {name}=2\.0"):
+        with pytest.raises(AttributeError, match=rf"make a new MPPI with {name}=2\.0"):
             setattr(plan, name, 2.0)
     for name in (*BUFFERS, "knot_actions", "adapted_noise", "model_fields", "model_returns"):
-        with pytest.raises(AttributeError, match=rf"plan.{name} is a buffer of fixed address: write into it"):
+        with pytest.raises(AttributeError, match=rf"plan.{name} is a buffer at a fixed address: write into the"):
             setattr(plan, name, torch.zeros(3))
 
 

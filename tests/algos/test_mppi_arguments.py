@@ -118,7 +118,7 @@ def test_arguments_are_sorted_into_settings_options_and_parameters() -> None:
 
 def test_an_ambiguous_name_must_be_given_in_config_or_params() -> None:
     message = (
-        r"'noise' is a setting of MPPI and a parameter of the task 'noisy': give the setting as "
+        r"'noise' is a setting of MPPI and a parameter of the task 'noisy': pass the setting as "
         r"config=lw.MPPIConfig\(noise=...\), or the parameter as params=\{'noise': ...\}"
     )
     with pytest.raises(ValueError, match=message):
@@ -146,11 +146,11 @@ def test_an_ambiguous_name_must_be_given_in_config_or_params() -> None:
         ({"nthread": -1}, "nthread must be a whole number"),
         ({"integrator": "rk5"}, "no integrator 'rk5'"),
         ({"horizon": 0}, "horizon must be a whole number from 1"),
-        ({"elites": 4}, "elites=4 is a setting of update='cem', not of 'mppi'"),
+        ({"elites": 4}, "elites=4 is a setting of update='cem', not of update='mppi'"),
         ({"update": "predictive_sampling", "min_noise": 0.1}, "min_noise=0.1 is a setting of update='cem', not of"),
         ({"update": "cem", "noise": np.eye(7)}, "noise of update='cem' must be standard deviations, not a covariance"),
-        ({"update": "cem", "min_noise": [0.1, 0.1]}, "min_noise must be a standard deviation or 7 of them, not"),
-        ({"models": 4}, "models=4 needs a task that draws model fields, and 'reach' draws none: write them in its"),
+        ({"update": "cem", "min_noise": [0.1, 0.1]}, "min_noise must be one standard deviation, or one for each"),
+        ({"models": 4}, "models=4 needs a task that draws model fields, but 'reach' draws none: write model"),
     ],
 )  # fmt: skip
 def test_wrong_arguments_are_refused_in_one_line(words: dict[str, Any], message: str) -> None:
@@ -209,7 +209,7 @@ def test_cem_and_predictive_sampling_are_mppi_with_another_update(planner: type[
     one, other = planner("reach", config, seed=1), MPPI("reach", config, update=update, seed=1)
     assert one.config == other.config and one.config.update == update
     assert torch.equal(one(one.state_of()), other(other.state_of()))
-    with pytest.raises(ValueError, match=f"update='mppi' is another planner than '{update}': call lw.MPPI with it"):
+    with pytest.raises(ValueError, match=f"update='mppi' is not the update of this planner, '{update}': use lw.MPPI"):
         planner("reach", update="mppi")
 
 

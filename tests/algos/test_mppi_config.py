@@ -22,7 +22,7 @@ from lyceum_warp.spaces import Space
          "temperature must be a finite number of at least 1.17549e-38"),
         ("discount", [2, -0.1, math.nan, "a", True], "discount must be a finite number from 0 to 1"),
         ("noise", [-1, math.nan, math.inf, [1, -1], [], [[1, 2], [2, 1]], [[1, 0.5], [0.2, 1]], np.ones((2, 3)), "a",
-                   [1, [2, 3]], None, True], "noise must be a standard deviation, one for each action, or"),
+                   [1, [2, 3]], None, True], "noise must be a standard deviation, a standard deviation for"),
         ("smoothing", [(1, 0), 1, (1, 0, math.nan), "abc", [1, [2, 3], 4], None], "smoothing must be 3 finite numbers"),
         ("fill", ["x", [1, math.nan], ["a", "b"], [[1.0]], [], None, math.inf], "fill must be 'zero', 'repeat' or"),
         ("termination", ["x", True, 3, ["stop"]], "termination must be 'stop' or 'ignore'"),
@@ -34,10 +34,10 @@ from lyceum_warp.spaces import Space
         ("knots", [0, 2.5, "a"], "knots must be a whole number from 1"),
         ("knots", [33], "knots=33 must be at most horizon, which is 32"),
         ("spline", ["quintic", 3, None], "spline must be 'zero', 'linear' or 'cubic'"),
-        ("spline", ["zero"], "spline='zero' interpolates between knots: give their number, as knots=4"),
+        ("spline", ["zero"], "spline='zero' interpolates between knots: give the number of knots"),
         ("models", [0, -1, 2.5, "a", None], "models must be a whole number from 1"),
         ("risk", ["x", True, None], "risk must be 'mean' or 'worst'"),
-        ("risk", ["worst"], "risk='worst' compares models: give their number, as models=4"),
+        ("risk", ["worst"], "risk='worst' compares models: give the number of models"),
         ("nominal_model", [1, "yes", None], "nominal_model must be True or False"),
     ],
 )  # fmt: skip
@@ -49,7 +49,7 @@ def test_a_setting_out_of_range_is_refused_by_name(name: str, wrong: list[Any], 
 
 
 def test_drawn_models_exclude_the_nominal_one() -> None:
-    with pytest.raises(ValueError, match="models=4 draws model fields, and nominal_model=True does not: omit one"):
+    with pytest.raises(ValueError, match="models=4 draws model fields, but nominal_model=True does not: omit one"):
         MPPIConfig(models=4, nominal_model=True)
 
 
@@ -77,9 +77,9 @@ def test_arrays_and_tensors_become_tuples_of_floats() -> None:
 
 
 @pytest.mark.parametrize("name, value, message", [
-    ("noise", [1, 2, 3], r"noise must be a standard deviation, 2 of them, or a positive definite covariance \(2, 2\)"),
-    ("noise", np.eye(3), r"noise must be a standard deviation, 2 of them, or a positive definite covariance \(2, 2\)"),
-    ("fill", [1], r"fill must be 'zero', 'repeat', a number or 2 of them, not \(1.0,"),
+    ("noise", [1, 2, 3], r"noise must be a standard deviation, 2 standard deviations, or a positive definite"),
+    ("noise", np.eye(3), r"noise must be a standard deviation, 2 standard deviations, or a positive definite"),
+    ("fill", [1], r"fill must be 'zero', 'repeat', a number or 2 numbers, not \(1.0,"),
 ])  # fmt: skip
 def test_settings_for_a_different_number_of_actions_are_refused(name: str, value: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):

@@ -155,16 +155,18 @@ def test_bad_input_raises_a_one_line_error() -> None:
         plan(states)
     with pytest.raises(ValueError, match=r"where must be a bool tensor of shape \(2,\), not a float32 tensor"):
         plan.reset(where=torch.zeros(2))
-    with pytest.raises(ValueError, match=r"a list with one for each of 2 plants, not \[1, 2, 3\]"):
+    with pytest.raises(ValueError, match=r"a list with a number for each of 2 plants, not \[1, 2, 3\]"):
         plan.reset([1, 2, 3])
     with pytest.raises(ValueError, match=r"seed must be a whole number from 0 to 2147483646, not 2147483647"):
         plan.reset(2**31 - 1)
     with pytest.raises(ValueError, match=r"seed must be a whole number .* not -1"):
         plan.reset([1, -1])
     assert plan.seeds == [0, 1]
-    with pytest.raises(AttributeError, match="make another MPPI with plants=3"):
+    with pytest.raises(AttributeError, match="make a new MPPI with plants=3"):
         plan.plants = 3
-    with pytest.raises(ValueError, match="plans for 2 plants, but this loop controls one: make it with plants=1"):
+    with pytest.raises(
+        ValueError, match="plans for 2 plants, but this loop controls one: make the controller with plants=1"
+    ):
         lw.control(lw.make("point_mass", autoreset=False), plan, steps=2)
 
 

@@ -229,7 +229,7 @@ def test_wrong_arguments_are_refused(env: lw.Env) -> None:
         lw.NPG(env, value=lw.ValueFunction(6, group="critic"))
     broken = lw.ValueFunction(6)
     broken.scale.fill_(math.nan)
-    with pytest.raises(ValueError, match="the value function's 'scale' is not finite: omit it to get a new value"):
+    with pytest.raises(ValueError, match="the value function's 'scale' is not finite: omit the value function"):
         lw.NPG(env, value=broken)
     with pytest.raises(ValueError, match="autoreset=True"):
         lw.NPG(lw.make("point_mass", autoreset=False))
@@ -328,7 +328,7 @@ def test_many_consecutive_updates_that_are_not_finite_end_a_run(task_file: TaskF
     message = str(raised.value)
     assert message.startswith(
         "the step of the policy and the fit of the value function in iteration 10 are not finite, as in the 9 "
-        "iterations before it, whose updates were skipped. The observation of the task 'wild' is 1e+30 in 'rate' in "
+        "iterations before, and non-finite updates are skipped. The observation of the task 'wild' is 1e+30 in 'rate' "
     )
     assert message.endswith("of 320 samples: scale it in observe, or normalise observations (normalize)")
     assert raised.value.__notes__[0].startswith(f"the run in {tmp_path / 'run'} is saved up to iteration ")

@@ -74,7 +74,7 @@ def test_a_state_of_another_shape_or_type_is_refused(point: lw.MPPI) -> None:
 def test_a_state_that_is_not_finite_is_refused_by_its_part(part: str, number: float, point: lw.MPPI) -> None:
     broken, before = point.state_of(), point.actions.clone()
     broken[point.env.state_space.parts[part]] = number
-    with pytest.raises(ValueError, match=f"the state to plan from has {number} in its '{part}': it must be finite"):
+    with pytest.raises(ValueError, match=f"the state to plan from has {number} in its '{part}': states must be finite"):
         point(broken)
     assert torch.equal(point.actions, before)
 

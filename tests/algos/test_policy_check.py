@@ -68,14 +68,14 @@ def frozen(module: nn.Module) -> nn.Module:
         (Net(Once.apply), r"cannot be differentiated twice, which NPG needs .*\): use other layers"),
         (frozen(Net()), r"no trainable parameter: use policy.requires_grad_\(True\)"),
         (Net().double(), r"fails for observations of shape \(4, 6\) \(RuntimeError: .*dtype"),
-        (Unused(), "do not depend on its parameter 'network.spare.weight': use it"),
+        (Unused(), "do not depend on its parameter 'network.spare.weight': use the parameter"),
         (Counting(), "two different mean actions for the same observations"),
         (nn.Sequential(nn.Linear(6, 2), nn.Dropout(0.5)), "two different mean actions .*dropout"),
         (
             nn.Sequential(nn.Linear(6, 2), nn.BatchNorm1d(2, track_running_stats=False)),
             r"fails .* \(1, 6\) .*more than 1",
         ),
-        (nn.Sequential(nn.Linear(6, 2), nn.Softmax(0)), "depends on the other rows of the batch"),
+        (nn.Sequential(nn.Linear(6, 2), nn.Softmax(0)), "depends on other rows of the batch"),
     ],
 )
 def test_npg_refuses_a_network_in_one_line(shared_env: SharedEnv, network: nn.Module, message: str) -> None:
@@ -90,7 +90,10 @@ def test_npg_refuses_a_network_in_one_line(shared_env: SharedEnv, network: nn.Mo
     ("policy", "message"),
     [
         (Net(), r"policy must be a GaussianPolicy, not Net: lw.GaussianPolicy\(nobs, nact, network=net\) makes one"),
-        (lw.GaussianPolicy(5, 2), "takes 5 observations and gives 2 actions, but the task 'point_mass' has 6 and 2"),
+        (
+            lw.GaussianPolicy(5, 2),
+            "takes 5 observations and gives 2 actions, but the task 'point_mass' has 6 observations and 2 actions",
+        ),
     ],
 )
 def test_npg_refuses_a_policy_in_one_line(shared_env: SharedEnv, policy: object, message: str) -> None:
@@ -138,11 +141,11 @@ def test_a_policy_with_a_users_network_is_saved_and_loaded(tmp_path: Path) -> No
     assert torch.equal(loaded(obs), policy(obs))
     with pytest.raises(
         ValueError,
-        match=r"custom class, test_policy_check.Net: .*lw.GaussianPolicy\(6, 2, network=..., normalize=True\)\)$",
+        match=r"custom class test_policy_check.Net: .*lw.GaussianPolicy\(6, 2, network=..., normalize=True\)\)$",
     ):
         lw.load(run)
     with pytest.raises(
-        ValueError, match=r"\('network.weight' is absent in the file, and \(2, 6\) in .*: give one with the same"
+        ValueError, match=r"\('network.weight' is absent in the file, and \(2, 6\) in .*: pass a policy with the same"
     ):
         lw.load(run, policy=lw.GaussianPolicy(6, 2, network=nn.Linear(6, 2), normalize=True))
 
@@ -154,7 +157,7 @@ def test_a_policy_of_a_users_class_is_not_loaded_as_another_class(tmp_path: Path
 
     run = Run.create(tmp_path / "run", {})
     run.save(policy_content(0, policy := Bounded(6, 2, (4,))), {})
-    with pytest.raises(ValueError, match="has a custom class, .*Bounded"):
+    with pytest.raises(ValueError, match="has the custom class .*Bounded"):
         lw.load(run)
     obs = torch.randn(3, 6)
     assert torch.equal(lw.load(run, policy=Bounded(6, 2, (4,)))(obs), policy(obs))

@@ -209,8 +209,8 @@ def test_a_run_has_all_files_and_resumes(tmp_path: Path) -> None:
     ({"num_steps": 0}, "num_steps must be a whole number from 1 "),
     ({"schedule": "linear"}, "schedule must be 'adaptive' or 'fixed', not 'linear'"),
     ({"final_entropy_coef": -1.0}, "final_entropy_coef must be a finite number of at least 0, not -1.0"),
-    ({"entropy_decay": 7}, r"entropy_decay must be two numbers of iterations, as in \(150, 200\), not 7"),
-    ({"entropy_decay": (5, 5)}, r"entropy_decay must end after it begins, not \(5, 5\)"),
+    ({"entropy_decay": 7}, r"entropy_decay must be a first and a last iteration, such as \(150, 200\), not 7"),
+    ({"entropy_decay": (5, 5)}, r"entropy_decay must have a last iteration after the first iteration, not \(5, 5\)"),
     ({"value_group": 3}, "value_group must be the name of a group of observations, not 3"),
 ])  # fmt: skip
 def test_hyperparameters_that_are_not_valid_are_refused(words: dict[str, Any], message: str) -> None:
@@ -219,7 +219,9 @@ def test_hyperparameters_that_are_not_valid_are_refused(words: dict[str, Any], m
 
 
 def test_arguments_that_do_not_fit_are_refused(env: lw.Env) -> None:
-    with pytest.raises(ValueError, match="200 mini-batches are more than the 48 samples: give more worlds, or make"):
+    with pytest.raises(
+        ValueError, match="200 mini-batches need at least as many samples, not 48: use more worlds, or make"
+    ):
         made(env, minibatches=200)
     with pytest.raises(ValueError, match="'metered' has no group 'actor' of observations: it has policy, critic"):
         made(env, value_group="actor")

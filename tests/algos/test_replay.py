@@ -95,7 +95,7 @@ def test_a_restored_buffer_samples_and_continues_identically(env: lw.Env) -> Non
         for buffer in (replay, other):
             env.set_state(state)
             buffer.step(torch.zeros(3, 1))
-    with pytest.raises(ValueError, match="the state has 15 steps of the sizes .* holds 22 of them"):
+    with pytest.raises(ValueError, match="the state has 15 steps of the sizes .* holds 22 steps"):
         lw.Replay(env, 90).load_state_dict(replay.state_dict())
 
 

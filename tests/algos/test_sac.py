@@ -214,9 +214,13 @@ def test_given_networks_are_trained_further(env: lw.Env) -> None:
     with pytest.raises(ValueError, match="value of PPO must be of type ValueFunction.* not TwinCritic"):
         lw.PPO(env, value=value)  # type: ignore[arg-type]
     wide = lw.SquashedPolicy(1, 1, (8,), low=[-2.0], high=[2.0])
-    with pytest.raises(ValueError, match=r"actions are from \[-2.0\] to \[2.0\], but those of the task 'metered' from"):
+    with pytest.raises(
+        ValueError, match=r"actions are from \[-2.0\] to \[2.0\], but actions of the task 'metered' are from"
+    ):
         lw.SAC(env, wide)
-    with pytest.raises(ValueError, match="the TwinCritic takes 1 observations and 1 actions, .* has 2 and 1"):
+    with pytest.raises(
+        ValueError, match="the TwinCritic takes 1 observations and 1 actions, .* has 2 observations and 1 actions"
+    ):
         lw.SAC(env, value=lw.TwinCritic(1, 1, group="critic"))
 
 
@@ -278,5 +282,5 @@ def test_defaults_depend_on_the_number_of_worlds() -> None:
 def test_hyperparameters_that_are_not_valid_are_refused(words: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         lw.SACConfig(**words)
-    with pytest.raises(ValueError, match="updates must be a multiple of actor_every, which is 4, not 6"):
+    with pytest.raises(ValueError, match="updates=6 must be a multiple of actor_every, which is 4"):
         lw.SACConfig(updates=6).resolved(4096)

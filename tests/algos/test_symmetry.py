@@ -113,7 +113,7 @@ def test_mirrored_samples_have_the_gradient_of_the_mirrored_task(env: lw.Env) ->
 
 
 def test_a_task_without_a_mirror_image_is_refused(shared_env: SharedEnv) -> None:
-    with pytest.raises(ValueError, match="the task 'hopper' declares no mirror image: give it mirror = lw.Mirror"):
+    with pytest.raises(ValueError, match="the task 'hopper' declares no mirror image: set mirror = lw.Mirror"):
         lw.PPO(shared_env("hopper"), config=dataclasses.replace(CONFIG, symmetry="exact"))
 
 
@@ -135,5 +135,5 @@ def test_sac_learns_symmetric_policies_and_keeps_them(symmetry: str, env: lw.Env
 
 
 def test_bounds_that_are_not_symmetric_are_refused() -> None:
-    with pytest.raises(ValueError, match="have other bounds than their mirror image"):
+    with pytest.raises(ValueError, match="have different bounds than their mirror images"):
         lw.SquashedPolicy(1, 1, (4,), low=[-1.0], high=[2.0], mirror={"obs": ([0], [-1.0]), "action": ([0], [-1.0])})
