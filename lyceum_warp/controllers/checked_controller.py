@@ -22,7 +22,8 @@ class CheckedController:
 
     Raises:
         ValueError: The controller cannot be called with a state and an observation, uses the plant for planning or
-            plans for several plants, or its time step is neither a multiple nor a fraction of the plant's.
+            plans for several plants, or has a time step that is neither a multiple nor a fraction of the plant's time
+            step.
     """
 
     def __init__(self, controller: Controller, env: Env) -> None:
@@ -34,8 +35,8 @@ class CheckedController:
             )
         if (plants := getattr(controller, "plants", 1)) != 1:
             raise ValueError(
-                f"the controller plans for {plants} plants, but this loop controls one: make it with plants=1, or "
-                "control the worlds of an environment with env.step(plan(env.get_state()))"
+                f"the controller plans for {plants} plants, but this loop controls one: make the controller with "
+                "plants=1, or control the worlds of an environment with env.step(plan(env.get_state()))"
             )
         self._controller: Any = controller
         self._names = env.action_space.columns
@@ -52,7 +53,7 @@ class CheckedController:
         Args:
             state: State of the plant, (state_size,) float64.
             obs: The plant's observation, (nobs,).
-            shift: Number of controller steps since the state of its last plan.
+            shift: Number of controller steps since the state of the last plan.
             step: Step of the plant, for error messages.
 
         Returns:
@@ -63,7 +64,7 @@ class CheckedController:
         """
         action = self._controller(state, obs, **({"shift": shift} if self._takes_shift else {}))
         plan = getattr(self._controller, "actions", None)
-        # the plan contains the action; copying both from a GPU would synchronise twice
+        # use the action in the plan, because copying both from a GPU would synchronise twice
         return self._checked(action, 1, step)[None] if plan is None else self._checked(plan, 2, step)
 
     def reset(self, seed: int | None) -> None:
@@ -72,12 +73,12 @@ class CheckedController:
             reset(seed)
 
     def quality(self) -> tuple[float, float]:
-        """The last plan's number of failed samples and effective sample size; NaN if unknown."""
+        """Get the last plan's number of failed samples and effective sample size; NaN if unknown."""
         summary = getattr(self._controller, "summary", None)
         if not isinstance(summary, Mapping):
             return math.nan, math.nan
         failed, effective = (float(summary.get(name, math.nan)) for name in ("failed_samples", "effective_samples"))
-        # if all samples failed, the weights are undefined, and the effective sample size is 0
+        # report an effective sample size of 0 if all samples failed, because the weights are undefined
         return failed, 0.0 if failed == getattr(self._controller, "samples", None) else effective
 
     def steps(self, plant_steps: int) -> int:
@@ -85,18 +86,18 @@ class CheckedController:
         return plant_steps * self._plan_steps // self._plant_steps
 
     def passed(self, before: int, now: int) -> int:
-        """Number of controller steps between two steps of the plant's episode; adjacent intervals add up exactly."""
+        """Count the controller steps between two steps of the plant's episode."""
         return self.steps(now) - self.steps(before)
 
     def action(self, plan: torch.Tensor, plant_steps: int) -> torch.Tensor:
-        """The action of a plan to apply ``plant_steps`` steps of the plant after the plan's state.
+        """Select the action for the plant ``plant_steps`` steps after the plan's initial state.
 
-        If a step of the plan takes several steps of the plant, all of them apply the plan's action, or, with
-        ``between="linear"``, interpolate to the next action. After the end of the plan, its last action applies.
+        If a plan's step covers several steps of the plant, all plant steps apply the same action, or with
+        ``between="linear"`` interpolate to the next action. After the end of the plan, the plan's last action applies.
 
         Args:
             plan: The plan, (horizon, nact).
-            plant_steps: Number of steps.
+            plant_steps: Number of steps of the plant.
 
         Returns:
             The action, (nact,).
@@ -110,7 +111,7 @@ class CheckedController:
         """Check that a plan of length ``horizon`` covers a number of plant steps.
 
         Raises:
-            ValueError: The plan is shorter.
+            ValueError: The plan covers fewer steps.
         """
         if (needed := self.steps(steps - 1) + 1) > horizon:
             plan = (
@@ -118,11 +119,11 @@ class CheckedController:
             )
             raise ValueError(
                 f"replan_every={steps} needs a plan of {needed} actions, but the controller has {plan}: plan more "
-                "often, or give it a longer horizon"
+                "often, or give the planner a longer horizon"
             )
 
     def description(self) -> dict[str, Any]:
-        """Name, settings, engine and device of the controller; see ``Trajectory.controller``."""
+        """Describe the controller by name, settings, engine and device; see ``Trajectory.controller``."""
         controller = self._controller
         found: dict[str, Any] = {"name": getattr(controller, "__name__", type(controller).__name__)}
         if (samples := getattr(controller, "samples", None)) is not None:
@@ -131,7 +132,7 @@ class CheckedController:
             found |= settings
         if isinstance(env := getattr(controller, "env", None), Env):
             found |= {"engine": env.engine.name, "device": env.device.alias}
-        # a JSON round trip, so that the result equals the content of a saved file; other types become strings
+        # convert to JSON and back, so that the result equals the content of a saved file; other types become strings
         return dict(json.loads(json.dumps(found, default=str)))
 
     def _checked(self, value: Any, ndim: int, step: int) -> torch.Tensor:
@@ -139,7 +140,7 @@ class CheckedController:
         if len(axes) != ndim or axes[-1] != nu or axes[0] == 0:
             wanted = f"return an action of shape ({nu},)" if ndim == 1 else f"have actions of shape (horizon, {nu})"
             raise ValueError(f"a controller must {wanted}, not {described(value)}")
-        plan: torch.Tensor = value.detach().to("cpu", torch.float32, copy=True)  # the next call may overwrite it
+        plan: torch.Tensor = value.detach().to("cpu", torch.float32, copy=True)  # the next call may overwrite the plan
         if not (finite := torch.isfinite(plan)).all():
             where = (~finite).nonzero()[0].tolist()
             number, name = plan[tuple(where)].item(), self._names[where[-1]]
@@ -148,7 +149,7 @@ class CheckedController:
 
 
 def _steps(plant: float, plan: float) -> tuple[int, int]:
-    """The numbers of plan steps and of plant steps in the longer of the two time steps.
+    """Compute how many plan steps and how many plant steps fit into the longer time step.
 
     Raises:
         ValueError: Neither time step is a multiple of the other.
@@ -156,29 +157,30 @@ def _steps(plant: float, plan: float) -> tuple[int, int]:
     many = round(max(plant, plan) / min(plant, plan))
     if not math.isclose(many * min(plant, plan), max(plant, plan), rel_tol=1e-6):
         raise ValueError(
-            f"the controller's step of {plan:g} s must be a whole multiple of the plant's, {plant:g} s, or a whole "
-            "fraction: choose the planner's frame_skip and timestep accordingly"
+            f"the controller's step of {plan:g} s must be a whole multiple or a whole fraction of the plant's step "
+            f"of {plant:g} s: choose the planner's frame_skip and timestep accordingly"
         )
     return (many, 1) if plant > plan else (1, many)
 
 
 def _check_call(controller: Any) -> None:
-    """Reject an object that cannot be called with a state and an observation."""
+    """Reject an object that is not a function of a state and an observation."""
     if not callable(controller):
         raise ValueError(
-            f"a controller must be callable with (state, obs), not {described(controller)}: give a function, or "
+            f"a controller must be callable with (state, obs), not {described(controller)}: pass a function, or "
             "lw.MPPI(...)"
         )
     signature = _signature(controller.forward if isinstance(controller, torch.nn.Module) else controller)
     if signature is not None and _fits(signature, 1) and not _fits(signature, 2):
         raise ValueError(
-            f"a controller is called with (state, obs), but {type(controller).__name__} takes one argument: give "
+            f"control loops call a controller with (state, obs), but {type(controller).__name__} takes one argument: "
+            "pass "
             "lambda state, obs: policy(obs)"
         )
 
 
 def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
-    """The signature of a function; None if it cannot be determined, as for some C functions."""
+    """Get a function's signature, or None if it is unknown, as for some C functions."""
     try:
         return inspect.signature(function)
     except (TypeError, ValueError):
@@ -186,7 +188,7 @@ def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
 
 
 def _fits(signature: inspect.Signature, count: int) -> bool:
-    """Whether ``count`` positional arguments fit a signature."""
+    """Check whether ``count`` positional arguments fit a signature."""
     try:
         signature.bind(*[None] * count)
     except TypeError:

@@ -19,10 +19,11 @@ from lyceum_warp.support.validate import positive_number
 @document_attributes
 @dataclasses.dataclass(frozen=True)
 class ControlReport:
-    """Statistics of a controller's episodes; the result of ``control_report``.
+    """Statistics of a controller's episodes, computed by ``control_report``.
 
-    A value is None if there are too few plans, if it does not apply, or if the controller does not report it. Each
-    trajectory's first plan loads kernels and captures graphs, so only ``first_plan_ms`` includes its planning time.
+    A value is None if there are too few plans, if the value does not apply, or if the controller does not report the
+    value. Each trajectory's first plan loads kernels and captures graphs, so only ``first_plan_ms`` includes the first
+    planning time.
     """
 
     task: str
@@ -38,11 +39,11 @@ class ControlReport:
     plans: int
     """Number of plans, excluding the first plan of each trajectory."""
     first_plan_ms: float | None
-    """Longest planning time of any first plan, milliseconds."""
+    """Longest planning time of a trajectory's first plan, milliseconds."""
     plan_mean_ms: float | None
     """Mean planning time, milliseconds."""
     plan_p50_ms: float | None
-    """Median planning time, milliseconds; needs 2 plans. This and the other quantiles are interpolated."""
+    """Median planning time, milliseconds; needs 2 plans. All quantiles are interpolated."""
     plan_p90_ms: float | None
     """90 % quantile of the planning time, milliseconds; needs 10 plans."""
     plan_p99_ms: float | None
@@ -54,20 +55,20 @@ class ControlReport:
     plan_jitter_ms: float | None
     """Standard deviation of the planning time, milliseconds."""
     plans_per_second: float | None
-    """Finished plans per second of wall time."""
+    """Number of finished plans per second of wall time."""
     deadline_ms: float
     """Deadline of a plan, milliseconds: 1 / ``rate``, or the plant's period."""
     misses: int
-    """Number of plans that took longer than the deadline."""
+    """Number of plans with a planning time above the deadline."""
     miss_share: float | None
-    """Fraction of the plans that took longer than the deadline."""
+    """Fraction of plans with a planning time above the deadline."""
     blind_plans: int | None
-    """Number of plans whose samples all failed, including first plans. Such a plan is the previous plan shifted in
-    time."""
+    """Number of plans, including first plans, without a valid sample. A plan without a valid sample is the previous
+    plan shifted in time."""
     known_plans: int
     """Number of plans with a known number of failed samples, including first plans."""
     failed_share: float | None
-    """Fraction of failed samples in these plans."""
+    """Fraction of failed samples in the plans with a known number of failed samples."""
     effective_samples_mean: float | None
     """Mean effective sample size of a plan: 1 if a single sample has all the weight, 0 if all samples failed."""
     tick_jitter_ms: float | None
@@ -83,7 +84,7 @@ class ControlReport:
     age_steps_mean: float
     """Mean age of the applied actions, in steps of the plant."""
     age_steps_max: int
-    """Maximum age of the applied actions, in steps of the plant: 1 if the controller kept up."""
+    """Maximum age of the applied actions, in steps of the plant; 1 if every plan was finished in time."""
     real_time_factor: float
     """Simulated seconds per second of wall time, over all episodes."""
     episode_seconds_mean: float
@@ -91,28 +92,28 @@ class ControlReport:
     return_mean: float
     """Mean return."""
     return_std: float | None
-    """Sample standard deviation of the returns (n - 1)."""
+    """Sample standard deviation (n - 1) of the returns."""
     eval_mean: float
     """Mean evaluation metric in the last states of the episodes."""
     success: float
-    """Fraction of the episodes that end in success."""
+    """Fraction of episodes that end in success."""
     success_low: float
     """Lower bound of the 95 % confidence interval of ``success`` (Wilson 1927)."""
     success_high: float
-    """Upper bound of that interval."""
+    """Upper bound of the 95 % confidence interval of ``success``."""
     params: Mapping[str, Any]
     """Parameters of the task."""
     controller: Mapping[str, Any]
     """Name and settings of the controller; see ``Trajectory.controller``."""
     versions: Mapping[str, Any]
-    """Packages, Python and machine of the first trajectory."""
+    """Versions of packages and Python, and the machine, of the first trajectory."""
 
     def to_json(self) -> str:
-        """The report as JSON; missing and non-finite numbers become null."""
+        """Convert the report to JSON; missing and non-finite numbers become null."""
         return json.dumps(_finite(dataclasses.asdict(self)), indent=2, allow_nan=False)
 
     def write(self, path: str | Path) -> Path:
-        """Write the JSON to a file, atomically, and return its path."""
+        """Write the report as JSON to a file, atomically, and return the file's path."""
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         with replaced(path) as temporary:
@@ -120,7 +121,7 @@ class ControlReport:
         return path
 
     def rows(self) -> list[tuple[str, str]]:
-        """The report as rows of strings: a label, and a number with its unit or "-" if it is missing."""
+        """Format the report as rows of two strings: a label, and a number with its unit ("-" if missing)."""
         rows = [
             ("episodes", f"{self.episodes} of {self.task} ({self.steps} steps, {self.mode})"),
             ("return", _text(self.return_mean, ".4g") + _text(self.return_std, ".2g", " ± {}", "")),
@@ -202,12 +203,12 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-# each quantile with the number of plans of which one, on average, lies beyond it
+# each quantile, and the number of plans that it needs
 _QUANTILES = {"p50": (0.5, 2), "p90": (0.9, 10), "p99": (0.99, 100), "p99_9": (0.999, 1000)}
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson's 95 % confidence interval of a proportion (Wilson 1927)."""
+    """Compute Wilson's 95 % confidence interval of a proportion (Wilson 1927)."""
     z = 1.959963984540054
     share = successes / trials
     middle = share + z * z / (2 * trials)
@@ -221,18 +222,18 @@ def _joined(parts: Iterable[torch.Tensor]) -> np.ndarray:
 
 
 def _std(values: np.ndarray) -> float | None:
-    """Sample standard deviation (n - 1); None if there are fewer than two values or if any is not finite."""
+    """Compute the sample standard deviation (n - 1); None with fewer than two values or with a non-finite value."""
     return float(values.std(ddof=1)) if len(values) > 1 and np.isfinite(values).all() else None
 
 
 def _differing_names(mappings: Sequence[Mapping[str, Any]]) -> list[str]:
     names = dict.fromkeys(name for mapping in mappings for name in mapping)
-    # compare as text, because NaN != NaN
+    # compare values as text, because NaN != NaN
     return [name for name in names if len({json.dumps(mapping.get(name)) for mapping in mappings}) > 1]
 
 
 def _plan_statistics(episodes: Sequence[Trajectory], deadline: float) -> dict[str, Any]:
-    """Planning times and missed deadlines, excluding the first plan of each episode."""
+    """Summarise planning times and missed deadlines, excluding the first plan of each episode."""
     times = _joined(episode.plan_times[1:] for episode in episodes)
     misses = int((times > deadline).sum())
     return {
@@ -253,7 +254,7 @@ def _plan_statistics(episodes: Sequence[Trajectory], deadline: float) -> dict[st
 
 
 def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:
-    """Plans per second, excluding the first plan of each episode and its planning time."""
+    """Compute the plans per second, excluding the first plan of each episode and its planning time."""
     plans, seconds = 0, 0.0
     for episode in episodes:
         ends = episode.plan_starts + episode.plan_times
@@ -263,7 +264,7 @@ def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:
 
 
 def _sample_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
-    """Statistics of failed and effective samples; plans for which the controller does not report them are omitted."""
+    """Summarise failed samples and effective sample sizes over the plans for which the controller reports them."""
     failed, effective = (_joined(getattr(e, name) for e in episodes) for name in ("plan_failed", "plan_effective"))
     failed, effective = failed[np.isfinite(failed)], effective[np.isfinite(effective)]
     samples = episodes[0].controller.get("samples")
@@ -277,7 +278,7 @@ def _sample_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
 
 
 def _tick_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
-    """Delays of the steps in an asynchronous run."""
+    """Summarise the delays of the steps in an asynchronous run."""
     if episodes[0].mode == "sync":
         return {"tick_jitter_ms": None, "tick_delay_max_ms": None, "late_ticks": None}
     delays = 1000 * _joined(episode.times - episode.period * torch.arange(episode.steps) for episode in episodes)

@@ -12,7 +12,7 @@ class Controller(Protocol):
     """A function that returns an action for the state and the observation of one world, the plant.
 
     Plain functions and ``lw.MPPI`` are controllers. To control with a policy, pass ``lambda state, obs: policy(obs)``.
-    All other members, listed in ``PlanningController``, are optional.
+    ``PlanningController`` lists further members, which are optional.
     """
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, /) -> torch.Tensor:
@@ -20,19 +20,19 @@ class Controller(Protocol):
 
         Args:
             state: State of the plant as in ``env.get_state()[0]``, (state_size,) float64, on the plant's device.
-            obs: The plant's observation, (nobs,) float32, on the same device.
+            obs: The plant's observation, (nobs,) float32, on the plant's device.
 
         Returns:
-            The action, (nu,), finite, on any device.
+            The action, (nu,), which is finite and on any device.
         """
         ...
 
 
 @runtime_checkable
 class PlanningController(Controller, Protocol):
-    """A controller that returns the first action of a plan, a sequence of actions. ``lw.MPPI`` is one.
+    """A controller that plans a sequence of actions and returns the first action, such as ``lw.MPPI``.
 
-    A controller implements only the members that it needs, and need not derive from this class.
+    A controller implements only the members that it needs, and need not derive from ``PlanningController``.
     """
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, /, *, shift: int = 1) -> torch.Tensor:
@@ -42,40 +42,41 @@ class PlanningController(Controller, Protocol):
             state: See ``Controller``.
             obs: See ``Controller``.
             shift: Number of steps of length ``timestep`` since the state of the last plan; 0 for the first plan after a
-                reset. With ``reset=False`` the loops assume that the last plan was made in the previous step, or with
-                ``replan_every`` in the last step when a plan was due. The loops pass ``shift`` only to controllers that
-                have this argument.
+                reset. With ``reset=False``, the loops assume that the last plan was made in the previous step, or with
+                ``replan_every`` at the last step that was due. The loops pass ``shift`` only to controllers with an
+                argument ``shift``.
 
         Returns:
-            The first action of the plan, (nu,). If the controller has ``actions``, the loops read these instead.
+            The first action of the plan, (nu,). If the controller has ``actions``, the loops read the plan from
+            ``actions`` instead.
         """
         ...
 
     def reset(self, seed: int | None, /) -> object:
-        """Prepare for a new episode. The loops call it with the run's seed, unless ``reset=False``."""
+        """Prepare for a new episode. The loops call this method with the run's seed, unless ``reset=False``."""
         ...
 
     @property
     def actions(self) -> torch.Tensor:
-        """The last plan, (horizon, nact), finite. The first row is the action for the given state."""
+        """The last plan, (horizon, nact), which is finite. The plan's first row is the action for the given state."""
         ...
 
     @property
     def timestep(self) -> float:
         """Simulated seconds between two actions of the plan; by default the plant's time step.
 
-        The interval must be a multiple or a whole fraction of the plant's time step.
+        The controller's time step must be a multiple or a whole fraction of the plant's time step.
         """
         ...
 
     @property
     def between(self) -> Literal["hold", "linear"]:
-        """How the plant's steps between two actions of the plan are filled; see ``MPPIConfig.between``."""
+        """Action for plant steps between two actions of the plan; see ``MPPIConfig.between``."""
         ...
 
     @property
     def plants(self) -> int:
-        """Number of plants to plan for, by default 1. The loops support only 1."""
+        """Number of plants to plan for, by default 1. The control loops support only 1 plant."""
         ...
 
     @property

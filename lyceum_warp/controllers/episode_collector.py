@@ -1,4 +1,4 @@
-"""Start the episode of a control loop, collect its steps and plans, and report its progress."""
+"""Start the episode of a control loop, collect the episode's steps and plans, and report progress."""
 
 import dataclasses
 import time
@@ -16,12 +16,12 @@ from lyceum_warp.support.validate import check_flag, check_function, check_kind,
 @document_attributes
 @dataclasses.dataclass(frozen=True)
 class ControlProgress:
-    """Progress of an episode after a step; the argument of ``on_step``."""
+    """Progress of an episode after a step, which is the argument of ``on_step``."""
 
     step: int
     """Number of steps so far."""
     time: float
-    """Wall time so far, including this step, seconds."""
+    """Wall time so far, including the last step, seconds."""
     reward: float
     """Reward of the step."""
     eval: float
@@ -33,7 +33,7 @@ class ControlProgress:
     age: float
     """Age of the action when it was applied, seconds; see ``Trajectory.ages``."""
     plans: int
-    """Number of plans up to and including this plan."""
+    """Number of plans so far, up to the plan that contains the action."""
 
 
 OnStep = Callable[[ControlProgress], object]
@@ -42,17 +42,17 @@ OnAbort = Callable[[Trajectory], object]
 
 @dataclasses.dataclass(frozen=True)
 class TimedPlan:
-    """A finished plan and its planning time."""
+    """A finished plan with its planning time."""
 
     index: int
-    step: int  # index of the state that the plan starts from
-    begun: float  # seconds on the run's clock
+    step: int  # index of the plan's initial state
+    begun: float  # start time, in seconds on the run's clock
     seconds: float
     actions: torch.Tensor  # (horizon, nact)
 
 
 def check_arguments(env: Env, *, reset: bool, on_step: OnStep | None, on_abort: OnAbort | None) -> None:
-    """Check the arguments that both loops share."""
+    """Check the arguments that both control loops share."""
     check_kind("env", env, Env, "as lw.make(..., autoreset=False) makes it")
     check_flag("reset", reset)
     check_function("on_step", on_step)
@@ -68,8 +68,8 @@ def begin_episode(
         The maximum number of steps, and the step of the episode at which the run starts.
 
     Raises:
-        ValueError: The environment has several worlds or automatic resets, its episodes may never end, the episode is
-            already over, or a seed is given without a reset.
+        ValueError: The environment has several worlds or automatic resets, its episodes may never end, the current
+            episode is over, or a seed is given without a reset.
     """
     if env.nworld != 1 or env.autoreset:
         raise ValueError(
@@ -77,13 +77,15 @@ def begin_episode(
             f"nworld={env.nworld}, autoreset={env.autoreset}: make(..., nworld=1, autoreset=False)"
         )
     if steps is None and env.horizon == 0:
-        raise ValueError(f"episodes of {env.task.name!r} may never end without a horizon: give steps, or a horizon")
+        raise ValueError(
+            f"episodes of {env.task.name!r} may never end without a horizon: pass steps, or give make() a horizon"
+        )
     limit = env.horizon if steps is None else whole_number("steps", steps, low=1)
     if reset:
         env.rand_reset(seed)
         controller.reset(seed)
     elif seed is not None:
-        raise ValueError(f"seed={seed} has no effect with reset=False: omit one of them")
+        raise ValueError(f"seed={seed} has no effect with reset=False: omit one of the two arguments")
     if env.done.item():
         raise ValueError("the episode is over before its first step: reset the environment, or omit reset=False")
     return limit, 0 if reset else int(env.episode_step.item())
@@ -100,7 +102,7 @@ class EpisodeCollector:
         mode: "sync" or "async"; see ``Trajectory.mode``.
         period: Wall time between two steps, seconds.
         seed: Seed of the run.
-        now: Reads the clock, in seconds.
+        now: Function that reads the clock, in seconds.
     """
 
     def __init__(
@@ -111,29 +113,30 @@ class EpisodeCollector:
         self.controller = controller.description()
         self.states, self.obs = [env.get_state()[0]], [env.obs[0].clone()]
         self.times: list[float] = []
-        self._applied: list[tuple[torch.Tensor, TimedPlan, float, bool]] = []  # action, plan, age, late
+        # each entry has action, plan, age and late
+        self._applied: list[tuple[torch.Tensor, TimedPlan, float, bool]] = []
         self._outcomes: list[tuple[float, float, bool]] = []
         self._plans: list[tuple[int, float, float, float, float]] = []
         self._now = now
         self.start = now()
 
     def restart_clock(self) -> None:
-        """Measure wall time from now instead of from the construction of the collector."""
+        """Measure wall time from now on, instead of from the collector's construction."""
         self.start = self._now()
 
     def elapsed(self) -> float:
-        """Seconds since the clock started."""
+        """Return the seconds since the clock started."""
         return self._now() - self.start
 
     def add_plan(self, plan: TimedPlan, quality: tuple[float, float]) -> None:
-        """Add a finished plan; ``quality`` is its number of failed samples and its effective sample size."""
+        """Add a finished plan with its ``quality``, the number of failed samples and the effective sample size."""
         self._plans.append((plan.step, plan.begun - self.start, plan.seconds, *quality))
 
     def before_step(self, plan: TimedPlan, now: float, age: float, *, late: bool) -> None:
-        """Record the current ``env.action`` just before it is applied.
+        """Record ``env.action`` just before the plant applies it.
 
         Args:
-            plan: The action's plan.
+            plan: The plan that contains the action.
             now: Seconds since the clock started.
             age: Age of the action, seconds.
             late: Whether the step starts late.
@@ -153,13 +156,13 @@ class EpisodeCollector:
             on_step(ControlProgress(step, self.elapsed(), *outcome, plan.seconds, age, plan.index + 1))
 
     def abort(self, on_abort: OnAbort | None, wall_seconds: float) -> None:
-        """Call ``on_abort`` with the steps so far, if there are any."""
+        """Call ``on_abort`` with the trajectory of the steps so far, if there are any."""
         if on_abort is not None and self._outcomes and self._plans:
             on_abort(self.trajectory(wall_seconds, done_reason=0))
 
     def trajectory(self, wall_seconds: float, done_reason: int) -> Trajectory:
         """Make the trajectory of all complete steps."""
-        steps = len(self._outcomes)  # outcomes are recorded last, so an interrupted step has none
+        steps = len(self._outcomes)  # an interrupted step has no outcome, because outcomes are recorded last
         rewards, evals, success = zip(*self._outcomes, strict=True)
         actions, applied, ages, late = zip(*self._applied[:steps], strict=True)
         plan_steps, *plans = zip(*self._plans, strict=True)

@@ -34,17 +34,19 @@ def control(
     """Control one world, the plant, until its episode ends. The plant waits for each plan.
 
     Args:
-        env: The plant: one world, made with ``autoreset=False``.
-        controller: Called for each plan; see ``lw.Controller``. The controller must not step ``env``.
-        steps: Steps after which to stop if the episode has not ended.
-        replan_every: Number of steps from one plan to the next. The steps in between apply the next actions of the
-            plan, so values above 1 need a controller with ``actions``.
+        env: The plant, an environment of one world made with ``autoreset=False``.
+        controller: Controller that is called for each plan; see ``lw.Controller``. The controller must not step
+            ``env``.
+        steps: Maximum number of steps, if the episode does not end earlier.
+        replan_every: Number of steps from one plan to the next plan. Steps without a new plan apply later actions of
+            the last plan, so values above 1 need a controller with ``actions``.
         seed: Seed of the initial state and of the controller.
         reset: Whether to reset the plant and the controller first. If False, the run continues from the plant's state
-            and the controller's last plan; ``replan_every`` must be the same as in the last run.
-        on_step: Called with a ``ControlProgress`` after each step. Planning times do not include it.
-        on_abort: Called with the trajectory of the complete steps, if there are any, when an exception, including
-            Ctrl-C, ends the run. The trajectory's ``done_reason`` is 0. The exception is raised afterwards.
+            and the controller's last plan; ``replan_every`` must not change between the runs.
+        on_step: Called with a ``ControlProgress`` after each step. Planning times do not include ``on_step``.
+        on_abort: Called with the trajectory of the complete steps if an exception, such as Ctrl-C, ends the run after
+            the first step. The trajectory's ``done_reason`` is 0. The loop raises the exception after calling
+            ``on_abort``.
 
     Returns:
         The trajectory of the episode; its ``period`` is the plant's time step.
@@ -56,7 +58,7 @@ def control(
     check_arguments(env, reset=reset, on_step=on_step, on_abort=on_abort)
     every = whole_number("replan_every", replan_every, low=1)
     checked = CheckedController(controller, env)
-    # steps are counted from the reset, so a run in several parts shifts its plans as a single run would
+    # count steps from the reset, so that a run in several parts shifts plans as a single run does
     limit, first = begin_episode(env, checked, steps, seed, reset=reset)
     episode = EpisodeCollector(env, checked, mode="sync", period=env.timestep, seed=seed)
     planned = max(first - 1, 0) // every * every

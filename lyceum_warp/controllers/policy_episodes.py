@@ -23,12 +23,12 @@ def policy_episodes(
 ) -> Iterator[Trajectory]:
     """Run a policy for whole episodes from random initial states, and yield them as trajectories.
 
-    With the same reset seed and number of worlds, these are the episodes of ``lw.evaluate``. The policy acts in all
+    The episodes equal the episodes of ``lw.evaluate`` with the same seed and number of worlds. The policy acts in all
     worlds at once, so the times in a trajectory refer to the whole batch.
 
     Args:
         env: An environment made with ``autoreset=False``; its worlds are reset.
-        policy: Called with observations, (nworld, nobs); returns actions, (nworld, nact).
+        policy: Function from observations, (nworld, nobs), to actions, (nworld, nact).
         episodes: Number of episodes.
         seed: Seed of the initial states; by default the worlds continue their random streams.
         controller: Description of the policy; see ``Trajectory.controller``.
@@ -63,14 +63,15 @@ def policy_episodes(
 
 
 class _Batch:
-    """One episode in every world of an environment, starting from its current states."""
+    """One episode in every world of an environment, starting from the worlds' current states."""
 
     def __init__(self, env: Env) -> None:
         self.env = env
         self._states, self._obs = [env.get_state().cpu()], [env.obs.cpu().clone()]
         self._actions: list[torch.Tensor] = []
         self._outcomes: list[torch.Tensor] = []
-        self._times: list[tuple[float, float, float]] = []  # action applied at, policy's duration, step ended at
+        # time of the action, duration of the policy's call, and time of the step's end
+        self._times: list[tuple[float, float, float]] = []
         self._lengths = torch.zeros(env.nworld, dtype=torch.long)
         self._reasons = torch.zeros(env.nworld, dtype=torch.long)
         self._start = time.perf_counter()
@@ -86,7 +87,7 @@ class _Batch:
         return bool((self._lengths > 0).all())
 
     def step(self, policy: Callable[[torch.Tensor], torch.Tensor]) -> None:
-        """Step all worlds, finished or not."""
+        """Step all worlds, including worlds with finished episodes."""
         env, begun = self.env, time.perf_counter()
         env.action.copy_(policy(env.obs))
         self._actions.append(env.action.cpu().clone())
@@ -101,7 +102,7 @@ class _Batch:
         self._reasons[over] = env.done_reason.cpu()[over].long()
 
     def trajectory(self, world: int, **origin: Any) -> Trajectory:
-        """The episode of a world; ``origin`` holds the attributes that describe its origin."""
+        """Make the trajectory of a world; ``origin`` has the attributes that describe the trajectory's origin."""
         env, steps = self.env, int(self._lengths[world])
         states, obs = (torch.stack([row[world] for row in rows[: steps + 1]]) for rows in (self._states, self._obs))
         rewards, evals, success = torch.stack([row[:, world] for row in self._outcomes[:steps]], 1)

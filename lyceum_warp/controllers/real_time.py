@@ -1,4 +1,4 @@
-"""Implement the real-time loop, ``lw.control_async``: the plant keeps its rate while a thread plans."""
+"""Implement the real-time loop, ``lw.control_async``: the plant steps at a fixed rate while a thread plans."""
 
 import atexit
 import contextlib
@@ -28,10 +28,10 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.validate import check_kind, positive_number
 
 # all in seconds
-_SPIN = 0.0005  # the last part of a wait, which polls the clock instead of sleeping
-_PATIENCE = 0.2  # how long an exception waits for an unfinished plan
-_EXIT_PATIENCE = 5.0  # how long the exit of the program waits for an unfinished plan
-_SWITCH_INTERVAL = 0.0005  # Python's default, 5 ms, is most of a fast plant's period
+_SPIN = 0.0005  # length of the last part of a wait, which polls the clock instead of sleeping
+_PATIENCE = 0.2  # timeout for an unfinished plan after an exception
+_EXIT_PATIENCE = 5.0  # timeout for an unfinished plan when the program exits
+_SWITCH_INTERVAL = 0.0005  # shorter than Python's default of 5 ms, which is most of a fast plant's period
 
 
 @torch.no_grad()
@@ -47,42 +47,43 @@ def control_async(
     on_abort: OnAbort | None = None,
     clock: "Clock | None" = None,
 ) -> Trajectory:
-    """Control one world, the plant, in real time: the plant steps by the wall clock and does not wait for plans.
+    """Control one world, the plant, in real time; the plant steps by the wall clock and does not wait for plans.
 
-    The plant steps in the calling thread. Step k is due at ``k * period``; a late step does not delay later steps. The
-    controller plans in a second thread, each time from the newest state, and never twice from the same state.
+    The plant steps in the calling thread. Step k of the plant is due at ``k * period``; a late step does not delay
+    later steps. The controller plans in a second thread, always from the newest state, and only once from each state.
 
-    Each step applies the newest finished plan, at the time that has passed since the plan's state: the action of the
-    plan's step at that time, or the last action if the plan is shorter. This compensates for the planning delay up to
-    the length of the plan. The plant waits for the first plan, so the first action has age 0. Later actions are at
-    least one step old, and exactly one step old if every plan takes less than a period.
+    Each step applies an action of the newest finished plan, selected by the time since the plan's initial state; after
+    the end of the plan, its last action applies. Selecting actions by time compensates for planning delays up to the
+    length of the plan. The plant waits for the first plan, so the first action has age 0. Later actions are at least
+    one step old, and exactly one step old if every plan takes less than a period.
 
-    Before the clock starts, the controller is called three times with the first state, and the plant takes three steps
-    and is restored to its state. This warm-up loads kernels and captures graphs, because Warp cannot capture a graph
-    while another thread launches kernels. For the same reason ``on_step`` must not call functions that evaluate given
-    states, such as ``env.get_reward(before, action, after)``.
+    Before the clock starts, a warm-up calls the controller three times with the first state, steps the plant three
+    times, and restores the plant's state. The warm-up loads kernels and captures graphs, because Warp cannot capture a
+    graph while another thread launches kernels. Functions that evaluate given states, such as ``env.get_reward(before,
+    action, after)``, also capture graphs, so ``on_step`` must not call them.
 
-    During the run Python switches between threads more often than usual (``sys.setswitchinterval``). To keep the plant
-    on time, leave a CPU core free by setting ``nthread`` of the planner's environment, and put the plant on the CPU. On
-    the planner's GPU, both would share a stream, and each step would wait for the previous plan.
+    During the run, Python switches between threads more often than usual (``sys.setswitchinterval``). To keep the plant
+    on time, leave a CPU core free by setting ``nthread`` of the planner's environment, and put the plant on the CPU. A
+    plant on the planner's GPU would share a stream with the planner, and each step would wait for the previous plan.
 
-    When the episode ends, the unfinished plan is completed and counted. When an exception, including Ctrl-C, ends the
-    run, the loop waits at most 0.2 seconds for the unfinished plan. Do not use the controller again until the thread,
-    named "lyceum_warp planner", has ended.
+    At the end of the episode, the loop waits for the unfinished plan and counts this plan, too. If an exception, such
+    as Ctrl-C, ends the run, the loop waits at most 0.2 seconds for the unfinished plan. Do not use the controller again
+    until the thread, named "lyceum_warp planner", has ended.
 
     Args:
-        env: The plant: one world, made with ``autoreset=False``.
-        controller: Called in the second thread; see ``lw.Controller``. The controller must plan in a separate
-            environment.
+        env: The plant, an environment of one world made with ``autoreset=False``.
+        controller: Controller that is called in the second thread; see ``lw.Controller``. The controller must plan in a
+            separate environment.
         period: Wall time between steps, seconds; by default the plant's time step, which is real time.
-        steps: Steps after which to stop if the episode has not ended.
+        steps: Maximum number of steps, if the episode does not end earlier.
         seed: Seed of the initial state and of the controller.
         reset: Whether to reset the plant and the controller first. If False, the run continues from the plant's state
             and the controller's last plan.
         on_step: Called with a ``ControlProgress`` after each step, in the calling thread. Slow calls delay the plant.
-        on_abort: Called with the trajectory of the complete steps, if there are any, when an exception, including
-            Ctrl-C, ends the run. The trajectory's ``done_reason`` is 0. The exception is raised afterwards.
-        clock: Replaces the wall clock, for instance by a subclass that does other work while the plant waits.
+        on_abort: Called with the trajectory of the complete steps if an exception, such as Ctrl-C, ends the run after
+            the first step. The trajectory's ``done_reason`` is 0. The loop raises the exception after calling
+            ``on_abort``.
+        clock: Clock that replaces the wall clock, such as a subclass that does other work while the plant waits.
 
     Returns:
         The episode.
@@ -125,18 +126,18 @@ class Clock:
     """The wall clock, with waits more precise than ``time.sleep``."""
 
     def now(self) -> float:
-        """Seconds since an arbitrary origin."""
+        """Return the seconds since an arbitrary origin."""
         return time.perf_counter()
 
     def wait_until(self, moment: float) -> None:
-        """Sleep until shortly before a moment of this clock, then poll the clock."""
+        """Sleep until shortly before a given moment, and then poll the clock."""
         while (left := moment - self.now()) > _SPIN:
             time.sleep(left - _SPIN)
         while self.now() < moment:
             pass
 
     def wait_for(self, event: threading.Event) -> None:
-        """Wait until an event is set. The loop uses this to wait for the first plan."""
+        """Wait until an event is set. The loop waits for the first plan with this method."""
         event.wait()
 
 
@@ -149,7 +150,7 @@ def run_plant(
     limit: int,
     on_step: OnStep | None,
 ) -> float:
-    """Step the plant by the clock until its episode ends; return the end of the last period, seconds."""
+    """Step the plant by the clock until its episode ends, and return the end of the last period, seconds."""
     start, period = episode.start, episode.period
     for k in range(limit):
         due = start + k * period
@@ -158,7 +159,7 @@ def run_plant(
         plan = plans.newest()
         env.action[0] = controller.action(plan.actions, k - plan.step)
         now = episode.elapsed()
-        # the first action has age 0, because the clock starts when its plan is finished
+        # the first action has age 0, because the clock starts after the first plan
         planned_from = episode.times[plan.step] if plan.step < k else now
         episode.before_step(plan, now, now - planned_from, late=late)
         if k > 0:
@@ -172,7 +173,7 @@ def run_plant(
 
 
 def _capture_graphs(env: Env) -> None:
-    """Step the plant until its graphs are captured, and restore its state."""
+    """Step the plant until its graphs are captured, and restore the plant's state."""
     before = env.get_state()
     for _ in range(3):
         env.step()
@@ -195,7 +196,7 @@ class PlannerThread:
 
     Args:
         controller: The controller.
-        clock: The clock of the run.
+        clock: The clock of the control loop.
         seed: Seed of the run.
         first: Step of the episode at which the run starts.
         reset: Whether the run started with a reset.
@@ -206,16 +207,19 @@ class PlannerThread:
     ) -> None:  # fmt: skip
         self._controller, self._clock, self._seed, self._first, self._reset = controller, clock, seed, first, reset
         self._plans: list[TimedPlan] = []
-        self._qualities: list[tuple[float, float]] = []  # one per plan, appended after the plan
+        self._qualities: list[tuple[float, float]] = []  # one entry per plan, appended after the plan
         self._error: BaseException | None = None
         self._begun = threading.Event()  # set after the first plan, or an error
-        # SimpleQueue is implemented in C, so no thread switch happens while one side holds a lock that the other needs
+        # use SimpleQueue, which is implemented in C, so that no thread loses the GIL while it holds the queue's lock
         self._states: queue.SimpleQueue[tuple[int, torch.Tensor, torch.Tensor] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="lyceum_warp planner", daemon=True)
         self._thread.start()
 
     def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor) -> None:
-        """Plan from this state next, unless a newer state is published first. The tensors must not change."""
+        """Make the thread plan from a state next, unless a newer state follows.
+
+        The caller must not change the tensors.
+        """
         self._states.put((step, state, obs))
 
     def wait(self) -> None:
@@ -229,7 +233,7 @@ class PlannerThread:
             raise self._error
 
     def newest(self) -> TimedPlan:
-        """The newest finished plan."""
+        """Return the newest finished plan."""
         self.check()
         return self._plans[-1]
 
@@ -237,8 +241,8 @@ class PlannerThread:
         """End the thread after its current plan.
 
         Args:
-            patience: Timeout in seconds; None for no limit. After a timeout the thread still ends after its current
-                plan, or at the exit of the program.
+            patience: Timeout in seconds; None for no limit. After a timeout, the thread ends after its current plan, or
+                when the program exits.
         """
         self._states.put(None)
         self._thread.join(patience)
@@ -251,7 +255,7 @@ class PlannerThread:
     def add_plans(self, episode: EpisodeCollector) -> None:
         """Add the finished plans to an episode."""
         qualities = list(self._qualities)
-        plans = self._plans[: len(qualities) + 1]  # the thread may not have appended the last quality yet
+        plans = self._plans[: len(qualities) + 1]  # the thread appends a plan before the plan's quality
         qualities += [(math.nan, math.nan)] * (len(plans) - len(qualities))
         for plan, quality in zip(plans, qualities, strict=True):
             episode.add_plan(plan, quality)
@@ -288,16 +292,17 @@ class PlannerThread:
         shift = controller.passed(self._first + last, self._first + step)
         actions = controller(state, obs, shift, step)
         self._plans.append(TimedPlan(len(self._plans), step, begun, self._clock.now() - begun, actions))
-        self._qualities.append(controller.quality())  # last, because the plant may be waiting for the plan
+        # append the quality last, because the plant may be waiting for the plan
+        self._qualities.append(controller.quality())
 
 
 _unfinished: "weakref.WeakSet[threading.Thread]" = weakref.WeakSet()
 
 
 def _interrupt_unfinished() -> None:
-    """End planner threads at the exit of the program; otherwise Python frees memory that the engine uses, and crashes.
+    """End planner threads when the program exits, because Python would otherwise free memory that the engine uses.
 
-    Python raises the exception in the thread once the engine's current call returns, after one iteration of the plan.
+    Python raises SystemExit in the thread after the engine's current call, at most one iteration of the plan later.
     """
     for thread in list(_unfinished):
         if thread.is_alive() and thread.ident is not None:

@@ -1,4 +1,4 @@
-"""Choose the largest setting of a planner whose plans meet the deadline in real time, from measured planning times."""
+"""Measure planning times, and choose the largest setting of a planner that meets a real-time deadline."""
 
 import bisect
 import dataclasses
@@ -12,22 +12,22 @@ from lyceum_warp.controllers.real_time import control_async
 from lyceum_warp.env import Env
 
 SHARE = 0.8
-"""Largest share of the deadline that the 99 % planning time may take."""
+"""Largest 99 % quantile of the planning time, as a fraction of the deadline."""
 
-_SECONDS = 0.4  # duration of a measurement, and its least number of steps
+_SECONDS = 0.4  # duration and minimum number of steps of a measurement
 _STEPS = 12
 
 
 @dataclasses.dataclass(frozen=True)
 class RealTimeSetting:
-    """The settings of a planner that determine its planning time."""
+    """Settings of a planner that determine its planning time."""
 
     samples: int
     """Number of samples."""
     horizon: int
     """Number of steps in a plan."""
     physics: str | None = None
-    """Name of the physics of the planner's worlds; None if it is not chosen by name."""
+    """Name of the physics options of the planner's worlds; None for options without a name."""
 
     def __str__(self) -> str:
         physics = "" if self.physics is None else f", physics {self.physics}"
@@ -36,20 +36,23 @@ class RealTimeSetting:
 
 @dataclasses.dataclass(frozen=True)
 class RealTimeChoice:
-    """A setting, and the measurements that led to it. Planning times are 99 % quantiles in seconds."""
+    """A chosen setting of a planner, and the measurements for the choice.
+
+    Planning times are 99 % quantiles in seconds.
+    """
 
     setting: RealTimeSetting
-    """The largest setting that meets the deadline, or else the fastest that was measured."""
+    """The largest setting that meets the deadline, or else the fastest measured setting."""
     planning_time: float
-    """Its planning time."""
+    """Planning time of the setting."""
     deadline: float
-    """Longest time of a plan, seconds."""
+    """Longest permitted planning time, seconds."""
     larger: tuple[int, float] | None
-    """The smallest measured number of samples that misses the deadline, and its planning time."""
+    """The smallest measured number of samples that misses the deadline, and the planning time with it."""
 
     @property
     def replan_every(self) -> int:
-        """Number of deadlines from one plan to the next: 1 if plans meet the deadline."""
+        """Number of deadlines from one plan to the next plan; 1 if plans meet the deadline."""
         return max(1, math.ceil(self.planning_time / (SHARE * self.deadline)))
 
     def __str__(self) -> str:
@@ -68,16 +71,17 @@ def choose_setting(
     *,
     deadline: float,
 ) -> RealTimeChoice:
-    """Choose the largest number of samples whose plans meet a deadline.
+    """Choose the largest number of samples with which plans meet a deadline.
 
-    If the smallest number of samples misses the deadline, shorter horizons are tried, and then other physics.
+    If the smallest number of samples misses the deadline, the function tries shorter horizons, and then other physics
+    options.
 
     Args:
         samples: Numbers of samples, in ascending order.
-        horizons: Horizons, the preferred one first.
-        physics: Names of physics, the preferred one first.
-        measure: Returns the 99 % quantile of a setting's planning times, seconds.
-        deadline: Longest time of a plan, seconds.
+        horizons: Horizons in the order of preference.
+        physics: Names of physics options in the order of preference.
+        measure: Function from a setting to the 99 % quantile of its planning times, seconds.
+        deadline: Longest permitted planning time, seconds.
 
     Returns:
         The choice. If no setting meets the deadline, the choice is the fastest measured setting.
@@ -95,7 +99,7 @@ def choose_setting(
                     missed.append(RealTimeChoice(setting, found, deadline, None))
                 else:
                     low = tried
-                # times grow at most in proportion to the number of samples
+                # planning times grow at most in proportion to the number of samples
                 reachable = bisect.bisect(samples, samples[tried] * budget / found) - 1
                 tried = min(max(reachable, low + 1), high - 1)
             if low >= 0:

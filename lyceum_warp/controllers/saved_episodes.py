@@ -1,4 +1,4 @@
-"""Load saved episodes for playback, and make an environment that fits them."""
+"""Load saved episodes for playback, and make an environment that accepts their states."""
 
 import os
 import stat
@@ -13,14 +13,14 @@ from lyceum_warp.task import Task
 
 
 def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajectory]:
-    """Load episodes of one task whose states have the same layout.
+    """Load episodes of one task with states of the same layout.
 
     Args:
         paths: Files written by ``Trajectory.save``, ``lyceum-warp plan`` or ``lyceum-warp eval --episodes-to``. The
             ``.npz`` files of a folder are loaded in alphabetical order.
 
     Returns:
-        The episodes by file, in the given order.
+        Map from files to episodes, in the order of ``paths``.
 
     Raises:
         FileNotFoundError: A file does not exist, or a folder holds no episode.
@@ -33,7 +33,7 @@ def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajec
         first = next(iter(episodes))
         _check_same(first, episodes[first], path, episodes[path])
     if not episodes:
-        raise ValueError("there is no episode to load: give at least one file")
+        raise ValueError("there is no episode to load: pass at least one file")
     return episodes
 
 
@@ -42,23 +42,23 @@ def episode_env(
 ) -> Env:
     """Make an environment for the states of saved episodes, with one world and no automatic resets.
 
-    The environment has the parameters, the model and the physics of the first episode. ``env.set_state`` accepts the
-    states of all given episodes.
+    The environment has the parameters, the model and the physics options of the first episode. ``env.set_state``
+    accepts the states of all given episodes.
 
-    Files of episodes may come from other people, and they name a task file, which is run as Python code. Without
-    ``task``, this function runs a task file only if the file and its folder belong to this user or to root, and no
-    other user can write to them.
+    Files of episodes may come from other people, and name a task file that is run as Python code. Without ``task``,
+    this function runs a task file only if the file and its folder belong to this user or to root, and no other user can
+    write to the file or folder.
 
     Args:
         episodes: The episodes, as ``load_episodes`` returns them.
-        task: The task. Required if it was defined in a notebook, if its file has moved, or if other users can write to
-            the file. The given task must have the same name as the episodes' task.
+        task: The task. The task is required if it was defined in a notebook, if the task's file has moved, or if other
+            users can write to the file. The given task must have the same name as the episodes' task.
         changes: Additional options and parameters of ``lw.make``.
 
     Raises:
         FileNotFoundError: The file of the task or of its model is missing.
-        ValueError: The task cannot be found or has a different name, other users can write to its file, or the states
-            do not fit the task.
+        ValueError: The task cannot be found or has a different name, other users can write to the task's file, or the
+            states do not fit the task.
     """
     if isinstance(episodes, Trajectory):
         episodes = {Path("the episode"): episodes}
@@ -72,7 +72,7 @@ def episode_env(
         kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
         raise kind(f"{path} cannot be shown: {error}") from error
     if env.task.name != first.task:
-        raise ValueError(f"{path} is an episode of the task {first.task!r}, not of {env.task.name!r}")
+        raise ValueError(f"{path} is an episode of the task {first.task!r}, not of the task {env.task.name!r}")
     check_episode(env, first, path)
     return env
 
@@ -89,12 +89,12 @@ def check_episode(env: Env, episode: Trajectory, name: str | Path = "the episode
         ValueError: The episode has a different task, or its states have a different layout.
     """
     if episode.task != env.task.name:
-        raise ValueError(f"{name} is an episode of the task {episode.task!r}, not of {env.task.name!r}")
+        raise ValueError(f"{name} is an episode of the task {episode.task!r}, not of the task {env.task.name!r}")
     now = {part: [place.start, place.stop] for part, place in env.state_space.parts.items()}
     if difference := _difference(episode.state_parts, now):
         raise ValueError(
-            f"{name} does not fit the task {episode.task!r} as it is now, whose states have {difference}: the task or "
-            "its model has changed, or options such as dynamics are missing"
+            f"{name} does not fit the current task {episode.task!r}, whose states have {difference}: the task or its "
+            "model has changed, or options such as dynamics are missing"
         )
 
 
@@ -116,16 +116,17 @@ def _files(paths: Iterable[str | Path]) -> list[Path]:
 def _check_same(first: Path, one: Trajectory, path: Path, other: Trajectory) -> None:
     if other.task != one.task:
         raise ValueError(
-            f"{path} is an episode of the task {other.task!r}, and {first} of {one.task!r}: load them separately"
+            f"{path} is an episode of the task {other.task!r}, and {first} of the task {one.task!r}: load the files "
+            "separately"
         )
     if difference := _difference(one.state_parts, other.state_parts):
-        raise ValueError(f"{path} is of another model than {first}: its states have {difference}")
+        raise ValueError(f"{path} is of a different model than {first}: its states have {difference}")
 
 
 def _difference(wanted: Mapping[str, Sequence[int]], found: Mapping[str, Sequence[int]]) -> str:
     """Describe the first difference between two state layouts, such as "qpos of 7 numbers, not 9".
 
-    Empty if they are equal.
+    The description is empty if the layouts are equal.
     """
     for name in {**wanted, **found}:
         one, other = (parts[name][1] - parts[name][0] if name in parts else None for parts in (wanted, found))
@@ -140,15 +141,16 @@ def _task(path: Path, episode: Trajectory, given: str | Path | type[Task] | None
     if given is not None:
         return find_task(given)
     spelled = episode.source.get("task", episode.task if "task" not in episode.source else None)
-    advice = f"give the task that {path} was made with, as a file that defines it"
+    advice = f"pass a file that defines the task of {path}"
     if spelled is None:
-        raise ValueError(f"the task {episode.task!r} was defined in a notebook or a program: {advice}")
+        raise ValueError(f"the task {episode.task!r} was defined in a notebook or a script: {advice}")
     file = spelled.partition(":")[0]
     if file.endswith(".py") and not Path(file).is_file():
         raise FileNotFoundError(f"the file of the task {episode.task!r}, {file}, does not exist any more: {advice}")
     if file.endswith(".py") and (reason := _foreign(Path(file).resolve())):
         raise ValueError(
-            f"{path} names the task file {file}, which would be run as code, and {reason}: if you trust it, give it as "
+            f"{path} names the task file {file}, which would be run as code, and {reason}: if you trust the file, "
+            "pass it as "
             f"the task, with --task {spelled} or task={spelled!r}"
         )
     try:
@@ -160,9 +162,9 @@ def _task(path: Path, episode: Trajectory, given: str | Path | type[Task] | None
 
 
 def _foreign(file: Path) -> str:
-    """Explain why a file may hold another user's code, such as "it can be written by other users".
+    """Explain why a file may contain another user's code, such as "it can be written by other users".
 
-    Empty if it cannot.
+    The explanation is empty if the file cannot contain another user's code.
     """
     if not hasattr(os, "getuid"):
         return "this system does not say who can write it"
@@ -176,7 +178,7 @@ def _foreign(file: Path) -> str:
 
 
 def _is_private(group: int) -> bool:
-    """Whether a group is root's or has only this user as a member (many systems give each user a group)."""
+    """Check whether a group belongs to root or has only this user as a member, as on many systems."""
     import grp
     import pwd
 

@@ -19,7 +19,7 @@ from lyceum_warp.support.versions import versions
 FORMAT = 1
 """Version of the file format. The version increases when older releases cannot read new files."""
 
-# dtype and axes of each array; axes with the same name have the same length
+# each array has a dtype and axes; axes with the same name have the same length
 _ARRAYS = {
     "states": (torch.float64, ("steps + 1", "state_size")), "obs": (torch.float32, ("steps + 1", "nobs")),
     "actions": (torch.float32, ("steps", "nu")), "rewards": (torch.float32, ("steps",)),
@@ -41,17 +41,17 @@ _SCALARS: dict[str, Callable[[Any], Any]] = {
 class Trajectory:
     """One episode of one world, the plant, under a controller. All tensors are on the CPU.
 
-    Step k leads from state k to state k + 1 under action k. To replay the episode bit for bit on the same engine, set
-    the first state with ``set_state`` and step with each action.
+    In step k, the plant moves from state k to state k + 1 under action k. To replay the episode bit for bit on the same
+    engine, set the first state with ``set_state`` and step with each action.
 
-    Times are seconds of wall time. The clock starts before the first plan in a synchronous run, and after it in an
-    asynchronous run.
+    Times are seconds of wall time. The clock starts before the first plan in a synchronous run, and after the first
+    plan in an asynchronous run.
     """
 
     states: torch.Tensor
-    """States, (steps + 1, state_size) float64. After a fault the last state is the first state of the next episode."""
+    """States, (steps + 1, state_size) float64. After a fault, the last state is the first state of the next episode."""
     obs: torch.Tensor
-    """Observations of the states, (steps + 1, nobs) float32. After a fault the last valid observation is repeated."""
+    """Observations of the states, (steps + 1, nobs) float32. After a fault, the last valid observation is repeated."""
     actions: torch.Tensor
     """Applied actions, (steps, nact) float32."""
     rewards: torch.Tensor
@@ -63,17 +63,17 @@ class Trajectory:
     times: torch.Tensor
     """Time at which each action was applied, (steps,) float64, seconds."""
     ages: torch.Tensor
-    """Age of each action when it was applied, (steps,) float64, seconds: the time since the plant was in the plan's
-    initial state. In a synchronous run the age of a plan's first action is the planning time."""
+    """Age of each action when it was applied, (steps,) float64, seconds. The age is the time since the plant was in the
+    plan's initial state. In a synchronous run, the age of a plan's first action is the planning time."""
     late: torch.Tensor
-    """Whether each step started late because the previous step was not finished in time, (steps,) bool. Always False in
-    a synchronous run."""
+    """Whether each step started late because the previous step was not finished in time, (steps,) bool. In a
+    synchronous run, no step is late."""
     plan_of: torch.Tensor
-    """Index of the plan that each action is from, (steps,) int64."""
+    """Index of the plan that contains each action, (steps,) int64."""
     plan_steps: torch.Tensor
-    """Index of the state that each plan starts from, (plans,) int64."""
+    """Index of each plan's initial state, (plans,) int64."""
     plan_starts: torch.Tensor
-    """Time at which planning started, (plans,) float64, seconds. Negative for the first plan of an asynchronous run."""
+    """Time at which planning started, (plans,) float64, seconds; negative for the first plan of an asynchronous run."""
     plan_times: torch.Tensor
     """Planning time, including the copy of the actions to the CPU, (plans,) float64, seconds."""
     plan_failed: torch.Tensor
@@ -81,7 +81,7 @@ class Trajectory:
     plan_effective: torch.Tensor
     """Effective sample size of each plan, (plans,) float64: 0 if all samples failed, NaN if unknown."""
     timestep: float
-    """Simulated seconds in a step."""
+    """Simulated duration of a step, seconds."""
     period: float
     """Wall time between two steps, seconds; in a synchronous run equal to ``timestep``."""
     wall_seconds: float
@@ -89,7 +89,7 @@ class Trajectory:
     mode: str
     """"sync" if the plant waited for each plan, "async" if it ran in real time."""
     done_reason: int
-    """Bits of ``Done``: why the episode ended; 0 if the run stopped earlier."""
+    """Reason why the episode ended, as bits of ``Done``; 0 if the run stopped earlier."""
     task: str
     """Name of the task."""
     engine: str
@@ -101,17 +101,17 @@ class Trajectory:
     seed: int | None
     """Seed of the initial state and of the controller, or None."""
     controller: Mapping[str, Any]
-    """The controller's ``name``, and its settings, ``engine`` and ``device`` if it has them."""
+    """The controller's ``name``, and settings, ``engine`` and ``device`` if the controller has them."""
     state_parts: Mapping[str, Sequence[int]]
-    """Columns of the named parts of a state: [start, stop]."""
+    """Columns of the named parts of a state, as [start, stop]."""
     obs_parts: Mapping[str, Sequence[int]]
     """Columns of the named parts of an observation."""
     action_names: Sequence[str]
     """Names of the action columns."""
     source: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Arguments of ``lw.make`` from which ``episode_env`` rebuilds the plant: ``task``, a name or "file:class" (None
-    for a task from a notebook or script); ``params``, the names of the parameters that were given; and ``options``.
-    Empty in files of earlier releases."""
+    for a task from a notebook or script); ``params``, the names of the given parameters; and ``options``. Files of
+    earlier releases lack these arguments."""
 
     @property
     def steps(self) -> int:
@@ -144,10 +144,10 @@ class Trajectory:
         return torch.arange(self.steps) - self.plan_steps[self.plan_of]
 
     def part(self, name: str) -> torch.Tensor:
-        """View of one part of all states, (steps + 1, size), such as ``part("qpos")``.
+        """Get a view of one part of all states, (steps + 1, size), such as ``part("qpos")``.
 
         Raises:
-            ValueError: The states have no such part.
+            ValueError: The states have no part of this name.
         """
         if name not in self.state_parts:
             raise ValueError(f"the states have no part {name!r}: they have {', '.join(self.state_parts)}")
@@ -167,13 +167,14 @@ class Trajectory:
         arrays: dict[str, Any] = {name: getattr(self, name).numpy() for name in _ARRAYS}
         arrays["info"] = np.array(json.dumps(info))
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replaced(path) as temporary, temporary.open("wb") as file:  # numpy would append .npz to a path
+        # pass an open file, because numpy would append .npz to a path
+        with replaced(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, **arrays)
         return path
 
     @classmethod
     def load(cls, path: str | Path) -> "Trajectory":
-        """Read a file that ``save`` wrote. This runs no code from the file.
+        """Read a file that ``save`` wrote. Loading runs no code from the file.
 
         Raises:
             FileNotFoundError: The file does not exist.
@@ -182,7 +183,8 @@ class Trajectory:
         path = Path(path)
         try:
             with np.load(path, allow_pickle=False) as file:
-                info = {"source": {}, **json.loads(str(file["info"]))}  # files of earlier releases have no source
+                # files of earlier releases lack the entry "source"
+                info = {"source": {}, **json.loads(str(file["info"]))}
                 if info["format"] <= FORMAT:
                     content: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
                     _check(content)
@@ -211,7 +213,7 @@ def _check(arrays: Mapping[str, torch.Tensor]) -> None:
 
 
 def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor]) -> None:
-    """Reject parts outside their array's columns, and a source with wrong types."""
+    """Reject parts outside the columns of an array, and a source with wrong types."""
     for name, array in (("state_parts", "states"), ("obs_parts", "obs")):
         for part, place in scalars[name].items():
             whole = isinstance(place, list) and len(place) == 2 and all(type(column) is int for column in place)
@@ -226,7 +228,7 @@ def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor
 
 
 def provenance(env: Env) -> dict[str, Any]:
-    """A trajectory's attributes that describe its origin: task, engine, versions, column names."""
+    """Collect the attributes that describe a trajectory's origin: task, engine, versions, column names."""
     params = {name: np.asarray(value).tolist() for name, value in env.task.params.items()}
     return {
         "task": env.task.name, "engine": env.engine.name, "params": params, "versions": versions(env.device.alias),
@@ -241,7 +243,7 @@ _PLACEMENT = ("engine", "device", "nthread", "nworld", "seed", "first_world", "a
 
 
 def source(env: Env) -> dict[str, Any]:
-    """Arguments that rebuild an environment; see ``Trajectory.source``."""
+    """Collect the arguments that rebuild an environment; see ``Trajectory.source``."""
     task = env.task.task
     options = {name: value for name, value in env.options.given().items() if name not in _PLACEMENT}
     model = options.pop("model", None)

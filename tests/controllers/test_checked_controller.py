@@ -25,13 +25,13 @@ def env() -> lw.Env:
 
 
 def test_an_object_that_is_not_callable_is_refused(env: lw.Env) -> None:
-    with pytest.raises(ValueError, match=r"must be callable with \(state, obs\), not str 'towards': give a function"):
+    with pytest.raises(ValueError, match=r"must be callable with \(state, obs\), not str 'towards': pass a function"):
         control(env, "towards")  # type: ignore[arg-type]
 
 
 def test_a_policy_of_one_argument_is_refused(env: lw.Env) -> None:
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
-    with pytest.raises(ValueError, match=r"GaussianPolicy takes one argument: give lambda state, obs: policy\(obs\)"):
+    with pytest.raises(ValueError, match=r"GaussianPolicy takes one argument: pass lambda state, obs: policy\(obs\)"):
         control(env, policy, steps=2)
     assert control(env, lambda state, obs: policy(obs), steps=2).steps == 2
 
@@ -83,7 +83,9 @@ def test_action_holds_or_interpolates_a_coarser_plan_and_skips_steps_of_a_finer_
 def test_a_time_step_that_is_not_a_multiple_of_the_plants_is_refused(env: lw.Env) -> None:
     planner = StepPlanner(env)
     planner.timestep = 1.5 * env.timestep
-    with pytest.raises(ValueError, match=r"step of 0.03 s must be a whole multiple of the plant's, 0.02 s, or a whole"):
+    with pytest.raises(
+        ValueError, match=r"step of 0.03 s must be a whole multiple or a whole fraction of the plant's step of 0.02 s"
+    ):
         CheckedController(planner, env)
 
 

@@ -29,7 +29,7 @@ def test_unsuitable_environments_are_refused(run: Run, shared_env: SharedEnv) ->
     for options, message in (
         ({}, "one world without automatic resets, not nworld=1, autoreset=True"),
         ({"nworld": 2, "autoreset": False}, "one world without automatic resets, not nworld=2, autoreset=False"),
-        ({"autoreset": False, "horizon": 0}, "give steps, or a horizon"),
+        ({"autoreset": False, "horizon": 0}, "pass steps, or give make"),
     ):
         with pytest.raises(ValueError, match=message):
             run(shared_env("point_mass", **options), towards)

@@ -75,16 +75,16 @@ def test_a_task_of_a_file_is_found_again(task_file: TaskFile, tmp_path: Path) ->
     made = episode_env(load_episodes(path))
     assert made.task.name == "my_pole" and made.task.task is env.task.task
     gone = dataclasses.replace(lw.Trajectory.load(path), source={"task": "/nowhere/my_pole.py:MyPole"})
-    with pytest.raises(FileNotFoundError, match=r"/nowhere/my_pole.py, does not exist any more: give the task"):
+    with pytest.raises(FileNotFoundError, match=r"/nowhere/my_pole.py, does not exist any more: pass a file"):
         episode_env(gone)
     assert episode_env(gone, task=file).task.name == "my_pole"
     notebook = dataclasses.replace(gone, source={"task": None})
-    with pytest.raises(ValueError, match="'my_pole' was defined in a notebook or a program: give the task"):
+    with pytest.raises(ValueError, match="'my_pole' was defined in a notebook or a script: pass a file"):
         episode_env(notebook)
     unknown = dataclasses.replace(gone, source={}, task="nonesuch")
-    with pytest.raises(ValueError, match="there is no task 'nonesuch': .*; give the task that the episode was made"):
+    with pytest.raises(ValueError, match="there is no task 'nonesuch': .*; pass a file that defines the task"):
         episode_env(unknown)
-    with pytest.raises(ValueError, match="is an episode of the task 'my_pole', not of 'point_mass'"):
+    with pytest.raises(ValueError, match="is an episode of the task 'my_pole', not of the task 'point_mass'"):
         episode_env(gone, task="point_mass")
 
 
@@ -92,7 +92,7 @@ def test_episodes_of_two_tasks_are_refused(folder: Path, tmp_path: Path) -> None
     other = lw.control(lw.make("cartpole", autoreset=False, horizon=3), lambda state, obs: torch.zeros(1))
     path = other.save(tmp_path / "other.npz")
     first = min(folder.iterdir())
-    message = f"{path} is an episode of the task 'cartpole', and {first} of 'point_mass'"
+    message = f"{path} is an episode of the task 'cartpole', and {first} of the task 'point_mass'"
     with pytest.raises(ValueError, match=message):
         load_episodes([folder, path])
 
@@ -101,15 +101,13 @@ def test_an_episode_of_another_model_is_refused(folder: Path, env: lw.Env, tmp_p
     first = min(folder.iterdir())
     plain = lw.make("point_mass", autoreset=False, horizon=3)
     path = lw.control(plain, towards).save(tmp_path / "plain.npz")
-    with pytest.raises(ValueError, match=f"{path} is of another model than {first}: its states have no body_mass"):
+    with pytest.raises(ValueError, match=f"{path} is of a different model than {first}: its states have no body_mass"):
         load_episodes([first, path])
     with pytest.raises(
-        ValueError, match=rf"another model than {path}: its states have body_mass of \d+ numbers, not 0"
+        ValueError, match=rf"a different model than {path}: its states have body_mass of \d+ numbers, not 0"
     ):
         load_episodes([path, first])
-    with pytest.raises(
-        ValueError, match=r"mine does not fit the task 'point_mass' as it is now, whose states have no bo"
-    ):
+    with pytest.raises(ValueError, match=r"mine does not fit the current task 'point_mass', whose states have no bo"):
         check_episode(plain, lw.Trajectory.load(first), "mine")
 
 
@@ -140,7 +138,7 @@ def test_a_task_file_that_others_can_write_is_not_run(
     file = folder / "evil.py"
     file.write_text(f"open({str(ran)!r}, 'w').close()\nraise ValueError('it ran')\n")
     episode = dataclasses.replace(episodes[0], source={"task": f"{file}:PointMass"})
-    advice = f"if you trust it, give it as the task, with --task {file}:PointMass"
+    advice = f"if you trust the file, pass it as the task, with --task {file}:PointMass"
     for place, mode, reason in ((file, 0o646, "it"), (folder, 0o777, f"its folder {folder}")):
         before = place.stat().st_mode
         place.chmod(mode)

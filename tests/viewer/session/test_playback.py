@@ -73,8 +73,12 @@ def test_states_are_played_back_without_rewards(shared_env: SharedEnv) -> None:
 def test_an_episode_that_does_not_fit_is_refused(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:
     env = lw.make("point_mass", dynamics=["body_mass"])
     for worlds, episodes, message in (
-        (shared_env("hopper"), trajectories, "episode 0 is an episode of the task 'point_mass', not of 'hopper'"),
-        (env, trajectories[0], "episode 0 does not fit the task 'point_mass' as it is now"),
+        (
+            shared_env("hopper"),
+            trajectories,
+            "episode 0 is an episode of the task 'point_mass', not of the task 'hopper'",
+        ),
+        (env, trajectories[0], "episode 0 does not fit the current task 'point_mass'"),
         (shared_env("hopper"), torch.zeros(3, 4), "or states of shape"),
     ):
         with pytest.raises(ValueError, match=message):
