@@ -1,11 +1,11 @@
 """Capture the phases of a step, a reset or a plan as graphs, and replay them.
 
-``Graphs.sequence`` turns a list of phases into calls: consecutive phases that consist of Warp launches become one
-graph, captured once and replayed. If the engine's calls also consist of launches, a whole step is one graph; otherwise
-they run between the graphs.
+``Graphs.sequence`` turns a list of phases into calls. Consecutive phases that consist of Warp launches become one
+graph, which is captured once and replayed. If the engine's calls also consist of launches, a whole step is one graph;
+otherwise the engine's calls run between the graphs.
 
 On the CPU, Warp runs each launch in one thread. Phases that process every world independently therefore become several
-graphs, one for each part of the worlds, and threads replay them in parallel.
+graphs, one for each part of the worlds, and threads replay the graphs in parallel.
 """
 
 import contextlib
@@ -24,36 +24,36 @@ from lyceum_warp.support.arrays import part_of_worlds
 from lyceum_warp.support.upstream import TILES_ON_CPU, separate_captures, separate_tiles, tiles
 
 Calls = tuple[Callable[[], None], ...]
-"""The result of ``Graphs.sequence``: functions to be called in order."""
+"""The result of ``Graphs.sequence``, functions to call in order."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Phase:
-    """One entry of a list of phases.
+    """One phase of a step, a reset or a plan.
 
     A phase must launch the same kernels on the same arrays each time, because a graph stores addresses and scalar
     arguments.
     """
 
     name: str
-    """Name of the phase, by which the rules of an environment find it."""
+    """Name of the phase, which ``lyceum_warp.testing`` uses."""
     run: Callable[[], object]
     """The function to run, without arguments."""
     engine: bool = False
     """Whether the phase calls the engine; such a call consists of Warp launches only on some engines."""
     by_world: bool = False
-    """Whether the phase only launches kernels through functions like ``arrays.launch_worlds`` and no world depends on
-    another world, so that threads can share the worlds."""
+    """Whether threads can share the worlds: the phase launches kernels only through functions such as
+    ``arrays.launch_worlds``, and no world depends on another world."""
 
 
 class Graphs:
-    """Turns phases into sequences of calls, and can discard all their graphs.
+    """Turns phases into sequences of calls, and can discard all captured graphs.
 
     Args:
-        device: Where the launches run; Warp can also capture graphs on the CPU.
-        enabled: False calls every phase directly.
-        capture_engine: Whether calls into the engine are made of launches.
-        workers: Threads that replay the graphs of phases with ``by_world``; by default only the caller's.
+        device: Device of the launches; Warp can also capture graphs on the CPU.
+        enabled: Whether to capture graphs; False calls every phase directly.
+        capture_engine: Whether calls of the engine consist of launches, so that graphs can include them.
+        workers: Threads that replay the graphs of phases with ``by_world``; by default only the caller's thread.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Graphs:
         return tuple(calls)  # type: ignore[arg-type]
 
     def forget(self) -> None:
-        """Discard all graphs because arrays were replaced; the next calls capture them again."""
+        """Discard all graphs because arrays were replaced; the next calls capture new graphs."""
         for graph in self._graphs:
             graph.forget()
 
@@ -100,20 +100,20 @@ class Graphs:
 
 
 SECONDS_A_THREAD = 5e-4
-"""Minimum seconds of work per thread; waking a thread takes about 20 microseconds."""
+"""Minimum work per thread in seconds; waking a thread takes about 20 microseconds."""
 TIMED = 8
-"""Number of timed calls. Only the fastest call is used, because other programs may slow some calls down."""
+"""Number of timed calls. Only the fastest call counts, because other programs may slow some calls down."""
 _CAPTURING = threading.RLock()
-"""Allows one capture at a time: controllers and viewers use environments in separate threads."""
+"""Lock that allows one capture at a time, because controllers and viewers use environments in separate threads."""
 separate_captures()
 separate_tiles()
 
 
 @contextlib.contextmanager
 def capturing() -> Iterator[None]:
-    """Context for a capture: excludes other captures and disables Python's garbage collection.
+    """Exclude other captures and disable Python's garbage collection during a capture.
 
-    A garbage collection may delete unused torch graphs, which makes a CUDA capture fail.
+    Garbage collection may delete unused torch graphs, which makes a CUDA capture fail.
     """
     with _CAPTURING:
         collects = gc.isenabled()
@@ -126,11 +126,11 @@ def capturing() -> Iterator[None]:
 
 
 class _Graph:
-    """Captures functions that consist of launches: as a single graph or, if they take long, as one graph per thread.
+    """Captures functions that consist of launches as one graph, or for long functions as one graph per thread.
 
-    The first call runs the functions directly, which loads their modules. The second call captures and replays them;
-    later calls only replay. With workers, the first replays are timed, and the shortest time determines how many
-    threads share the work.
+    The first call runs the functions directly, which loads their modules. The second call captures and replays the
+    functions; later calls only replay. With workers, the first replays are timed, and the shortest time determines how
+    many threads share the work.
     """
 
     def __init__(

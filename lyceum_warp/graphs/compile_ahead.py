@@ -1,8 +1,8 @@
 """Compile kernels ahead of time, on all cores, with progress on stderr.
 
-Warp compiles a module silently at the first launch of one of its kernels. On a new GPU this takes a minute or more per
-task. ``compile_ahead`` rehearses the launches of a step, and compiles in parallel the modules that are not in Warp's
-cache.
+Warp compiles a module silently at the first launch of one of its kernels. On a new GPU, compilation takes a minute or
+more per task. ``compile_ahead`` rehearses the launches of a step, and compiles in parallel the modules that are not in
+Warp's cache.
 """
 
 import concurrent.futures
@@ -23,7 +23,7 @@ from lyceum_warp.support.upstream import is_compiled
 
 @dataclasses.dataclass(frozen=True)
 class Built:
-    """Modules of kernels that were compiled."""
+    """Result of compiling kernels ahead of time."""
 
     modules: int = 0
     """Number of modules that were compiled."""
@@ -34,13 +34,13 @@ class Built:
 
 
 def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str) -> Built:
-    """Compile the kernels that a function launches and that are not cached, and report progress on stderr.
+    """Compile the uncached kernels that a function launches, and report progress on stderr.
 
     Args:
-        function: Consists of launches. The function is called with kernel launches disabled, so its arrays may hold
-            garbage afterwards.
-        device: Where the kernels will run.
-        purpose: What the kernels are for, such as "hopper"; shown in the report.
+        function: Function that consists of launches. The function runs with kernel launches disabled, so the function's
+            arrays may contain garbage afterwards.
+        device: Device on which the kernels will run.
+        purpose: Purpose of the kernels for the report, such as "hopper".
     """
     with rehearse() as rehearsal:
         function()
@@ -56,7 +56,7 @@ def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str)
             for future in concurrent.futures.as_completed(futures):
                 report(*future.result())
         finally:
-            pool.shutdown(cancel_futures=True)  # needed after an error or Ctrl-C
+            pool.shutdown(cancel_futures=True)  # cancel remaining modules after an error or Ctrl-C
     return Built(len(missing), len(wanted) - len(missing), time.perf_counter() - start)
 
 
@@ -67,12 +67,12 @@ def _load(module: Any, block: int, device: wp.Device) -> tuple[str, float]:
 
 
 def _block(device: wp.Device, block: int | None) -> int:
-    """The block size of a launch; on the CPU it is always 1."""
+    """Get the block size of a launch, which is always 1 on the CPU."""
     return 1 if device.is_cpu else block or 256
 
 
 class _Report:
-    """A progress bar on a terminal; elsewhere a line for each module."""
+    """Prints a progress bar on a terminal, and elsewhere a line for each module."""
 
     def __init__(self, total: int, purpose: str, device: wp.Device) -> None:
         self._text = f"compiling kernels of {purpose} for {device.alias}"

@@ -1,4 +1,4 @@
-"""Find the kernels that a function launches, without launching anything."""
+"""Find the kernels that a function launches, without launching the kernels."""
 
 import contextlib
 import threading
@@ -13,30 +13,30 @@ _lock = threading.RLock()
 
 
 class Rehearsal:
-    """Replaces Warp's launch functions, and lists the kernels' modules."""
+    """Replaces Warp's launch functions, and lists the modules of launched kernels."""
 
     def __init__(self) -> None:
         self.modules: dict[tuple[Any, int | None], None] = {}
-        """Modules and block sizes (None for the default), in launch order."""
+        """Modules and block sizes (None for Warp's default) in launch order."""
 
     def launch(self, kernel: Any, dim: Any = None, *args: Any, block_dim: int | None = None, **kwargs: Any) -> None:
         """Add a kernel's module to the list."""
-        # a generic kernel is compiled for its argument types; an empty launch loads no module
+        # skip generic kernels, which are compiled for argument types, and empty launches, which load no module
         if np.prod(dim) and not kernel.is_generic:
             self.modules[kernel.module, block_dim] = None
 
 
 @contextlib.contextmanager
 def rehearse() -> Iterator[Rehearsal]:
-    """List this thread's launches instead of running them; graph branches and loops run once.
+    """List this thread's launches instead of running the kernels; graph branches and loops run once.
 
-    Copies and allocations still run, so arrays may hold garbage afterwards. Other threads launch as usual; only their
-    rehearsals wait.
+    Copies and allocations still run, so arrays may contain garbage afterwards. Other threads launch as usual, but wait
+    before rehearsing.
     """
     rehearsal = Rehearsal()
     functions: dict[str, Callable[..., None]] = {"launch": rehearsal.launch, "launch_tiled": rehearsal.launch}
     functions |= {"capture_while": _loop, "capture_if": _branch}
-    # sorts and scans would read garbage
+    # do not run sorts and scans, which would read garbage
     functions |= dict.fromkeys(("radix_sort_pairs", "segmented_sort_pairs", "array_scan"), _nothing)
     with _lock, replaced_in_this_thread(functions):
         yield rehearsal

@@ -5,10 +5,10 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 
 class Workers:
-    """A pool of threads that start on demand and end once this object is garbage-collected.
+    """Pool of threads that start on demand and end when the pool is garbage-collected.
 
     Args:
-        nthread: The largest number of threads, including the caller's.
+        nthread: Maximum number of threads, including the caller's thread.
     """
 
     def __init__(self, nthread: int) -> None:
@@ -16,13 +16,13 @@ class Workers:
         self._pool = ThreadPoolExecutor(max(nthread - 1, 1), "lyceum_warp")
 
     def run(self, calls: Sequence[Callable[[], object]]) -> None:
-        """Call functions that release Python's GIL, in parallel, and wait until all have returned.
+        """Call functions that release Python's GIL in parallel, and wait until all functions have returned.
 
         Args:
-            calls: The functions, at most ``nthread``; the caller's thread runs the first one.
+            calls: The functions, at most ``nthread``; the caller's thread runs the first function.
 
         Raises:
-            BaseException: Any exception that a function raised; the other functions have ended.
+            BaseException: Any exception that a function raised; all other functions have ended.
         """
         others: list[Future[object]] = []
         try:
@@ -36,7 +36,7 @@ class Workers:
 
 
 def _wait(futures: Sequence[Future[object]]) -> None:
-    """Wait for all futures, even after an interrupt, because they write arrays that the caller reads next."""
+    """Wait for all futures, even after an interrupt, because the functions write arrays that the caller reads next."""
     interrupt: KeyboardInterrupt | None = None
     while not all(future.done() for future in futures):
         try:

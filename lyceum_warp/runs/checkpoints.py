@@ -16,24 +16,24 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.files import newer_format, replaced
 
 FORMAT = 1
-"""Format version of run folders and their files. It increases when older releases can no longer read new files."""
+"""Format version of run folders and their files. The version increases when older releases cannot read new files."""
 
 _FIX = "restore the file from a copy, or train again into another folder"
 
 PolicyContent = dict[str, Any]
-"""A saved policy: ``iteration``, ``policy``, and ``value`` if there is a value function."""
+"""Content of a saved policy: ``iteration``, ``policy``, and ``value`` if there is a value function."""
 
 _CLASSES: dict[str, type[nn.Module]] = {"policy": GaussianPolicy, "value": ValueFunction}
-"""Default classes of networks, for files that name no class."""
+"""Classes of networks for files that name no class."""
 
 
 def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> PolicyContent:
-    """Copy a policy and a value function to the CPU, to be written to a file.
+    """Copy a policy and a value function to the CPU, in the format of a file.
 
     Args:
         iteration: Number of complete iterations.
         policy: The policy.
-        value: The value function, if there is one.
+        value: The value function, or None.
     """
     content: PolicyContent = {"lyceum_warp": FORMAT, "iteration": iteration}
     for name, module in (("policy", policy), ("value", value)):
@@ -56,67 +56,67 @@ def write_content(path: Path, content: Mapping[str, Any], **options: Any) -> Non
         content: The content to write.
         options: Additional arguments for ``replaced``.
     """
-    buffer = io.BytesIO()  # Python's write raises OSError on a full disk; torch raises other errors
+    buffer = io.BytesIO()  # write with Python, which raises OSError on a full disk, unlike torch
     torch.save(content, buffer)
     with replaced(path, **options) as temporary:
         temporary.write_bytes(buffer.getbuffer())
 
 
 def policy_of(content: PolicyContent, path: Path, given: nn.Module | None = None) -> nn.Module:
-    """Make the policy stored in a file.
+    """Make a policy from a file's content.
 
     Args:
-        content: The file's content.
-        path: The file, for messages.
-        given: A policy into which the weights are loaded; by default a new one.
+        content: Content of the file.
+        path: The file, which error messages name.
+        given: A policy into which the weights are loaded; by default a new policy.
 
     Raises:
-        ValueError: The file holds no policy, or its weights do not fit the given policy.
+        ValueError: The file has no policy, or the weights do not fit the given policy.
     """
     return _filled(content, path, "policy", given)
 
 
 def value_of(content: PolicyContent, path: Path) -> nn.Module:
-    """Make the value function stored in a file.
+    """Make a value function from a file's content.
 
     Args:
-        content: The file's content.
-        path: The file, for messages.
+        content: Content of the file.
+        path: The file, which error messages name.
 
     Raises:
-        ValueError: The file holds no value function.
+        ValueError: The file has no value function.
     """
     if "value" not in content:
-        raise ValueError(f"{path} holds no value function: the run's algorithm has none")
+        raise ValueError(f"{path} has no value function, because the run's algorithm learns none")
     return _filled(content, path, "value", None)
 
 
 def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | None) -> nn.Module:
-    """Load weights from a file into a network."""
+    """Load a network's weights from a file's content."""
     saved = content[name]
     try:
         module = given
         if module is None:
-            with torch.device("meta"):  # compare shapes before memory is allocated
+            with torch.device("meta"):  # compare shapes before allocating memory
                 module = _made(name, saved)
         if different := _difference(module, saved["state"]):
-            fix = _FIX if given is None else "give one with the same structure as the run's"
-            raise ValueError(f"its {name} has other parameters ({different}): {fix}")
+            fix = _FIX if given is None else "pass a policy with the same structure as the run's policy"
+            raise ValueError(f"its {name} has different parameters ({different}): {fix}")
         module = _made(name, saved) if given is None else given
         module.load_state_dict(saved["state"])
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     except (KeyError, TypeError, RuntimeError, NotImplementedError) as error:
-        raise ValueError(f"{path} holds no {name} of lyceum_warp ({_first_sentence(error)}): {_FIX}") from error
+        raise ValueError(f"{path} contains no {name} of lyceum_warp ({_first_sentence(error)}): {_FIX}") from error
     return module
 
 
 def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
-    """Make a network of the class and shape named in a file; the class must be part of this package."""
+    """Make a network with the class and shape in a file; the class must be part of this package."""
     kind: Any = _CLASSES[name]
     own, shape = saved.get("class"), saved["shape"]
     if own is not None:
-        # modules outside algos may run code when they are imported
+        # do not import modules outside algos, because importing may run code
         kind = pydoc.locate(own) if own.startswith("lyceum_warp.algos.") and shape is not None else None
         if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
             fix = f": give one, as in lw.load(run, policy={own.rpartition('.')[2]}(...))" if name == "policy" else ""
@@ -131,21 +131,21 @@ def check_sizes(policy: Any, env: Env, path: Path) -> None:
     Args:
         policy: The policy.
         env: The environment.
-        path: The policy's file, for the message.
+        path: The policy's file, which the error message names.
 
     Raises:
-        ValueError: The sizes differ.
+        ValueError: The sizes of the policy and the environment differ.
     """
     sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
     if sizes != wanted:
         raise ValueError(
             f"the policy in {path} takes {sizes[0]} observations and gives {sizes[1]} actions, but the task "
-            f"{env.task.name!r} has {wanted[0]} and {wanted[1]}: use a task with the sizes that it was trained on"
+            f"{env.task.name!r} has {wanted[0]} and {wanted[1]}: use a task with the policy's sizes"
         )
 
 
 def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
-    """The first difference between the weight shapes of a module and of a file; "" if they are equal."""
+    """Describe the first difference between the weight shapes of a module and of a file; "" if all shapes are equal."""
     own, saved = ({name: tuple(part.shape) for name, part in s.items()} for s in (module.state_dict(), state))
     saved = {name: own[name] for name in getattr(module, "LATER", ())} | saved
     for name in {**own, **saved}:
@@ -158,12 +158,12 @@ def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
 def read_checkpoint(
     path: Path, device: str | torch.device = "cpu", *, parts: tuple[str, ...] = ("iteration", "policy", "state")
 ) -> dict[str, Any]:
-    """Read a checkpoint or a saved policy. This executes no code from the file.
+    """Read a checkpoint or a saved policy. Reading executes no code from the file.
 
     Args:
         path: The file.
-        device: Device for its tensors.
-        parts: Names of required entries.
+        device: Device for the tensors.
+        parts: Names of the entries that the file must have.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -174,10 +174,10 @@ def read_checkpoint(
     try:
         data = io.BytesIO(path.read_bytes())
         with zipfile.ZipFile(data) as archive:
-            # torch writes checksums but does not check them, and it ignores the content of records marked as folders
+            # test the checksums that torch does not test, and find records marked as folders, which torch ignores
             folders = (record.filename for record in archive.infolist() if record.external_attr & 0x10)
             if (name := archive.testzip() or next(folders, None)) is not None:
-                raise ValueError(f"its record {name} is corrupt")
+                raise ValueError(f"the record {name} is corrupt")
         data.seek(0)
         content = torch.load(data, map_location=device, weights_only=True)
     except OSError:
@@ -192,14 +192,14 @@ def read_checkpoint(
     if missing := set(parts) - content.keys():
         raise ValueError(f"the checkpoint {path} lacks {', '.join(sorted(missing))}: {_FIX}")
     if wrong := [name for name, value in content.items() if not _KINDS.get(name, lambda value: True)(value)]:
-        raise ValueError(f"the checkpoint {path} has other content than lyceum_warp writes as {wrong[0]}: {_FIX}")
+        raise ValueError(f"the checkpoint {path} has an invalid value for {wrong[0]}: {_FIX}")
     if "state" in content and content["state"].get("iteration", content["iteration"]) != content["iteration"]:
         raise ValueError(f"the policy and the state in the checkpoint {path} are from different iterations: {_FIX}")
     return content
 
 
 def _is_network(saved: Any) -> bool:
-    """Whether a value has the structure of a saved network."""
+    """Check whether a value has the structure of a saved network."""
     return (
         isinstance(saved, dict)
         and isinstance(saved.get("shape", ""), dict | None)
@@ -215,7 +215,7 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
     "state": lambda value: isinstance(value, dict) and type(value.get("iteration", 0)) is int,
     "score": lambda value: isinstance(value, dict) and isinstance(value.get("value"), int | float),
 }  # fmt: skip
-"""Checks of the entries of a file, by name."""
+"""Map entries of a checkpoint to functions that check their values."""
 
 
 def check_format(path: Path, number: Any) -> None:
@@ -226,7 +226,7 @@ def check_format(path: Path, number: Any) -> None:
         number: The format number in the file.
 
     Raises:
-        ValueError: The format is unknown.
+        ValueError: This release does not know the format.
     """
     if not isinstance(number, int) or number < 1:
         raise ValueError(f"{path} was not written by lyceum_warp: its format is {number!r}")
@@ -235,6 +235,6 @@ def check_format(path: Path, number: Any) -> None:
 
 
 def _first_sentence(error: BaseException) -> str:
-    """The first sentence of an error message; torch's messages can fill a page."""
+    """Get the first sentence of an error message, because torch's messages can fill a page."""
     text = str(error).strip() or type(error).__name__
     return text.splitlines()[0].split(". ")[0][:200]

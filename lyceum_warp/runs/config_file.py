@@ -9,7 +9,7 @@ from lyceum_warp.runs.checkpoints import check_format
 from lyceum_warp.support.validate import whole_number
 
 _COUNT = 0
-"""Marks entries that are non-negative whole numbers."""
+"""Mark of entries that are non-negative whole numbers."""
 
 _ENTRIES: dict[str, Any] = {
     "task": str | None, "params": dict, "options": dict, "physics": dict, "engine": str, "device": str,
@@ -19,7 +19,7 @@ _ENTRIES: dict[str, Any] = {
     "kept": {"name": str, "file": str, "model": str, "model_given": bool, "source_hash": str, "model_hash": str,
              "modules": dict, "program": bool},
 }  # fmt: skip
-"""The kind of each entry: a type, ``_COUNT``, or the entries of a dict. All entries are optional."""
+"""Map each entry to a type, ``_COUNT``, or a dict of entries. All entries are optional."""
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -48,7 +48,7 @@ def read_config(path: Path) -> dict[str, Any]:
 
 def _check(entries: Any, kinds: Mapping[str, Any]) -> None:
     if not isinstance(entries, dict):
-        raise ValueError(f"{entries!r} is in place of {', '.join(kinds)}")
+        raise ValueError(f"{entries!r} is not a dict of {', '.join(kinds)}")
     for name in kinds.keys() & entries.keys():
         kind, value = kinds[name], entries[name]
         if kind is _COUNT:

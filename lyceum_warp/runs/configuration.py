@@ -32,14 +32,14 @@ log = logging.getLogger(__name__)
 ALGORITHMS: dict[str, tuple[Any, Any]] = {
     "npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig), "sac": (SAC, SACConfig)
 }  # fmt: skip
-"""The algorithms of the command line and config.json, by name: the classes of the learner and its hyperparameters."""
+"""Map names of algorithms, as in config.json, to the classes of the learner and its hyperparameters."""
 
 
 def describe(learner: Learner) -> dict[str, Any]:
-    """The content of config.json; ``Configuration`` makes the same learner from it."""
+    """Make the content of config.json, from which ``Configuration`` makes the same learner."""
     env, options = learner.env, learner.env.options
     others = options.given()
-    if learner.team.neighbours > 1:  # a different number of processes may resume the run
+    if learner.team.neighbours > 1:  # omit nthread, because a different number of processes may resume the run
         others.pop("nthread", None)
     for name in others.keys() - {"nthread", "horizon", "graphs", "fields", "dynamics"}:
         del others[name]
@@ -65,10 +65,10 @@ def describe(learner: Learner) -> dict[str, Any]:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Configuration:
-    """A run's configuration: the task, the environment's options, and the algorithm with its hyperparameters."""
+    """Configuration of a run: the task, the environment's options, and the algorithm with its hyperparameters."""
 
     task: str | None
-    """The task's name or file; None if it was defined in a notebook."""
+    """The task's name or file; None if the task was defined in a notebook."""
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """The task's parameters."""
     options: EnvOptions
@@ -78,22 +78,22 @@ class Configuration:
     hyperparameters: Any
     """The algorithm's hyperparameters; None for an algorithm that is not in ``ALGORITHMS``."""
     seed: int | None = None
-    """Seed of the algorithm; None for the environment's seed."""
+    """Seed of the algorithm; None means the environment's seed."""
     threads: int = 1
     """Threads of torch."""
 
     @classmethod
     def of(cls, run: Run) -> "Configuration":
-        """Read the configuration of a run.
+        """Read a run's configuration.
 
         Raises:
             ValueError: A value is missing or not valid.
         """
         config = run.config
         try:
-            # earlier releases accepted options as --param and stored them in "params", or had no "physics"
+            # earlier releases stored options given as --param in "params", or had no "physics"
             words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
-            words.pop("unroll", None)  # an option of earlier releases, which changed no numbers
+            words.pop("unroll", None)  # ignore an option of earlier releases that changed no numbers
             base = EnvOptions(
                 engine=config["engine"], device=config["device"], nworld=config["nworld"], seed=config["seed"]
             )  # fmt: skip
@@ -122,10 +122,10 @@ class Configuration:
 
         Args:
             team: The processes that train together.
-            run: The run whose task to use. The run's copies replace files that have moved or changed.
-            networks: The initial policy and value function; None for new ones.
-            note: Called with messages about the task's files.
-            task: A task to use instead of the run's; its current version is used.
+            run: The run that provides the task. The run's copies replace files that have moved or changed.
+            networks: The initial policy and value function; None for new networks.
+            note: Function that is called with messages about the task's files.
+            task: A task, in its current version, to use instead of the run's task.
             trust: Whether to execute a run's task although this user did not make the run on this machine.
 
         Raises:
@@ -146,7 +146,7 @@ class Configuration:
                 assert self.task is not None
                 env = Env(self.task, options, **self.params)
             else:
-                # rank 0 checks the run; other machines may have no record of it
+                # only rank 0 checks trust, because other machines may have no record of the run
                 env = run_env(run, options, self.params, note=note, task=task, trust=trust or not team.leads)
             seed = self.options.seed if self.seed is None else self.seed
             learner: Learner = ALGORITHMS[self.algorithm][0](env, *networks, self.hyperparameters, seed=seed, team=team)
@@ -154,17 +154,17 @@ class Configuration:
 
 
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:
-    """The initial policy and value function for a learner, and their iteration.
+    """Get the initial policy and value function for a learner, and the iteration that saved them.
 
     Args:
         run: The run that saved the networks.
-        which: Which policy of the run; None to resume the run. The networks are then None if the hyperparameters
-            describe them completely. The hyperparameters are not enough if the run started from the networks of another
-            run, or if it uses ``limit``.
+        which: Policy of the run, or None to resume the run. When resuming, the networks are None if the hyperparameters
+            describe the networks completely, which they do not if the run started from another run's networks or uses
+            ``limit``.
 
     Raises:
-        FileNotFoundError: The run has no such policy.
-        ValueError: The file cannot be read, or the policy has a class outside this package.
+        FileNotFoundError: The run has no policy of this name or number.
+        ValueError: The file cannot be read, or the policy's class is not part of this package.
     """
     path = run.policy_file("last" if which is None else which)
     content = read_checkpoint(path, parts=("iteration", "policy"))

@@ -28,7 +28,7 @@ from lyceum_warp.support.versions import versions
 
 _CONFIG, _VERSIONS, _TASK = "config.json", "versions.json", "task"
 _UNFINISHED = {f"{name}.tmp" for name in (_CONFIG, _VERSIONS, _TASK)}
-"""Files that may remain if the creation of a run is killed; they are replaced."""
+"""Files that may remain if the creation of a run is killed, and that a new run replaces."""
 
 log = logging.getLogger(__name__)
 
@@ -41,12 +41,12 @@ class Run:
     ``config.json``     the task, its parameters, the engine, its physics, the seed and all hyperparameters
     ``versions.json``   versions of the packages and of Python, the machine, the commit
     ``metrics.csv``     one row per iteration
-    ``policy.pt``       the last policy, and its value function
+    ``policy.pt``       the last policy and the value function
     ``best.pt``         the policy with the best return
     ``policies/``       the policy of every n-th iteration, with ``keep_every``
     ``checkpoint.pt``   the complete state to resume from exactly, at the same iteration as ``policy.pt``
-    ``previous.pt``     the checkpoint before it
-    ``replay/``         the replay buffer of the checkpoint, for algorithms that have one
+    ``previous.pt``     the previous checkpoint
+    ``replay/``         the replay buffer of the checkpoint, if the algorithm has one
     ``transfer.json``   the verdict of ``lw.transfer`` on the last policy
     ``task/``           copies of the task's file, modules and model, unless they are part of the package
     =================== ======================================================================================
@@ -101,9 +101,9 @@ class Run:
         if (folder / _CONFIG).exists():
             way = f", or continue the run (train --resume {folder}, or resume=True in Python)"
             trained = (folder / "checkpoint.pt").exists()  # a planner run has no checkpoint
-            raise ValueError(f"{folder} holds a run: give another folder{way if trained else ''}")
+            raise ValueError(f"{folder} contains a run: use another folder{way if trained else ''}")
         if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - _UNFINISHED):
-            raise ValueError(f"{folder} exists and is not an empty folder: give another folder")
+            raise ValueError(f"{folder} exists and is not an empty folder: use another folder")
 
     @classmethod
     def create(
@@ -116,14 +116,14 @@ class Run:
     ) -> "Run":
         """Create a run folder with the versions, the copy of the task, and the configuration.
 
-        If this fails, nothing is left in the folder. The run is recorded as trusted in the user's state directory
-        (``lyceum_warp.runs.trust``), so its task can be executed later without ``trust=True``.
+        A failure leaves no files in the folder. The run is recorded as trusted in the user's state directory
+        (``lyceum_warp.runs.trust``), so later calls can execute the run's task without ``trust=True``.
 
         Args:
             folder: A new or empty folder.
-            config: The configuration, consisting of JSON values.
-            device: Device of the run; see ``versions``.
-            files: Contents of the folder ``task``, by path: files to copy, or bytes.
+            config: The configuration, which consists of JSON values.
+            device: Device of the run, of which ``versions.json`` names the hardware.
+            files: Contents of the folder ``task`` by path; each is a file to copy, or bytes.
 
         Raises:
             ValueError: The folder is not empty, or is a file.
@@ -131,7 +131,7 @@ class Run:
         folder = Path(folder)
         cls.check_free(folder)
         run = cls(folder, {"format": FORMAT, **config})
-        text = json.dumps(run.config, indent=2)  # this may fail, so the folder is created later
+        text = json.dumps(run.config, indent=2)  # conversion may fail, so create the folder afterwards
         task, now = folder / f"{_TASK}.tmp", json.dumps(versions(device), indent=2)
         try:
             shutil.rmtree(task, ignore_errors=True)
@@ -145,7 +145,7 @@ class Run:
                 versions_file.write_text(now)
                 if files:
                     task.rename(run.task_folder)
-        except BaseException:  # a full disk, a folder that cannot be written, a signal
+        except BaseException:  # for example a full disk, missing permissions or a signal
             shutil.rmtree(folder, ignore_errors=True)
             raise
         remember(folder, run.config)
@@ -156,7 +156,7 @@ class Run:
         """Open the run in a folder.
 
         Raises:
-            FileNotFoundError: There is no run in the folder.
+            FileNotFoundError: The folder has no run.
             ValueError: The configuration cannot be read, or was written by a newer release.
         """
         folder = Path(folder)
@@ -172,7 +172,7 @@ class Run:
             temporary.write_text(json.dumps(self.config, indent=2))
 
     def versions(self) -> dict[str, Any]:
-        """The content of ``versions.json``; an empty dict if it is damaged."""
+        """Read ``versions.json``; an empty dict if the file is damaged."""
         try:
             then = json.loads((self.folder / _VERSIONS).read_text())
         except (OSError, ValueError, RecursionError):
@@ -181,10 +181,10 @@ class Run:
 
     @contextlib.contextmanager
     def settings(self) -> Iterator[None]:
-        """Add the path of ``config.json`` to errors that its settings may cause within the block.
+        """Add the path of ``config.json`` to errors that the run's settings may cause within the with block.
 
         Raises:
-            ValueError: The settings do not make an environment or a learner.
+            ValueError: The settings are not valid for an environment or a learner.
             FileNotFoundError: A file named in the settings is missing.
         """
         try:
@@ -202,7 +202,8 @@ class Run:
             now: The current versions, from ``versions()``.
 
         Returns:
-            The changed entries, as (then, now). ``versions.json`` lists them under "resumed".
+            The changed entries, each as a pair of the old and the new version. ``versions.json`` lists the changed
+            entries under "resumed".
         """
         then = self.versions()
         changed, noted = {}, {}
@@ -220,31 +221,31 @@ class Run:
         """Read the rows of the metrics table. Empty cells become None.
 
         Raises:
-            FileNotFoundError: The run has no table yet.
+            FileNotFoundError: The run has no metrics table yet.
             ValueError: The table cannot be read.
         """
         if not self.metrics.exists():
-            raise FileNotFoundError(f"there is no {self.metrics}: the run has no complete iteration")
+            raise FileNotFoundError(f"there is no file {self.metrics}, because the run has no complete iteration")
         return read_metrics(self.metrics)
 
     # policies
 
     def numbered(self, iteration: int) -> Path:
-        """Path of an iteration's policy, if it was saved."""
+        """Get the path of an iteration's policy, which exists if the policy was saved."""
         return self.folder / "policies" / f"{iteration:06d}.pt"
 
     def policy_file(self, which: str | int = "last") -> Path:
-        """Path of a saved policy.
+        """Get the path of a saved policy.
 
         Args:
             which: "last", "best", or the number of an iteration.
 
         Raises:
-            FileNotFoundError: The run has no such policy; the message lists its policies.
-            ValueError: ``which`` is something else.
+            FileNotFoundError: The run has no policy of this name or number; the message lists the run's policies.
+            ValueError: ``which`` is neither a name nor a number.
         """
         if which == "last":
-            # earlier releases wrote the policy only into the checkpoint
+            # earlier releases stored the policy only in the checkpoint
             return self.policy if self.policy.is_file() else self.checkpoint
         if which == "best":
             path = self.best
@@ -264,10 +265,10 @@ class Run:
         return ", ".join([*known, *map(str, numbers)]) or "none yet"
 
     def best_score(self, *, note: Callable[[str], None] = log.warning) -> tuple[int, float] | None:
-        """The iteration and the score of the best policy; None if there is no best policy.
+        """Read the iteration and the score of the best policy; None if there is no best policy.
 
         Args:
-            note: Called with a message if the file of the best policy is damaged.
+            note: Function that is called with a message if the file of the best policy is damaged.
         """
         if not self.best.is_file():
             return None
@@ -285,20 +286,20 @@ class Run:
 
         Args:
             content: The policy and the value function.
-            state: The state of the algorithm: tensors, numbers, strings, and dicts and lists of them.
+            state: The state of the algorithm, which consists of tensors, numbers, strings, dicts and lists.
         """
         write_content(self.policy, content)
         checkpoint = {**content, "state": dict(state)}
         write_content(self.checkpoint, checkpoint, durable=True, previous=self.previous)
 
     def read(self, device: str | torch.device = "cpu", *, note: Callable[[str], None] = log.warning) -> dict[str, Any]:
-        """Read the checkpoint: ``iteration``, ``policy``, ``state``, and ``value`` if there is one.
+        """Read the checkpoint's ``iteration``, ``policy`` and ``state``, and ``value`` if the checkpoint has one.
 
-        If it is broken or missing, the previous checkpoint is read instead.
+        If the checkpoint is broken or missing, the previous checkpoint is read instead.
 
         Args:
-            device: Device for its tensors.
-            note: Called with a message if the previous checkpoint is read.
+            device: Device for the tensors.
+            note: Function that is called with a message if the previous checkpoint is read.
 
         Raises:
             FileNotFoundError: The run has no checkpoint.
@@ -313,7 +314,9 @@ class Run:
                 note(f"{cause}: {self.previous}, of iteration {content['iteration']}, is used instead")
                 return content
             if isinstance(error, ValueError) and self.policy.is_file():
-                raise ValueError(f"{error}, or begin with the run's policy: train --from {self.folder}") from error
+                raise ValueError(
+                    f"{error}, or start a new run with the old run's policy: train --from {self.folder}"
+                ) from error
             raise
 
 
@@ -327,18 +330,18 @@ def load(
     """Load a run's policy, including its observation normaliser. ``policy.act(obs)`` returns actions without noise.
 
     For a ``GaussianPolicy``, ``policy(obs)`` returns the same mean actions. The parameters are frozen; ``NPG(env,
-    policy=lw.load(RUN))`` unfreezes and trains them.
+    policy=lw.load(RUN))`` unfreezes and trains the parameters.
 
     Args:
-        run: A run's folder, or a policy file in it.
+        run: A run's folder, or a policy file in this folder.
         which: "last", "best" (see ``train``), or the number of a saved iteration.
         policy: A policy into which the weights are loaded; required for custom classes of policies or networks.
-        device: Device for its parameters.
+        device: Device for the parameters.
 
     Raises:
-        FileNotFoundError: There is no such run, or it has no such policy.
+        FileNotFoundError: The run does not exist, or has no policy of this name or number.
         ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release; or ``policy``
-            is missing although required, or does not fit.
+            is required but missing, or does not fit the file.
     """
     check_kind("policy", policy, torch.nn.Module | None, "as lw.GaussianPolicy(nobs, nact, network=...)")
     content, path = _content(run, which, device)
@@ -346,36 +349,36 @@ def load(
 
 
 def load_value(run: str | Path | Run, *, which: str | int = "last", device: str | torch.device = "cpu") -> Any:
-    """Load a run's value function, a ``ValueFunction``: ``value(obs, step)`` predicts discounted returns.
+    """Load a run's value function, a ``ValueFunction`` that predicts discounted returns by ``value(obs, step)``.
 
-    A run of SAC has a ``TwinCritic`` instead: ``value(obs, unit_action)``.
+    A run of SAC has a ``TwinCritic`` instead, which is called as ``value(obs, unit_action)``.
 
     Args:
-        run: A run's folder, or a file in it with a value function.
+        run: A run's folder, or a file with a value function in this folder.
         which: See ``load``.
-        device: Device for its parameters.
+        device: Device for the parameters.
 
     Raises:
-        FileNotFoundError: There is no such run, or it has no such file.
-        ValueError: The file holds no value function, is broken, was not written by lyceum_warp, or was written by a
-            newer release.
+        FileNotFoundError: The run or the file does not exist.
+        ValueError: The file has no value function, is broken, was not written by lyceum_warp, or was written by a newer
+            release.
     """
     content, path = _content(run, which, device)
     return value_of(content, path).to(device).eval().requires_grad_(False)
 
 
 def _content(run: str | Path | Run, which: str | int, device: str | torch.device) -> tuple[PolicyContent, Path]:
-    """The content of a saved policy, and its file."""
+    """Read the content of a saved policy, and return the content and the file."""
     check_kind("run", run, str | Path | Run, "a run's folder")
     check_kind("which", which, str | int, "as 'last', 'best' or 100")
     check_kind("device", device, str | torch.device, "as 'cpu' or 'cuda:0'")
     try:
         torch.device(device)
     except RuntimeError as error:
-        raise ValueError(f"there is no device {device!r}: use one as 'cpu' or 'cuda:0'") from error
+        raise ValueError(f"there is no device {device!r}: use a device such as 'cpu' or 'cuda:0'") from error
     if isinstance(run, (str, Path)) and Path(run).is_file():
         if which != "last":
-            raise ValueError(f"{run} is a file with one policy: give the run's folder to choose {which!r}")
+            raise ValueError(f"{run} is a file with one policy: pass the run's folder to choose {which!r}")
         path = Path(run)
     else:
         run = run if isinstance(run, Run) else Run.open(run)

@@ -16,20 +16,20 @@ from typing import IO, Any
 log = logging.getLogger(__name__)
 
 BEAT, STALE = 10.0, 120.0
-"""Seconds between heartbeats, and seconds without a heartbeat after which a lock is stale."""
+"""Seconds between heartbeats, and seconds without heartbeats after which a lock is stale."""
 
 
 class RunLock:
-    """The lock of a run, held within a ``with`` block: a file ``lock`` that stores the process and its host.
+    """Lock of a run within a with block, by a file ``lock`` that stores the process and its host.
 
-    A daemon thread updates the file's modification time every 10 s. A lock from this host is taken over if its process
-    is gone or its time is more than 120 s old. Clocks of different hosts differ, so a lock from another host is taken
-    over only on request.
+    A daemon thread updates the lock file's modification time every 10 s. A process takes over a lock from the same host
+    if the locking process is gone or the modification time is more than 120 s old. Clocks of different hosts differ, so
+    a lock from another host is taken over only on request.
 
     Args:
         folder: The run's folder.
         take_over: Whether to take over the lock from any other process.
-        note: Called with a message if the lock is taken over.
+        note: Function that is called with a message if the lock is taken over.
 
     Raises:
         ValueError: Another process has the lock.
@@ -50,14 +50,14 @@ class RunLock:
                 reason = "on request" if self._take_over else self._free(other)
                 if not reason:
                     raise ValueError(
-                        f"the run in {self._folder} is being written by {_named(other)}: end it first, or take the run "
-                        "over with --take-over (take_over=True in Python)"
+                        f"the run in {self._folder} is being written by {_named(other)}: end this process first, or "
+                        "take the run over with --take-over (take_over=True in Python)"
                     )
                 self._note(f"the run in {self._folder} is taken over from {_named(other)}, {reason}")
             file.truncate(0)
             file.write(self._own)
             file.flush()
-            os.utime(self._path, (time.time(),) * 2)  # the time of this host, not of a file server
+            os.utime(self._path, (time.time(),) * 2)  # use this host's time, not a file server's time
         self._thread.start()
         return self
 
@@ -80,7 +80,7 @@ class RunLock:
                 raise ValueError(f"the run in {self._folder} was taken over by {_named(_owner(text))}")
 
     def _free(self, other: dict[str, Any]) -> str:
-        """The reason why another process's lock can be taken over; "" if it cannot."""
+        """Explain why another process's lock can be taken over; "" if it cannot be taken over."""
         if other.get("host") != platform.node():
             return ""
         if _started(other["pid"]) != other["started"]:
@@ -96,10 +96,10 @@ class RunLock:
 
     @contextlib.contextmanager
     def _file(self, mode: str) -> Iterator[IO[str]]:
-        """Open the lock file exclusively within the block."""
+        """Open the lock file exclusively within the with block."""
         while True:
             with self._path.open(mode) as file:
-                with contextlib.suppress(ImportError, OSError):  # Windows, and file systems without flock
+                with contextlib.suppress(ImportError, OSError):  # Windows and some file systems have no flock
                     import fcntl
 
                     fcntl.flock(file, fcntl.LOCK_EX)
@@ -107,11 +107,11 @@ class RunLock:
                     file.seek(0)
                     yield file
                     return
-            # the file was deleted while this process waited: try again
+            # try again, because the file was deleted while this process waited
 
 
 def _owner(text: str) -> dict[str, Any]:
-    """The process stored in a lock file; an empty dict if the file is damaged."""
+    """Parse the process in a lock file; an empty dict if the file is damaged."""
     try:
         other = json.loads(text)
         return {"host": str(other["host"]), "pid": int(other["pid"]), "started": str(other["started"])}
@@ -124,10 +124,7 @@ def _named(owner: dict[str, Any]) -> str:
 
 
 def _started(pid: int) -> str:
-    """The start time of a process, to distinguish it from later processes with the same pid.
-
-    Returns "" if the process does not exist.
-    """
+    """Get the start time of a process, which distinguishes processes with the same pid; "" if there is no process."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         return "" if state[0] == "Z" else state[19]  # a zombie process counts as ended

@@ -10,11 +10,11 @@ from lyceum_warp.support.files import replaced
 
 
 def append_row(path: Path, row: Mapping[str, Any]) -> None:
-    """Append a row. New columns, for instance after a change of the task, are empty in earlier rows.
+    """Append a row. New columns, for example after a change of the task, are empty in earlier rows.
 
     Args:
         path: The table; it need not exist.
-        row: Values by column. None becomes an empty cell; floats are written with all digits.
+        row: Values by the names of columns. A value of None becomes an empty cell; floats are written with all digits.
     """
     lines: list[list[str]] = []
     if path.exists():
@@ -32,15 +32,15 @@ def append_row(path: Path, row: Mapping[str, Any]) -> None:
             for line in lines[1:]:
                 writer.writerow([*line, *[""] * (len(columns) - len(known))])
     with path.open("a", newline="") as file:
-        csv.writer(file).writerow(map(row.get, columns))  # None becomes an empty cell
+        csv.writer(file).writerow(map(row.get, columns))  # csv writes None as an empty cell
 
 
 def read_metrics(path: Path, *, lines: list[str] | None = None) -> list[dict[str, float | None]]:
-    """Read the rows. An empty cell is None.
+    """Read the rows. Empty cells become None.
 
     Args:
         path: The table.
-        lines: Lines to read instead of the file's.
+        lines: Lines to read instead of the table's lines.
 
     Raises:
         ValueError: A cell is not a number, or the rows differ in length.
@@ -53,7 +53,7 @@ def read_metrics(path: Path, *, lines: list[str] | None = None) -> list[dict[str
 
 
 def _lines(path: Path) -> list[str]:
-    """The lines of the table, with their ends."""
+    """Read the lines of the table, including line ends."""
     try:
         with path.open(newline="") as file:
             return file.readlines()
@@ -69,7 +69,7 @@ def cut_rows(path: Path, iteration: int) -> None:
         iteration: Number of the last iteration to keep. The first row need not be iteration 1.
 
     Raises:
-        ValueError: A row to be kept is damaged. The file does not change.
+        ValueError: A row to keep is damaged; the table then does not change.
     """
     if not path.exists():
         return
@@ -78,7 +78,7 @@ def cut_rows(path: Path, iteration: int) -> None:
     column = header.index("iteration") if "iteration" in header else None
     kept = []
     for i, line in enumerate(lines):
-        number: float = i  # the line's index if the cell is broken; read_metrics below reports broken lines
+        number: float = i  # use the line's index if the cell is broken, because read_metrics reports broken lines
         with contextlib.suppress(ValueError, IndexError, csv.Error):
             number = float(next(csv.reader([line]))[column]) if i and column is not None else i
         if line.endswith("\n") and (i == 0 or number <= iteration):

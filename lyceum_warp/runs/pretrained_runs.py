@@ -1,4 +1,4 @@
-"""Find the pretrained policies of the package: run folders without training state, whose weights are float16."""
+"""Find the package's pretrained policies, which are run folders with float16 weights and without training state."""
 
 import difflib
 from pathlib import Path
@@ -10,15 +10,14 @@ _FOLDER = Path(__file__).resolve().parents[1] / "pretrained"
 
 
 def pretrained_tasks() -> list[str]:
-    """Names of the tasks that have a pretrained policy."""
+    """List the tasks that have a pretrained policy."""
     return sorted(path.parent.name.replace("-", "/") for path in _FOLDER.glob("*/config.json"))
 
 
 def pretrained_run(task: str) -> Path:
-    """The folder of a task's pretrained policy; functions such as ``lw.load`` accept it like any run.
+    """Get the folder of a task's pretrained policy, which functions such as ``lw.load`` accept like any run.
 
-    The folder's config.json holds the settings of the training and, under ``evaluated``, the return that the policy
-    reached.
+    The folder's config.json has the training settings and, under ``evaluated``, the policy's return.
 
     Example:
         >>> policy = lw.load(lw.pretrained_run("hopper"))
@@ -33,12 +32,14 @@ def pretrained_run(task: str) -> Path:
     if task not in tasks:
         close = difflib.get_close_matches(task, tasks, 1)
         hint = f"did you mean {close[0]}? " if close else ""
-        raise ValueError(f"there is no pretrained policy of {task!r}: {hint}there are {', '.join(tasks)}")
+        raise ValueError(
+            f"there is no pretrained policy of {task!r}: {hint}the tasks with a policy are {', '.join(tasks)}"
+        )
     return _FOLDER / file_name(task)
 
 
 def pretrained_text(run: Run) -> str:
-    """A line on the training of a pretrained policy, and on the settings that differ from the task's defaults."""
+    """Describe in one line a pretrained policy's training and the settings that differ from the task's defaults."""
     config, found = run.config, run.config["evaluated"]
     settings = {**config["params"], **config["physics"], **config["options"]}
     given = ", ".join(f"{name} {value}" for name, value in settings.items()) or "its defaults"

@@ -1,9 +1,9 @@
-"""Save a replay buffer beside a run's checkpoint, in files that are written only once.
+"""Save a replay buffer in files that are written only once, in addition to a run's checkpoint.
 
 The sequence of all steps is divided into equal parts, each about 1/64 of the buffer, with one file per part. A save
-only writes the parts that have grown, so its duration is proportional to the new steps. A part that has grown gets a
-new file name. The old files are deleted after the checkpoint has been replaced, so the checkpoint always finds its
-steps.
+only writes the parts that have grown, so the duration of a save is proportional to the number of new steps. A part that
+has grown gets a new file name. The old files are deleted after the checkpoint has been replaced, so the files always
+contain the checkpoint's steps.
 """
 
 from collections.abc import Iterator
@@ -18,19 +18,19 @@ _PARTS = 64
 
 
 def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, lock: RunLock | None) -> None:
-    """Write the parts that have grown; all ranks must call this.
+    """Write the parts of the replay buffer that have grown; all ranks must call this function.
 
     Args:
-        folder: The folder; None on ranks that do not write.
+        folder: The folder of the files; None on ranks that do not write.
         replay: The replay buffer.
         team: The processes.
         since: Number of stored steps at the last save.
-        lock: The run's lock, checked before each file is written; None with ``folder``.
+        lock: The run's lock, which is checked before each write; None if ``folder`` is None.
     """
     oldest = replay.stored - replay.count
     for start, end in _parts(replay, max(since, oldest), replay.stored):
         first = max(start, oldest)
-        rows = {  # gather concatenates along the first axis, so the axis of the worlds comes first
+        rows = {  # move the axis of the worlds first, because gather concatenates along the first axis
             name: team.gather(part.transpose(0, 1).contiguous()).transpose(0, 1).cpu().contiguous()
             for name, part in replay.rows(first, end).items()
         }
@@ -57,27 +57,27 @@ def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
         folder: The folder.
         replay: The replay buffer.
         stored: Number of stored steps.
-        own: This process's worlds.
+        own: Indices of this process's worlds.
 
     Raises:
         ValueError: A file is missing or damaged.
     """
     oldest = max(0, stored - replay.steps)
     for start, end in _parts(replay, oldest, stored):
-        # the part may have grown in a later save whose checkpoint is lost; it begins with the same steps
+        # a part's file may contain more steps after the needed steps, if the checkpoint of a later save was lost
         longer = sorted(path for path in folder.glob(f"{start:012d}-*.pt") if path.name >= _name(start, end))
         if not longer:
             raise ValueError(f"{folder} lacks steps {start} to {end} of the replay buffer")
         content = read_checkpoint(longer[0], parts=("first", "rows"))
         if content["first"] > max(start, oldest):
-            raise ValueError(f"{longer[0]} lacks steps before {content['first']}")
+            raise ValueError(f"{longer[0]} lacks the replay buffer's steps before {content['first']}")
         steps = end - content["first"]
         replay.set_rows(content["first"], {name: part[:steps, own] for name, part in content["rows"].items()})
     replay.restore(stored)
 
 
 def _parts(replay: Replay, first: int, stored: int) -> Iterator[tuple[int, int]]:
-    """Start and end of each part that has steps from ``first`` to ``stored``."""
+    """Yield the start and end of each part that has steps from ``first`` to ``stored``."""
     each = -(-replay.steps // _PARTS)
     for start in range(first // each * each, stored, each):
         yield start, min(start + each, stored)

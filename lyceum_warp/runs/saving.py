@@ -18,35 +18,35 @@ SAVE_SECONDS = 30.0
 """Maximum number of seconds between saves."""
 
 SHARE = 100
-"""A run is saved earlier once it has trained this many times as long as the last save took."""
+"""Ratio of training time to the last save's duration above which a save is due before the maximum time."""
 
 LONG = 20
-"""After a long save, a run is saved only once it has trained this many times as long as the save took."""
+"""Minimum ratio of training time to the last save's duration before the next save."""
 
 
 class Saver:
     """Writes a run's files.
 
     Rows of iterations, a new best policy and numbered policies are written immediately. The last policy and the
-    complete state are saved together: at the start, at the end, and after the first iteration that ends at least 30 s
-    after the last save, or earlier, once training has taken 100 times as long as the last save. So saves of 20 ms
-    happen every 2 s and take 1 % of the time; saves of 1 s happen every 30 s and take 3 %. After ``kill -9`` the run
-    resumes from the last save.
+    complete state are saved together: at the start, at the end, and at most 30 s after the last save, or after training
+    for 100 times the duration of the last save if this is earlier. For example, saves of 20 ms happen every 2 s and
+    take 1 % of the time; saves of 1 s happen every 30 s and take 3 % of the time. After ``kill -9``, the run resumes
+    from the last save.
 
     All ranks have a saver and make the same calls; only rank 0 writes.
 
     Args:
         run: The run; None on ranks that do not write.
-        lock: The run's lock, checked before every write; None with ``run``.
+        lock: The run's lock, which is checked before every write; None if ``run`` is None.
         learner: The algorithm.
-        keep_every: Iterations between two numbered policies; 0 for none.
-        save_every: Iterations between two saves; 0 for the rule above.
-        saved: Number of the iteration whose state is saved; -1 for none.
-        note: Called with a message if the file of the best policy is damaged.
+        keep_every: Iterations between two numbered policies; 0 for no numbered policies.
+        save_every: Iterations between two saves; 0 to save by time.
+        saved: Number of the last saved iteration; -1 before the first save.
+        note: Function that is called with a message if the file of the best policy is damaged.
     """
 
     saved: int
-    """Number of the iteration whose state is saved."""
+    """Number of the last saved iteration."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class Saver:
         self._stored = learner.replay.stored if learner.replay is not None and saved >= 0 else 0
 
     def write(self, iteration: Iteration) -> float | None:
-        """Write an iteration's row, and its policy if it is the best so far or due as a numbered policy.
+        """Write an iteration's row, and the policy if it is the best so far or due as a numbered policy.
 
         Returns:
             The return that selects the best policy; None if the iteration has no return.
@@ -81,7 +81,7 @@ class Saver:
         score = None if score is None or math.isnan(score) else score
         better = score is not None and score > self._best
         numbered = self.keep_every > 0 and learner.iteration % self.keep_every == 0
-        # an iteration's episodes are sampled by the policy before its update
+        # the policy before the update sampled the iteration's episodes
         sampled = name == "return_mean"
         before = self._before
         if better or numbered or sampled:
@@ -97,7 +97,7 @@ class Saver:
         return score
 
     def due(self) -> bool:
-        """Whether it is time to save."""
+        """Check whether it is time to save."""
         if self.save_every:
             return self.learner.iteration % self.save_every == 0
         wait = max(min(SAVE_SECONDS, SHARE * self._seconds), LONG * self._seconds)
@@ -107,7 +107,7 @@ class Saver:
         """Save the last policy and the complete state."""
         start = time.perf_counter()
         learner, run, replay = self.learner, self.run, self.learner.replay
-        state = learner.state_dict()  # gathers the worlds of all ranks
+        state = learner.state_dict()  # all ranks call state_dict, which gathers the worlds
         if replay is not None:
             write_replay(None if run is None else run.replay, replay, learner.team, self._stored, self._lock)
         with learner.team.together():

@@ -1,4 +1,4 @@
-"""Copy a run's task into its folder, and choose between the copy and the original later."""
+"""Copy a run's task into the run's folder, and later choose between the copy and the original."""
 
 import hashlib
 import io
@@ -26,20 +26,20 @@ log = logging.getLogger(__name__)
 Note = Callable[[str], None]
 
 Files = dict[Path, Path | bytes]
-"""Files, with their contents or the paths to copy from."""
+"""Map files to their contents, or to the paths from which they are copied."""
 
 _MODEL, _TABLES = "model", "tables"
 _APART = 2
-"""If a task's file is nested deeper than this below the common folder with its model, both get separate folders."""
+"""Maximum depth of a task's file below the common folder of task and model; deeper files get a separate folder."""
 _LARGEST = 512 * 2**20
-"""Models whose files exceed this number of bytes are not copied."""
+"""Maximum size of a model's files in bytes; larger models are not copied."""
 _MOST_MODULES, _LARGEST_MODULES = 100, 8 * 2**20
-"""Modules imported from a task's folder are not copied if their number, or their total size in bytes, exceeds these
+"""Maximum number and maximum total size in bytes of a task's modules; a run folder has no copy of modules beyond these
 limits."""
 
 
 def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
-    """Collect an environment's task for a run folder; tasks of the package are not copied.
+    """Collect the files of an environment's task for a run folder, except for tasks of the package.
 
     Returns:
         The entry ``kept`` of config.json, and the files for the folder ``task`` by path.
@@ -78,7 +78,7 @@ def json_value(name: str, value: Any) -> Any:
 
 
 def _table(value: Any) -> Any:
-    """The file or the array of a table parameter; None for other parameters."""
+    """Get the file or the array of a table parameter; None for any other parameter."""
     if _is_table(value):
         return Path(value)
     array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
@@ -86,23 +86,27 @@ def _table(value: Any) -> Any:
 
 
 def _is_table(value: Any) -> bool:
-    """Whether a parameter is the path of a ``.npy`` file."""
+    """Check whether a parameter is the path of a ``.npy`` file."""
     return isinstance(value, str | Path) and str(value).endswith(".npy")
 
 
 def _npy(array: np.ndarray) -> bytes:
-    """The content of a .npy file."""
+    """Make the content of a .npy file."""
     buffer = io.BytesIO()
     np.save(buffer, array)
     return buffer.getvalue()
 
 
 def _sources(file: Path, loaded: Mapping[Path, bytes]) -> dict[Path, bytes]:
-    """A task's file and, within the limits, the modules that it imports from its folder."""
+    """Get a task's file and, unless they are too many or too large, the modules that it imports from its folder."""
     size = sum(map(len, loaded.values())) - len(loaded[file])
     if len(loaded) - 1 <= _MOST_MODULES and size <= _LARGEST_MODULES:
         return dict(loaded)
-    log.info("%s imports %d modules from its folder, too many or too large to copy", file, len(loaded) - 1)
+    log.info(
+        "%s imports %d modules from its folder, which are too many or too large for a copy in the run's folder",
+        file,
+        len(loaded) - 1,
+    )
     return {file: loaded[file]}
 
 
@@ -117,20 +121,20 @@ def run_env(
 ) -> Env:
     """Make an environment for a run's task.
 
-    If a file or a model has moved or changed since the run started, the run's own copy is used, and ``note`` is called.
+    If a file or a model has moved or changed since the run started, the run's copy is used, and ``note`` is called.
     Tasks of the package are used in their current version.
 
     Args:
         run: The run.
         options: Options of the environment.
         params: Parameters of the task.
-        note: Called with each message.
-        task: A different task, used in its current version.
+        note: Function that is called with each message.
+        task: A different task, in its current version.
         trust: Whether to execute the task and read the files of a run that this user did not make on this machine; see
             ``lyceum_warp.runs.trust``.
 
     Raises:
-        ValueError: The task does not fit, or the run is not trusted.
+        ValueError: The task does not fit the run, or the run is not trusted.
         FileNotFoundError: The task or its model is missing, and the run has no copy.
     """
     kept, chosen = run.config.get("kept", {}), run.config["task"]
@@ -144,9 +148,9 @@ def run_env(
     if chosen is None or kept.get("program"):
         where = "a notebook" if chosen is None else chosen.partition(":")[0]
         raise ValueError(
-            f"the task {run.task_name!r} of the run in {run.folder} was defined in {where}, which trained it: give a "
-            f"file that only defines it (eval --task my_task.py, train my_task.py --from), or resume in "
-            "that program (resume=True)"
+            f"the task {run.task_name!r} of the run in {run.folder} was defined in {where}, which started the "
+            "training: pass a file that only defines the task (eval --task my_task.py, train my_task.py --from), or "
+            "resume in that program (resume=True)"
         )
     path, colon, attribute = chosen.partition(":")
     copy = run.task_folder / kept.get("file", "")
@@ -162,7 +166,7 @@ def run_env(
     params, copy = run_params(run, params), run.task_folder / kept.get("model", "")
     if not copy.is_file():
         return Env(chosen, options, **params)
-    if kept.get("model_given") and not isinstance(options.model, str):  # the model was made in Python
+    if kept.get("model_given") and not isinstance(options.model, str):  # the run's model was made in Python
         return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
     try:
         env = Env(chosen, options, **params)
@@ -181,7 +185,7 @@ def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, b
     Args:
         file: The task's file.
         kept: The entry ``kept`` of config.json.
-        loaded: Contents of loaded files; other files are read.
+        loaded: Contents of files that are already loaded; all other files are read.
     """
     changes = []
     for name, hashed in {file.name: kept.get("source_hash"), **kept.get("modules", {})}.items():
@@ -195,19 +199,20 @@ def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, b
 
 
 def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = True) -> None:
-    """Report differences of an environment's task and model from the run's task and model.
+    """Report how an environment's task and model differ from the run's task and model.
 
-    The environment's versions are used.
+    The environment keeps its own task and model.
 
     Args:
         run: The run.
         env: The environment.
-        note: Called with each message.
-        model: Whether to compare the compiled model, too. Other physics also change the compiled model.
+        note: Function that is called with each message.
+        model: Whether to compare the compiled model, too. Different physics options also change the compiled model.
     """
     kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
     file = next(iter(loaded), None)
-    hashed = None if kept.get("program") else kept.get("source_hash")  # a training script contains more than the task
+    # ignore changes to a training script, which contains more than the task
+    hashed = None if kept.get("program") else kept.get("source_hash")
     for change in _source_changes(file, {**kept, "source_hash": hashed}, loaded) if file is not None else ():
         note(f"{change}: it is used as it is now" if "changed" in change else change)
     if model and _model_changed(run, env):
@@ -215,7 +220,7 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = 
 
 
 def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
-    """The task parameters; the run's own copies replace missing tables."""
+    """Get the task parameters, with the run's copies in place of missing tables."""
     found = dict(params)
     for name, value in params.items():
         copy = run.task_folder / _TABLES / f"{name}.npy"
@@ -225,7 +230,7 @@ def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _model_changed(run: Run, env: Env) -> bool:
-    """Whether the model has changed since the run started; False with a different version of MuJoCo."""
+    """Check whether the model has changed since the run started; False with a different version of MuJoCo."""
     known = run.config.get("kept", {}).get("model_hash")
     return run.versions().get("mujoco") == mujoco.__version__ and known not in (None, _model_hash(env))
 
@@ -235,7 +240,7 @@ def _digest(content: bytes) -> str:
 
 
 def _model_hash(env: Env) -> str:
-    """A hash of the compiled model, independent of the process and of paths."""
+    """Hash the compiled model, independently of the process and of paths."""
     found = hashlib.sha256()
     for owner in (env.task.model, env.task.model.opt):
         for name in sorted(dir(owner)):
@@ -250,15 +255,15 @@ def _model_hash(env: Env) -> str:
 
 
 def _beside(path: Path, file: Path) -> str:
-    """The path of a module relative to the folder of a task's file."""
+    """Get the path of a module relative to the folder of a task's file."""
     return path.relative_to(file.parent).as_posix()
 
 
 def _names_in_copy(paths: Collection[Path], file: Path | None, modules: Collection[Path] = ()) -> dict[Path, str]:
-    """The paths within the folder ``task`` for a task's file, its modules and its model's files.
+    """Choose paths within the folder ``task`` for a task's file, its modules and its model's files.
 
-    Relative paths are preserved, so that the copied task finds the copied model. If the task's file and its model are
-    in distant folders, each gets a separate folder.
+    Relative paths are preserved, so that the copied task finds the copied model. If the task's file and model are in
+    distant folders, both get separate folders.
     """
     if not paths:
         return {}
@@ -271,9 +276,9 @@ def _names_in_copy(paths: Collection[Path], file: Path | None, modules: Collecti
 
 
 def _model_files(env: Env) -> tuple[Path | None, Files]:
-    """The main file and all files of a task's model.
+    """Get the main file and all files of a task's model.
 
-    A model made in Python is written as MJCF; the files that it refers to are copied unchanged.
+    A model made in Python is written as MJCF; files to which the model refers are copied unchanged.
     """
     task, given = env.task.task, env.options.model
     source = given if given is not None else task.model
@@ -288,7 +293,7 @@ def _model_files(env: Env) -> tuple[Path | None, Files]:
         spec = env.task.spec.copy()
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the environment has already logged them
+                warnings.simplefilter("ignore")  # the environment has already logged the warnings
                 spec.compile()
                 text = spec.to_xml()
         except (ValueError, mujoco.FatalError) as error:
@@ -306,10 +311,10 @@ def _model_files(env: Env) -> tuple[Path | None, Files]:
 
 
 def _dependencies(source: Path) -> list[Path]:
-    """The files that a model file refers to: includes, other models, meshes, textures, height fields."""
+    """List the files to which a model file refers: includes, other models, meshes, textures, height fields."""
     if source.suffix.lower() != ".urdf":
         return [path for name in mujoco.mju_getXMLDependencies(str(source)) if (path := Path(name)) != source]
-    root = ET.parse(source).getroot()  # MuJoCo lists no dependencies of a URDF
+    root = ET.parse(source).getroot()  # parse a URDF, because MuJoCo lists no dependencies of URDF files
     folders = [source.parent / (compiler.get("meshdir") or "") for compiler in root.iter("compiler")]
     names = [mesh.get("filename", "").removeprefix("package://") for mesh in root.iter("mesh")]
     found = {
@@ -320,7 +325,7 @@ def _dependencies(source: Path) -> list[Path]:
 
 
 def _spec_dependencies(spec: mujoco.MjSpec, folder: Path) -> list[Path]:
-    """The files that a model made in Python refers to."""
+    """List the files to which a model made in Python refers."""
     parts = (*spec.meshes, *spec.hfields, *spec.skins)
     names = [Path(spec.meshdir, part.file) for part in parts if part.file]
     for texture in spec.textures:

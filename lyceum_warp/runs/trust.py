@@ -1,4 +1,4 @@
-"""Record the runs that this user made or trusts, and refuse to execute or read the files of other runs."""
+"""Record runs that this user made or trusts, and refuse to execute or read the files of all other runs."""
 
 import datetime
 import hashlib
@@ -17,7 +17,7 @@ def remember(folder: Path, config: Mapping[str, Any]) -> None:
 
     Args:
         folder: The run's folder.
-        config: The content of its config.json.
+        config: Content of the run's config.json.
     """
     record = _record(folder, config)
     try:
@@ -33,9 +33,9 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
 
     Args:
         folder: The run's folder.
-        config: The content of its config.json.
-        named: A file that the run refers to, for the message.
-        runs: Whether the file is executed; otherwise it is only read.
+        config: Content of the run's config.json.
+        named: A file to which the run refers, for the error message.
+        runs: Whether the run's task is executed, instead of files only being read.
         trust: Whether to trust and record the run.
 
     Raises:
@@ -45,20 +45,21 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
         return
     if not trust:
         raise ValueError(
-            f"the run in {folder} was not made by you on this machine, and it would {'run' if runs else 'read'} "
-            f"{named}: look at the folder, then allow it with --trust (trust=True in Python)"
+            f"the run in {folder} was not made by you on this machine, and the command would "
+            f"{'run' if runs else 'read'} {named}: look at the folder, then allow the run with --trust (trust=True in "
+            "Python)"
         )
     remember(folder, config)
 
 
 def _record(folder: Path, config: Mapping[str, Any]) -> Path:
-    """The file that records a run as trusted; its name is a hash of everything that the run can execute or read."""
+    """Name the file that records a run as trusted by a hash of everything that the run can execute or read."""
     kept = config.get("kept", {})
     paths = [{key: value for key, value in config.get(part, {}).items() if isinstance(value, str)}
              for part in ("params", "options")]  # fmt: skip
     found = hashlib.sha256(json.dumps([config.get("task"), kept, paths], sort_keys=True).encode())
     task = folder / "task"
-    # hash the copy, so that the original may be edited; without a copy, hash the original
+    # hash the copy if there is one, so that the user may edit the original
     main = task / kept["file"] if "file" in kept else Path(str(config.get("task")).partition(":")[0])
     for name, path in [*((str(path.relative_to(task)), path) for path in sorted(task.rglob("*"))), ("", main)]:
         link, content = os.readlink(path) if path.is_symlink() else None, ""

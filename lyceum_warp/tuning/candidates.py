@@ -9,12 +9,12 @@ from lyceum_warp.options import CONES, INTEGRATORS, JACOBIANS
 
 _ITERATIONS = (4, 2, 1)
 _LS_ITERATIONS = (10, 5)
-"""Iteration limits to try, if they are below the model's limit."""
+"""Iteration limits to try, if lower than the model's limit."""
 
 _AUTO_SPARSE = {"mujoco": 60, "warp": 33}
-"""Number of degrees of freedom from which each engine uses a sparse Jacobian."""
+"""Minimum number of degrees of freedom for which each engine uses a sparse Jacobian."""
 _DENSE_LIMIT = 60
-"""MuJoCo Warp supports a dense Jacobian up to this number of degrees of freedom."""
+"""Maximum number of degrees of freedom for which MuJoCo Warp supports a dense Jacobian."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,18 +24,18 @@ class Setting:
     name: str
     """Short description; empty for the unchanged task."""
     group: str
-    """The kind of change. A combination has at most one setting of each group."""
+    """Kind of change. A combination has at most one setting of each group."""
     physics: Mapping[str, Any]
-    """Options that differ from the task's, by their names in ``lw.PhysicsOptions``."""
+    """Options that differ from the task's options, by their names in ``lw.PhysicsOptions``."""
     parts: tuple["Setting", ...] = ()
-    """The settings of a combination, in order."""
+    """Settings of a combination, in order."""
 
 
 def candidates(env: Env) -> list[Setting]:
-    """The settings to try one by one, in order.
+    """List the settings to try one by one, in order.
 
     Args:
-        env: The unchanged task.
+        env: Environment of the unchanged task.
     """
     option, limits = env.task.model.opt, env.options.physics.solver or {}
     cone, integrator = _name(CONES, option.cone), _name(INTEGRATORS, option.integrator)
@@ -55,7 +55,7 @@ def candidates(env: Env) -> list[Setting]:
         words = {"frame_skip": substeps, "timestep": timestep}
         name = f"{substeps} x {1e3 * timestep:.4g} ms"
         found.append(Setting(name, "substeps", words))
-        if integrator != "implicitfast":  # stable with longer time steps
+        if integrator != "implicitfast":  # implicitfast is stable with longer time steps
             found.append(Setting(f"{name}, implicitfast", "substeps", {**words, "integrator": "implicitfast"}))
     found += [Setting(f"jacobian {name}", "jacobian", {"jacobian": name}) for name in _other_jacobian(env)]
     if cone == "elliptic" and option.impratio != 1.0:
@@ -67,7 +67,7 @@ def candidates(env: Env) -> list[Setting]:
 
 
 def not_tried(env: Env) -> list[str]:
-    """The settings that are not tried on this engine, each with the reason."""
+    """List the settings that are not tried on the environment's engine, each with the reason."""
     found = ["the PGS solver: MuJoCo Warp lacks it, so the package uses Newton on both engines"]
     if env.engine.name == "warp":
         if env.task.model.nv > _DENSE_LIMIT:
@@ -78,9 +78,9 @@ def not_tried(env: Env) -> list[str]:
 
 
 def combined(settings: Iterable[Setting]) -> Setting | None:
-    """Combine settings; earlier settings override later ones. None if the result is one of the settings.
+    """Combine settings, with priority for earlier settings; None if the result is one of the settings.
 
-    A setting is omitted if an earlier setting has the same group or sets one of its options.
+    A setting is omitted if an earlier setting has the same group or sets the same option.
     """
     parts: list[Setting] = []
     physics: dict[str, Any] = {}
@@ -95,14 +95,14 @@ def combined(settings: Iterable[Setting]) -> Setting | None:
 
 
 def flags(physics: Mapping[str, Any]) -> str:
-    """The flags that select a setting in lyceum-warp train and plan."""
+    """Format a setting as flags of lyceum-warp train and plan."""
     words = [f"--solver {name}={limit}" for name, limit in physics.get("solver", {}).items()]
     words += [f"--{name.replace('_', '-')} {value}" for name, value in physics.items() if name != "solver"]
     return " ".join(words)
 
 
 def task_line(physics: Mapping[str, Any]) -> str:
-    """The line of Python that offers a setting as a task's fast physics."""
+    """Format a setting as a line of Python that gives a task the physics options "fast"."""
     words = ", ".join(f"{name}={value!r}" for name, value in physics.items()).replace("'", '"')
     return f'physics = {{"fast": lw.PhysicsOptions({words})}}'
 
@@ -112,7 +112,7 @@ def _name(names: Mapping[str, Any], value: int) -> str | None:
 
 
 def _fewer(substeps: int) -> list[int]:
-    """Numbers of substeps below the given one, halved each time."""
+    """List numbers of substeps below a given number, halving each time."""
     found = []
     while substeps > 1:
         substeps = (substeps + 1) // 2
@@ -121,7 +121,7 @@ def _fewer(substeps: int) -> list[int]:
 
 
 def _other_jacobian(env: Env) -> list[str]:
-    """The other form of the Jacobian, if the engine supports it."""
+    """Return the other form of the Jacobian, dense or sparse, if the engine supports this form."""
     nv, engine = env.task.model.nv, env.engine.name
     now = _name(JACOBIANS, env.task.model.opt.jacobian)
     if now == "auto":

@@ -1,4 +1,4 @@
-"""Judge a setting by the confidence interval of its difference in returns and a tolerance."""
+"""Judge a setting by a tolerance and the confidence interval of its difference in returns."""
 
 import dataclasses
 import math
@@ -13,39 +13,39 @@ TOLERANCES = {"strict": 0.02, "loose": 0.05, "any": math.inf}
 """Largest accepted difference of returns, relative to the mean absolute return of the unchanged task."""
 
 RANK_CORRELATIONS = {"strict": 0.9, "loose": 0.8, "any": -1.0}
-"""Smallest accepted rank correlation between a planner's physics and the plant's, by name of the tolerance.
-bench/rank_loss.py compares it with the loss of planned return."""
+"""Smallest accepted rank correlation between a planner's physics and the plant's physics, by name of the tolerance. The
+program bench/rank_loss.py compares rank correlations with losses of planned return."""
 
 LEAST_GAIN = 1.03
-"""A setting must be faster by at least this factor, or take less memory, to be judged further."""
+"""Minimum speed-up of a setting for which returns are compared, unless the setting takes less memory."""
 _LEAST_SAVING = 0.95
 
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """The difference of returns between a setting and the unchanged task, relative to the mean absolute return."""
+    """Difference of returns between a setting and the unchanged task, relative to the mean absolute return."""
 
     mean: float
     low: float
     high: float
-    """The bounds of the 95 % interval."""
+    """Bounds of the 95 % confidence interval."""
     episodes: int
 
     def within(self, tolerance: float) -> bool:
-        """Whether the interval lies within the tolerance."""
+        """Check whether the interval lies within the tolerance."""
         return -tolerance <= self.low and self.high <= tolerance
 
     def beyond(self, tolerance: float) -> bool:
-        """Whether the interval lies outside the tolerance."""
+        """Check whether the interval lies outside the tolerance."""
         return self.low > tolerance or self.high < -tolerance
 
     def __str__(self) -> str:
-        """The interval in percent."""
+        """Format the interval in percent."""
         return f"[{100 * self.low:+.1f}, {100 * self.high:+.1f}]"
 
 
 def difference(reference: np.ndarray, returns: np.ndarray) -> Difference:
-    """Compare the returns of the same episodes, (episodes,) each.
+    """Compare two arrays of returns of the same episodes, each (episodes,).
 
     If all returns of the unchanged task are 0, every difference is infinite.
     """
@@ -60,7 +60,7 @@ def difference(reference: np.ndarray, returns: np.ndarray) -> Difference:
 
 @dataclasses.dataclass(frozen=True)
 class Correlation:
-    """The mean rank correlation over some states, with the bounds of its 95 % interval."""
+    """Mean rank correlation over some states, with the bounds of its 95 % confidence interval."""
 
     mean: float
     low: float
@@ -68,28 +68,28 @@ class Correlation:
 
     @classmethod
     def of(cls, values: np.ndarray) -> "Correlation":
-        """The mean of the states' correlations, (states,)."""
+        """Average the correlations of the states, (states,)."""
         mean, half = mean_interval(values)
         return cls(mean, max(mean - half, -1.0), min(mean + half, 1.0))
 
 
 def episodes_needed(found: Difference, half_width: float) -> int:
-    """Estimate the number of episodes for an interval of the given half-width from some episodes.
+    """Estimate from some episodes how many episodes give an interval of a given half-width.
 
-    Only their spread is used, not their mean, so the number does not depend on the result (Stein's two-stage
-    procedure).
+    The estimate uses only the spread of the returns, not their mean, so it does not depend on the result (Stein's
+    two-stage procedure).
     """
     now = (found.high - found.low) / 2
     return found.episodes if now <= half_width else math.ceil(min(found.episodes * (now / half_width) ** 2, 1e9))
 
 
 def buys(speedup: float, memory: float) -> bool:
-    """Whether a setting is faster or takes less memory, by the lower bound of its speed-up and the ratio of memory."""
+    """Check whether a setting saves time or memory, given the speed-up's lower bound and the ratio of memory."""
     return speedup >= LEAST_GAIN or memory <= _LEAST_SAVING
 
 
 def verdict(row: Mapping[str, Any], tolerance: str) -> str:
-    """Derive the verdict of a row of results; see ``Tuning.rows``."""
+    """Derive the verdict on a row of results; see ``Tuning.rows``."""
     if row["refused"]:
         return "refused"
     if "ranks" in row:

@@ -1,4 +1,4 @@
-"""Compare a planner's physics with the plant's: the planning time, and the ranking of the same samples."""
+"""Compare planners with different physics options by planning time, and by the ranking of equal samples."""
 
 import dataclasses
 import statistics
@@ -19,25 +19,25 @@ _SAMPLES = 64
 _MOVING_STEPS, _FALLING_STEPS, _LYING_STEPS = 30, 200, 10
 _REPLAN_EVERY = 6
 _IMPROVEMENTS = 2
-"""Number of improvements of the plan before the compared samples are drawn around it."""
+"""Number of improvements of a plan before the compared samples are drawn around the plan."""
 
 
 class Rankings:
-    """Compares a planner's physics with the plant's.
+    """Compares a planner's physics options with the plant's options.
 
-    From each state, planners with both physics draw the same samples around the same plan. A planner only uses the
-    order and the differences of returns, so the rank correlation of the returns shows whether it can plan with coarser
-    physics. There are states of three kinds:
+    From each state, planners with both physics options draw the same samples around the same plan. A planner only uses
+    the order and the differences of returns, so the rank correlation of the returns shows whether a planner can use
+    coarser physics. The states are of three kinds:
 
-    - standing: random initial states;
-    - moving: states of the plant after 30 steps under the planner with the plant's physics, replanning every 6 steps;
-    - fallen: states after random actions until the end of the episode, at most 200 steps, and 10 steps more.
+    - standing: states after a random reset;
+    - moving: states after 30 steps under the planner with the plant's physics, which replans every 6 steps;
+    - fallen: states after random actions until the end of the episode, for at most 200 steps, and for 10 more steps.
 
     Args:
         task: The task.
         states: Number of states of each kind.
         repeats: Number of timed plans.
-        samples: Number of samples.
+        samples: Number of samples of a plan.
         seed: Seed of states and noise.
         words: Options and parameters as for ``lw.MPPI``.
     """
@@ -57,7 +57,7 @@ class Rankings:
         return MPPI(self.task, physics=PhysicsOptions(**physics), plants=plants, **self.words)
 
     def _find_states(self) -> dict[str, torch.Tensor]:
-        """States of each kind, (states, state_space.size)."""
+        """Compute the states of each kind, (states, state_space.size)."""
         plant = self.reference.replicate(nworld=self.states, autoreset=False)
         plant.rand_reset(self.seed)
         found = {"standing": plant.get_state()}
@@ -81,7 +81,7 @@ class Rankings:
         return found
 
     def _prepared(self, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Plan from some states; return the plans and the plant's returns of samples around them, (states, samples)."""
+        """Plan from some states, and return the plans and the returns, (states, samples), of samples around them."""
         self.exact.reset(self.seed)
         for _ in range(_IMPROVEMENTS):
             self.exact(start, shift=0)
@@ -89,7 +89,7 @@ class Rankings:
         return plan, self._returns(self.exact, start, plan)
 
     def _returns(self, planner: MPPI, start: torch.Tensor, plan: torch.Tensor) -> torch.Tensor:
-        """Returns of the samples that a planner draws around a plan, (states, samples)."""
+        """Compute the returns of the samples that a planner draws around a plan, (states, samples)."""
         planner.reset(self.seed + 1)
         planner.knot_actions.copy_(plan)
         planner(start, shift=0)
@@ -106,7 +106,7 @@ class Rankings:
         start = self.starts["moving"][0]
         for repeat in range(self.repeats + 1):
             exact, own = self._seconds(self.one, start), self._seconds(one, start)
-            if repeat:  # the first plans warm up
+            if repeat:  # do not time the first plans, which load kernels
                 times.append(own)
                 ratios.append(exact / own)
         row |= {"plan_ms": 1e3 * statistics.median(times), "speedup": statistics.median(ratios), "ranks": {}}
@@ -117,7 +117,7 @@ class Rankings:
         return row
 
     def _seconds(self, planner: MPPI, start: torch.Tensor) -> float:
-        """Seconds of a plan from a state."""
+        """Measure the seconds of planning from a state."""
         begin = time.perf_counter()
         planner(start)
         if planner.actions.is_cuda:
@@ -126,9 +126,9 @@ class Rankings:
 
 
 def rank_correlations(first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
-    """Compute Spearman's rank correlation of each row of two (rows, n) arrays; rows of equal numbers are omitted.
+    """Compute Spearman's rank correlation of each row of two (rows, n) arrays, omitting rows of equal numbers.
 
-    Equal numbers have their mean rank.
+    Equal numbers get the mean of their ranks.
     """
     a, b = (_ranks(values.double()) for values in (first, second))
     a, b = a - a.mean(1, keepdim=True), b - b.mean(1, keepdim=True)

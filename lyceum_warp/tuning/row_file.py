@@ -16,11 +16,11 @@ _VERSIONS = ("lyceum_warp", "mujoco", "mujoco_warp")
 
 
 def identity(env: Env, **more: Any) -> dict[str, Any]:
-    """Everything except the setting that results depend on: task, machine, worlds and versions.
+    """Collect everything else than the setting that affects results: task, machine, worlds and versions.
 
     Args:
-        env: The unchanged task.
-        more: Additional entries, JSON values.
+        env: Environment of the unchanged task.
+        more: Additional entries, which are JSON values.
     """
     kept, _ = task_copy(env)
     params = {name: json_value(name, value) for name, value in env.given_params.items()}
@@ -34,18 +34,18 @@ def identity(env: Env, **more: Any) -> dict[str, Any]:
 
 
 class RowFile:
-    """Rows of results in a file, by setting.
+    """Stores rows of results in a file, one row per setting.
 
     Args:
         path: The file; it need not exist.
-        identity: Only rows with this identity count; see ``identity``.
+        identity: Identity of the rows to use; all other rows are ignored. See the function ``identity``.
 
     Raises:
-        ValueError: The file holds something else.
+        ValueError: The file is not a file of results.
     """
 
     def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
-        self.path, self.identity = path, json.loads(json.dumps(identity))  # JSON has lists in place of tuples
+        self.path, self.identity = path, json.loads(json.dumps(identity))  # convert tuples to lists, as in JSON
         self._rows: dict[str, dict[str, Any]] = {}
         self._whole = 0
         lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
@@ -54,20 +54,20 @@ class RowFile:
                 row = json.loads(line)
                 found, key = row["identity"], _key(row["physics"])
             except (ValueError, TypeError, KeyError):
-                # the writing process was killed; the next row replaces this line
+                # replace the incomplete line of a killed process by the next row
                 if number == len(lines) and line.startswith(_BEGIN):
                     break
-                raise ValueError(f"line {number} of {path} is not a result of tune: give another file") from None
+                raise ValueError(f"line {number} of {path} is not a result of tune: use another file") from None
             self._whole += len(line)
             if found == self.identity:
                 self._rows[key] = row
 
     def get(self, physics: Mapping[str, Any]) -> dict[str, Any] | None:
-        """The row of a setting, if the file has it."""
+        """Get the row of a setting, or None if the file has no such row."""
         return self._rows.get(_key(physics))
 
     def add(self, row: Mapping[str, Any]) -> dict[str, Any]:
-        """Append a row to the file, and return it as read from JSON."""
+        """Append a row to the file, and return the row as read from JSON."""
         line = json.dumps({**row, "identity": self.identity})
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.open("ab") as file:

@@ -1,4 +1,4 @@
-"""Search for the fastest physics of a task that keeps its returns: `lw.tune`."""
+"""Search for a task's fastest physics options with equal returns: `lw.tune`."""
 
 import dataclasses
 import hashlib
@@ -23,7 +23,7 @@ from lyceum_warp.tuning.row_file import RowFile, identity
 from lyceum_warp.tuning.trial import FULL, SHORT, Effort, Trials
 
 NWORLD, GPU_NWORLD = 256, 4096
-"""Number of worlds by default."""
+"""Default number of worlds, on a CPU and on a GPU."""
 
 Row = dict[str, Any]
 
@@ -31,15 +31,16 @@ Row = dict[str, Any]
 @document_attributes
 @dataclasses.dataclass(frozen=True)
 class Tuning:
-    """The results of ``tune``."""
+    """Results of ``tune``."""
 
     rows: list[Row]
-    """The results of each setting, the fastest first; docs/physics.md describes the entries. ``verdict`` is "same",
-    "different" or "not shown" (the interval of the returns lies within, outside or across the tolerance), "faults"
-    (more than twice as many as in the unchanged task), "no gain" (less than 3 % faster and no smaller: returns are not
-    compared), "refused" (by MuJoCo or the engine, whose reason is in ``refused``), or for a planner "ranks badly"."""
+    """Results of each setting, the fastest first; docs/physics.md describes the entries. The entry ``verdict`` is
+    "same", "different" or "not shown" (the interval of the returns lies within, outside or across the tolerance),
+    "faults" (more than twice as many faults as in the unchanged task), "no gain" (less than 3 % faster and not smaller,
+    so that returns are not compared), "refused" (by MuJoCo or the engine; ``refused`` has the reason), or for a planner
+    "ranks badly"."""
     reference: Row
-    """The results of the unchanged task, measured against itself."""
+    """Results of comparing the unchanged task with itself."""
     not_tried: list[str]
     """Settings that were not tried, with reasons."""
     path: Path
@@ -47,17 +48,17 @@ class Tuning:
 
     @property
     def best(self) -> Row | None:
-        """The fastest setting with the same returns; None if there is none."""
+        """Return the fastest setting with the same returns; None without such a setting."""
         return next((row for row in self.rows if row["verdict"] == "same"), None)
 
     @property
     def flags(self) -> str:
-        """The flags of the best setting for lyceum-warp train and plan; empty if there is none."""
+        """Format the best setting as flags of lyceum-warp train and plan; empty without a best setting."""
         return flags(self.best["physics"]) if self.best else ""
 
     @property
     def task_line(self) -> str:
-        """The line of the task that offers the best setting as ``physics="fast"``; empty if there is none."""
+        """Format the best setting as the line of a task for ``physics="fast"``; empty without a best setting."""
         return task_line(self.best["physics"]) if self.best else ""
 
 
@@ -75,35 +76,35 @@ def tune(
     progress: Callable[[Row], object] | None = None,
     **words: Any,
 ) -> Tuning:
-    """Measure the gain and the side effects of each physics option of a task, and find the fastest with equal returns.
+    """Measure gain and side effects of a task's physics options, and find the fastest options with equal returns.
 
-    Every setting is compared with the unchanged task in the same process: steps per second in alternation, memory,
-    faults, divergence, and the returns of the same episodes under random actions and under a policy. Settings are tried
-    alone first; then the best of each group are combined; while the returns differ, the least useful setting is
-    removed.
+    Every setting is compared with the unchanged task in the same process: steps per second, memory, faults, divergence,
+    and the returns of equal episodes under random actions and under a policy. Settings are first tried alone.
+    Afterwards, the best settings of all groups are combined, and the least useful setting is removed while the returns
+    differ.
 
     Args:
-        task: Name of a task, a file with one, or its class.
-        run: Folder of a run of this task. The run's policy also plays the episodes, and the run's parameters are the
-            defaults.
-        which: Which policy of the run: "last", "best", or the number of a saved iteration.
-        tolerance: "strict": the 95 % interval of the difference of returns lies within 2 % of the mean absolute
-            return; "loose": within 5 %; "any": only faults count.
+        task: Name of a task, path of a task file, or a task class.
+        run: Folder of a run of the same task. The run's policy also plays the episodes, and the run's parameters are
+            the defaults.
+        which: Policy of the run: "last", "best", or the number of a saved iteration.
+        tolerance: Tolerance for the 95 % interval of the difference of returns, relative to the mean absolute return:
+            "strict" (2 %), "loose" (5 %) or "any" (only faults count).
         short: Whether to compare the first 100 steps of episodes, for a few seconds, instead of whole episodes.
-        episodes: Number of episodes of each setting, rounded up to a multiple of the number of worlds. By default it is
-            chosen for the width of the interval, within the time limit: a minute, or 5 s if ``short``.
-        planning: Whether to find physics for the task's planner instead of its worlds: compares planning times, and the
-            rankings of the same samples under both physics, from standing, moving and fallen states. A setting is
-            suggested if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8 ("loose").
-            ``nworld`` is then the number of samples, by default 64, and ``episodes`` the number of states of each kind.
-        out: File of the results, to which rows are appended; existing rows are not measured again. By default
+        episodes: Number of episodes of each setting, rounded up to a multiple of the number of worlds. By default, the
+            width of the interval determines the number, within the time limit of a minute, or of 5 s if ``short``.
+        planning: Whether to find physics options for the task's planner instead of its worlds, by comparing planning
+            times and the rankings of the same samples, from standing, moving and fallen states. A setting is suggested
+            if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8 ("loose"). With ``planning``,
+            ``nworld`` is the number of samples, by default 64, and ``episodes`` is the number of states of each kind.
+        out: File of the results, to which rows are appended; existing rows are not measured again. The default is
             tune/TASK.jsonl, or tune/TASK-planning.jsonl.
         seed: Seed of initial states and actions.
-        progress: Called with each row.
-        words: Options and parameters as for ``lw.make``; by default 256 worlds on the CPU, 4096 on a GPU.
+        progress: Function that is called with each row of results.
+        words: Options and parameters as for ``lw.make``; by default 256 worlds on the CPU, and 4096 worlds on a GPU.
 
     Raises:
-        ValueError: An argument is unknown or does not fit, or the run is one of another task.
+        ValueError: An argument is unknown or not valid, or the run belongs to a different task.
         FileNotFoundError: A model, a task or a run is missing.
     """
     check_word("tolerance", tolerance, list(TOLERANCES))
@@ -135,7 +136,7 @@ def _trials(
     task: type[Task], run: str | Path | None, which: str, words: Mapping[str, Any], *, effort: Effort, seed: int,
     episodes: int | None,
 ) -> Trials:  # fmt: skip
-    """Make the trials of the unchanged task, with the policy of a run if one is given."""
+    """Make the trials of the unchanged task, with the policy of a given run."""
     options, params = EnvOptions.split(words)
     if "nworld" not in words:
         options = options.changed({"nworld": GPU_NWORLD if str(options.device).startswith("cuda") else NWORLD})
@@ -153,19 +154,19 @@ def _digest(run: str | Path, which: str) -> str:
 
 
 def _params_of(run: str | Path, task: type[Task]) -> Mapping[str, Any]:
-    """The task parameters of a run.
+    """Get the task parameters of a run.
 
     Raises:
-        ValueError: The run belongs to another task.
+        ValueError: The run belongs to a different task.
     """
     opened = Run.open(run)
     if opened.task_name != task_name(task):
-        raise ValueError(f"{run} is a run of the task {opened.task_name!r}, not of {task_name(task)!r}")
+        raise ValueError(f"{run} is a run of the task {opened.task_name!r}, not of the task {task_name(task)!r}")
     return Configuration.of(opened).params
 
 
 class _Search:
-    """The search over settings."""
+    """Searches over physics settings."""
 
     def __init__(
         self, trials: Trials | Rankings, file: RowFile, tolerance: str, progress: Callable[[Row], object] | None
@@ -183,11 +184,11 @@ class _Search:
         settings = [setting for setting, _ in good]
         while (both := combined(settings)) is not None:
             row = self._row(both)
-            if row["name"] == both.name:  # a single setting was already tried alone
+            if row["name"] == both.name:  # skip a single setting, which was already tried alone
                 rows.append(row)
             if row["verdict"] == "same":
                 break
-            settings = settings[: settings.index(both.parts[-1])]  # remove the least useful part
+            settings = settings[: settings.index(both.parts[-1])]  # remove the least useful setting
         rows.sort(key=lambda row: -row.get("speedup", 0.0))
         return Tuning(rows, reference, not_tried(env), self.file.path)
 

@@ -1,4 +1,4 @@
-"""Compare a physics setting with the unchanged task: speed, memory, faults, divergence, returns."""
+"""Compare a physics setting with the unchanged task by speed, memory, faults, divergence and returns."""
 
 import dataclasses
 import gc
@@ -21,9 +21,9 @@ from lyceum_warp.tuning.judgement import TOLERANCES, Difference, buys, differenc
 
 DIVERGENCE_STEPS = (1, 10, 50)
 NUDGE = 1e-6
-"""Standard deviation of the perturbation of positions and velocities that shows how chaotic the task is."""
+"""Standard deviation of a perturbation of positions and velocities, which shows how chaotic the task is."""
 _HALF_WIDTH = TOLERANCES["strict"] / 2
-"""Target half-width of the confidence interval of the difference of returns; it determines the number of episodes."""
+"""Target half-width of the difference's confidence interval, which determines the number of episodes."""
 _CONTACT_STATES = 64
 
 Policy = Callable[[torch.Tensor], torch.Tensor]
@@ -31,16 +31,16 @@ Policy = Callable[[torch.Tensor], torch.Tensor]
 
 @dataclasses.dataclass(frozen=True)
 class Effort:
-    """How long to measure."""
+    """Limits on the duration of measurements."""
 
     repeats: int
-    """Number of timed blocks of steps, each with the unchanged task and with the setting."""
+    """Number of timed blocks of steps, each run with the unchanged task and with the setting."""
     block_seconds: float
     """Duration of a block with the unchanged task."""
     judging_seconds: float
     """Time limit for all episodes of the unchanged task, separately for random actions and for the policy."""
     steps: int
-    """Longest episode; 0 for the task's own horizon."""
+    """Maximum number of steps in an episode; 0 means the task's horizon."""
     recorded_at: tuple[int, ...]
     """Numbers of steps after which states are recorded; speed and divergence are measured from these states."""
 
@@ -50,15 +50,15 @@ SHORT = Effort(repeats=7, block_seconds=0.1, judging_seconds=5.0, steps=100, rec
 
 
 class Trials:
-    """Compares settings with the unchanged task, alternating between them in this process.
+    """Compares settings with the unchanged task, alternating between both in one process.
 
     Args:
-        reference: The unchanged task, with ``autoreset=False``.
-        policy: The policy, or None.
-        effort: How long to measure.
+        reference: Environment of the unchanged task, made with ``autoreset=False``.
+        policy: The policy of a run, or None.
+        effort: Limits on the duration of measurements.
         seed: Seed of initial states and actions.
-        episodes: Number of episodes of each setting; by default chosen for the width of the interval, within the time
-            limit.
+        episodes: Number of episodes of each setting; by default, the interval's width and the time limit determine the
+            number.
     """
 
     def __init__(
@@ -74,10 +74,13 @@ class Trials:
         self._batch_seconds: dict[str, float] = {}
         self._record()
 
-    # states in the middle of a run, and actions that follow them
+    # recorded states and actions
 
     def _record(self) -> None:
-        """Record states, and 50 actions after each; half of the worlds follow the policy, the others act at random."""
+        """Record states, and the next 50 actions after each state.
+
+        Half of the worlds follow the policy, and half of the worlds act at random.
+        """
         env, draw = self.reference, random_actions(self.reference, self.seed)
         policy_worlds = torch.arange(env.nworld, device=env.obs.device)[:, None] % 2 == 1
         self._parts = [env.state_space.parts[name] for name in ("qpos", "qvel")]
@@ -116,7 +119,7 @@ class Trials:
         return torch.where(policy_worlds, self.policy(self.reference.obs), random)
 
     def _share_in_contact(self) -> float:
-        """The fraction of recorded states with contacts, from a sample of them on the CPU."""
+        """Compute the fraction of recorded states with contacts, from a sample of the states on the CPU."""
         model, size = self.reference.task.model, self.reference.engine.integration_size
         data, kind = mujoco.MjData(model), mujoco.mjtState.mjSTATE_INTEGRATION.value
         states = torch.cat(self._starts)[:, :size].cpu().numpy()
@@ -130,7 +133,7 @@ class Trials:
     # one setting
 
     def measure(self, setting: Setting) -> dict[str, Any]:
-        """Measure a setting; the row of its results has returns only if the setting saves time or memory."""
+        """Measure a setting, and return a row of results, with returns only if the setting saves time or memory."""
         row: dict[str, Any] = {"name": setting.name, "physics": dict(setting.physics), "refused": ""}
         before = self._free()
         try:
@@ -157,7 +160,7 @@ class Trials:
         return row
 
     def _free(self) -> int:
-        """Free memory of the device; 0 on the CPU."""
+        """Get the free memory of the device; 0 on the CPU."""
         if not self.reference.device.is_cuda:
             return 0
         gc.collect()
@@ -166,7 +169,7 @@ class Trials:
         return free_memory(self.reference.device) or 0
 
     def _speed(self, env: Env) -> tuple[float, float, float]:
-        """Steps per second of all worlds, and the median and the lower bound of the speed-up over the unchanged task.
+        """Measure steps per second of all worlds, and the median and the lower bound of the speed-up.
 
         The lower bound is the smaller of the lower quartile and the ratio of the fastest blocks, because other
         processes may slow down some blocks.
@@ -179,7 +182,7 @@ class Trials:
         return count / float(np.median(own)), float(np.median(exact / own)), float(low)
 
     def _seconds(self, env: Env, k: int) -> float:
-        """Seconds of a block of steps from the k-th recorded states, after one step that is not timed."""
+        """Measure the seconds of a block of steps from the k-th recorded states, after one untimed step."""
         actions = self._actions[k]
         env.set_state(self._starts[k])
         env.step(actions[0])
@@ -191,7 +194,7 @@ class Trials:
         return time.perf_counter() - start
 
     def _velocities(self, env: Env, k: int, start: torch.Tensor | None = None) -> torch.Tensor:
-        """Velocities after some steps from the k-th states, (times, nworld, nv) float64; NaN after a fault."""
+        """Compute velocities after some steps from the k-th states, (times, nworld, nv) float64; NaN after a fault."""
         env.set_state(self._starts[k] if start is None else start)
         found, bad = [], torch.zeros(env.nworld, dtype=torch.bool, device=env.obs.device)
         for step, action in enumerate(self._actions[k], 1):
@@ -202,13 +205,13 @@ class Trials:
         return torch.stack(found)
 
     def _distance(self, velocities: list[torch.Tensor]) -> list[float]:
-        """Median distance to the exact velocities after 1, 10 and 50 steps, in units of each velocity's RMS."""
+        """Compute the median distance to the exact velocities after 1, 10 and 50 steps, in units of their RMS."""
         exact, found = torch.cat(self._exact, 1), torch.cat(velocities, 1)
         scale = exact.square().nanmean(1, keepdim=True).sqrt().clamp_min(1e-9)
         return ((found - exact) / scale).square().mean(2).sqrt().nanmedian(1).values.tolist()
 
     def _compare(self, env: Env, source: str) -> tuple[Difference, np.ndarray, np.ndarray]:
-        """The difference of returns, and the numbers of faults and steps with the setting and the unchanged task.
+        """Compare returns, and count faults and steps with the setting and with the unchanged task.
 
         The spread in the first batch of episodes determines the number of batches, within the time limit.
         """
@@ -233,9 +236,9 @@ class Trials:
         return difference(*np.concatenate(pairs, axis=1)), faults, steps
 
     def _episodes(self, env: Env, source: str, batch: int) -> tuple[np.ndarray, int, int]:
-        """Returns of one episode per world, (nworld,), and the numbers of faults and of steps.
+        """Compute the returns of one episode per world, (nworld,), and the numbers of faults and of steps.
 
-        Episodes of the same batch have the same initial states, random streams and, under random actions, actions.
+        Episodes of the same batch have equal initial states, random streams and, without a policy, random actions.
         """
         seed = self.seed + 1 + batch
         self.reference.rand_reset(seed)

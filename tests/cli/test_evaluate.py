@@ -99,7 +99,7 @@ def test_the_evaluated_episodes_are_saved(trained: Path, tmp_path: Path, capsys:
     env.step(load(trained)(env.obs))
     torch.testing.assert_close(env.get_state()[0], episodes[2].states[10], rtol=1e-6, atol=1e-6)
     assert cli.main(["eval", str(trained), *options, "--episodes-to", str(out)]) == 2
-    refused(capsys, f"{out} exists and is not an empty folder: give another folder")
+    refused(capsys, f"{out} exists and is not an empty folder: use another folder")
 
 
 def test_a_video_is_made_with_the_camera_that_is_named(

@@ -79,7 +79,10 @@ def test_a_planner_uses_the_suggested_physics_unless_others_are_given(
     assert config["frame_skip"] == 2 and config["between"] == "linear"
     capsys.readouterr()
     assert plan(tmp_path / "other", "--timestep", "0.013", *QUIET) == 2
-    refused(capsys, "the controller's step of 0.013 s must be a whole multiple of the plant's, 0.02 s")
+    refused(
+        capsys,
+        "the controller's step of 0.013 s must be a whole multiple or a whole fraction of the plant's step of 0.02 s",
+    )
     assert not (tmp_path / "other").exists()
 
 
@@ -244,7 +247,7 @@ def test_every_update_is_saved_and_printed_by_name(tmp_path: Path, capsys: pytes
     (["--planner-param", "nworld=9"], ["nworld is an option", "use --samples"]),
     (["--nthread", "-1"], ["nthread", "-1"]),
     (["--planner-model", "nowhere.xml"], ["there is no file", str(Path("nowhere.xml").resolve())]),
-    (["--fill", "1", "2", "3"], ["fill", "2 of them"]),
+    (["--fill", "1", "2", "3"], ["fill", "2 numbers"]),
     (["--fill", "1", "zero"], ["fill", "1 zero"]),
     (["--seed", "-1"], ["seed", "-1"]),
     (["--seed", "2147483647", "--episodes", "2"], ["seed of the last episode", "2147483648"]),
@@ -270,7 +273,7 @@ def test_a_folder_that_is_not_empty_is_refused(tmp_path: Path, capsys: pytest.Ca
     refused(capsys, "run")
     (tmp_path / "run" / "config.json").write_text("{}")
     assert plan(tmp_path / "run") == 2
-    assert "--resume" not in (error := capsys.readouterr().err) and "holds a run: give another folder" in error
+    assert "--resume" not in (error := capsys.readouterr().err) and "contains a run: use another folder" in error
 
 
 def test_an_interrupt_keeps_complete_episodes(

@@ -283,7 +283,7 @@ def test_resume_refuses_broken_checkpoints(trained: Path, tmp_path: Path, capsys
     refused(capsys, str(checkpoint), "is damaged", "restore the file from a copy")
     other = changed_config(trained, tmp_path / "other", lambda config: config.update(nworld=3))
     assert cli.main(other) == 2
-    refused(capsys, "does not fit the configuration beside it")
+    refused(capsys, "does not fit the run's configuration")
     for folder in ("run", "other"):
         assert (tmp_path / folder / "metrics.csv").read_bytes() == (trained / "metrics.csv").read_bytes()
 
@@ -321,7 +321,7 @@ def test_a_broken_best_policy_is_replaced_with_a_message(
 def test_train_refuses_to_overwrite_a_run(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = {path: path.read_bytes() for path in trained.iterdir()}
     assert train(trained, "--iterations", "9") == 2
-    refused(capsys, str(trained), "--resume", "give another folder")
+    refused(capsys, str(trained), "--resume", "use another folder")
     assert before == {path: path.read_bytes() for path in trained.iterdir()}
 
 

@@ -115,7 +115,7 @@ def test_a_policy_of_any_class_is_saved_without_a_value_function(tmp_path: Path)
     assert load(run, policy=Mine()).act(torch.ones(2)).tolist() == [3.0, 3.0]
     with pytest.raises(ValueError, match=r"has a custom class, test_checkpoints.Mine: .* policy=Mine\(...\)\)$"):
         load(run)
-    with pytest.raises(ValueError, match="holds no value function"):
+    with pytest.raises(ValueError, match="has no value function"):
         load_value(run)
 
 

@@ -14,7 +14,7 @@ from lyceum_warp.runs.folder import Run
     ("entries", "words"),
     [
         ({"task": 3}, "task must be"),
-        ({"kept": []}, r"\[\] is in place of name, file"),
+        ({"kept": []}, r"\[\] is not a dict of name, file"),
         ({"kept": {"file": 3}}, "file must be of type str, not 3"),
         ({"kept": {"modules": {"terms.py": 1}}}, "terms.py must be of type str, not 1"),
         ({"params": None}, "params must be of type dict"),

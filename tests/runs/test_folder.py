@@ -50,12 +50,12 @@ def test_a_run_knows_the_name_of_its_task(tmp_path: Path, config: dict[str, obje
 
 def test_create_refuses_a_folder_with_content(run: Run, tmp_path: Path) -> None:
     before = {path: path.read_bytes() for path in run.folder.iterdir()}
-    with pytest.raises(ValueError, match=r"holds a run: give another folder, or continue the run"):
+    with pytest.raises(ValueError, match=r"contains a run: use another folder, or continue the run"):
         Run.create(run.folder, {})
     assert before == {path: path.read_bytes() for path in run.folder.iterdir()}
     (tmp_path / "file").write_text("mine")
     for place in (tmp_path, tmp_path / "file"):
-        with pytest.raises(ValueError, match="is not an empty folder: give another folder"):
+        with pytest.raises(ValueError, match="is not an empty folder: use another folder"):
             Run.create(place, {})
 
 

@@ -43,7 +43,7 @@ def run(tmp_path: Path) -> Path:
 
 def test_a_second_writer_is_refused_until_the_first_ends(tmp_path: Path) -> None:
     with pytest.raises(KeyError), RunLock(tmp_path):
-        line = rf"the run in {tmp_path} is being written by process {os.getpid()} on {platform.node()}: end it first"
+        line = rf"the run in {tmp_path} is being written by process {os.getpid()} on {platform.node()}: end this"
         with pytest.raises(ValueError, match=line), RunLock(tmp_path):
             pass
         raise KeyError

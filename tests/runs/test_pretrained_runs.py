@@ -69,4 +69,4 @@ def test_eval_runs_a_pretrained_policy(capsys: pytest.CaptureFixture[str]) -> No
 @pytest.mark.parametrize("command", ["eval", "view"])
 def test_a_task_without_a_pretrained_policy_is_refused(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([command, "reacher", "--pretrained"]) == 2
-    refused(capsys, "there is no pretrained policy of 'reacher': there are ", ", hopper")
+    refused(capsys, "there is no pretrained policy of 'reacher': the tasks with a policy are ", ", hopper")

@@ -298,7 +298,7 @@ def test_a_task_defined_in_a_program_is_evaluated_from_a_file(
         capsys,
         "the task 'point_mass'",
         "was defined in a notebook",
-        "give a file that only defines it (eval --task my_task.py",
+        "pass a file that only defines the task (eval --task my_task.py",
     )
     assert cli.main(["eval", str(tmp_path / "run"), "--task", "point_mass", "--episodes", "2"]) == 0
 

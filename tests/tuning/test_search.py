@@ -110,12 +110,12 @@ def test_each_wrong_argument_raises_an_error(run: Path, tmp_path: Path) -> None:
     wrong: list[tuple[str, dict[str, Any], str]] = [
         ("hoper", {}, "there is no task 'hoper': did you mean hopper"),
         ("hopper", {"tolerance": "tight"}, "tolerance must be 'strict', 'loose' or 'any', not 'tight'"),
-        ("hopper", {"run": run}, "is a run of the task 'point_mass', not of 'hopper'"),
+        ("hopper", {"run": run}, "is a run of the task 'point_mass', not of the task 'hopper'"),
         ("hopper", {"run": tmp_path / "none"}, "there is no run in"),
         ("point_mass", {"run": run, "which": "worst"}, "which must be 'last', 'best' or the number"),
         ("hopper", {"episodes": 0}, "episodes must be a whole number from 1 .*, not 0"),
         ("hopper", {"short": "yes"}, "short must be True or False, not 'yes'"),
-        ("hopper", {"out": other, "nworld": 2}, "line 1 of .*notes.txt is not a result of tune: give another file"),
+        ("hopper", {"out": other, "nworld": 2}, "line 1 of .*notes.txt is not a result of tune: use another file"),
         ("hopper", {"gravity": 3}, "gravity"),
     ]
     for task, words, message in wrong:
