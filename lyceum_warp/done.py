@@ -1,8 +1,8 @@
-"""Name the reasons why an episode ends, as bits.
+"""Define the reasons why an episode ends, as bits.
 
 Both engines report the same bits for the same fault, with two exceptions. On the C engine, a world that runs out of
-arena memory may report ENGINE_WARNING as well as an overflow. On the Warp engine, an overflow of the shared contact
-pool is reported in every world whose contacts did not fit.
+arena memory may report ENGINE_WARNING as well as an overflow. On the Warp engine, every world whose contacts did not
+fit reports an overflow of the shared contact pool.
 """
 
 import enum
@@ -12,7 +12,7 @@ from lyceum_warp.support.docstrings import document_attributes
 
 @document_attributes
 class Done(enum.IntFlag):
-    """Why an episode ended; ``env.done_reason`` holds these bits for each world."""
+    """Reasons why an episode ended, as bits; ``env.done_reason`` has the bits of each world."""
 
     TERMINATED = 1
     """The task's ``terminated`` returned True."""
@@ -37,4 +37,4 @@ class Done(enum.IntFlag):
 
 
 FAULTS = ~(Done.TERMINATED | Done.TRUNCATED)
-"""Bits of faults; the other bits are ordinary ends of an episode."""
+"""Bits that mark faults; all other bits mark ordinary ends of an episode."""

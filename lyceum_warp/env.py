@@ -42,13 +42,13 @@ _ARGUMENTS = """Args:
         (nworld,). A table is an array, a tensor, a nested list, or the path of a ``.npy`` file.
 
 Raises:
-    ValueError: An argument is unknown or does not fit; the message names the argument and says how to fix it.
-    FileNotFoundError: A model file or a task file is missing.
+    ValueError: An argument is unknown or not valid; the message names the argument and the fix. FileNotFoundError: A
+    model file or a task file is missing.
 """
 
 
 def _document_arguments(function: Any) -> Any:
-    """Decorator: insert the arguments into the docstring and the signature, for ``help``."""
+    """Decorate a function by inserting the arguments into its docstring and signature, for ``help``."""
     arguments = _ARGUMENTS.replace("{options}", OPTION_DOCS)
     function.__doc__ = inspect.cleandoc(function.__doc__).replace("{arguments}", arguments)
     function.__signature__ = signature_of_options(function)
@@ -67,18 +67,19 @@ def make(task: str | type[Task], options: EnvOptions | None = None, **words: Any
 @_document_arguments
 @document_attributes
 class Env:
-    """One task in many worlds, with every array allocated once and shared with torch.
+    """One task in many worlds; every array is allocated once and shared with torch.
 
-    Write ``action``, call ``step``, and read the other buffers, which are updated in place. When an episode ends, its
-    world starts a new random episode within the same step: ``obs`` is then the first observation of the new episode,
-    and ``final_obs`` the last observation of the old one.
+    Write ``action``, call ``step``, and read the other buffers, which are updated in place. When an episode ends, the
+    world starts a new random episode within the same step: ``obs`` is then the new episode's first observation, and
+    ``final_obs`` the old episode's last observation.
 
-    A world with a fault (see ``Done``) restarts and is counted in ``fault_counts``; no bit of any other world changes.
-    The transition has reward 0 and the last valid observation as ``final_obs``. In the Warp engine all worlds share a
-    pool of contacts: if it overflows, every world whose contacts did not fit has a fault.
+    A world with a fault (see ``Done``) restarts, and ``fault_counts`` counts the fault; no bit of any other world
+    changes. A transition with a fault has the reward 0 and the last valid observation as ``final_obs``. In the Warp
+    engine, all worlds share a pool of contacts. If the pool overflows, every world whose contacts did not fit has a
+    fault.
 
-    On a GPU, use these tensors on torch's default stream, which is synchronised with Warp's; synchronise other streams
-    yourself.
+    On a GPU, use an environment's tensors on torch's default stream, which is synchronised with Warp's stream.
+    Synchronise any other stream yourself.
 
     {arguments}
     """
@@ -88,9 +89,9 @@ class Env:
     final_obs: torch.Tensor
     """Observations at the end of the last step, before any reset, (nworld, nobs), float32."""
     obs_groups: dict[str, torch.Tensor]
-    """Observations by group, each (nworld, size of the group); ``policy`` is ``obs``."""
+    """Observations of each group, (nworld, size of the group), by name; ``policy`` is ``obs``."""
     final_obs_groups: dict[str, torch.Tensor]
-    """``final_obs`` by group."""
+    """``final_obs`` of each group of observations, by the group's name."""
     reward: torch.Tensor
     """Rewards of the last step, (nworld,), float32."""
     eval: torch.Tensor
@@ -106,13 +107,14 @@ class Env:
     episode_metric_sums: torch.Tensor
     """``episode_metrics`` as one tensor, (nworld, number of metrics), in the order of ``metrics``."""
     shared: dict[str, torch.Tensor]
-    """The memory that all worlds share, by name; only ``update_shared`` changes it, with the task's ``share``."""
+    """The memory that all worlds share, by name; only ``update_shared`` changes the memory, with the task's
+    ``share``."""
     success: torch.Tensor
     """Whether the task's goal has been met for ``success_steps`` steps in a row, (nworld,), bool."""
     done: torch.Tensor
     """Whether the episode ended for any reason, (nworld,), bool."""
     done_reason: torch.Tensor
-    """Bits of ``Done``, (nworld,), int32."""
+    """Reasons why the episode ended, as bits of ``Done``, (nworld,), int32."""
     action: torch.Tensor
     """Actions of the next step, (nworld, nact), float32. A non-finite action is a fault and is replaced by zero."""
     episode_step: torch.Tensor
@@ -122,17 +124,17 @@ class Env:
     nworld: int
     """Number of worlds."""
     timestep: float
-    """Simulated seconds in a step, over all its substeps."""
+    """Simulated duration of a step, which includes all substeps, seconds."""
     device: wp.Device
-    """The Warp device; ``obs.device`` is its torch counterpart."""
+    """The Warp device; ``obs.device`` is the same device in torch."""
     options: EnvOptions
-    """The options that the environment was made with; names of physics are replaced by their options."""
+    """The options of the environment, in which named physics options are resolved."""
     task: BoundTask
-    """The task with its model, parameters (``task.params``) and kernels."""
+    """The task with the model, the parameters (``task.params``) and the kernels."""
     engine: Engine
-    """The physics; ``engine.name`` is "mujoco" or "warp"."""
+    """The physics engine; ``engine.name`` is "mujoco" or "warp"."""
     worlds: Worlds
-    """The arrays and phases behind this environment; internal."""
+    """The arrays and phases of the environment, for internal use."""
     obs_space: Space
     """Parts of an observation and their columns."""
     obs_spaces: dict[str, Space]
@@ -190,9 +192,9 @@ class Env:
                 self.engine.prepare_capture()
             self.engine.reset(worlds.everyone)
             probe = Probe(self.task, worlds.after, worlds.params, self.device)
-            probe.check_bounds()  # check writes before any function of the task writes into an array
+            probe.check_bounds()  # check writes before the task's functions write into the environment's arrays
             self.rand_reset(options.seed)
-            if self.task.dynamics and not _replica:  # at later resets, invalid values are a fault of the world
+            if self.task.dynamics and not _replica:  # later resets report invalid values as faults
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
             probe.check_observations()
             if not _replica:
@@ -205,18 +207,20 @@ class Env:
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name in self.__dict__ and name in _BUFFERS:
-            raise AttributeError(f"env.{name} is a buffer of fixed address: write into it, as env.{name}.copy_(...)")
+            raise AttributeError(
+                f"env.{name} is a buffer at a fixed address: write into the buffer, as env.{name}.copy_(...)"
+            )
         super().__setattr__(name, value)
 
     def __reduce__(self) -> Any:
         raise TypeError(
-            "an environment cannot be pickled or copied: make it again from its arguments (env.replicate() does), and "
-            "send env.get_state() to another process"
+            "an environment cannot be pickled or copied: use env.replicate(); for another process, send "
+            "env.get_state() to a new environment there"
         )
 
     @functools.cached_property
     def model(self) -> mujoco.MjModel:
-        """The compiled model, read-only, because the engine uses its own copy.
+        """The compiled model, which is read-only because the engine uses its own copy.
 
         To change the physics, list model fields in the task's ``World`` and write them in ``startup`` or ``randomize``,
         or pass an edited MjSpec as ``model=``. ``copy.copy(env.model)`` is an ordinary MjModel that can be edited.
@@ -225,7 +229,7 @@ class Env:
 
     @property
     def horizon(self) -> int:
-        """Steps after which an episode is truncated; 0 for never."""
+        """Number of steps after which an episode is truncated; 0 means never."""
         return self.worlds.horizon
 
     @property
@@ -235,18 +239,18 @@ class Env:
 
     @property
     def autoreset(self) -> bool:
-        """Whether finished worlds start a new episode within the same step."""
+        """Whether worlds start a new episode within the step that ends an episode."""
         return self.worlds.autoreset
 
     # the step
 
     def step(self, action: torch.Tensor | None = None) -> None:
-        """Advance every world by one step under ``action``, and start new episodes in worlds whose episode ended.
+        """Advance every world by one step, and start new episodes in worlds whose episode ended.
 
-        ``Worlds.step_phases`` lists the phases in order.
+        ``Worlds.step_phases`` lists the phases of a step in order.
 
         Args:
-            action: Copied into ``env.action`` first, if given; (nworld, nact).
+            action: Actions to copy into ``env.action`` before the step, (nworld, nact).
 
         Raises:
             ValueError: The action has the wrong shape or type.
@@ -275,7 +279,7 @@ class Env:
         """Reset worlds to random initial states, and zero their actions.
 
         Args:
-            seed: Restarts the worlds' random streams; by default each world continues its own.
+            seed: Seed that restarts the worlds' random streams; by default each world continues its stream.
             mask: Worlds to change, (nworld,) bool; by default all.
         """
         worlds = self.worlds
@@ -289,18 +293,18 @@ class Env:
     # the state
 
     def get_state(self, out: torch.Tensor | None = None, mask: torch.Tensor | None = None) -> torch.Tensor:
-        """The complete state of every world, (nworld, state_space.size), float64; it determines the world's future.
+        """Get the complete state of every world, (nworld, state_space.size), float64.
 
-        A state holds the engine's integration state, fields left by the last substep, model fields that differ between
-        worlds, the step and episode counters, the random stream, the task's memory, the metric sums, and the count for
-        ``success_steps``. ``state_space.parts`` names their columns.
+        A state determines the future of its world: the engine's integration state, fields left by the last substep,
+        model fields that differ between worlds, the step and episode counters, the random stream, the task's memory,
+        the metric sums, and the count for ``success_steps``. ``state_space.parts`` names the columns of a state.
 
         Args:
-            out: Where to write the states.
-            mask: Worlds whose rows of ``out`` to write, (nworld,) bool; by default all.
+            out: Tensor into which the states are written.
+            mask: Worlds whose rows of ``out`` are written, (nworld,) bool; by default all.
 
         Raises:
-            ValueError: An argument has the wrong shape or type, or a mask comes without ``out``.
+            ValueError: An argument has the wrong shape or type, or a mask is given without ``out``.
         """
         worlds = self.worlds
         for call in worlds.programs.read_state:
@@ -308,20 +312,20 @@ class Env:
         if mask is None:
             return _copied(worlds.state_view, out)
         if out is None:
-            raise ValueError("a mask selects the rows of out that get_state writes: give out as well")
+            raise ValueError("a mask selects the rows of out that get_state writes: pass out as well")
         check_tensor(out, "out", worlds.state_view)
         worlds.set_mask(mask)
         return torch.where(worlds.mask_view[:, None], worlds.state_view, out, out=out)
 
     def set_state(self, state: torch.Tensor, mask: torch.Tensor | None = None, *, check: bool = True) -> None:
-        """Put worlds into states from ``get_state``, exactly; every getter reflects them afterwards.
+        """Set worlds exactly to states from ``get_state``; every getter then returns values of these states.
 
-        The reward becomes 0, because there is no transition.
+        The reward becomes 0, because setting a state is not a transition.
 
         Args:
-            state: (nworld, state_space.size), float64.
+            state: States, (nworld, state_space.size), float64.
             mask: Worlds to change, (nworld,) bool; by default all.
-            check: Whether to refuse states that are not finite. On a GPU the check waits for the device.
+            check: Whether to refuse states that are not finite. On a GPU, the check waits for the device.
 
         Raises:
             ValueError: The state has the wrong shape or type, or is not finite.
@@ -332,51 +336,52 @@ class Env:
         if check and (bad := ~torch.isfinite(state) & worlds.mask_view[:, None]).any():
             world, column = bad.nonzero()[0].tolist()
             part, number = self.state_space.part_at(column), state[world, column].item()
-            raise ValueError(f"the state of world {world} has {number} in its {part!r}: it must be finite")
+            raise ValueError(f"the state of world {world} has {number} in its {part!r}: states must be finite")
         worlds.state_view.copy_(state)
         for call in worlds.programs.restore_state:
             call()
 
-    # getters and setters of the paper's interface
+    # getters and setters
 
     def get_obs(
         self, state: torch.Tensor | None = None, out: torch.Tensor | None = None, *, group: str = "policy"
     ) -> torch.Tensor:
-        """Observations of the current states, or of given ones, (nworld, nobs).
+        """Get observations of the current states, or of given states, (nworld, nobs).
 
         Args:
             state: States to observe, (nworld, state_space.size).
-            out: Where to write the observations.
+            out: Tensor into which the observations are written.
             group: Name of the observation group.
 
         Raises:
-            ValueError: There is no such group, or an argument has the wrong shape or type.
+            ValueError: There is no group of this name, or an argument has the wrong shape or type.
         """
         check_group(group, self.obs_groups, self.task.name)
         return _copied((self if state is None else self._scratch_at(state)).obs_groups[group], out)
 
     def get_eval(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
-        """The evaluation metric after the last step, or of given states, (nworld,)."""
+        """Get the evaluation metric after the last step, or of given states, (nworld,)."""
         return _copied(self.eval if state is None else self._scratch_at(state).eval, out)
 
     def get_terminated(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
-        """Whether the last step terminated the episode, or given states are terminal, (nworld,) bool."""
+        """Check whether the last step terminated the episode, or whether given states are terminal, (nworld,) bool."""
         return _copied(self.terminated if state is None else self._scratch_at(state).worlds.terminated_view, out)
 
     def get_reward(
         self, before: torch.Tensor | None = None, action: torch.Tensor | None = None,
         after: torch.Tensor | None = None, out: torch.Tensor | None = None,
     ) -> torch.Tensor:  # fmt: skip
-        """Rewards of the last step, or of given transitions, (nworld,).
+        """Get the rewards of the last step, or of given transitions, (nworld,).
 
-        Given transitions are judged in scratch worlds; the live worlds stay unchanged. The result differs from
-        ``env.reward`` if an event of the task changed fields that the reward reads, because events follow the reward.
+        Scratch worlds compute the rewards of given transitions, so that the environment's worlds do not change. The
+        result differs from ``env.reward`` if an event of the task changed fields that the reward reads, because events
+        follow the reward.
 
         Args:
-            before: States before, (nworld, state_space.size).
-            action: Actions, (nworld, nact).
-            after: States after.
-            out: Where to write the rewards.
+            before: States before the transitions, (nworld, state_space.size).
+            action: Actions of the transitions, (nworld, nact).
+            after: States after the transitions.
+            out: Tensor into which the rewards are written.
 
         Raises:
             ValueError: Only part of a transition is given, or an argument has the wrong shape or type.
@@ -384,7 +389,7 @@ class Env:
         if before is None and action is None and after is None:
             return _copied(self.reward, out)
         if before is None or action is None or after is None:
-            raise ValueError("a reward belongs to a transition: give before, action and after, or none of them")
+            raise ValueError("a reward belongs to a transition: pass before, action and after, or none of the three")
         self._check_action(action)
         scratch = self._scratch_at(before)
         scratch.worlds.keep_before()
@@ -393,7 +398,7 @@ class Env:
         return _copied(scratch.reward, out)
 
     def get_action(self, out: torch.Tensor | None = None) -> torch.Tensor:
-        """The actions of the next step, (nworld, nact)."""
+        """Get the actions of the next step, (nworld, nact)."""
         return _copied(self.action, out)
 
     def set_action(self, action: torch.Tensor) -> None:
@@ -410,13 +415,15 @@ class Env:
         if not torch.isfinite(action).all():
             world, i = (~torch.isfinite(action)).nonzero()[0].tolist()
             name = self.action_space.part_at(i)
-            raise ValueError(f"the action {name!r} of world {world} is {action[world, i].item()}: it must be finite")
+            raise ValueError(
+                f"the action {name!r} of world {world} is {action[world, i].item()}: actions must be finite"
+            )
 
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
-        """A live view of a field of MjData or MjModel, by MuJoCo's name.
+        """Get a live view of a field of MjData or MjModel, by MuJoCo's name.
 
-        An environment keeps ``time``, ``ctrl`` and the fields that its task reads. Request other fields when you make
-        the environment, as in ``make("hopper", fields=["site_xpos", "body_mass"])``. Do not write into the view: use
+        An environment keeps ``time``, ``ctrl`` and the fields that its task reads. Request other fields when making the
+        environment, as in ``make("hopper", fields=["site_xpos", "body_mass"])``. Do not write into the view: use
         ``set_state`` or ``set_dynamics``.
 
         Args:
@@ -425,14 +432,14 @@ class Env:
                 geom or camera.
 
         Raises:
-            ValueError: The environment does not keep this field, or the model has no such element.
+            ValueError: The environment does not keep the field, or the model has no element of this name.
         """
         if name not in self._fields:
             check_field_name(name)
             (describe_model_field if is_model_field(name) else describe)(self.task.model, name)
             kept = ", ".join(sorted(self._fields))
             raise ValueError(
-                f"this environment of {self.task.name!r} does not keep the field {name!r}: make it with "
+                f"this environment of {self.task.name!r} does not keep the field {name!r}: make the environment with "
                 f"fields=[{name!r}] (it keeps {kept})"
             )
         view = self._fields[name]
@@ -443,14 +450,15 @@ class Env:
         return view[:, where.start] if one_object else view[:, where]
 
     def set_dynamics(self, mask: torch.Tensor | None = None, **fields: Any) -> None:
-        """Set model fields that the task randomizes or ``dynamics=`` lists, and update the constants derived from them.
+        """Set model fields that the task randomizes or ``dynamics=`` lists, and update derived constants.
 
         Each reset first restores the nominal values of fields that the task's ``initialize``, ``randomize`` or
         ``event`` writes. Other fields keep the new values until ``rand_reset(seed=...)``.
 
         Args:
             mask: Worlds to change, (nworld,) bool; by default all.
-            fields: Values by model field, as in ``body_mass=masses``: one row per world, or one row for all worlds.
+            fields: Values of model fields by name, as in ``body_mass=masses``, with one row per world or one row for
+                all worlds.
 
         Raises:
             ValueError: A field is unknown or the same in all worlds, or a value has the wrong size, is not finite, or
@@ -471,39 +479,39 @@ class Env:
             if field.name in names and (problem := field.problem(self.task.model, columns[field.name].cpu().numpy())):
                 raise ValueError(f"{self.task.name!r}: {problem}")
 
-    # memory that all worlds share
+    # shared memory
 
     def update_shared(self, total: Callable[[torch.Tensor], object] | None = None) -> None:
-        """Update ``shared`` with the task's ``share``, from the sums over the transitions since the last update.
+        """Update ``shared`` with the task's ``share``, which reads sums over the transitions since the last update.
 
-        Observations that depend on ``shared`` are updated, too. Learners call this method after each rollout. Nothing
-        waits for the device.
+        The update includes observations that depend on ``shared``. Learners call this method after each rollout. The
+        host does not wait for the device.
 
         Args:
-            total: Adds the sums of several processes, int64, in place, such as ``Team.sum``. All processes must call
-                this method.
+            total: Function that adds the sums, int64, of several processes in place, such as ``Team.sum``. All
+                processes must call ``update_shared``.
         """
         if self.shared and total is not None:
             total(torch_view(self.worlds.sums))
         self.worlds.update_shared()
 
     def get_shared(self) -> torch.Tensor:
-        """A copy of the memory that all worlds share and of the sums for its next update, for ``set_shared``.
+        """Copy the memory that all worlds share and the sums for the memory's next update, for ``set_shared``.
 
         Returns:
-            The memory, followed by the sums; float64, empty if the task has none.
+            The memory followed by the sums, float64; empty if the task has no shared memory.
         """
         parts = (torch_view(self.worlds.shared)[0], torch_view(self.worlds.sums) / steps.UNIT)
         return torch.cat([part.double() for part in parts])
 
     def set_shared(self, state: torch.Tensor) -> None:
-        """Set the memory that all worlds share, and the sums for its next update.
+        """Set the memory that all worlds share, and the sums for the memory's next update.
 
         Args:
-            state: From ``get_shared`` of an environment of the same task.
+            state: The result of ``get_shared`` of an environment of the same task.
 
         Raises:
-            ValueError: The state has another size or type.
+            ValueError: The state has the wrong size or type.
         """
         check_tensor(state, "the state of shared memory", self.get_shared())
         size = self.worlds.shared.shape[1]
@@ -514,18 +522,18 @@ class Env:
         for name, memory in other.shared.items():
             self.shared[name].copy_(memory)
 
-    # parameters and other environments of the same task
+    # parameters and copies
 
     @property
     def given_params(self) -> dict[str, Any]:
-        """The task parameters that were given, by name; all others have their defaults."""
+        """The given task parameters by name; all other parameters have their defaults."""
         return dict(self._given_params)
 
     def set_params(self, **params: Any) -> None:
-        """Change parameters of the task from the next step on, in place.
+        """Change parameters of the task in place, from the next step on.
 
         Raises:
-            ValueError: There is no such parameter, or the size of the observation would change.
+            ValueError: A parameter is unknown, or the size of the observation would change.
         """
         self.task.change_params(params)
         self._given_params = self._given_params | params
@@ -537,7 +545,7 @@ class Env:
         """Copy the parameters and the shared memory of another environment of the same task.
 
         Raises:
-            ValueError: ``other`` is not an environment, or belongs to a task with other parameters.
+            ValueError: ``other`` is not an environment, or its task has different parameters.
         """
         check_kind("other", other, Env, "an environment of the same task")
         self.set_params(**other._params_for(self.nworld, {**self._given_params, **other._given_params}))
@@ -546,11 +554,11 @@ class Env:
     def replicate(self, *, nworld: int | None = None, **changes: Any) -> "Env":
         """Make another environment of the same task, with the same options and parameters except for the given changes.
 
-        ``seed`` and ``first_world`` become 0 unless given. Parameters with one value per world are repeated if the
+        By default, ``seed`` and ``first_world`` become 0. Parameters with one value per world are repeated if the
         number of worlds differs.
         """
         nworld = self.nworld if nworld is None else nworld
-        # the parsed model, because its file may have changed
+        # pass the parsed model, because the model's file may have changed
         own = {"horizon": self.horizon, "autoreset": self.autoreset, "model": self.task.spec}
         known, params = EnvOptions.split(changes, self.options.changed(own | {"seed": 0, "first_world": 0}))
         given = self._params_for(nworld, self._given_params)
@@ -559,22 +567,22 @@ class Env:
         return made
 
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
-        """``replicate`` for a few worlds, as for an evaluation: with engine="auto" they run on the C engine.
+        """Replicate the environment with a few worlds, as for an evaluation; engine="auto" selects the C engine.
 
-        On a GPU a step of a few worlds takes nearly as long as a step of thousands.
+        On a GPU, a step of a few worlds takes nearly as long as a step of thousands of worlds.
         """
         return self.replicate(nworld=nworld, **(options_for_few_worlds(self.options.engine, self.device) | changes))
 
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
-        """The values of the named parameters, for ``nworld`` worlds."""
+        """Get the values of the named parameters, for ``nworld`` worlds."""
         known, worlds = self.task.parameters, np.arange(nworld) % self.nworld
-        # keep other values in the form in which they were given, for instance an element's name instead of its index
+        # keep other values as given, for example an element's name instead of its index
         given = {name: value for name, value in self._given_params.items() if name not in known.tables}
         values = {name: (known.values | given)[name] for name in names}
         return values | {name: known.values[name][worlds] for name in names if name in known.per_world}
 
     def _scratch_at(self, given: torch.Tensor) -> "Env":
-        """Scratch worlds of the same task in the given states; made at first use."""
+        """Set scratch worlds of the same task to the given states; the first call makes the scratch worlds."""
         if self._scratch is None:
             self._scratch = self.replicate()
         self._scratch._copy_shared(self)
@@ -584,19 +592,19 @@ class Env:
     # diagnostics
 
     def check_process(self) -> None:
-        """Raise RuntimeError if this process was forked after the environment was made."""
+        """Raise RuntimeError if this process was forked after making the environment."""
         _ = self.worlds.programs
 
     @property
     def bytes_per_world(self) -> float:
-        """Estimated bytes of memory per world, without the model, which all worlds share."""
+        """Estimate the bytes of memory per world, without the model, which all worlds share."""
         physics = self.options.engine, self.task.model, self.device, self.task.fields
         engine = bytes_per_world(*physics, dynamics=self.task.dynamics, **self.options.for_engine())
         return engine + own_bytes_per_world(self.task)
 
     @property
     def fault_counts(self) -> dict[str, int]:
-        """Number of faults of each kind since construction; waits for the device."""
+        """Count the faults of each kind since construction; the host waits for the device."""
         counts = self.worlds.fault_count.numpy().sum(axis=0)
         return {bit.name.lower(): int(counts[bit.bit_length() - 1]) for bit in FAULTS}  # type: ignore[union-attr]
 

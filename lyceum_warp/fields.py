@@ -1,4 +1,4 @@
-"""Describe the fields of MjData: the stage that computes each, its Warp type, and how it stays current."""
+"""Describe the fields of MjData by their Warp types and by the stages that compute and update the fields."""
 
 import dataclasses
 import difflib
@@ -9,13 +9,14 @@ import numpy as np
 import warp as wp
 
 quat = wp.vec4
-"""A quaternion in MuJoCo's order w, x, y, z. Warp's quaternion functions, which expect x, y, z, w, do not accept it."""
+"""A quaternion in MuJoCo's order w, x, y, z. Do not pass a ``quat`` to Warp's quaternion functions, which expect the
+order x, y, z, w."""
 
 vec10 = wp.types.vector(length=10, dtype=wp.float32)
 
 
 class Stage(enum.IntEnum):
-    """A stage of a forward pass, with the values of mjtStage."""
+    """Stages of a forward pass, with the values of mjtStage."""
 
     NONE = 0
     POSITION = 1
@@ -39,16 +40,16 @@ STATE_FIELDS = {
     "mocap_quat": mujoco.mjtState.mjSTATE_MOCAP_QUAT,
     "userdata": mujoco.mjtState.mjSTATE_USERDATA,
 }
-"""Fields of the integration state, with their mjtState component."""
+"""Fields of the integration state, each with its mjtState component."""
 
 INPUTS = ("ctrl", "xfrc_applied", "qfrc_applied", "mocap_pos", "mocap_quat", "userdata")
-"""State fields that the physics reads and never changes. A task may write them before a step."""
+"""State fields that the engine reads and never changes. A task may write these fields before a step."""
 
 INITIAL = ("qpos", "qvel", "act", "eq_active", *INPUTS)
 """Fields that make up an initial state."""
 
 READ_ONLY = ("history", "plastic")
-"""Fields of the integration state that only the physics writes: delayed samples and deformations."""
+"""Fields of the integration state that only the engine writes: delayed samples and deformations."""
 
 _POSITION = (
     "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat cam_xpos cam_xmat "
@@ -75,7 +76,7 @@ ON_DEMAND = {
     "subtree_linvel": mujoco.mjtSensor.mjSENS_SUBTREELINVEL,
     "subtree_angmom": mujoco.mjtSensor.mjSENS_SUBTREEANGMOM,
 }
-"""Fields that MuJoCo leaves at zero unless a sensor of the model needs them, each with one such sensor type."""
+"""Fields that MuJoCo leaves at zero unless a sensor needs the field, each with a type of such sensors."""
 
 SENSED = {"sensordata", *ON_DEMAND}
 """Fields that are computed only if the model's sensors are enabled."""
@@ -103,7 +104,7 @@ _KINDS = {
     "subtree_angmom".split(),
     _Kind.mjOBJ_BODY,
 ) | dict.fromkeys(("xanchor", "xaxis"), _Kind.mjOBJ_JOINT)  # fmt: skip
-"""For fields with one row per object: the kind of object, by the field's name or prefix."""
+"""Map the name or prefix of a field with one row per object to the kind of object."""
 
 _QPOS = (_Kind.mjOBJ_JOINT, "jnt_qposadr", "nq")
 _DOFS = (_Kind.mjOBJ_JOINT, "jnt_dofadr", "nv")
@@ -127,8 +128,8 @@ _RANGES = (
     | {"sensordata": _SENSORS, "flexvert_xpos": _VERTICES}
     | dict.fromkeys(("flexedge_length", "flexedge_velocity"), _EDGES)
 )  # fmt: skip
-"""For fields in which an object may have several rows, by name or prefix: the kind of object, the MjModel array with
-the index of its first row, and the array of row counts or the total number of rows."""
+"""Map the name or prefix of a field in which an object may have several rows to the kind of object, the MjModel array
+with the index of an object's first row, and the array of row counts or the total number of rows."""
 
 _COUNTS = {
     _Kind.mjOBJ_ACTUATOR: "nactuator",
@@ -149,11 +150,11 @@ _COUNTS = {
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """One field of one model, and how the engine updates it."""
+    """One field of a model, with the stages that update the field."""
 
     name: str
     shape: tuple[int, ...]
-    """Shape of one world's value, without the axis that is part of ``dtype``."""
+    """Shape of the field in one world, without the axis that is part of ``dtype``."""
     dtype: type
     """Warp type of an element: float, wp.vec3, quat (w, x, y, z), ..."""
     refresh: Stage
@@ -163,13 +164,13 @@ class Field:
     lagged: bool
     """Whether the field keeps the value left by ``mj_step``, which lags one substep behind the state."""
     snapshot: bool
-    """Whether the field is saved beside the integration state, because it is not a function of it."""
+    """Whether states include the field, because it is not a function of the integration state."""
     written: bool = False
     """Whether the task writes the field before a step; only for ``INPUTS``."""
 
     @property
     def size(self) -> int:
-        """Number of scalars in one world's value."""
+        """Number of scalars of the field in one world."""
         return int(np.prod(self.shape, dtype=int)) * max(1, wp.types.type_size_in_bytes(self.dtype) // 4)
 
 
@@ -178,12 +179,12 @@ _KNOWN = (*STATE_FIELDS, *DERIVED_FIELDS, "sensordata")
 
 
 def similar_data_fields(name: str) -> list[str]:
-    """Names of MjData fields similar to a name, closest first."""
+    """List MjData fields with similar names, closest first."""
     return difflib.get_close_matches(name, _KNOWN, 3)
 
 
 def is_data_field(name: str) -> bool:
-    """Whether MjData has a field of this name that an environment can keep."""
+    """Check whether a name is the name of an MjData field that an environment can keep."""
     return name in STATE_FIELDS or name in DERIVED_FIELDS or name in SENSED
 
 
@@ -192,10 +193,10 @@ def describe(
 ) -> Field:
     """Describe a field of a model.
 
-    Positions, velocities and functions of them match the current state after every step, restart and event. Fields of
+    Fields of the position and velocity stages match the current state after every step, restart and event. Fields of
     the acceleration stage, such as ``qacc``, ``cfrc_ext`` or actuator forces, are computed by the last substep from the
-    state before it; at the start of an episode, from the first state. In ``sensordata`` each sensor follows its own
-    stage.
+    state before the substep, and at the start of an episode from the first state. In ``sensordata``, each sensor's
+    columns follow the sensor's stage.
 
     Args:
         model: The compiled model.
@@ -206,8 +207,8 @@ def describe(
         written: Whether the task writes the field before a step. Controls are always written.
 
     Raises:
-        ValueError: There is no such field, no enabled sensor makes MuJoCo compute it, ``written`` is set for a field
-            not in ``INPUTS``, or ``cleared`` for a field of the current state.
+        ValueError: There is no field of this name, no enabled sensor makes MuJoCo compute the field, ``written`` is set
+            for a field not in ``INPUTS``, or ``cleared`` is set for a field of the current state.
     """
     if written and name not in INPUTS:
         raise ValueError(f"the field {name!r} cannot be written before a step: the inputs are {', '.join(INPUTS)}")
@@ -215,7 +216,7 @@ def describe(
     if name in SENSED and not _sensed(model, name):
         raise ValueError(
             f"MuJoCo computes the field {name!r} only for a sensor, and this model has no enabled sensor that needs "
-            f"it: list the field in the task's World, or give make() fields=[{name!r}]"
+            f"it: list the field in the task's World, or pass fields=[{name!r}] to make()"
         )
     if name in STATE_FIELDS:
         refresh = reset = Stage.NONE
@@ -237,7 +238,7 @@ def describe(
     if cleared:
         if not snapshot or refresh > Stage.NONE:
             raise ValueError(
-                f"the field {name!r} cannot be cleared: it belongs to the current state, so take it out of cleared"
+                f"the field {name!r} cannot be cleared, because it belongs to the current state: remove it from cleared"
             )
         reset = Stage.NONE
     shape: tuple[int, ...] = np.shape(getattr(mujoco.MjData(model), name))
@@ -248,27 +249,27 @@ def describe(
 
 
 def early_sensor_columns(model: mujoco.MjModel) -> np.ndarray:
-    """The columns of ``sensordata`` that hold sensors of the position and velocity stages, (n,) int."""
+    """Get the columns of ``sensordata`` for sensors of the position and velocity stages, (n,) int."""
     early = np.flatnonzero(model.sensor_needstage < Stage.ACCELERATION)
     ranges = [np.arange(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i]) for i in early]
     return np.concatenate([np.zeros(0, int), *ranges])
 
 
 def state_columns(model: mujoco.MjModel, name: str) -> slice:
-    """The columns of a state field in the integration state (mjSTATE_INTEGRATION)."""
+    """Get the columns of a state field in the integration state (mjSTATE_INTEGRATION)."""
     component = STATE_FIELDS[name].value
     start = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION.value & (component - 1))
     return slice(start, start + mujoco.mj_stateSize(model, component))
 
 
 def _sensed(model: mujoco.MjModel, name: str) -> bool:
-    """Whether a sensor of the model makes MuJoCo compute a field."""
+    """Check whether a sensor of the model makes MuJoCo compute a field."""
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
         return False
     if name == "sensordata":
         return True
     kind = mujoco.mjtSensor
-    if ON_DEMAND[name] == kind.mjSENS_FRAMELINACC:  # one pass computes all of them
+    if ON_DEMAND[name] == kind.mjSENS_FRAMELINACC:  # one pass of MuJoCo computes accelerations and forces
         kinds = [kind.mjSENS_ACCELEROMETER, kind.mjSENS_FORCE, kind.mjSENS_TORQUE, kind.mjSENS_FRAMELINACC,
                  kind.mjSENS_FRAMEANGACC]  # fmt: skip
     else:
@@ -277,15 +278,15 @@ def _sensed(model: mujoco.MjModel, name: str) -> bool:
 
 
 def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
-    """The rows of a named element of the model in a field of MjData or MjModel.
+    """Get the rows of a named element of the model in a field of MjData or MjModel.
 
-    Several rows are possible for a joint (coordinates in ``qpos``; degrees of freedom in ``qvel``, ``dof_damping`` and
-    similar fields), a sensor (``sensordata``), an actuator (controls in ``ctrl``, activations in ``act``, outputs in
-    ``actuator_force``) and a flex (vertices). A mocap body has one row in ``mocap_pos``. In all other fields each
+    A joint may have several rows (coordinates in ``qpos``; degrees of freedom in ``qvel``, ``dof_damping`` and similar
+    fields), as may a sensor (``sensordata``), an actuator (controls in ``ctrl``, activations in ``act``, outputs in
+    ``actuator_force``) and a flex (vertices). A mocap body has one row in ``mocap_pos``. In all other fields, each
     object has one row.
 
     Raises:
-        ValueError: The model has no such element, or the element has no rows in the field.
+        ValueError: The model has no element of this name, or the element has no rows in the field.
     """
     if name in ("mocap_pos", "mocap_quat"):
         i = int(model.body_mocapid[_find(model, _Kind.mjOBJ_BODY, element)])
@@ -311,12 +312,12 @@ def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
 
 
 def has_several_rows(name: str) -> bool:
-    """Whether an object may have several rows in a field, as a joint has in ``cdof``."""
+    """Check whether an object may have several rows in a field, as a joint has in ``cdof``."""
     return name in _RANGES or name.partition("_")[0] in _RANGES
 
 
 def rows(model: mujoco.MjModel, name: str) -> int:
-    """The length of a field of MjData or MjModel along the axis of its named elements."""
+    """Get the length of a field of MjData or MjModel along the axis of its named elements."""
     owner = model if hasattr(model, name) else mujoco.MjData(model)
     return len(getattr(owner, name))
 

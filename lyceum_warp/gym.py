@@ -1,7 +1,7 @@
 """Register all tasks with Gymnasium: ``gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=64)``.
 
-Importing this module registers each task under the name of its class, as ``lyceum/HalfCheetah-v0``. A task's file is
-loaded when an environment is made. ``register`` adds a task of your own.
+Importing this module registers each task under the name of its class, such as ``lyceum/HalfCheetah-v0``. A task's file
+is loaded when an environment is made. ``register`` adds a task of your own.
 """
 
 import re
@@ -22,11 +22,11 @@ def register(task: str | Path | type[Task]) -> str:
     A task with the same id is replaced.
 
     Args:
-        task: Name of a task, path of its file, or its class.
+        task: Name of a task, path of a task file, or a task class.
 
     Raises:
-        ValueError: There is no such task.
-        FileNotFoundError: There is no such file.
+        ValueError: The task does not exist.
+        FileNotFoundError: The task file does not exist.
     """
     known = isinstance(task, str) and task in task_names()
     name = str(task) if known else task_name(find_task(task))

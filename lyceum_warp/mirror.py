@@ -1,4 +1,4 @@
-"""Declare the mirror image of a task, in which left and right are exchanged, by the names of its parts."""
+"""Declare the mirror image of a task, which exchanges left and right, by the names of its parts."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 
 Reflection = tuple[Sequence[int], Sequence[float]]
-"""A permutation of columns with signs: the mirror image of a row is ``signs * row[order]``."""
+"""Order and signs of columns; the mirror image of a row is ``signs * row[order]``."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Mirror:
     """The mirror image of a task in the plane between left and right, for ``lw.Task.mirror``.
 
-    A reflection applies to a part's name wherever it occurs: in observations, actions and states. A reflection consists
-    of the signs of the part's columns, such as ``"command": (1, -1, -1)`` for velocities forwards and to the left and a
-    yaw rate; or of an order of the columns followed by their signs, such as ``"foot_force": ([1, 0], [1, 1])`` for a
-    left and a right foot. In the base's axes, a vector has the signs (1, -1, 1), and an angular velocity (-1, 1, -1).
-    The reflection "action" applies to a whole action whose parts are actuators.
+    A reflection applies to all parts with the given name in observations, actions and states. A reflection consists of
+    either the signs of the part's columns, such as ``"command": (1, -1, -1)`` for velocities forwards and to the left
+    and a yaw rate, or an order of the columns followed by their signs, such as ``"foot_force": ([1, 0], [1, 1])`` for a
+    left and a right foot. In the base's axes, a vector has the signs (1, -1, 1), and an angular velocity has the signs
+    (-1, 1, -1). The reflection "action" applies to the whole action, if its parts are actuators.
 
     Args:
         parts: Reflections by the names of parts.
@@ -30,28 +30,28 @@ class Mirror:
     parts: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        """Complete reflections given only by signs, and check all reflections."""
+        """Add the order to reflections that have only signs, and check all reflections."""
         parts = {name: _complete(part) for name, part in self.parts.items()}
         for name, (order, signs) in parts.items():
             places, factors = np.asarray(order), np.asarray(signs)
             fits = sorted(order) == list(range(len(signs))) and set(np.abs(factors)) <= {1.0}
             if not fits or (places[places] != range(len(order))).any() or (factors * factors[places] != 1.0).any():
                 raise ValueError(
-                    f"the reflection {name!r} of lw.Mirror must be its own inverse, as ([1, 0], [-1, -1]) is, not "
+                    f"the reflection {name!r} of lw.Mirror must be its own inverse, such as ([1, 0], [-1, -1]), not "
                     f"{self.parts[name]!r}"
                 )
         object.__setattr__(self, "parts", parts)
 
     def columns(self, parts: Mapping[str, slice], *, task: str, whole: str | None = None) -> Reflection:
-        """Combine the reflections of the parts into the reflection of a row.
+        """Combine the reflections of all parts of a row into the reflection of the row.
 
         Args:
             parts: The columns of each part, in the format of ``Space.parts``.
-            task: Name of the task, for messages.
+            task: Name of the task for error messages.
             whole: Name of a reflection of the whole row, if there is one.
 
         Raises:
-            ValueError: A part has no reflection, or its reflection has another size.
+            ValueError: A part has no reflection, or its reflection has a different size.
         """
         if whole is not None and whole in self.parts:
             parts = {whole: slice(0, max(part.stop for part in parts.values()))}

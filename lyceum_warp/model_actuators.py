@@ -6,14 +6,14 @@ from lyceum_warp.support.validate import positive_number
 
 
 def follow_velocity(actuator: mujoco.MjsActuator, speed: float) -> None:
-    """Turn a position servo into one whose control is the velocity of its target.
+    """Turn a position servo into an actuator with the velocity of the servo's target as control.
 
-    The gains do not change. The target becomes an activation of the model (``act``), limited to the control range that
-    the actuator had before.
+    The actuator's gains do not change. The target becomes an activation of the model (``act``), limited to the
+    actuator's old control range.
 
     Args:
-        actuator: A position servo with a control range; changed in place.
-        speed: The new controls range from -speed to speed, in m/s or rad/s.
+        actuator: A position servo with a control range, which is changed in place.
+        speed: Limit of the new controls, which range from -speed to speed, in m/s or rad/s.
 
     Raises:
         ValueError: The actuator is not a position servo, has no control range, or the speed is not positive.
@@ -26,7 +26,7 @@ def follow_velocity(actuator: mujoco.MjsActuator, speed: float) -> None:
     if actuator.biastype != mujoco.mjtBias.mjBIAS_AFFINE or actuator.biasprm[1] != -kp or kp <= 0.0:
         raise ValueError(f"{name} is not a position servo: define it as <position kp=...>, or call set_to_position")
     if actuator.ctrlrange[0] >= actuator.ctrlrange[1]:
-        raise ValueError(f"{name} has no range for its target: set its ctrlrange first")
+        raise ValueError(f"{name} has no range for its target: set the actuator's ctrlrange first")
     speed = positive_number("speed", speed, "m/s or rad/s")
     actuator.set_to_intvelocity(kp=kp, kv=-actuator.biasprm[2])
     actuator.actrange, actuator.ctrlrange = actuator.ctrlrange, (-speed, speed)

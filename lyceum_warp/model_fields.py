@@ -15,7 +15,7 @@ from lyceum_warp.support.validate import described
 
 
 class Constants(enum.IntFlag):
-    """Groups of a model's constants that MuJoCo computes from other fields (mj_setConst)."""
+    """Groups of model constants that MuJoCo computes from other fields (mj_setConst)."""
 
     NONE = 0
     FIXED = 1
@@ -25,13 +25,13 @@ class Constants(enum.IntFlag):
     INERTIAL = 4
     """Inverse weights and unit accelerations at ``qpos0``."""
     PRIVATE = 8
-    """Constants of the C engine alone: coinciding frames, bounding volumes of bodies, indices and flags."""
+    """Constants that only the C engine uses: coinciding frames, bounding volumes of bodies, indices and flags."""
 
 
 _ALL = Constants.FIXED | Constants.KINEMATIC | Constants.INERTIAL | Constants.PRIVATE
 _POSES = Constants.KINEMATIC | Constants.INERTIAL | Constants.PRIVATE
 _WRAPPED = {"geom_pos", "geom_quat", "geom_size"}
-"""Geom fields that matter to a tendon wrapping around the geom."""
+"""Geom fields that affect a tendon wrapping around the geom."""
 
 _WRAPS = [int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER)]
 
@@ -40,10 +40,10 @@ _FIELDS = (
         # contacts
         "geom_friction geom_solmix geom_solref geom_solimp "
         "pair_friction pair_solref pair_solreffriction pair_solimp pair_margin pair_gap "
-        # joints, degrees of freedom
+        # joints
         "jnt_solref jnt_solimp jnt_stiffness jnt_range jnt_actfrcrange jnt_margin "
         "dof_solref dof_solimp dof_frictionloss dof_damping "
-        # equality constraints and tendons
+        # equalities and tendons
         "eq_solref eq_solimp "
         "tendon_solref_lim tendon_solimp_lim tendon_solref_fri tendon_solimp_fri tendon_range tendon_actfrcrange "
         "tendon_margin tendon_frictionloss tendon_lengthspring "
@@ -65,7 +65,7 @@ _FIELDS = (
     | dict.fromkeys(("cam_pos", "cam_quat"), Constants.KINEMATIC | Constants.PRIVATE)
     | {"body_mass": _ALL, "geom_size": Constants.FIXED | Constants.PRIVATE}
 )
-"""The fields that can differ between worlds on every engine, with the constants derived from each."""
+"""Fields that can differ between worlds on every engine, each with the constants derived from the field."""
 
 _OPTIONS = {"gravity", "magnetic", "wind", "density", "viscosity"}
 """The fields that are attributes of MjModel.opt."""
@@ -90,13 +90,13 @@ _REASONS = (
 )  # fmt: skip
 
 _POSITIVE = {"body_mass", "body_inertia", "geom_size"}
-"""Fields whose elements must be positive if their nominal values are."""
+"""Fields with elements that must be positive if the nominal values are positive."""
 
 NOT_NEGATIVE = _POSITIVE | set(
     "geom_friction pair_friction jnt_stiffness dof_damping dof_armature dof_frictionloss tendon_stiffness "
     "tendon_damping tendon_armature tendon_frictionloss actuator_damping actuator_armature density viscosity".split()
 )
-"""Fields whose elements must not be negative."""
+"""Fields with elements that must not be negative."""
 
 _TYPES = {
     2: wp.vec2, 3: wp.vec3, 4: wp.vec4, 5: wp.types.vector(length=5, dtype=wp.float32), 6: wp.spatial_vector,
@@ -106,11 +106,11 @@ _TYPES = {
 
 @dataclasses.dataclass(frozen=True)
 class ModelField:
-    """One field of one model that can differ between worlds."""
+    """One field of a model that can differ between worlds."""
 
     name: str
     shape: tuple[int, ...]
-    """Shape of one world's value, without the axis that ``dtype`` holds."""
+    """Shape of the field in one world, without the axis that is part of ``dtype``."""
     dtype: type
     """Warp type of an element: float, wp.vec3, wp.vec4 for quaternions (w, x, y, z), ..."""
     constants: Constants
@@ -118,7 +118,7 @@ class ModelField:
 
     @property
     def size(self) -> int:
-        """Number of floats in one world's value."""
+        """Number of floats of the field in one world."""
         return int(np.prod(self.shape, dtype=int)) * wp.types.type_size_in_bytes(self.dtype) // 4
 
     @property
@@ -132,7 +132,7 @@ class ModelField:
         return self.name in _COMPUTED
 
     def problem(self, model: mujoco.MjModel, rows: np.ndarray) -> str | None:
-        """A one-line message about the first value that MuJoCo cannot simulate; None if all values are valid.
+        """Describe in one line the first value that MuJoCo cannot simulate; None if all values are valid.
 
         Args:
             model: The compiled model.
@@ -160,27 +160,27 @@ class ModelField:
         )
 
     def value(self, model: mujoco.MjModel) -> np.ndarray:
-        """The field's value in a model, float64; an array is a view into the model."""
+        """Get the field's value in a model, float64; an array is a view into the model."""
         return np.asarray(getattr(model.opt if self.option else model, self.name))
 
 
 def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[str, torch.Tensor]) -> None:
-    """Write values of model fields into their columns of a batch of states.
+    """Write values of model fields into the fields' columns of a batch of states.
 
     Args:
         model: The compiled model.
-        values: Values by field name: one row per world, or one row for all worlds.
-        columns: Columns of all model fields that differ between worlds, by name, (nworld, size) each.
+        values: Values by field name, each with one row per world or one row for all worlds.
+        columns: Columns of all model fields that differ between worlds by name, each (nworld, size).
 
     Raises:
         ValueError: A field is unknown or the same in every world, or a value has the wrong size.
     """
     for name, value in values.items():
-        field = describe_model_field(model, name)  # raises for a misspelt name
+        field = describe_model_field(model, name)  # raises an error for a misspelt name
         if name not in columns:
             raise ValueError(
-                f"the model field {name!r} is the same in every world of this environment: make it with "
-                f"dynamics=[{name!r}], or let the task write it"
+                f"the model field {name!r} is the same in every world of this environment: make the environment with "
+                f"dynamics=[{name!r}], or let the task write the field"
             )
         target = columns[name]
         try:
@@ -194,12 +194,12 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
 
 
 def similar_model_fields(name: str) -> list[str]:
-    """Similar names of fields that can differ between worlds, closest first."""
+    """List similarly named fields that can differ between worlds, closest first."""
     return difflib.get_close_matches(name, _FIELDS, 3)
 
 
 def is_model_field(name: str) -> bool:
-    """Whether MjModel or its options have an attribute of this name."""
+    """Check whether MjModel or MjModel.opt has an attribute of a given name."""
     return name in _FIELDS or hasattr(mujoco.MjModel, name) or hasattr(mujoco.MjOption, name)
 
 
@@ -212,7 +212,8 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
         varies: Whether to accept only fields that can differ between worlds.
 
     Raises:
-        ValueError: There is no such field, it does not hold real numbers, or it cannot differ between worlds.
+        ValueError: There is no field of this name, the field has no real numbers, or the field cannot differ between
+            worlds.
     """
     if not varies and name not in _FIELDS:
         value: Any = getattr(model, name, None)
@@ -231,7 +232,7 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
     constants = _FIELDS[name]
     if name in _WRAPPED and np.isin(model.wrap_type, _WRAPS).any():
         constants |= _POSES
-    # a scalar becomes a row of one element, so that a task can write it
+    # a scalar becomes a row of one element, so that a task can write the scalar
     shape: tuple[int, ...] = np.shape(getattr(model.opt if name in _OPTIONS else model, name)) or (1,)
     return _described(name, shape, constants)
 
@@ -243,17 +244,17 @@ def _described(name: str, shape: tuple[int, ...], constants: Constants) -> Model
 
 
 MOVED_INERTIA = {"body_ipos", "body_iquat"}
-"""Fields that must be equal in all worlds for "simple" bodies, whose inertial frame equals the body frame."""
+"""Fields that must be equal in all worlds for "simple" bodies, for which the inertial frame equals the body frame."""
 
 
 def check_simple(model: mujoco.MjModel, name: str) -> None:
-    """Refuse a field that moves the inertial frame of a body compiled as simple.
+    """Refuse a field that moves the inertial frame of a body that is compiled as simple.
 
     Raises:
-        ValueError: The model has such a body.
+        ValueError: The field moves the inertial frame, and the model has a simple body.
     """
     if name in MOVED_INERTIA and (simple := np.flatnonzero(model.body_simple[1:]) + 1).size:
         raise ValueError(
             f"{name} can't differ between worlds while bodies are compiled as simple (the bodies {simple.tolist()}): "
-            'set simple="false" on them'
+            'set simple="false" on these bodies'
         )

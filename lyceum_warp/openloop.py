@@ -1,4 +1,4 @@
-"""Roll out given actions in every world, and evaluate their rewards and terminations."""
+"""Roll out given actions in every world, and compute rewards and terminations."""
 
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -28,32 +28,32 @@ from lyceum_warp.world_arrays import memory_columns, own_parts
 
 @document_attributes
 class OpenLoop:
-    """Rolls out the worlds of an environment from one or several states under given actions, and stores their rewards.
+    """Rolls out an environment's worlds from one or several states under given actions, and stores rewards.
 
-    Write ``state`` and ``actions``, call ``run``, and read the other tensors, which are updated in place. Episodes do
-    not end within the horizon: the caller decides what termination means. The C engine runs the whole horizon in one
-    native call if that is exact and the task has neither ``control`` nor ``substep``; otherwise it runs step by step.
-    On the Warp engine the rollout is one graph.
+    Write ``state`` and ``actions``, call ``run``, and read the other tensors, which are updated in place. Episodes
+    continue to the horizon even after a termination; the caller decides how to treat terminations. The C engine runs
+    the whole horizon in one native call if this is exact and the task has neither ``control`` nor ``substep``, and
+    otherwise step by step. On the Warp engine, the rollout is one graph.
 
     Args:
-        env: Worlds to roll out; do not use them for anything else.
+        env: Environment of the worlds to roll out, which must not be used for anything else.
         horizon: Number of steps.
         keys: Keys of the worlds' random streams, (nworld,) uint32 on the environment's device, read at every run. By
-            default each world uses the key in ``state`` and draws the same numbers as with ``env.step``.
-        nominal_model: Whether model fields that differ between worlds take their nominal values instead of those in
+            default, each world uses the key in ``state`` and draws the same numbers as with ``env.step``.
+        nominal_model: Whether model fields that differ between worlds take nominal values instead of the values in
             ``state``.
         models: Values of model fields that differ between worlds, by name, each (n, size) float64 on the environment's
-            device, read at every run: world w uses row w % n instead of the values in ``state``.
-        states: Number of states to start from. Each state has nworld / states consecutive worlds.
+            device. Every run reads the values: world w uses row w % n instead of the values in ``state``.
+        states: Number of initial states. Each initial state has nworld / states consecutive worlds.
 
     Raises:
         ValueError: The environment resets its worlds automatically, ``keys`` has the wrong shape, type or device, the
-            worlds cannot be divided among the states, or the buffers do not fit into memory.
+            number of worlds is not a multiple of the number of states, or the buffers do not fit into memory.
     """
 
     state: torch.Tensor
-    """The initial state of every world, (state_space.size,) float64; the same tensor as ``states`` if there are
-    several."""
+    """The initial state of every world, (state_space.size,) float64; with several initial states, equal to
+    ``states``."""
     states: torch.Tensor
     """The initial states, (states, state_space.size) float64."""
     actions: torch.Tensor
@@ -67,7 +67,7 @@ class OpenLoop:
     final_obs_groups: dict[str, torch.Tensor]
     """Observations after the last step by group; ``policy`` is ``final_obs``."""
     fault: torch.Tensor
-    """Bits of ``Done`` for the faults of a world, (nworld,) int32; if a bit is set, ignore that world's rewards."""
+    """Faults of each world as bits of ``Done``, (nworld,) int32; ignore the rewards of a world with a fault."""
     phases: tuple[Phase, ...]
     """The phases of ``run``, for callers that add phases to the same graph."""
 
@@ -85,7 +85,7 @@ class OpenLoop:
         self.horizon = whole_number("horizon", horizon, low=1)
         n, nact, task = env.nworld, env.action_space.size, env.task
         if n % (states := whole_number("states", states, low=1)):
-            raise ValueError(f"nworld={n} cannot be divided among states={states}: choose a multiple")
+            raise ValueError(f"nworld={n} must be a multiple of states={states}")
         if keys is not None and (keys.shape, keys.dtype, keys.device) != ((n,), wp.uint32, env.device):
             raise ValueError(
                 f"keys must be a wp.array of shape ({n},) and type uint32 on {env.device}, not of shape {keys.shape} "
@@ -98,7 +98,7 @@ class OpenLoop:
         with wp.ScopedDevice(env.device):
             self._state = wp.zeros((states, env.state_space.size), dtype=wp.float64)
             self._actions = wp.zeros((self.horizon, n, nact), dtype=float)
-            # in stepwise rollouts each step computes its own controls
+            # stepwise rollouts compute controls step by step instead
             self._controls = wp.zeros((self.horizon, n, 0 if stepwise else task.model.nu), dtype=float)
             self._reward = wp.zeros(rows, dtype=float)
             self._terminated = wp.zeros(rows, dtype=bool)
@@ -108,7 +108,7 @@ class OpenLoop:
             for group, space in env.obs_spaces.items():
                 setattr(self._obs, group, wp.zeros((n, space.size), dtype=float))
             self._no_memory = wp.zeros((rows + n, 0), dtype=float)
-            # the states before each step, after each step and at the end are views of one buffer per field
+            # one buffer per field holds the states before each step, after each step and at the end
             self._fields: dict[str, wp.array] = {}
             self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
             if task.shared:
@@ -149,7 +149,7 @@ class OpenLoop:
 
     @staticmethod
     def _bytes_per_world(env: Env, horizon: int) -> int:
-        """Estimated bytes of the buffers per world."""
+        """Estimate the bytes of the buffers per world."""
         fields = [field for field in env.task.fields if field.name in env.task.types]
         numbers = sum(field.size for field in fields) + sum(field.size for field in env.task.dynamics)
         numbers += sum(own_parts(env.task).values())
@@ -169,7 +169,7 @@ class OpenLoop:
         )
 
     def _step_by_step(self) -> tuple[Phase, ...]:
-        """The phases for a task with ``control`` or ``substep``, which read the state at every step or substep."""
+        """List the phases for a task with ``control`` or ``substep``, which read the state at every step or substep."""
         engine, worlds = self.env.engine, self.worlds
         phases = [
             Phase("start", self._start),
@@ -210,7 +210,7 @@ class OpenLoop:
         wp.launch(planning.controls, self._actions.shape[:2], args, device=device)
 
     def _overwrite_model(self) -> None:
-        """Overwrite the model fields in every world's state with their nominal values."""
+        """Overwrite the model fields in every world's state with nominal values."""
         columns, states = self.env.state_space.parts, self.worlds.state
         nominal: Mapping[str, wp.array] = self.env.engine.nominal
         for name, row in nominal.items():
@@ -219,12 +219,12 @@ class OpenLoop:
             wp.launch(planning.overwrite, (states.shape[0], row.shape[1]), args, device=self.env.device)
 
     def _transitions(self) -> list[Any]:
-        """The batches, the parameters and the actions of the transitions of the whole horizon."""
+        """Get the batches, parameters and actions of all transitions of the horizon."""
         actions = self._actions.reshape((-1, self._actions.shape[2]))
         return [self._before, self._after, self.worlds.params, actions]
 
     def _advance_memory(self) -> None:
-        """Advance the task's memory along the horizon."""
+        """Advance the task's memory over all steps of the horizon."""
         n, kernels = self.env.nworld, self.env.task.kernels
         if kernels.advance_rows is not None:
             rows = (self.horizon + 1) * n
@@ -234,19 +234,19 @@ class OpenLoop:
             ]
             args = [*self._transitions(), self.worlds.counters, *memories]
             launch_worlds(kernels.advance_rows, n, args, self.env.device)
-        else:  # the memory stays constant
+        else:  # the task's memory stays constant
             for buffer in self._memories.values():
                 for t in range(self.horizon):
                     wp.copy(buffer[t + 1], buffer[0])
 
     def _judge_rows(self) -> None:
-        """Judge all transitions of the horizon at once."""
+        """Compute the rewards and terminations of all transitions of the horizon at once."""
         rows, (*batches, actions) = self.horizon * self.env.nworld, self._transitions()
         args = [*batches, self.worlds.weights, actions, self._reward, self._terminated]
         launch_worlds(self.env.task.kernels.judge_rows, rows, args, self.env.device)
 
     def _end_of_horizon(self) -> None:
-        """Advance the step counters, collect faults, and observe the last states."""
+        """Advance the step counters, collect the worlds' faults, and observe the worlds' last states."""
         wp.launch(planning.add_to, self.env.nworld, [self.horizon, self.worlds.counters.step], device=self.env.device)
         self._end(self._last)
 
@@ -265,7 +265,7 @@ class OpenLoop:
         launch_worlds(kernels.judge_rows, n, args, device)
 
     def _end(self, batch: object) -> None:
-        """Collect the worlds' faults, and observe their last states."""
+        """Collect the worlds' faults, and observe the worlds' last states."""
         worlds, n, device = self.worlds, self.env.nworld, self.env.device
         self.env.engine.find_faults(worlds.everyone)
         wp.launch(planning.merge_faults, n, [self.env.engine.fault, self._fault], device=device)

@@ -1,7 +1,7 @@
 """Define the options of an environment and of its physics.
 
-``make``, ``replicate``, MPPI, the command line, the help texts and the suggestions for misspelt names are all generated
-from these two classes. To add an option, add a field here.
+The arguments of ``make``, ``replicate`` and MPPI, the command line, the help texts and the suggestions for misspelt
+names are generated from ``EnvOptions`` and ``PhysicsOptions``. To add an option, add a field to one of the classes.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from lyceum_warp.support.docstrings import attribute_docs, document_attributes, 
 from lyceum_warp.support.validate import check_flag, check_kind, described, finite_number, positive_number, whole_number
 
 ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
-"""The source of a model: a file or an MjSpec."""
+"""Source of a model, which is a file or an MjSpec."""
 
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 INTEGRATORS = {
@@ -32,16 +32,16 @@ JACOBIANS = {
     "auto": mujoco.mjtJacobian.mjJAC_AUTO,
 }  # fmt: skip
 SOLVER_LIMITS = {"iterations": 1, "ls_iterations": 1, "noslip_iterations": 0}
-"""The limits of the constraint solver that ``solver`` accepts, with the smallest value of each."""
+"""Limits of the constraint solver that ``solver`` accepts, each with its smallest value."""
 
 
 def _for_engine(default: Any) -> Any:
-    """The dataclass field of an option that is passed to the engine's constructor."""
+    """Make the dataclass field of an option for the engine's constructor."""
     return dataclasses.field(default=default, metadata={"engine": True})
 
 
 def given_values(options: Any) -> dict[str, Any]:
-    """The fields of a dataclass that differ from their defaults, by name."""
+    """Get the fields of a dataclass that differ from their defaults, by name."""
     values = {field.name: (getattr(options, field.name), field.default) for field in dataclasses.fields(options)}
     return {name: value for name, (value, default) in values.items() if value is not default and value != default}
 
@@ -64,7 +64,7 @@ def _one_of(what: str, name: Any, known: Mapping[str, Any]) -> None:
 
 def _checked_limits(solver: Any) -> dict[str, int]:
     if not isinstance(solver, Mapping):
-        raise ValueError(f"solver must be a dict of limits, as solver={{'iterations': 4}}, not {solver!r}")
+        raise ValueError(f"solver must be a dict of limits, such as solver={{'iterations': 4}}, not {solver!r}")
     if unknown := [name for name in solver if name not in SOLVER_LIMITS]:
         raise ValueError(f"solver has no limit {unknown[0]!r}: it takes {', '.join(map(repr, SOLVER_LIMITS))}")
     return {name: whole_number(f"solver's {name}", value, low=SOLVER_LIMITS[name]) for name, value in solver.items()}
@@ -73,15 +73,15 @@ def _checked_limits(solver: Any) -> dict[str, int]:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhysicsOptions:
-    """How the worlds are simulated. None keeps the setting of the task or its model.
+    """Options of the simulation. An option of None keeps the setting of the task or the model.
 
     Raises:
         ValueError: A value is unknown or out of range.
     """
 
     base: str | None = None
-    """Name of one of the task's ``physics``, to which the other options are applied; "exact" means the task's own
-    physics."""
+    """Name of physics options in the task's ``physics``, to which all other options are added; "exact" means the
+    options of the task's model."""
     frame_skip: int | None = None
     """Substeps in a step."""
     timestep: float | None = None
@@ -91,20 +91,22 @@ class PhysicsOptions:
     integrator: str | None = None
     """Integrator: euler, rk4, implicit or implicitfast."""
     jacobian: str | None = None
-    """Constraint Jacobian: dense, sparse or auto. The form changes speed and memory, and results only by rounding."""
+    """Constraint Jacobian: dense, sparse or auto. The choice of Jacobian affects speed and memory, and affects results
+    only by rounding."""
     impratio: float | None = None
-    """Stiffness of contacts against slip, relative to their stiffness against penetration; for elliptic cones."""
+    """Ratio of a contact's stiffness against slip to its stiffness against penetration, for elliptic cones."""
     solver: Mapping[str, int] | None = None
-    """Limits of the constraint solver: any of iterations, ls_iterations (of its line search) and noslip_iterations
-    (0 turns the noslip solver off)."""
+    """Limits of the constraint solver: iterations, ls_iterations (of the line search) and noslip_iterations (0 turns
+    the noslip solver off)."""
     nconmax: int | None = _for_engine(None)
-    """Contact capacity per world, on average (Warp engine); by default twice the peak of random rollouts."""
+    """Average contact capacity per world (Warp engine); the default is twice the peak number of contacts in random
+    rollouts."""
     njmax: int | None = _for_engine(None)
-    """Constraint capacity of each world (Warp engine); by default twice the peak of random rollouts, plus room for
-    inactive equality constraints."""
+    """Constraint capacity of each world (Warp engine); the default is twice the peak number of constraints in random
+    rollouts, plus room for inactive equality constraints."""
     deterministic: bool = _for_engine(False)
-    """Make runs on a CUDA device reproducible bit for bit, as runs on the CPU always are. Takes 5 to 18 times the time
-    and 5 to 7 times the memory on hopper, half_cheetah and humanoid."""
+    """Make runs on a CUDA device reproducible bit for bit, as runs on the CPU always are. Reproducible runs of hopper,
+    half_cheetah and humanoid take 5 to 18 times the time and 5 to 7 times the memory."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -123,17 +125,17 @@ class PhysicsOptions:
             object.__setattr__(self, "solver", _checked_limits(self.solver) or None)
 
     def given(self) -> dict[str, Any]:
-        """The options that differ from their defaults, by name."""
+        """Get the options that differ from their defaults, by name."""
         return given_values(self)
 
     def resolved(self, named: Mapping[str, "PhysicsOptions"]) -> "PhysicsOptions":
-        """Replace ``base`` by the options that it names.
+        """Replace ``base`` by the named physics options.
 
         Args:
-            named: The task's physics.
+            named: The task's physics options by name.
 
         Raises:
-            ValueError: The task has no physics of this name.
+            ValueError: The task has no physics options of this name.
         """
         if self.base is None:
             return self
@@ -146,7 +148,7 @@ class PhysicsOptions:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EnvOptions:
-    """The number of worlds, where they run, and how their episodes start and end.
+    """Options of an environment: the number of worlds, device, engine, and start and end of episodes.
 
     Raises:
         ValueError: A value is of the wrong type or out of range.
@@ -157,32 +159,32 @@ class EnvOptions:
     device: str | None = None
     """cpu (the default), or a CUDA device such as cuda:0."""
     engine: str | Callable[..., Any] = "auto"
-    """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU. Also a callable
-    with the signature of ``lyceum_warp.engines.base.Engine``, for an engine of your own."""
+    """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU. For an engine of
+    your own, pass a callable with the signature of ``lyceum_warp.engines.base.Engine``."""
     nthread: int | None = _for_engine(None)
     """Threads of the C engine; by default all cores."""
     seed: int = 0
     """Seed of the worlds' random streams."""
     first_world: int = 0
-    """Index of the first world, if several processes share a batch: a world's random stream depends on its index in the
-    whole batch."""
+    """Index of the first world, if several processes share a batch. A world's random stream depends on the world's
+    index in the whole batch."""
     autoreset: bool = True
-    """Whether a world whose episode ended starts a new one within the same step. If False, finished worlds keep
-    stepping with ``done`` set until they are reset; only worlds with a fault restart at once."""
+    """Whether a world starts its next episode within the step that ends an episode. If False, finished worlds keep
+    stepping with ``done`` set until a reset; only worlds with a fault restart at once."""
     horizon: int | None = None
-    """Steps after which an episode is truncated, or 0 for never; by default the task's horizon."""
+    """Steps after which an episode is truncated, or 0 for no limit; by default the task's horizon."""
     graphs: bool = True
-    """Whether launches are captured as graphs and replayed. False is for debugging, and gives the same
-    results."""
+    """Whether launches are captured as graphs and replayed. Disable graphs for debugging; results are the same."""
     model: ModelSource | None = None
-    """A model that replaces the task's: a file or an MjSpec."""
+    """File or MjSpec that replaces the task's model."""
     fields: Collection[str] = ()
-    """Additional fields to keep, for ``env.field``."""
+    """Names of additional fields that ``env.field`` returns."""
     dynamics: Collection[str] = ()
-    """Model fields that may differ between worlds, for ``env.set_dynamics``, in addition to the fields that the task
+    """Model fields that ``env.set_dynamics`` may set in each world, in addition to the fields that the task
     randomizes."""
     physics: PhysicsOptions = PhysicsOptions()
-    """How the worlds are simulated; also the name of one of the task's ``physics``, or "exact" for its own."""
+    """Physics options, or the name of options in the task's ``physics``; "exact" means the options of the task's
+    model."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -191,7 +193,8 @@ class EnvOptions:
         check_kind("device", self.device, str | None, "as 'cpu' or 'cuda:0'")
         if not isinstance(self.engine, str) and not callable(self.engine):
             raise ValueError(f"engine must be 'auto', 'mujoco', 'warp' or a callable, not {described(self.engine)}")
-        if self.model is not None and not isinstance(self.model, mujoco.MjModel):  # MjModel has a specific error
+        # an MjModel gets a specific error elsewhere
+        if self.model is not None and not isinstance(self.model, mujoco.MjModel):
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         object.__setattr__(self, "physics", _physics(self.physics))
         _flags(self, "autoreset", "graphs")
@@ -207,14 +210,14 @@ class EnvOptions:
 
         Args:
             words: The keyword arguments.
-            base: The options to start from; by default ``EnvOptions()``.
+            base: The options that keywords change; by default ``EnvOptions()``.
         """
         rest = {name: value for name, value in words.items() if name not in OPTIONS}
         options = {name: value for name, value in words.items() if name in OPTIONS}
         return (base or cls()).changed(options), rest
 
     def changed(self, words: Mapping[str, Any]) -> "EnvOptions":
-        """Copy with some options changed, by name, including physics options."""
+        """Copy the options with changes by name, including physics options."""
         physics = {name: value for name, value in words.items() if name in _PHYSICS}
         others = {name: value for name, value in words.items() if name not in _PHYSICS}
         if physics:
@@ -222,12 +225,12 @@ class EnvOptions:
         return dataclasses.replace(self, **others)
 
     def for_engine(self) -> dict[str, Any]:
-        """The options of the engine's constructor, by name."""
+        """Get the options of the engine's constructor, by name."""
         both = [(options, field) for options in (self, self.physics) for field in dataclasses.fields(options)]
         return {field.name: getattr(options, field.name) for options, field in both if field.metadata.get("engine")}
 
     def given(self) -> dict[str, Any]:
-        """The options that differ from their defaults, by name, including physics options."""
+        """Get the options that differ from their defaults, by name, including physics options."""
         own = given_values(self)
         own.pop("physics", None)
         return own | self.physics.given()
@@ -247,18 +250,18 @@ OPTIONS = (*(field.name for field in dataclasses.fields(EnvOptions)), *_PHYSICS)
 _DOCS = {**attribute_docs(EnvOptions), **attribute_docs(PhysicsOptions)}
 
 OPTION_DOCS = listed({name: _DOCS[name] for name in OPTIONS})
-"""The options with their docstrings, as the body of an ``Args:`` section."""
+"""Docstrings of all options, as the body of an ``Args:`` section."""
 
 _OTHER_WORDS = {
     "num_envs": "nworld", "n_envs": "nworld", "xml_file": "model", "max_episode_steps": "horizon", "record": "graphs",
     "iterations": "solver={'iterations': ...}", "ls_iterations": "solver={'ls_iterations': ...}",
     "noslip_iterations": "solver={'noslip_iterations': ...}",
 }  # fmt: skip
-"""Names of options in other packages and in earlier releases, with their names here."""
+"""Map names of options in other packages and earlier releases to names in this release."""
 
 
 def suggestion(word: str, others: Iterable[str] = ()) -> str:
-    """A hint "did you mean ...?" for an unknown name; empty if no known name is similar.
+    """Return a hint "did you mean ...?" for an unknown name, or "" if no known name is similar.
 
     Args:
         word: The unknown name.
@@ -269,7 +272,7 @@ def suggestion(word: str, others: Iterable[str] = ()) -> str:
 
 
 def signature_of_options(function: Callable[..., Any]) -> inspect.Signature:
-    """The signature of a function with every option as a keyword in place of ``**words``."""
+    """Make a function's signature that has every option as a keyword in place of ``**words``."""
     keyword = inspect.Parameter.KEYWORD_ONLY
     options = [
         inspect.Parameter(field.name, keyword, default=field.default, annotation=field.type)

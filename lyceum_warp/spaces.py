@@ -13,13 +13,13 @@ from lyceum_warp.model_fields import ModelField
 
 @dataclasses.dataclass(frozen=True)
 class Space:
-    """One world's vector: its named parts, dtype and optional bounds.
+    """Vector of one world with named parts, a dtype and optional bounds.
 
     A scalar has no axis. An environment's arrays have an additional leading axis over worlds.
     """
 
     parts: Mapping[str, slice] = dataclasses.field(default_factory=dict)
-    """The columns of each named part, in order."""
+    """Columns of each named part, in order."""
     dtype: torch.dtype = torch.float32
     low: np.ndarray | None = None
     """Lower bounds, of shape ``shape``; None without bounds."""
@@ -42,7 +42,7 @@ class Space:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(size,), or () for a scalar."""
+        """Shape of the vector, (size,), or () for a scalar."""
         return (self.size,) if self.parts else ()
 
     @property
@@ -55,11 +55,11 @@ class Space:
         ]
 
     def part_at(self, column: int) -> str:
-        """Name of the part that a column belongs to."""
+        """Get the name of the part that contains a column."""
         return next(name for name, part in self.parts.items() if part.start <= column < part.stop)
 
     def split(self, values: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Views of the parts of (..., size) values, by name."""
+        """Get views of the parts of (..., size) values, by name."""
         return {name: values[..., part] for name, part in self.parts.items()}
 
 
@@ -67,16 +67,16 @@ COUNTERS = ("step", "key", "episode", "done_reason")
 """Counters in a state: steps since the reset, key of the random stream, episode number, bits of ``Done``."""
 
 OWN_PARTS = (*COUNTERS, "metrics", "success_steps")
-"""Parts that an environment adds to a state, besides MuJoCo's state and the task's memory."""
+"""Parts that an environment adds to MuJoCo's state and the task's memory."""
 
 
 def action_space(
     model: mujoco.MjModel, action_range: tuple[float, float] | None, actions: Mapping[str, int] | None = None
 ) -> Space:
-    """The space of actions: each actuator's controls, bounded by ``action_range`` or the control ranges.
+    """Make the space of actions from the actuators' controls, with ``action_range`` or the control ranges as bounds.
 
-    An actuator may have several controls or none. An unnamed actuator is named by its index. A task's own ``actions``
-    have bounds only if there is an ``action_range``.
+    An actuator may have several controls or none. An actuator without a name gets a name from its index. Actions in
+    ``actions``, which are not controls, have bounds only if ``action_range`` is given.
     """
     if actions is not None:
         space = Space.of(actions)
@@ -88,12 +88,12 @@ def action_space(
 
 
 def _controls(model: mujoco.MjModel) -> dict[str, int]:
-    """The number of controls by actuator name, in the order of the controls."""
+    """Count the controls of each actuator by name, in the order of the controls."""
     given = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nactuator)]
     sizes: dict[str, int] = {}
     for i in np.argsort(model.actuator_ctrladr, kind="stable").tolist():
         name = given[i] or f"actuator_{i}"
-        while not given[i] and name in given:  # another actuator has this name
+        while not given[i] and name in given:  # another actuator already has this name
             name = f"{name}_"
         if model.actuator_ctrlnum[i]:
             sizes[name] = int(model.actuator_ctrlnum[i])
@@ -101,10 +101,10 @@ def _controls(model: mujoco.MjModel) -> dict[str, int]:
 
 
 def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | None) -> np.ndarray:
-    """The scale and the offset that map actions to controls, (nu, 2).
+    """Compute the scale and the offset that map actions to controls, (nu, 2).
 
     Raises:
-        ValueError: There is an ``action_range``, but a control has no range.
+        ValueError: A control has no range, although ``action_range`` is given.
     """
     if action_range is None:
         return np.tile((1.0, 0.0), (model.nu, 1))
@@ -113,8 +113,7 @@ def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | Non
         unlimited = np.flatnonzero(~np.isfinite(ranges).all(axis=1)).tolist()
         raise ValueError(
             f"action_range maps actions to the controls' ranges, but the controls {unlimited} have no range in the "
-            f"model: "
-            "set their ctrlrange, or omit action_range"
+            "model: set the actuators' ctrlrange, or omit action_range"
         )
     low, high = action_range
     gain = (ranges[:, 1] - ranges[:, 0]) / (high - low)
@@ -122,18 +121,18 @@ def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | Non
 
 
 def control_ranges(model: mujoco.MjModel) -> np.ndarray:
-    """Lower and upper bound of each control, (nu, 2); infinite if the model sets none."""
+    """Get the lower and upper bound of each control, (nu, 2); infinite without a bound in the model."""
     return np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf))
 
 
 def state_space(
     model: mujoco.MjModel, snapshots: Iterable[Field], dynamics: Iterable[ModelField], own: Mapping[str, int]
 ) -> Space:
-    """The space of states: integration state in MuJoCo's order, snapshots, model fields, counters, additional parts.
+    """Make the space of states: integration state in MuJoCo's order, snapshots, model fields, counters, other parts.
 
     Args:
         model: The compiled model.
-        snapshots: Fields that are saved beside the integration state.
+        snapshots: Fields that states include in addition to the integration state.
         dynamics: Model fields that differ between worlds.
         own: Additional parts and their sizes, such as the task's memory.
     """

@@ -1,4 +1,4 @@
-"""Define the base class of tasks, and the table of the functions that a task may have."""
+"""Define the base class of tasks, and the table of task functions."""
 
 import dataclasses
 import inspect
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     T = TypeVar("T")
 
     class Row(Generic[T]):
-        """One world's values of a field; inside a kernel, a one-dimensional Warp array."""
+        """Values of a field in one world; inside a kernel, a one-dimensional Warp array."""
 
         shape: tuple[int, ...]
 
@@ -33,42 +33,43 @@ else:
 
 @dataclasses.dataclass(frozen=True)
 class TaskFunction:
-    """A function that a task may have: its signature, its purpose and its default."""
+    """Signature, purpose and default of a task function."""
 
     name: str
     arguments: str
-    """The arguments as in a task's file."""
+    """The arguments, in the syntax of a task's file."""
     result: type | None
-    """The type of its result: float, bool, or None for a function that writes into its arguments."""
+    """Type of the function's result: float, bool, or None for a function that writes into its arguments."""
     about: str
     """Purpose and default of the function, for the documentation."""
     default: str | None = None
-    """The body of the default function; None for no default."""
+    """Body of the default function; None without a default."""
     optional: str = ""
-    """Optional arguments at the end, as in a task's file."""
+    """Optional last arguments, in the syntax of a task's file."""
     writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """The fields that the function may write, by argument: "inputs", "memory", "lasting" (lasting memory and the
-    model), or "start" (all that a reset may write). Rows for results, such as ``obs``, may always be written."""
+    """Map arguments to the fields that the function may write: "inputs", "memory", "lasting" (lasting memory and the
+    model), or "start" (every field that a reset may write). A function may always write into rows for results, such as
+    ``obs``."""
 
     @property
     def signature(self) -> str:
-        """The first line of the function's definition, without ``def``."""
+        """Get the first line of the function's definition, without ``def``."""
         return f"{self.name}({self.arguments})" + (f" -> {self.result.__name__}" if self.result else "")
 
     @property
     def argument_names(self) -> tuple[str, ...]:
-        """The names of all its arguments, in order."""
+        """List the names of all arguments, in order."""
         arguments = ", ".join(filter(None, (self.arguments, self.optional)))
         return tuple(argument.partition(": ")[0] for argument in arguments.split(", "))
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The annotations of its required arguments, in order."""
+        """List the annotations of the required arguments, in order."""
         return _kinds(self.arguments)
 
     @property
     def all_kinds(self) -> tuple[str, ...]:
-        """The annotations of all its arguments, in order."""
+        """List the annotations of all arguments, in order."""
         return self.kinds + _kinds(self.optional)
 
 
@@ -130,26 +131,27 @@ FUNCTIONS = {
                      "``env.update_shared``. Default: keeps it."),
     )
 }  # fmt: skip
-"""The functions of a task, by name. Checks, kernels, error messages and ``help(lw.Task)`` are made from this table."""
+"""The functions of a task, by name. Checks, kernels, error messages and ``help(lw.Task)`` use this table of
+functions."""
 
 
 RESULTS = ("obs", "ctrl", "metrics", "rng", "sums", "shared")
-"""Arguments that are rows for results, which a function may write."""
+"""Arguments that are rows for results, into which a function may write."""
 
 MEMORIES = ("memory", "lasting_memory")
-"""The kinds of memory. Each world has one row of floats for each kind, which holds the parts of this kind in World."""
+"""Kinds of memory. Each world has one row of floats per kind for the memory that World declares."""
 
 GROUP_PREFIX = "observe_"
-"""``observe_critic`` writes the group ``critic`` of the observations."""
+"""Prefix of functions that write a group of observations; ``observe_critic`` writes the group ``critic``."""
 
 
 def observer_name(group: str) -> str:
-    """The name of the function that writes a group of observations."""
+    """Get the name of the function that writes a group of observations."""
     return "observe" if group == "policy" else f"{GROUP_PREFIX}{group}"
 
 
 def _document_functions(cls: type["Task"]) -> type["Task"]:
-    """Class decorator: put the table of functions into the docstring."""
+    """Decorate a class by inserting the table of functions into its docstring."""
     rows = []
     for function in FUNCTIONS.values():
         rows += [f"    {function.signature}", *textwrap.wrap(function.about, 108, initial_indent=" " * 8,
@@ -160,185 +162,188 @@ def _document_functions(cls: type["Task"]) -> type["Task"]:
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """A part of a world's memory or of an observation, made by ``memory``, ``lasting_memory`` or ``part``."""
+    """Part of a world's memory or of an observation; made by ``memory``, ``lasting_memory`` or ``part``."""
 
     kind: str
-    """One of ``MEMORIES``, or "obs"."""
+    """Kind of the part: one of ``MEMORIES``, or "obs"."""
     size: int | str
-    """Number of elements, or the name of a table in Params with this number of rows."""
+    """Number of elements, or the name of a table in Params with one row per element."""
 
 
 def memory(size: int | str = 1) -> Any:
-    """Declare task memory, as a default in World: a row that ``advance`` or ``substep`` writes and a reset clears.
+    """Declare task memory, as a default in World; ``advance`` or ``substep`` writes the row, and a reset clears it.
 
     Task memory belongs to the state. The field's type is ``Row[float]``, ``Row[wp.vec3]`` or another row of numbers.
 
     Args:
-        size: Number of elements, or the name of a table in Params: one element for each of its rows.
+        size: Number of elements, or the name of a table in Params with one row per element.
     """
     return Part("memory", size)
 
 
 def lasting_memory(size: int | str = 1) -> Any:
-    """Declare memory that outlives episodes, as a default in World: for instance the level of a curriculum.
+    """Declare memory that outlives episodes, such as the level of a curriculum, as a default in World.
 
-    Lasting memory is cleared only when a world's random stream starts (``rand_reset(seed=...)``); ``startup`` may then
-    write it.
+    Lasting memory is cleared only when a world's random stream starts (``rand_reset(seed=...)``), and ``startup`` may
+    then write it.
 
     Args:
-        size: Number of elements, or the name of a table in Params: one element for each of its rows.
+        size: Number of elements, or the name of a table in Params with one row per element.
     """
     return Part("lasting_memory", size)
 
 
 def part(size: int | str = 1) -> Any:
-    """Declare a part, as a default in the struct of an observation group, in Shared or in Sums.
+    """Declare a part of an observation group, of Shared or of Sums, as a default in the struct.
 
     Args:
-        size: Number of elements, or the name of a table in Params: one element for each of its rows.
+        size: Number of elements, or the name of a table in Params with one row per element.
     """
     return Part("obs", size)
 
 
 class Element(int):
-    """A named element, whose index is looked up in the compiled model; made by ``site`` and similar functions."""
+    """Name of a model's element, which is replaced by the element's index; made by ``site`` and similar functions."""
 
     field: str
     name: str
 
     def __new__(cls, field: str, name: str) -> "Element":
-        """An integer with the element's name; its own value is not used."""
+        """Make an integer with the element's name; the integer's value is not used."""
         element = super().__new__(cls, -1)
         element.field, element.name = field, name
         return element
 
 
 def site(name: str) -> int:
-    """As a default in Params: the index of a site, in ``site_xpos`` and the other ``site_`` fields."""
+    """Declare the index of a site in ``site_xpos`` and other ``site_`` fields, as a default in Params."""
     return Element("site_xpos", name)
 
 
 def sites(*names: str) -> Any:
-    """As a default of a ``wp.array[int]`` in Params: the indices of sites."""
+    """Declare the indices of sites, as a default of a ``wp.array[int]`` in Params."""
     return [site(name) for name in names]
 
 
 def body(name: str) -> int:
-    """As a default in Params: the index of a body, in ``xpos`` and the other fields of bodies."""
+    """Declare the index of a body in ``xpos`` and other fields of bodies, as a default in Params."""
     return Element("xpos", name)
 
 
 def bodies(*names: str) -> Any:
-    """As a default of a ``wp.array[int]`` in Params: the indices of bodies."""
+    """Declare the indices of bodies, as a default of a ``wp.array[int]`` in Params."""
     return [body(name) for name in names]
 
 
 def geom(name: str) -> int:
-    """As a default in Params: the index of a geom, in ``geom_xpos`` and the other ``geom_`` fields."""
+    """Declare the index of a geom in ``geom_xpos`` and other ``geom_`` fields, as a default in Params."""
     return Element("geom_xpos", name)
 
 
 def geoms(*names: str) -> Any:
-    """As a default of a ``wp.array[int]`` in Params: the indices of geoms."""
+    """Declare the indices of geoms, as a default of a ``wp.array[int]`` in Params."""
     return [geom(name) for name in names]
 
 
 def camera(name: str) -> int:
-    """As a default in Params: the index of a camera, in ``cam_xpos`` and the other ``cam_`` fields."""
+    """Declare the index of a camera in ``cam_xpos`` and other ``cam_`` fields, as a default in Params."""
     return Element("cam_xpos", name)
 
 
 def tendon(name: str) -> int:
-    """As a default in Params: the index of a tendon, in ``ten_length`` and the ``ten_`` and ``tendon_`` fields."""
+    """Declare the index of a tendon in ``ten_`` and ``tendon_`` fields, as a default in Params."""
     return Element("ten_length", name)
 
 
 def equality(name: str) -> int:
-    """As a default in Params: the index of an equality constraint, in ``eq_active`` and the other ``eq_`` fields."""
+    """Declare the index of an equality constraint in ``eq_active`` and other ``eq_`` fields, as a default in Params."""
     return Element("eq_active", name)
 
 
 def actuator(name: str) -> int:
-    """As a default in Params: the index of an actuator, in ``actuator_force`` and the other ``actuator_`` fields."""
+    """Declare the index of an actuator in ``actuator_force`` and other ``actuator_`` fields, as a default in Params."""
     return Element("actuator_force", name)
 
 
 def actuators(*names: str) -> Any:
-    """As a default of a ``wp.array[int]`` in Params: the indices of actuators."""
+    """Declare the indices of actuators, as a default of a ``wp.array[int]`` in Params."""
     return [actuator(name) for name in names]
 
 
 def ctrl(actuator: str) -> int:
-    """As a default in Params: the index of an actuator's first control in ``ctrl``. Most actuators have one."""
+    """Declare the index of an actuator's first control in ``ctrl``, as a default in Params.
+
+    Most actuators have one control.
+    """
     return Element("ctrl", actuator)
 
 
 def act(actuator: str) -> int:
-    """As a default in Params: the index of an actuator's first activation in ``act``."""
+    """Declare the index of an actuator's first activation in ``act``, as a default in Params."""
     return Element("act", actuator)
 
 
 def joint(name: str) -> int:
-    """As a default in Params: the index of a joint, in ``xanchor``, ``xaxis`` and the ``jnt_`` fields."""
+    """Declare the index of a joint in ``xanchor``, ``xaxis`` and ``jnt_`` fields, as a default in Params."""
     return Element("xanchor", name)
 
 
 def joints(*names: str) -> Any:
-    """As a default of a ``wp.array[int]`` in Params: the indices of joints."""
+    """Declare the indices of joints, as a default of a ``wp.array[int]`` in Params."""
     return [joint(name) for name in names]
 
 
 def qpos(joint: str) -> int:
-    """As a default in Params: the index of a joint's first coordinate in ``qpos``."""
+    """Declare the index of a joint's first coordinate in ``qpos``, as a default in Params."""
     return Element("qpos", joint)
 
 
 def qposes(*joints: str) -> Any:
-    """As a default of a ``wp.array[int]`` in Params: the indices of the first coordinates of joints in ``qpos``."""
+    """Declare the indices of joints' first coordinates in ``qpos``, as a default of a ``wp.array[int]`` in Params."""
     return [qpos(name) for name in joints]
 
 
 def dof(joint: str) -> int:
-    """As a default in Params: the index of a joint's first degree of freedom in ``qvel`` and fields of its size."""
+    """Declare the index of a joint's first degree of freedom in ``qvel`` and similar fields, as a default in Params."""
     return Element("qvel", joint)
 
 
 def dofs(*joints: str) -> Any:
-    """As a default of a ``wp.array[int]`` in Params: the indices of the first degrees of freedom of joints."""
+    """Declare the indices of joints' first degrees of freedom, as a default of a ``wp.array[int]`` in Params."""
     return [dof(name) for name in joints]
 
 
 def sensor(name: str) -> int:
-    """As a default in Params: the index of a sensor's first number in ``sensordata``."""
+    """Declare the index of a sensor's first number in ``sensordata``, as a default in Params."""
     return Element("sensordata", name)
 
 
 def sensors(*names: str) -> Any:
-    """As a default of a ``wp.array[int]`` in Params: the indices of the first numbers of sensors in ``sensordata``."""
+    """Declare the indices of sensors in ``sensordata``, as a default of a ``wp.array[int]`` in Params."""
     return [sensor(name) for name in names]
 
 
 def mocap(body: str) -> int:
-    """As a default in Params: the index of a mocap body, in ``mocap_pos`` and ``mocap_quat``."""
+    """Declare the index of a mocap body in ``mocap_pos`` and ``mocap_quat``, as a default in Params."""
     return Element("mocap_pos", body)
 
 
 @dataclasses.dataclass(frozen=True)
 class FromModel:
-    """A parameter that is computed from the compiled model, made by ``from_model``."""
+    """Parameter that is computed from the compiled model; made by ``from_model``."""
 
     function: Callable[[mujoco.MjModel, Any], Any]
 
 
 def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
-    """Declare a value that is computed from the compiled model and other parameters, as a default in Params.
+    """Declare a parameter computed from the compiled model and other parameters, as a default in Params.
 
     ``mass: float = lw.from_model(lambda model, p: model.body_subtreemass[p.trunk])`` is the mass of the robot. The
-        value is recomputed if another parameter changes, unless it was given explicitly.
+        parameter is recomputed if another parameter changes, unless a value was given explicitly.
 
     Args:
-        function: A function of the MjModel and of an object with parameters as attributes: the parameters with ordinary
-            defaults, and those that Params computes before this one.
+        function: Function of the MjModel and of an object with parameters as attributes: the parameters with ordinary
+            defaults, and computed parameters that Params declares earlier.
     """
     return FromModel(function)
 
@@ -346,19 +351,19 @@ def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Planning:
-    """A task's settings for MPPI: settings of the planner, and options and parameters of its worlds.
+    """Settings of a task for MPPI: settings of the planner, and options and parameters of the planner's worlds.
 
     Raises:
         ValueError: A part is not a dict.
     """
 
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Settings of the planner, by the names of ``lw.MPPIConfig``."""
+    """Settings of the planner, by their names in ``lw.MPPIConfig``."""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Options of the planner's worlds, by the names of ``lw.make``, such as ``{"physics": "fast"}``."""
+    """Options of the planner's worlds, by their names in ``lw.make``, such as ``{"physics": "fast"}``."""
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Parameters of the planner's worlds, by the names of the task's ``Params``. If MPPI has a value function, these
-    parameters are ignored, because the function was fitted to the rewards of the unchanged task."""
+    """Parameters of the planner's worlds, by their names in the task's ``Params``. If MPPI has a value function, the
+    parameters in ``Planning`` are ignored, because the function was fitted to the rewards of the unchanged task."""
 
     def __post_init__(self) -> None:
         """Check the type of every part."""
@@ -395,132 +400,137 @@ class Training:
 class Task:
     """Base class of tasks: a model, the fields that functions read, and a few functions of one world.
 
-    A subclass names its model and the parts of its observation. Its module has two Warp structs, ``World`` (the
-    fields that the functions read, by MuJoCo's names) and ``Params`` (the keyword arguments of ``make``, with
-    defaults; ``dt`` and ``substep_dt``, the seconds in a step and in a substep, are filled in), and the functions, each
-    a ``wp.func``. Structs and functions may also be attributes of the class.
+    A subclass names its model and the parts of its observation. The subclass's module has two Warp structs and the
+    task's functions. The struct ``World`` lists the fields that the functions read. The struct ``Params`` lists the
+    keyword arguments of ``make``, with defaults; its fields ``dt`` and ``substep_dt`` are filled with the seconds of a
+    step and a substep. Each function is a ``wp.func``. Structs and functions may also be attributes of the class.
 
     ``World`` lists fields of MjData, such as ``qpos`` and ``site_xpos``, and fields of MjModel, such as ``body_mass``
     and ``geom_friction``, under MuJoCo's names. Model fields that ``startup``, ``initialize``, ``randomize`` or
     ``event`` write differ between worlds and belong to the state; all other model fields are the same in all worlds.
     ``World`` also names the task's memory: ``air_time: Row[float] = lw.memory(4)``, or ``lw.lasting_memory(4)``.
 
-    A default in ``Params`` may name an element of the model, such as ``tip: int = lw.site("tip")``: the functions get
-    its index. ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``, ``lw.actuator``,
-    ``lw.ctrl``, ``lw.act``, ``lw.tendon``, ``lw.equality``, ``lw.sensor`` and ``lw.mocap`` work likewise. A field of
-    type ``wp.array[float]``, ``wp.array2d[wp.vec3]`` or the like is a table that all worlds share, such as a motion to
-    follow; its default is a nested list or an array. A table of named elements is written
-    ``feet: wp.array[int] = lw.sites("left_foot", "right_foot")``, or with ``lw.bodies``, ``lw.geoms``, ``lw.joints``,
-    ``lw.qposes``, ``lw.dofs``, ``lw.actuators`` or ``lw.sensors``. ``lw.from_model`` computes a default from the
-    compiled model.
+    A default in ``Params`` may name an element of the model, such as ``tip: int = lw.site("tip")``; the functions then
+    get the element's index. ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``,
+    ``lw.actuator``, ``lw.ctrl``, ``lw.act``, ``lw.tendon``, ``lw.equality``, ``lw.sensor`` and ``lw.mocap`` work
+    likewise. A field of type ``wp.array[float]``, ``wp.array2d[wp.vec3]`` or a similar type is a table that all worlds
+    share, such as a motion to follow. The default of a table is a nested list or an array. A table of named elements is
+    declared by ``feet: wp.array[int] = lw.sites("left_foot", "right_foot")``, or with ``lw.bodies``, ``lw.geoms``,
+    ``lw.joints``, ``lw.qposes``, ``lw.dofs``, ``lw.actuators`` or ``lw.sensors``. ``lw.from_model`` computes a default
+    from the compiled model.
 
     Functions:
     {functions}
 
-    ``s``, ``s0`` and ``s1`` are one world's fields: now, before the step, and after it. Fields of the position and
-    velocity stages belong to that state; fields of the acceleration stage (forces, accelerations) come from the last
-    substep. Each sensor has the stage of its quantity. Controls are clipped to the model's ranges; ``reward`` sees the
-    action as given. ``rng`` is the world's random stream: pass it to ``lw.uniform`` and ``lw.normal``.
+    The arguments ``s``, ``s0`` and ``s1`` are one world's fields in the current state, before the step, and after the
+    step. Fields of the position and velocity stages belong to this state; fields of the acceleration stage (forces,
+    accelerations) come from the last substep. Each sensor has the stage of its quantity. Controls are clipped to the
+    model's ranges, but ``reward`` gets the unclipped action. Pass the argument ``rng``, the world's random stream, to
+    ``lw.uniform`` and ``lw.normal``.
 
     A function may write the following fields if ``World`` lists them; any other write is refused:
 
     - ``control``: the inputs xfrc_applied, qfrc_applied, mocap_pos, mocap_quat and userdata. An input keeps its value
-      until it is written again; a reset clears it.
+      until the next write or reset.
     - ``initialize``, ``randomize`` and ``event``: qpos, qvel, act, ctrl, eq_active, the inputs, memory, lasting memory
-      and model fields. Every reset restores the nominal values of these model fields before ``initialize`` runs, so
-      that draws never add up. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
+      and model fields. Every reset restores the nominal values of model fields before ``initialize`` runs, so that
+      draws never add up. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
       ``sensordata``), which are computed afterwards.
-    - ``startup``: model fields and lasting memory, which resets then do not change.
+    - ``startup``: model fields and lasting memory, with values that resets do not change.
     - ``substep``: memory and lasting memory. ``advance``: memory and lasting memory of ``s1``.
 
-    ``reject`` sees an initial state before it settles. While a new episode settles, no ``substep`` runs.
+    ``reject`` gets the initial state before the state settles. While an initial state settles, no ``substep`` runs.
 
-    An event runs after the transition is judged and before the next observation, but not in worlds that restart.
-    Open-loop rollouts and planners omit events.
+    An event runs after the reward and the termination of a step and before the next observation, but not in worlds that
+    restart. Open-loop rollouts and planners run no events.
 
-    Quaternions in fields are in MuJoCo's order w, x, y, z, and typed ``Row[lw.quat]``. Warp's own quaternion functions
-    expect x, y, z, w and refuse them: use ``lw.quat_rotate``, ``lw.quat_mul``, ``lw.quat_from_axis_angle`` and others.
+    Quaternions in fields have MuJoCo's order w, x, y, z, and the type ``Row[lw.quat]``. Warp's own quaternion functions
+    expect the order x, y, z, w and refuse ``lw.quat``: use ``lw.quat_rotate``, ``lw.quat_mul``,
+    ``lw.quat_from_axis_angle`` and others.
     """
 
     model: ClassVar[Any]
-    """The model: a file (relative to the task's file, or one that gymnasium ships), ``lw.package_model(...)`` for a
-    file of another package, an MjSpec, or a static method without arguments that returns one of these."""
+    """The model: a file (relative to the task's file, or one of gymnasium's models), ``lw.package_model(...)`` for a
+    file of another package, an MjSpec, or a static method without arguments that returns any of these."""
     frame_skip: ClassVar[int] = 1
     """Substeps in a step."""
     obs: ClassVar[Any]
-    """The observation's parts and their sizes, in order, such as ``{"position": 5, "velocity": 6}``; or a static method
-    of the Params that returns them. A task may have several groups of observations, such as
-    ``{"policy": {"position": 5}, "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy``,
-    which is ``env.obs``, and ``observe_critic``, with the same arguments, writes the group ``critic``. A task omits
-    ``obs`` if the last argument of these functions is a Warp struct, whose fields have defaults ``lw.part(size)``."""
+    """Parts of the observation and their sizes, in order, such as ``{"position": 5, "velocity": 6}``; or a static
+    method that computes the sizes from the Params. A task may have several groups of observations, such as ``{"policy":
+    {"position": 5}, "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy``, which is
+    ``env.obs``, and ``observe_critic``, with the same arguments, writes the group ``critic``. A task omits ``obs`` if
+    the last argument of ``observe`` is a Warp struct with the defaults ``lw.part(size)``."""
     rewards: ClassVar[Mapping[str, float]] = {}
-    """The terms of the reward and their weights per second, such as ``{"upright": 1.0, "effort": -0.1}``, in place of
-    ``reward``. A term is a function of the module that returns a float; its arguments are found by name: ``s0``,
-    ``action``, ``s1`` (or ``s``), ``p``, or the result of another function of that name, a parameter, a field of
-    World. The reward is dt times the sum of weight times term. ``lw.make(task, upright=2.0)`` and ``set_params`` change
-    weights, and each term is a metric, with its weight and dt. ``env.task.reward_text`` shows the generated source."""
+    """Terms of the reward with weights per second, such as ``{"upright": 1.0, "effort": -0.1}``, in place of
+    ``reward``. A term is a function of the module that returns a float. The arguments of a term are found by name:
+    ``s0``, ``action``, ``s1`` (or ``s``), ``p``, the result of another function, a parameter, or a field of World. The
+    reward is dt times the weighted sum of the terms. ``lw.make(task, upright=2.0)`` and ``set_params`` change weights.
+    Each term, multiplied by its weight and dt, is also a metric. ``env.task.reward_text`` shows the generated
+    source."""
     terminations: ClassVar[tuple[str, ...]] = ()
-    """Names of functions that end the episode if one returns True, in place of ``terminated``. The functions may take
-    ``s``, ``p`` and the named arguments of terms. Each function is also a metric: 1 if it returns True after the step,
-    otherwise 0."""
+    """Names of functions that end the episode if any of them returns True, in place of ``terminated``. The functions
+    may take ``s``, ``p`` and the named arguments of terms. Each function is also a metric: 1 if it returns True after
+    the step, otherwise 0."""
     metrics: ClassVar[tuple[str, ...]] = ()
-    """Names of the metrics that ``measure`` writes. Without ``measure``, they are functions with the arguments of terms
-    that return a float or a bool."""
+    """Names of the metrics that ``measure`` writes. Without ``measure``, each name is a function that takes the
+    arguments of terms and returns a float or a bool."""
     horizon: ClassVar[int] = 1000
-    """Steps after which an episode is truncated; 0 for never."""
+    """Number of steps after which an episode is truncated; 0 means never."""
     success_steps: ClassVar[int] = 1
-    """Number of successive steps that must end with ``success`` before ``env.success`` is True. If it is more than 1,
-    the part ``success_steps`` of the state holds the current count, which a reset clears."""
+    """Number of successive steps that must end in success before ``env.success`` is True. If ``success_steps`` is more
+    than 1, the state has a part ``success_steps`` with the current count, which a reset clears."""
     lagged: ClassVar[tuple[str, ...]] = ()
-    """Fields that keep the values left by ``mj_step``, one substep behind the state, as in some Gymnasium tasks."""
+    """Fields that keep the values left by ``mj_step``, which lag one substep behind the state, as in some Gymnasium
+    tasks."""
     cleared: ClassVar[tuple[str, ...]] = ()
-    """Fields left by the last substep, such as contact forces, to zero at the start of an episode. Without this entry,
-    a forward pass of the worlds that restart computes these fields. A reset clears them before ``initialize``."""
+    """Fields left by the last substep, such as contact forces, that a reset clears before ``initialize``. A forward
+    pass of the restarting worlds computes such fields if ``cleared`` does not list them."""
     actions: ClassVar[Mapping[str, int | str] | None] = None
-    """The parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls;
-    ``control`` then turns them into inputs. A size may be the name of a table in Params: one number for each of its
-    rows. If None, an action has one number for each control."""
+    """Parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls; ``control``
+    then converts actions to inputs. A size may be the name of a table in Params with one row per number. If ``actions``
+    is None, an action has one number for each control."""
     action_range: ClassVar[tuple[float, float] | None] = None
-    """The range of actions, which the default ``control`` scales to the model's control ranges. If None, actions are
-    controls, or have no bounds if the task has ``actions``."""
+    """The range of actions, which the default ``control`` scales to the model's control ranges. If ``action_range`` is
+    None, actions are controls, or are unbounded if the task has ``actions``."""
     keyframe: ClassVar[str | None] = None
-    """Name of the model's keyframe at which ``reset`` starts, before ``initialize``; None for the model's ``qpos0``."""
+    """Name of the model's keyframe to which ``reset`` sets the state before ``initialize``; None means ``qpos0``."""
     draws: ClassVar[int] = 10
-    """Maximum number of initial states that a reset draws while ``reject`` returns True; the last one is kept."""
+    """Maximum number of initial states that a reset draws while ``reject`` returns True; a reset keeps the last
+    draw."""
     settle: ClassVar[int] = 0
-    """Substeps in which an initial state settles before the first observation of its episode, under its own controls
-    and without ``substep``. The time then starts from 0."""
+    """Number of substeps in which an initial state settles, under its own controls and without ``substep``, before the
+    first observation of the episode. The episode's time starts at 0 after settling."""
     gymnasium: ClassVar[str | None] = None
     """Id of the Gymnasium environment that the task reimplements, with its model, observation, reward, termination,
-    reset and parameters, such as "Hopper-v5"; None if there is none. Subclasses do not inherit it."""
+    reset and parameters, such as "Hopper-v5"; None without such an environment. Subclasses do not inherit this
+    attribute."""
     trace: ClassVar[str | None] = None
     """Name of the site or body whose path the viewer draws for a planner's samples. If None, the viewer draws the
     centre of mass of a robot with a floating base, or the end of an arm."""
     mirror: ClassVar[Any] = None
-    """The task's mirror image, ``lw.Mirror(...)``, or a static method ``mirror(model, p)`` that returns it, to learn
-    symmetric policies; None if there is none."""
+    """The task's mirror image, ``lw.Mirror(...)``, or a static method ``mirror(model, p)`` that returns the mirror
+    image, to learn symmetric policies; None without a mirror image."""
     physics: ClassVar[Mapping[str, PhysicsOptions]] = {}
-    """Physics to choose from by name, such as ``{"fast": lw.PhysicsOptions(integrator="implicitfast")}``, as in
-    ``lw.make(task, physics="fast")``. The default, "exact", is the physics of the model and ``frame_skip``."""
+    """Physics options by name, such as ``{"fast": lw.PhysicsOptions(integrator="implicitfast")}`` for ``lw.make(task,
+    physics="fast")``. The default, "exact", means the options of the model and ``frame_skip``."""
     planning: ClassVar[Planning] = Planning()
     """The task's settings for MPPI, such as ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
     training: ClassVar[Training] = Training()
     """The task's settings for ``lyceum-warp train``, such as ``lw.Training(algorithm="ppo", settings={...})``."""
 
-    # World, Params and Warp functions of the module when the class was defined
+    # World, Params and Warp functions of the module at the definition of the class
     scope: ClassVar[dict[str, Any]]
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Change the model, or the model passed to ``make``, before it is compiled. The default keeps the model."""
+        """Change the task's model, or the model passed to ``make``, before compilation. By default, nothing changes."""
 
     @staticmethod
     def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
-        """Return metadata for ONNX files, such as gains, that a robot needs to run a policy: JSON values by name.
+        """Return metadata for ONNX files as JSON values by name, such as gains that a robot needs to run a policy.
 
-        The default is empty.
-
-        ``model`` is the compiled model, and ``p`` has the parameters as attributes.
+        By default, the metadata are empty. The argument ``model`` is the compiled model, and ``p`` has the parameters
+        as attributes.
         """
         return {}
 
@@ -528,7 +538,7 @@ class Task:
         super().__init_subclass__(**keywords)
         if "gymnasium" not in vars(cls):
             cls.gymnasium = None
-        # a copy, because a later cell of a notebook may define another task with the same names
+        # store a copy, because a later cell of a notebook may define another task with the same names
         module = vars(sys.modules[cls.__module__])
         cls.scope = {
             name: value

@@ -1,4 +1,4 @@
-"""Make rough ground: a height field of patches with increasing difficulty, for models and as a table for kernels."""
+"""Make rough ground as a height field of patches with increasing difficulty, for models and for kernels."""
 
 import dataclasses
 import difflib
@@ -12,18 +12,19 @@ import numpy as np
 from lyceum_warp.task import from_model
 
 Shape = Callable[[np.ndarray, np.ndarray, float, np.random.Generator], np.ndarray]
-"""``shape(x, y, amount, rng)``: the heights of a square patch, m, (n, n), from the coordinates of its points relative
-to its centre, m, (n, n) each. The outline of a patch is then set to 0, so that patches meet without a step."""
+"""Function ``shape(x, y, amount, rng)`` that returns the heights of a square patch, m, (n, n), from the coordinates of
+the points relative to the patch's centre, m, (n, n) each. The outline of a patch is set to 0 afterwards, so that
+patches meet without a step."""
 
 _PLATFORM = 1.0
-"""Half the side length of the flat square at the centre of a patch, m."""
+"""Half the side of the flat square at the centre of a patch, m."""
 
 _BASE = 1.0
-"""Thickness of the ground below its lowest point, m."""
+"""Thickness of the ground below the lowest point, m."""
 
 
 def _inwards(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Distance of points from the outline of a patch, m, but not more than the distance of the platform."""
+    """Compute the distance of points from the outline of a patch, m, with the platform's distance as maximum."""
     half = float(x.max())
     return np.clip(half - np.maximum(abs(x), abs(y)), 0.0, max(half - _PLATFORM, 0.0))
 
@@ -58,20 +59,20 @@ def _rough(x: np.ndarray, y: np.ndarray, amount: float, rng: np.random.Generator
     side = x[0]
     knots = np.arange(side[0], side[-1] + 0.2, 0.2)
     values = rng.uniform(-amount, amount, (len(knots), len(knots)))
-    for _ in range(2):  # bilinear: along x, then along y
+    for _ in range(2):  # interpolate along x, then along y
         values = np.array([np.interp(side, knots, row) for row in values]).T
     return values
 
 
 def _waves(x: np.ndarray, y: np.ndarray, amount: float, rng: np.random.Generator) -> np.ndarray:
-    number = 2.0 * np.pi / x.max()  # two waves in a patch
+    number = 2.0 * np.pi / x.max()  # two waves per patch
     heights: np.ndarray = amount * np.sin(number * x) * np.sin(number * y)
     return heights
 
 
 def _stones(x: np.ndarray, y: np.ndarray, amount: float, rng: np.random.Generator) -> np.ndarray:
     pitch, depth, tiny = 0.8, 0.5, 1e-6
-    into = [(side + tiny) % pitch for side in (x, y)]  # distance from the near edge of a gap
+    into = [(side + tiny) % pitch for side in (x, y)]  # distance from a gap's near edge
     gap = np.logical_or(*[(phase > 2 * tiny) & (phase < amount) for phase in into])
     return np.where(gap & _around_platform(x, y), -depth, 0.0)
 
@@ -82,15 +83,15 @@ _KINDS: dict[str, tuple[Shape, float]] = {
     "stairs_up": (_stairs, -0.2), "stairs_down": (_stairs, 0.2),
     "steps": (_steps, 0.2), "rough": (_rough, 0.08), "waves": (_waves, 0.2), "stones": (_stones, 0.4),
 }  # fmt: skip
-"""The shapes of patches, and their sizes (``amount``) at difficulty 1."""
+"""Shapes of patches, each with the size (``amount``) at difficulty 1."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Terrain:
-    """Rough ground: a field of square patches, in rows of increasing difficulty along y and in columns by kind along x.
+    """Rough ground, a field of square patches in rows of increasing difficulty along y and columns by kind along x.
 
-    The difficulty of level i is (i + 1) / ``levels``. A patch depends only on the seed, its level and its column. All
-    patches have height 0 along their outline, and a flat border surrounds them.
+    The difficulty of level i is (i + 1) / ``levels``. A patch depends only on the seed and on the patch's level and
+    column. All patches have height 0 along their outline, and a flat border surrounds all patches.
 
     =================== ======================================================== ===================
     kind                ground around the middle of a patch                      at difficulty 1
@@ -106,21 +107,22 @@ class Terrain:
     """
 
     kinds: Mapping[str | Shape, int]
-    """Kinds of patches, in order, each with its number of columns. A kind is a name from the table, or a function
-    ``shape(x, y, difficulty, rng)`` that returns the heights of a patch, m, (n, n); x and y are the coordinates of its
-    points relative to its centre, (n, n)."""
+    """Kinds of patches, in order, each with a number of columns. A kind is a name from the table, or a function
+    ``shape(x, y, difficulty, rng)`` that returns the heights of a patch, m, (n, n); x and y are the coordinates of the
+    points relative to the patch's centre, (n, n)."""
     levels: int = 10
     """Number of rows."""
     patch: float = 8.0
-    """Side of a patch, m; a multiple of ``resolution``."""
+    """Side of a patch, m, which is a multiple of ``resolution``."""
     resolution: float = 0.1
-    """Distance between neighbouring points of the field, m. A vertical wall becomes a slope of this width."""
+    """Distance between neighbouring points of the field, m. A vertical wall becomes a slope of the width
+    ``resolution``."""
     border: float = 4.0
-    """Width of the border, m; a multiple of ``resolution``."""
+    """Width of the border, m, which is a multiple of ``resolution``."""
     seed: int = 0
     """Seed of all random heights."""
     scale: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Sizes at difficulty 1, by kind, in place of the sizes in the table."""
+    """Sizes at difficulty 1, by kind, which replace the sizes in the table."""
 
     def __post_init__(self) -> None:
         """Check the description.
@@ -146,12 +148,12 @@ class Terrain:
 
     @functools.cached_property
     def columns(self) -> tuple[str | Shape, ...]:
-        """The kind of each column."""
+        """Return the kind of each column."""
         return tuple(kind for kind, count in self.kinds.items() for _ in range(count))
 
     @functools.cached_property
     def heights(self) -> np.ndarray:
-        """Heights of all points, m, (points along y, points along x)."""
+        """Compute the heights of all points, m, (points along y, points along x)."""
         cells, edge = self._cells, round(self.border / self.resolution)
         found = np.zeros([count * cells + 1 + 2 * edge for count in (self.levels, len(self.columns))])
         for level in range(self.levels):
@@ -164,9 +166,9 @@ class Terrain:
 
     @functools.cached_property
     def origins(self) -> np.ndarray:
-        """Centres of the patches relative to the plane that the field replaces, m, (levels, columns, 3).
+        """Compute the patches' centres relative to the plane that the field replaces, m, (levels, columns, 3).
 
-        z is the greatest height within 0.5 m.
+        The z coordinate of a centre is the greatest height within 0.5 m.
         """
         cells, edge, around = self._cells, round(self.border / self.resolution), round(0.5 / self.resolution)
         around = min(around, cells // 2)
@@ -178,14 +180,14 @@ class Terrain:
         return found
 
     def add_to(self, spec: mujoco.MjSpec, *, name: str = "terrain") -> None:
-        """Add the ground to a model, replacing the world's plane.
+        """Add the ground to a model in place of the world's plane.
 
-        The plane becomes the height field and keeps its name, friction and material; without a plane the model gets a
-        geom ``name``. A corner between patches in the middle of the field is at the plane's position, so a robot that
+        The plane becomes the height field and keeps its name, friction and material; without a plane, the model gets a
+        geom ``name``. The plane's position becomes a corner between patches in the middle of the field, so a robot that
         stood on the plane stands on the field. The model's extent, on which cameras depend, does not change.
 
         Args:
-            spec: The model, changed in place; for instance in a task's ``edit_model``.
+            spec: The model, which is changed in place, for example in a task's ``edit_model``.
             name: Name of the height field.
 
         Raises:
@@ -194,7 +196,7 @@ class Terrain:
         planes = [geom for geom in spec.worldbody.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
         if len(planes) > 1:
             named = ", ".join(repr(geom.name) for geom in planes)
-            raise ValueError(f"the model has the planes {named}: delete all but one, which becomes the terrain")
+            raise ValueError(f"the model has the planes {named}: delete all planes but one, which becomes the terrain")
         if np.isnan(spec.stat.extent):
             without = spec.copy().compile().stat
             spec.stat.extent, spec.stat.center = without.extent, without.center
@@ -208,16 +210,16 @@ class Terrain:
 
     @property
     def _cells(self) -> int:
-        """Distances between points along the side of a patch."""
+        """Return the number of distances between points along the side of a patch."""
         return round(self.patch / self.resolution)
 
     @property
     def _corner(self) -> np.ndarray:
-        """The corner of the first patch, m, (2,)."""
+        """Return the corner of the first patch, m, (2,)."""
         return -self.patch * np.array([len(self.columns) // 2, self.levels // 2])
 
     def _patch(self, level: int, column: int) -> np.ndarray:
-        """Heights of one patch, m, (n, n)."""
+        """Compute the heights of one patch, m, (n, n)."""
         kind, difficulty = self.columns[column], (level + 1) / self.levels
         side = self.resolution * (np.arange(self._cells + 1) - self._cells / 2)
         x, y = np.meshgrid(side, side)
@@ -236,10 +238,11 @@ class Terrain:
 
 
 def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """The table of a model's height field, m, (1 + points along y, 1 + points along x); see ``height_field``.
+    """Make the table of a model's height field, m, (1 + points along y, 1 + points along x); see ``height_field``.
 
     Raises:
-        ValueError: The model has no such height field, or it is not used by exactly one fixed and upright geom.
+        ValueError: The model has no height field of this name, or the height field does not belong to exactly one fixed
+            and upright geom.
     """
     number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_HFIELD, name)
     if number < 0:
@@ -251,8 +254,8 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
     fixed = (model.body_weldid[model.geom_bodyid[geoms]] == 0).all()
     if len(geoms) != 1 or not fixed or not np.allclose(data.geom_xmat[geoms[0]], np.eye(3).ravel(), atol=1e-9):
         raise ValueError(
-            f"the height field {name!r} must be the shape of one geom, which is fixed and not turned: "
-            f"{len(geoms)} geoms have it"
+            f"the height field {name!r} must be the shape of one fixed and upright geom: {len(geoms)} geoms have this "
+            "shape"
         )
     position, (along_x, along_y, height, _) = data.geom_xpos[geoms[0]], model.hfield_size[number]
     nrow, ncol = int(model.hfield_nrow[number]), int(model.hfield_ncol[number])
@@ -268,14 +271,13 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
 def height_field(name: str) -> Any:
     """Declare the table of a model's height field, as a default in Params.
 
-    For ``lw.ground_height`` and ``height_scan``.
-
-    The first row of the table holds the x coordinates of the points, its first column their y coordinates, and the rest
-    their heights z in the world's frame, m, (1 + points along y, 1 + points along x). All worlds share it. Declare it
-    as ``ground: wp.array2d[float] = lw.height_field("terrain")``.
+    The table is for ``lw.ground_height`` and ``lw.height_scan``. The first row of the table has the points' x
+    coordinates, the first column the y coordinates, and the rest the heights z in the world's frame, m, (1 + points
+    along y, 1 + points along x). All worlds share the table. Declare the table as in ``ground: wp.array2d[float] =
+    lw.height_field("terrain")``.
 
     Args:
-        name: The name of the height field, as in the model; ``lw.Terrain.add_to`` names it "terrain".
+        name: Name of the height field in the model, which is "terrain" by default in ``lw.Terrain.add_to``.
     """
     return from_model(lambda model, _: height_table(model, name))
 
@@ -284,7 +286,8 @@ def scan_grid(length: float, width: float, *, spacing: float = 0.1) -> np.ndarra
     """Declare a grid of points around a robot for ``lw.height_scan``, (n, 2), m, as a default in Params.
 
     The first point is at the rear right. Points are ordered by x (forwards), then by y (to the left).
-    ``lw.scan_grid(1.6, 1.0)`` has 17 x 11 points. Declare it as ``scan: wp.array[wp.vec2] = lw.scan_grid(1.6, 1.0)``.
+    ``lw.scan_grid(1.6, 1.0)`` has 17 x 11 points. Declare the grid as in ``scan: wp.array[wp.vec2] = lw.scan_grid(1.6,
+    1.0)``.
 
     Args:
         length: Extent along x, forwards, m.

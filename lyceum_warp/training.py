@@ -34,15 +34,15 @@ from lyceum_warp.viz.video import check_video
 log = logging.getLogger(__name__)
 
 Callback = Callable[[Any], Any]
-"""Called with each iteration's statistics; their class depends on the algorithm."""
+"""Function that is called with an iteration's statistics, an ``Iteration`` of the algorithm."""
 
 
 class Display:
-    """Shows the progress of training; this base class only logs messages."""
+    """Shows the progress of training; the base class only logs messages."""
 
     @contextlib.contextmanager
     def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
-        """Context that surrounds training, up to a total number of iterations."""
+        """Make a context that surrounds training, up to a total number of iterations."""
         yield
 
     def __call__(self, iteration: Iteration) -> None:
@@ -75,53 +75,54 @@ def train(
     entries: Mapping[str, Any] | None = None,
     display: Display | None = None,
 ) -> Run:
-    """Train, and write metrics, policies and checkpoints into a run folder, as ``lyceum-warp train`` does.
+    """Train a learner, and write metrics, policies and checkpoints into a run folder, as ``lyceum-warp train`` does.
 
-    ``lw.load(folder)`` returns the last policy, and ``lw.load(folder, which="best")`` the policy with the best return.
-    The return is ``mean_return`` if the learner evaluates the mean policy. Otherwise the return is ``return_mean`` over
-    the iteration's episodes, which the policy sampled before the update.
+    The call ``lw.load(folder)`` returns the last policy, and ``lw.load(folder, which="best")`` returns the policy with
+    the best return. The return is ``mean_return`` if the learner evaluates the mean policy. Without evaluations, the
+    return is ``return_mean`` over the iteration's episodes, which the policy sampled before the update.
 
     The policy and the complete state are saved at the start, at the end, and every 30 s, or more often if saving takes
     at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run resumes from the last save and produces the
-    same numbers. On Ctrl-C, SIGTERM or SIGHUP the run is saved and ends after the current iteration; a second signal
-    ends it at once.
+    same numbers. On Ctrl-C, SIGTERM or SIGHUP, the run is saved and ends after the current iteration; a second signal
+    ends the run at once.
 
     Args:
-        learner: The algorithm: ``NPG(env)``, or another ``lyceum_warp.algos.learner.Learner``.
-        folder: The run's folder, new or empty.
-        iterations: Total number of iterations, including those before ``resume``.
-        callback: Called with each iteration after its row was written. If it returns True, training ends. If it raises
-            an error, the run is saved and the error is raised again.
-        target_return: Training ends once the return, as defined above, reaches this number.
-        minutes: Time limit; training ends after the iteration that exceeds it. None for no limit.
-        keep_every: Iterations between two numbered policies; 0 for none.
+        learner: The algorithm, such as ``NPG(env)`` or another ``lyceum_warp.algos.learner.Learner``.
+        folder: The run's folder, which is new or empty.
+        iterations: Total number of iterations, including iterations before resuming.
+        callback: Function of an iteration, called after the iteration's row was written. Training ends if the callback
+            returns True. If the callback raises an error, the run is saved and the error is raised again.
+        target_return: Return at which training ends, compared with the return that selects the best policy.
+        minutes: Time limit; training ends after the iteration that exceeds the limit. A limit of None means no limit.
+        keep_every: Iterations between two numbered policies; 0 for no numbered policies.
         save_every: Iterations between two saves; 0 to save by time.
         tensorboard: Whether to also write the metrics for TensorBoard.
-        video_every: Iterations between two videos of the policy, ``videos/000100.mp4`` and so on in the folder; 0 for
-            none. If a video fails, a warning is logged, and training continues without videos.
-        camera: Camera of the videos: a camera of the model by name or index, a ``viz.cameras.FreeCamera``, or "free"
-            for MuJoCo's default free camera.
-        transfer: Whether to judge the policy's transfer at the end, by ``lw.transfer``, and to write ``transfer.json``
-            into the folder. By default only cheap comparisons run, for a few seconds: a GPU with the C engine, and the
-            run's physics with the task's exact physics. True also compares with the Warp engine after training on CPU
-            cores, and with each physics of the task.
-        resume: Whether to continue the run in the folder. ``learner`` must be made with the same arguments.
-        take_over: Whether to continue a run that another process has locked, on this or another host. The other process
-            then ends at its next write.
+        video_every: Iterations between two videos of the policy, such as ``videos/000100.mp4`` in the folder; 0 for no
+            videos. If a video fails, a warning is logged, and training continues without videos.
+        camera: Camera of the videos, which is a camera of the model by name or index, a ``viz.cameras.FreeCamera``, or
+            "free" for MuJoCo's default free camera.
+        transfer: Whether to judge the policy's transfer at the end with ``lw.transfer``, and to write ``transfer.json``
+            into the folder. By default, only comparisons of a few seconds run: the C engine after training on a GPU,
+            and the task's exact physics after training with different physics options. With ``transfer=True``, the Warp
+            engine after training on CPU cores, and each of the task's physics options, are also compared.
+        resume: Whether to continue the run in the folder. To resume, make the learner with the same arguments as
+            before.
+        take_over: Whether to continue a run that another process has locked, on the same or another host. The locking
+            process then ends at its next write.
         entries: Additional JSON entries for config.json.
-        display: Shows the progress; by default only messages are logged.
+        display: Object that shows the progress; by default, only messages are logged.
 
     Returns:
         The run. ``run.rows()`` returns the metrics.
 
     Raises:
-        ValueError: The folder is not empty, an argument is out of range, the run does not fit ``learner``, or another
-            process has locked it or taken it over.
+        ValueError: The folder is not empty, an argument is out of range, the run does not fit the learner, or another
+            process has locked or taken over the run.
         ImportError: ``tensorboard`` is True, but the extra ``tensorboard`` is not installed.
         NoVideoError: ``video_every`` is given, but the extra ``viz`` is not installed.
-        OSError: The folder cannot be written; ``resume=True`` later continues from the last save.
+        OSError: The folder cannot be written; the run can be resumed from the last save later.
         FloatingPointError: An update of the learner is not finite.
-        Interrupted: One of several ranks received a signal.
+        Interrupted: With several ranks, one rank received a signal.
     """
     check_kind("learner", learner, Learner, "as lw.NPG(env)")
     check_kind("folder", folder, str | Path, "as 'runs/mine'")
@@ -187,11 +188,11 @@ def train(
 
 
 _PAIRS = 64
-"""Pairs of episodes for the transfer verdict at the end of training."""
+"""Number of pairs of episodes for the transfer verdict at the end of training."""
 
 
 def _judge_transfer(run: Run, learner: Learner, wanted: bool | None, display: Display) -> None:
-    """Write the transfer verdict on the policy into the run, if requested or if it takes only seconds."""
+    """Write the policy's transfer verdict into the run, if requested or if the comparison takes only seconds."""
     env, exact = learner.env, task_physics(learner.env)[1] == EXACT
     on_gpu = env.device.is_cuda and env.engine.name == "warp"
     if wanted is False or (wanted is None and exact and not on_gpu):
@@ -202,7 +203,7 @@ def _judge_transfer(run: Run, learner: Learner, wanted: bool | None, display: Di
             env, learner.policy, _PAIRS, seed=env.options.seed + 1, warp=on_gpu or wanted is True,
             physics=wanted is True, progress=progress,
         )  # fmt: skip
-    except Exception as error:  # an error of any kind must not discard the training
+    except Exception as error:  # an error must not discard the training
         display.note(f"no verdict on transfer ({one_line(error)})")
         return
     with replaced(run.transfer) as temporary:
@@ -213,7 +214,7 @@ def _learn(
     learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None,
     limit: float,
 ) -> None:  # fmt: skip
-    """Iterate until the target, the last iteration or the time limit, in seconds; all ranks save and end together."""
+    """Iterate up to the target, the last iteration or the time limit, in seconds; all ranks save and end together."""
     team, run, deadline = learner.team, saver.run, time.monotonic() + limit
     ended = False
     with postponed(insist=team.size == 1) as noted:
@@ -253,11 +254,11 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
     if reached is not None and target is not None and reached["return"] >= target:
         raise ValueError(
             f"the run in {folder} is finished: its return reached {reached['return']:.6g} in iteration "
-            f"{reached['iteration']}: give a target return above that, or inf for none"
+            f"{reached['iteration']}: use a larger target return, or inf for none"
         )
     if settings["iterations"] <= done:
         raise ValueError(
-            f"the run in {folder} already has {done} iterations: give more (--iterations {2 * done}, or "
+            f"the run in {folder} already has {done} iterations: ask for more iterations (--iterations {2 * done}, or "
             f"iterations={2 * done} in Python)"
         )
     _check_equal(run, learner)
@@ -268,9 +269,9 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
             read_replay(run.replay, learner.replay, content["state"]["stored"], learner.own_worlds)
     except Exception as error:  # a damaged state may raise any error
         text = " ".join(str(error).split())
-        raise ValueError(f"{run.checkpoint} does not fit the configuration beside it: {text}") from error
+        raise ValueError(f"{run.checkpoint} does not fit the run's configuration: {text}") from error
     if learner.team.leads:
-        cut_rows(run.metrics, done)  # a killed run may have written rows of iterations that were not saved
+        cut_rows(run.metrics, done)  # a killed run may have written rows of unsaved iterations
         if changed := run.changed(versions(run.config["device"])):
             text = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
             note(f"versions have changed, so numbers may differ from an uninterrupted run's: {text}")
@@ -283,10 +284,10 @@ def _check_equal(run: Run, learner: Learner) -> None:
     old, new, algorithm = then.options, env.options, run.config["algorithm"]
     now["engine"] = engine_name(now["engine"], now["device"])
     own = {"engine": engine_name(old.engine, old.device), "algorithm": algorithm, "nworld": old.nworld}
-    # omit options that do not affect the results; note_changes compares the model
+    # omit options that do not affect results, and the model, which note_changes compares
     options = {"horizon": old.horizon, "fields": old.fields, "dynamics": old.dynamics}
     params = dict.fromkeys(now["params"]) | run_params(run, then.params)
-    # a run of an earlier release lacks the newest hyperparameters
+    # runs of earlier releases lack the newest hyperparameters
     hyperparameters = run.config.get(algorithm, {}), json.loads(json.dumps(learner.settings()))
     for before, after in (
         ({"task": run.config.get("kept", {}).get("name", env.task.name)}, {"task": env.task.name}),
@@ -297,5 +298,5 @@ def _check_equal(run: Run, learner: Learner) -> None:
             if value != after.get(name):
                 raise ValueError(
                     f"the run in {run.folder} has {name} {value}, not {after.get(name)}, and a run keeps its "
-                    f"settings: omit it, or start a new run in another folder"
+                    f"settings: omit {name}, or start a new run in another folder"
                 )

@@ -1,7 +1,7 @@
 """Compute the tables of a walking robot from its compiled model, and prepare models for walking.
 
-Functions with the arguments ``(model, p)`` are for ``lw.from_model``: ``p`` has the parameters ``joints`` and ``feet``,
-indices of joints and of sites. The base is the body of the first joint, which must be free.
+Functions with the arguments ``(model, p)`` are for ``lw.from_model``; ``p`` has the parameters ``joints`` and ``feet``,
+which are indices of joints and of sites. The base is the body of the first joint, which must be a free joint.
 """
 
 import functools
@@ -18,14 +18,14 @@ from lyceum_warp.mirror import Mirror
 
 _JOINT, _SENSOR = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_SENSOR
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-_FORCE, _NET = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3  # parameters of a contact sensor
+_FORCE, _NET = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3  # contact sensor parameters
 
 
 # joints
 
 
 def base(model: mujoco.MjModel, p: Any = None) -> int:
-    """The body that moves freely.
+    """Get the floating base, the body of the free joint.
 
     Raises:
         ValueError: The first joint of the model is not free.
@@ -36,17 +36,17 @@ def base(model: mujoco.MjModel, p: Any = None) -> int:
 
 
 def joint_qpos(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The index of each joint in ``qpos``, (joints,)."""
+    """Get the index of each joint in ``qpos``, (joints,)."""
     return model.jnt_qposadr[p.joints]
 
 
 def joint_dof(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The index of each joint in ``qvel``, (joints,)."""
+    """Get the index of each joint in ``qvel``, (joints,)."""
     return model.jnt_dofadr[p.joints]
 
 
 def servos(model: mujoco.MjModel, p: Any) -> list[int]:
-    """The actuator of each joint, (joints,).
+    """Get the actuator of each joint, (joints,).
 
     Raises:
         ValueError: A joint does not have exactly one actuator.
@@ -63,14 +63,14 @@ def servos(model: mujoco.MjModel, p: Any) -> list[int]:
 
 
 def controls(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The index of each joint's servo in ``ctrl``, (joints,)."""
+    """Get the index of each joint's servo in ``ctrl``, (joints,)."""
     return model.actuator_ctrladr[servos(model, p)]
 
 
 def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """A quarter of the position error, rad, at which the servo of each joint reaches its force limit, (joints,).
+    """Compute mjlab's scale of actions, 0.25 * limit / kp, rad, (joints,).
 
-    0.25 * limit / kp, mjlab's scale of actions.
+    The scale is a quarter of the position error at which a joint's servo reaches its force limit.
 
     Raises:
         ValueError: A servo has no force limit.
@@ -78,12 +78,12 @@ def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
     limits = force_limits(model, p)
     if not limits.all():
         unlimited = _name(model, _JOINT, p.joints[int(np.argmin(limits))])
-        raise ValueError(f"the servo of the joint {unlimited} has no force limit: give action_scale, in rad")
+        raise ValueError(f"the servo of the joint {unlimited} has no force limit: pass action_scale, in rad")
     return 0.25 * limits / model.actuator_gainprm[servos(model, p), 0]
 
 
 def force_limits(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The largest force of each joint's servo, N m, (joints,); 0 without a limit."""
+    """Get the largest force of each joint's servo, N m, (joints,); 0 without a limit."""
     actuators = servos(model, p)
     return np.where(
         model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators, 1],
@@ -92,34 +92,34 @@ def force_limits(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def home_qpos(model: mujoco.MjModel) -> np.ndarray:
-    """The coordinates of the keyframe "home", or else ``qpos0``."""
+    """Get the coordinates of the keyframe "home", or ``qpos0`` without this keyframe."""
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home")
     return model.qpos0 if key < 0 else model.key_qpos[key]
 
 
 def home_pose(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The positions of the joints in ``home_qpos``, rad, (joints,)."""
+    """Get the positions of the joints in ``home_qpos``, rad, (joints,)."""
     return home_qpos(model)[joint_qpos(model, p)]
 
 
 def home_height(model: mujoco.MjModel, p: Any) -> float:
-    """The height of the base in ``home_qpos``, m."""
+    """Get the height of the base in ``home_qpos``, m."""
     return float(home_qpos(model)[2])
 
 
 def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
     """Collect the names, gains and poses with which a robot runs a velocity policy, for ``lw.Task.deployment``.
 
-    Lists are in the order of ``joints``.
+    All lists are in the order of ``joints``.
     """
     actuators, stages = servos(model, p), np.asarray(p.stages)
-    # the joint's own damping, which adds to the servo's
+    # damping of the joint itself, which adds to the servo's damping
     damping = model.dof_damping[joint_dof(model, p)].reshape(len(actuators), -1)[:, 0]
     yaw, lateral = float(stages[:, 3].max()), float(np.max(p.lateral_velocity))
     clock = {"gait_frequency": float(p.gait_frequency)} if hasattr(p, "gait_frequency") else {}  # Hz
     return clock | {
         "base": model.body(base(model)).name,
-        "velocimeter": np.asarray(p.imu).tolist(),  # position on the base, m
+        "velocimeter": np.asarray(p.imu).tolist(),  # position on base, m
         "joints": [model.joint(joint).name for joint in p.joints],
         "default_pose": np.asarray(p.default_pose).tolist(),
         "action_scale": np.asarray(p.action_scale).tolist(),
@@ -135,10 +135,10 @@ def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
 
 
 def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
-    """The mirror image of a velocity task in the plane y = 0 of the base, for ``lw.Task.mirror``.
+    """Make the mirror image of a velocity task in the plane y = 0 of the base, for ``lw.Task.mirror``.
 
-    With all joints at 0, a joint's position and axis are the mirror image of its partner's. The partner is the joint on
-    the other side, or the joint itself. Masses need not be symmetric.
+    With all joints at 0, the position and axis of a joint must be the mirror image of its partner's. The partner is the
+    joint on the other side, or the joint itself. The masses of the robot need not be symmetric.
 
     Raises:
         ValueError: A joint or a foot has no partner, or the default pose or the scale of actions is not symmetric.
@@ -176,7 +176,7 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
         **dict.fromkeys(("joint_position", "joint_velocity", "last_action"), joints),
         "clock": (-1.0, -1.0),  # the feet are half a cycle apart
         **dict.fromkeys(("foot_height", "foot_air_time", "foot_contact"), feet), "foot_force": vectors,
-        # these state fields also contain joints that the task does not use
+        # qpos and qvel also contain joints that the task does not use
         "qpos": ([*range(7), *(partner[hinges] + 6)], [*flip, 1.0, *spin, *sign[hinges]]),
         "qvel": ([*range(6), *(partner[hinges] + 5)], [*flip, *spin, *sign[hinges]]),
     }  # fmt: skip
@@ -188,13 +188,10 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
 
 
 # legs
-#
-# With all joints at 0, every joint of a leg has a constant axis in the base's axes, and a constant position relative to
-# the joint before it. A joint turns all later joints of its leg.
 
 
 def leg_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The joints from the base to each foot, (feet, longest leg); -1 fills the rows of shorter legs.
+    """List the joints from the base to each foot, (feet, longest leg); -1 fills the rows of shorter legs.
 
     Raises:
         ValueError: A foot is not connected to the base by hinges.
@@ -205,41 +202,41 @@ def leg_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def leg_qpos(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The index of each of ``leg_joints`` in ``qpos``; -1 fills the rows of shorter legs."""
+    """Get the index of each of ``leg_joints`` in ``qpos``; -1 fills the rows of shorter legs."""
     joints = leg_joints(model, p)
     return np.where(joints < 0, -1, model.jnt_qposadr[joints])
 
 
 def leg_dof(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The index of each of ``leg_joints`` in ``qvel``; -1 fills the rows of shorter legs."""
+    """Get the index of each of ``leg_joints`` in ``qvel``; -1 fills the rows of shorter legs."""
     joints = leg_joints(model, p)
     return np.where(joints < 0, -1, model.jnt_dofadr[joints])
 
 
 def leg_axes(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The axis of each of ``leg_joints``, (feet, longest leg, 3)."""
+    """Get the axis of each of ``leg_joints``, (feet, longest leg, 3)."""
     data = _straight(model)
     return data.xaxis[leg_joints(model, p)]
 
 
 def leg_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The position of each of ``leg_joints`` relative to the previous joint, or to the base for the first joint, m."""
+    """Get the position of each of ``leg_joints`` relative to the leg's previous joint, or to the base, m."""
     anchors = _straight(model).xanchor[leg_joints(model, p)]
     return np.diff(anchors, axis=1, prepend=0.0)
 
 
 def foot_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The position of each foot's site relative to its last joint, m, (feet, 3)."""
+    """Get the position of each foot's site relative to the foot's last joint, m, (feet, 3)."""
     data = _straight(model)
     return np.array([data.site_xpos[foot] - data.xanchor[_last_joint(model, foot)] for foot in p.feet])
 
 
 def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Spheres that touch a plane if and only if the foot does, (feet, most spheres, 4): centre and radius, m.
+    """Compute spheres that touch a plane if and only if the foot does, (feet, most spheres, 4): centre and radius, m.
 
-    Centres are relative to the foot's last joint. A capsule becomes two spheres at its ends, a box becomes its corners,
-    and any other geom the corners of its bounding box. Radii include the margin at which a contact starts to exert
-    force.
+    Centres are relative to the foot's last joint. A capsule becomes spheres at both ends, a box becomes spheres at its
+    corners, and any other geom becomes spheres at the corners of its bounding box. Radii include the margin at which a
+    contact starts to exert force.
 
     Raises:
         ValueError: A foot has no geom in ``foot_geoms``.
@@ -249,19 +246,19 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
     for foot in p.feet:
         geoms = [geom for geom in p.foot_geoms if model.geom_bodyid[geom] == model.site_bodyid[foot]]
         if not geoms:
-            raise ValueError(f"none of foot_geoms belongs to the body of the foot {model.site(foot).name!r}")
+            raise ValueError(f"no geom in foot_geoms belongs to the body of the foot {model.site(foot).name!r}")
         found = np.concatenate([_with_margin(model, geom, spheres_of(model, data, geom)) for geom in geoms])
         found[:, :3] -= data.xanchor[_last_joint(model, foot)]
         spheres.append(found)
     most = max(map(len, spheres))
-    return np.array([np.resize(found, (most, 4)) for found in spheres])  # repeat spheres of feet that have fewer
+    return np.array([np.resize(found, (most, 4)) for found in spheres])  # feet with fewer spheres repeat theirs
 
 
 def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
-    """The geoms of the feet's bodies that can touch the ground (any geom of the world body).
+    """List the geoms of the feet's bodies that can touch the ground (any geom of the world body).
 
     Raises:
-        ValueError: A foot has no such geom.
+        ValueError: A foot has no geom that can touch the ground.
     """
     found = []
     for foot in p.feet:
@@ -273,7 +270,7 @@ def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
 
 
 def contact_geoms(model: mujoco.MjModel, body: int) -> list[int]:
-    """The geoms of a body that can touch a geom of the world body."""
+    """List the geoms of a body that can touch a geom of the world body."""
     ground = np.flatnonzero(model.geom_bodyid == 0).tolist()
     pairs = {frozenset(pair) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
     geoms = np.flatnonzero(model.geom_bodyid == body).tolist()
@@ -281,23 +278,23 @@ def contact_geoms(model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def foot_forces(model: mujoco.MjModel, p: Any) -> list[int]:
-    """The index in ``sensordata`` of the force on each foot, from the sensor FOOT_force, (feet,).
+    """Get the index in ``sensordata`` of the force on each foot, from the sensor FOOT_force, (feet,).
 
     Raises:
-        ValueError: There is no sensor of three numbers with this name.
+        ValueError: The model has no sensor FOOT_force with three numbers.
     """
     found = []
     for foot in p.feet:
         name = f"{model.site(foot).name}_force"
         sensor = mujoco.mj_name2id(model, _SENSOR, name)
         if sensor < 0 or model.sensor_dim[sensor] != 3:
-            raise ValueError(f"the model has no sensor {name!r} of a contact's force: prepare_walker adds it")
+            raise ValueError(f"the model has no sensor {name!r} of a contact's force: prepare_walker adds this sensor")
         found.append(int(model.sensor_adr[sensor]))
     return found
 
 
 def leg_of(model: mujoco.MjModel, body: int) -> list[int]:
-    """The joints from the base to a body.
+    """List the joints from the base to a body.
 
     Raises:
         ValueError: The body is not connected to the base by hinges.
@@ -336,7 +333,7 @@ def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[
 
 
 def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.ndarray:
-    """Add a geom's contact margin minus its gap, for contacts with the ground, to the radii of its spheres."""
+    """Add a geom's contact margin minus its gap, for contacts with the ground, to the radii of the geom's spheres."""
     ground = np.flatnonzero(model.geom_bodyid == 0)
     margin = model.geom_margin[geom] + model.geom_margin[ground].max()
     gap = model.geom_gap[geom] + model.geom_gap[ground].max()
@@ -344,7 +341,7 @@ def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.nd
 
 
 def spheres_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
-    """The spheres of ``soles`` for a geom, in the world's axes, (spheres, 4)."""
+    """Compute a geom's spheres for ``soles``, in the world's axes, (spheres, 4)."""
     size, kind = model.geom_size[geom], mujoco.mjtGeom
     radius, middle = 0.0, np.zeros(3)
     if model.geom_type[geom] == kind.mjGEOM_SPHERE:
@@ -375,15 +372,15 @@ def prepare_walker(
 ) -> None:
     """Prepare a model for a velocity task: add force sensors to the feet, and let the feet determine the friction.
 
-    The model's own sensors are removed, because each costs time and the task reads none of them. Geoms of the feet get
-    priority in contacts, so that their randomized friction applies. Explicit contact pairs of a foot with the ground
-    are replaced by ordinary contacts.
+    The model's own sensors are removed, because sensors cost time and the task reads none of the model's sensors. Geoms
+    of the feet get priority in contacts, so that the feet's randomized friction applies. Ordinary contacts replace
+    explicit contact pairs of a foot with the ground.
 
     Args:
-        spec: The model, changed in place.
+        spec: The model, which is changed in place.
         feet: Names of the sites of the feet.
-        timestep: Seconds in a substep; None keeps the model's.
-        iterations: Maximum numbers of iterations of the solver and of its line search; None keeps the model's.
+        timestep: Seconds in a substep; None keeps the model's time step.
+        iterations: Maximum numbers of iterations of the solver and of the line search; None keeps the model's limits.
 
     Raises:
         ValueError: A site of a foot is missing.
@@ -417,14 +414,15 @@ def prepare_walker(
 
 
 def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]]) -> None:
-    """Add sites of feet to a model, changed in place.
+    """Add sites of feet to a model in place.
 
     Args:
         spec: The model.
-        feet: For each site by name: its body, or a joint or geom of this body, and its position in the body, m.
+        feet: Map from the name of a site to its body, or a joint or geom of this body, and to its position in the body,
+            m.
 
     Raises:
-        ValueError: There is no such element.
+        ValueError: The model has no element of this name.
     """
     for name, (element, position) in feet.items():
         owner = spec.joint(element) or spec.geom(element)
@@ -435,15 +433,16 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
 
 
 def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0) -> None:
-    """Turn the motors of joints into position servos, in place; existing servos do not change.
+    """Turn joints' motors into position servos in place; existing servos do not change.
 
-    The force limit does not change. A servo reaches it at a position error of ``reach`` rad: kp = limit / reach. The
-    servo is critically damped for the joint's inertia at ``qpos0``: kp + kd s + M s^2 has a double root.
+    The servo's force limit does not change. A servo reaches the limit at a position error of ``reach`` rad, so kp =
+    limit / reach. The servo is critically damped for the joint's inertia M at ``qpos0``, so kp + kd s + M s^2 has a
+    double root.
 
     Args:
         spec: The model.
-        joints: Names of the joints, with one actuator each.
-        reach: Error at which a servo's force reaches its limit, rad.
+        joints: Names of the joints, which have one actuator each.
+        reach: Position error at which a servo's force reaches its limit, rad.
 
     Raises:
         ValueError: A joint has no actuator, or its force has no limit.
@@ -462,7 +461,9 @@ def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0
         if model.jnt_actfrclimited[joint]:
             limits.append(float(model.jnt_actfrcrange[joint, 1]))
         if not math.isfinite(limit := min(limits)):
-            raise ValueError(f"the motor of the joint {name!r} has no limit: give it a ctrlrange or a forcerange")
+            raise ValueError(
+                f"the motor of the joint {name!r} has no limit: give the motor a ctrlrange or a forcerange"
+            )
         kp, dof = limit / reach, int(model.jnt_dofadr[joint])
         kd = max(2.0 * math.sqrt(kp * model.dof_M0[dof]) - model.dof_damping[dof].sum(), 0.0)
         servo = spec.actuators[actuator]
@@ -473,13 +474,13 @@ def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0
 
 
 def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.015) -> None:
-    """Replace each colliding box of a foot by two capsules along its longer side, for height fields.
+    """Replace each colliding box of a foot by two capsules along the box's longer side, for height fields.
 
-    MuJoCo Warp 4.0 finds contacts of boxes and height fields with wrong normals and depths, which throw a robot away.
-    The capsules lie within the outline of the sole and touch its lowest plane; masses do not change.
+    MuJoCo Warp 4.0 finds contacts of boxes and height fields with wrong normals and depths, which throw robots into the
+    air. The capsules lie within the outline of the foot's sole and touch the sole's lowest plane; masses do not change.
 
     Args:
-        spec: The model, changed in place, after ``prepare_walker``.
+        spec: The model after ``prepare_walker``, which is changed in place.
         feet: Names of the sites of the feet.
         radius: Radius of the capsules, m.
 
@@ -491,7 +492,7 @@ def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.01
         for box in [g for g in spec.site(name).parent.geoms if g.type == box_type and (g.contype or g.conaffinity)]:
             long, short = (0, 1) if box.size[0] >= box.size[1] else (1, 0)
             if box.size[short] < radius:
-                raise ValueError(f"the box of the foot {name!r} is {2 * box.size[short]} m wide: give a smaller radius")
+                raise ValueError(f"the box of the foot {name!r} is {2 * box.size[short]} m wide: use a smaller radius")
             frame = spec.site(name).parent.add_frame(pos=box.pos, quat=box.quat)
             for kind in ("type", "axisangle", "xyaxes", "zaxis", "euler"):
                 setattr(frame.alt, kind, getattr(box.alt, kind))

@@ -19,7 +19,7 @@ from lyceum_warp.task import MEMORIES
 
 
 def own_bytes_per_world(task: BoundTask) -> int:
-    """Estimated bytes per world of ``WorldArrays``, without the engine's arrays."""
+    """Estimate the bytes per world of ``WorldArrays``, without the engine's arrays."""
     snapshots = [field for field in task.fields if field.snapshot]
     state_size = state_space(task.model, snapshots, task.dynamics, own_parts(task)).size
     copies = sum(field.size for field in task.fields)
@@ -28,7 +28,7 @@ def own_bytes_per_world(task: BoundTask) -> int:
 
 
 def own_parts(task: BoundTask) -> dict[str, int]:
-    """Sizes of the parts that ``Worlds`` adds to a state, except the counters."""
+    """Compute the sizes of the parts that ``Worlds`` adds to a state, except the counters."""
     form, found = task.task, dict[str, int]()
     for layout in task.memory.values():
         found |= sizes(layout)
@@ -37,17 +37,17 @@ def own_parts(task: BoundTask) -> dict[str, int]:
 
 
 def memory_columns(task: BoundTask, space: Space) -> dict[str, slice]:
-    """The columns of ``memory`` and ``lasting_memory`` in a state, if the task has them."""
+    """Get the columns of ``memory`` and ``lasting_memory`` in a state, if the task has such memory."""
     ends = {name: [space.parts[part] for part in layout] for name, layout in task.memory.items() if layout}
     return {name: slice(parts[0].start, parts[-1].stop) for name, parts in ends.items()}
 
 
 class WorldArrays:
-    """The arrays of many worlds of one task on one engine, all allocated here.
+    """Allocates all arrays of many worlds of one task on one engine.
 
     Args:
-        task: The task, bound to its model and parameters.
-        engine: The physics; it has the task's fields.
+        task: The task with its model and parameters.
+        engine: The physics engine, with the task's fields.
     """
 
     def __init__(self, task: BoundTask, engine: Engine) -> None:
@@ -69,15 +69,15 @@ class WorldArrays:
             for name in ("memory", "lasting_memory", "lasting_memory")
         )
         self.metric_sums = wp.zeros((n, len(self.task.metrics)), dtype=float)
-        """Sums of the metrics over the episode so far."""
+        """Sums of the metrics over the current episode so far."""
         self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
-        """Number of successive successful steps, up to ``success_steps``; the array has no columns if one step is
-        enough."""
+        """Number of successive successful steps, up to ``success_steps``; the array has no columns if ``success_steps``
+        is 1."""
         own = ("memory", "lasting_memory", "metric_sums", "success_counts")
         self._clearable = {name: getattr(self, name) for name in own}
         self._clearable |= {name: flat(self.engine.arrays[name]) for name in task.cleared}
         self._zeros = wp.zeros(max(array.shape[1] for array in self._clearable.values()), dtype=float)
-        # the live fields after a step, and copies of them from before the step
+        # fields after a step, and copies of the fields before the step
         self.after, self.before = kernels.Batch(), kernels.Batch()
         self._copies: dict[str, wp.array] = {}
         constant = {f.name: shared_rows(f.value(model), f.dtype, n, self.device) for f in self.task.constants}
@@ -87,12 +87,12 @@ class WorldArrays:
             self.task.check_field(name, live)
             live = with_memory(live)
             setattr(self.after, name, live)
-            if live.size and name not in constant and name not in varied:  # no step changes the model
+            if live.size and name not in constant and name not in varied:  # steps do not change the model
                 self._copies[name] = wp.zeros_like(live)
             setattr(self.before, name, self._copies.get(name, live))
         self._allocate_shared()
         self.fields = {**self.engine.arrays, **constant}
-        """The arrays of all fields of the engine and the model, (nworld, ...), by name."""
+        """Arrays of all fields of the engine and the model, (nworld, ...), by name."""
         drawn = [f.name for f in self.task.dynamics if f.name in self.task.writes.get("event", ())]
         self._model_copies = {name: wp.zeros_like(self.engine.arrays[name]) for name in drawn}
         self.params = self.task.parameters.array(self.device)
@@ -102,11 +102,11 @@ class WorldArrays:
         self.state_space = state_space(model, self.engine.snapshots, self.task.dynamics, own_parts(self.task))
 
     def _allocate_shared(self) -> None:
-        """Allocate the memory that all worlds share, and the sums over worlds that update it."""
+        """Allocate the memory that all worlds share, and the sums over worlds that update the memory."""
         layouts = self.task.shared
         shared, sums = (sum(sizes(layouts.get(name, {})).values()) for name in ("Shared", "Sums"))
         self.shared, self.sums = wp.zeros((1, shared), dtype=float), wp.zeros(sums, dtype=wp.int64)
-        """The memory, (1, size), and the sums in units of 1 / ``steps.UNIT``, (size of Sums,)."""
+        """Shared memory, (1, size), and sums in units of 1 / ``steps.UNIT``, (size of Sums,)."""
         self._shares = wp.zeros((self.nworld, sums), dtype=float)
         if layouts:
             for batch in (self.after, self.before):
@@ -127,14 +127,15 @@ class WorldArrays:
         self.outcome.metrics = self.metrics  # type: ignore[assignment]
         self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
         parts = int(steps.OBSERVE_FIRST) + len(self.obs_spaces)
-        self._judging = parts if self.device.is_cuda else 1  # number of threads that judge a world
+        self._judging = parts if self.device.is_cuda else 1  # number of threads per world for judging
         self._found = steps.Findings()
         self._found.reward, self._found.eval = wp.zeros(n, dtype=float), wp.zeros(n, dtype=float)
         self._found.terminated, self._found.success = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
         self._found.fault = wp.zeros((parts, n), dtype=int)  # type: ignore[assignment]
         self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
         self._finite_obs = wp.zeros((len(self.obs_spaces), n), dtype=bool)
-        self._observing = len(self.obs_spaces) if self.device.is_cuda else 1  # number of threads that observe a world
+        # number of threads per world for observing
+        self._observing = len(self.obs_spaces) if self.device.is_cuda else 1
         self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
         self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}
 
@@ -161,23 +162,23 @@ class WorldArrays:
         self.fault_count = wp.zeros((n, int(FAULTS).bit_length()), dtype=int)
 
     def _allocate_masks(self) -> None:
-        """Allocate masks of worlds, (nworld,) bool each."""
+        """Allocate masks of worlds, each (nworld,) bool."""
         n = self.nworld
         self.everyone = wp.full(n, True, dtype=bool)
         self.mask = wp.zeros(n, dtype=bool)
-        """Worlds to reset or restore next; see ``set_mask``."""
+        """Worlds that the next reset or restore changes; see ``set_mask``."""
         self.restarting = wp.zeros(n, dtype=bool)
-        """Worlds whose episode ended in this step."""
+        """Worlds that ended an episode in the last step."""
         self._rejected = wp.zeros(n, dtype=bool)
-        """Worlds whose initial state the task rejects, so it is drawn again."""
+        """Worlds with a rejected initial state, which is drawn again."""
         self._continuing = wp.zeros(n, dtype=bool)
-        """Worlds that do not restart and ran their events."""
+        """Worlds that ran events instead of restarting."""
         self._physics_changed = wp.zeros(n, dtype=bool)
-        """Worlds whose physics an event of this step changed."""
+        """Worlds in which an event of the last step changed the physics."""
         self._changed = wp.zeros(n, dtype=bool)
-        """Worlds whose physics or task memory an event of this step changed."""
+        """Worlds in which an event of the last step changed the physics or the task's memory."""
         self._outdated = wp.zeros(n, dtype=bool)
-        """Worlds that restarted or were changed by events since their last observation."""
+        """Worlds that restarted, or that events changed, since the last observation."""
         self.mask_view, self.changed_view = torch_view(self.mask), torch_view(self._changed)
         self.terminated_view = torch_view(self._found.terminated)
 
@@ -187,7 +188,7 @@ class WorldArrays:
         return {group: torch_view(getattr(into, group)) for group in self.obs_spaces}
 
     def set_mask(self, mask: torch.Tensor | None) -> None:
-        """Choose the worlds to reset or restore next; None for all."""
+        """Choose the worlds that the next reset or restore changes; None for all worlds."""
         if mask is None:
             self.mask_view.fill_(True)
         else:
@@ -195,7 +196,7 @@ class WorldArrays:
             self.mask_view.copy_(mask)
 
     def pack_state(self, ended: wp.array) -> None:
-        """Write every world's state vector into ``state``; ``ended`` fills the part ``done_reason``, (nworld,)."""
+        """Write every world's state vector into ``state``, with ``ended``, (nworld,), as the part ``done_reason``."""
         size = self.engine.state_size
         self.engine.get_state(self.state[:, :size])
         own = self.counters
@@ -211,7 +212,7 @@ class WorldArrays:
             launch_rows(state.narrow, self.mask, columns, array)
 
     def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
-        """The arrays of ``own_parts``, with their columns in the state."""
+        """Yield the arrays of ``own_parts``, each with its columns in the state."""
         columns = memory_columns(self.task, self.state_space)
         columns |= {name: self.state_space.parts[name] for name in own_parts(self.task) if name in OWN_PARTS}
         arrays = {"metrics": self.metric_sums, "success_steps": self.success_counts}

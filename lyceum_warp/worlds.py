@@ -1,4 +1,4 @@
-"""Run the phases of a step, of a reset, and of reading and restoring states; ``Worlds.step_phases`` lists a step."""
+"""Run the phases of a step, of a reset, and of reading and restoring states."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -28,7 +28,7 @@ from lyceum_warp.world_arrays import WorldArrays
 
 @dataclasses.dataclass(frozen=True)
 class Programs:
-    """An environment's phases as callables, for one combination of horizon, autoreset and graphs."""
+    """Phases of an environment as callables, for one combination of horizon, autoreset and graphs."""
 
     graphs: Graphs
     step: Calls
@@ -39,12 +39,12 @@ class Programs:
 
 
 class Worlds(WorldArrays):
-    """Many worlds of one task on one engine: arrays at fixed addresses, and the phases that process them.
+    """Many worlds of one task on one engine: arrays at fixed addresses, and phases that process the arrays.
 
-    Every phase must launch the same kernels on the same arrays each time, because graphs replay it.
+    Every phase must launch the same kernels on the same arrays each time, because graphs replay the phase.
 
     Args:
-        task: The task, bound to its model and parameters.
+        task: The task with its model and parameters.
         engine: The physics engine, with the task's fields.
         options: Options of the environment.
     """
@@ -58,7 +58,7 @@ class Worlds(WorldArrays):
         self.configure(horizon=horizon, autoreset=options.autoreset, graphs=options.graphs)
 
     def configure(self, *, horizon: int, autoreset: bool, graphs: bool) -> None:
-        """Set the horizon, whether episodes restart automatically, and whether launches are captured as graphs.
+        """Set the horizon, automatic restarts, and whether launches are captured as graphs.
 
         Captured graphs contain the horizon and the automatic restarts, so each combination has separate graphs.
         """
@@ -78,12 +78,12 @@ class Worlds(WorldArrays):
         self.step = self.programs.step
 
     def drop_programs(self) -> None:
-        """Break the reference cycles through the programs, so that the environment's threads and memory are freed."""
+        """Break reference cycles through the programs, so that the environment's threads and memory are freed."""
         self._programs.clear()
         del self.programs, self.step
 
     def _make_workers(self) -> Workers | None:
-        """Worker threads for launches around the engine's calls; None if only the caller's thread launches."""
+        """Make worker threads for launches around the engine's calls; None if only the caller's thread launches."""
         # Warp's kernels in debug mode are not thread-safe
         if not self.device.is_cpu or self.engine.capturable or wp.config.mode == "debug":
             return None
@@ -93,7 +93,7 @@ class Worlds(WorldArrays):
     # phases
 
     def step_phases(self, substeps: int | None = None) -> list[Phase]:
-        """The phases of one step, in order; by default with all the task's substeps."""
+        """List the phases of one step, in order; by default with all substeps of the task."""
         return [
             *self._transition_phases(substeps),
             *self._restart_phases(self.restarting, randomly=True),
@@ -104,7 +104,7 @@ class Worlds(WorldArrays):
         ]
 
     def _phases_of_a_graph(self) -> list[Phase]:
-        """``step_phases`` for a step that is a single graph, which skips the parts that concern no world."""
+        """List the phases of a step that is a single graph and skips parts that affect no world."""
         if not self.engine.capturable:
             return self.step_phases()
         restart = self._restart_phases(self.restarting, randomly=True)
@@ -132,7 +132,7 @@ class Worlds(WorldArrays):
         return Phase(every[0].name, partial(self.engine.run_for, mask, run), engine=True)
 
     def _transition_phases(self, substeps: int | None = None) -> list[Phase]:
-        """Advance to the next state, and judge the transition."""
+        """List the phases that advance to the next state and judge the transition."""
         return [
             Phase("act", self.act, by_world=True),
             *self.physics_phases(substeps),
@@ -141,12 +141,12 @@ class Worlds(WorldArrays):
         ]
 
     def _tally_phases(self) -> list[Phase]:
-        """Add up the task's sums over all worlds, in one thread because atomic additions on a CPU require it."""
+        """Add up the task's sums over all worlds in one thread, as atomic additions on a CPU require."""
         kernel = self.task.kernels.tally_worlds if self.autoreset else None
         return [] if kernel is None else [Phase("tally", partial(self._tally, kernel))]
 
     def physics_phases(self, substeps: int | None = None) -> list[Phase]:
-        """The substeps of a step; by default all."""
+        """List the phases of a step's substeps; by default of all substeps."""
         skip = self.task.frame_skip if substeps is None else substeps
         if (kernel := self.task.kernels.substep_memory) is None:
             return self.engine.step_phases(skip)
@@ -154,7 +154,7 @@ class Worlds(WorldArrays):
         return substep * skip
 
     def reset_phases(self, *, randomly: bool) -> list[Phase]:
-        """The phases that start episodes in the worlds of ``mask``, in order."""
+        """List the phases that start episodes in the worlds of ``mask``, in order."""
         return [
             *self._restart_phases(self.mask, randomly=randomly),
             *self._refresh_phases(self.mask),
@@ -162,7 +162,7 @@ class Worlds(WorldArrays):
         ]
 
     def _restart_phases(self, mask: wp.array, *, randomly: bool) -> list[Phase]:
-        """Put the masked worlds into initial states; derived fields are not computed yet."""
+        """List the phases that set masked worlds to initial states, without derived fields."""
         phases = [Phase("restart", partial(self._restart, mask, randomly=randomly), by_world=True)]
         if self.task.reset_dynamics:
             phases.append(Phase("dynamics", partial(self.engine.apply_model, mask), engine=True))
@@ -173,12 +173,12 @@ class Worlds(WorldArrays):
         return phases
 
     def _event_phases(self) -> list[Phase]:
-        """The task's events between two steps, in worlds that continue."""
+        """List the phases of the task's events, which run between two steps in worlds that continue."""
         kernel = self.task.kernels.run_events
         return [] if kernel is None else [Phase("event", partial(self._event, kernel))]
 
     def _moved_phases(self) -> list[Phase]:
-        """Update model constants and derived fields in worlds whose physics an event changed."""
+        """List the phases that update model constants and derived fields after events."""
         if self.task.kernels.run_events is None:
             return []
         phases, changed = [], self._physics_changed
@@ -189,12 +189,12 @@ class Worlds(WorldArrays):
         return phases
 
     def _observe_phases(self) -> list[Phase]:
-        """Observe the worlds that changed since they were judged."""
+        """List the phases that observe worlds that changed since the transition was judged."""
         changed = self.restarting if self.task.kernels.run_events is None else self._outdated
         return [Phase("observe", partial(self._observe, changed), by_world=True)]
 
     def _refresh_phases(self, mask: wp.array) -> list[Phase]:
-        if self.engine.reset_stage == Stage.NONE:  # no field is derived from the state
+        if self.engine.reset_stage == Stage.NONE:  # no derived fields to compute
             return []
         return [Phase("refresh", partial(self.engine.refresh, mask), engine=True)]
 
@@ -203,7 +203,7 @@ class Worlds(WorldArrays):
         return [Phase("read state", self._read_state)]
 
     def restore_phases(self) -> list[Phase]:
-        """The phases that restore the masked worlds from ``state``, and update everything that getters read."""
+        """List the phases that restore the masked worlds from ``state``, and update everything that getters read."""
         engine_columns = self.state[:, : self.engine.state_size]
         return [
             Phase("restore engine", partial(self.engine.set_state, engine_columns, self.mask), engine=True),
@@ -214,7 +214,8 @@ class Worlds(WorldArrays):
     def rehearsal(self) -> None:
         """Run every phase that consists of launches once, so that ``compile_ahead`` can list the kernels."""
         self.seed_streams(0)
-        # only the first substep differs from the others, and the Warp engine needs a millisecond or more to list one
+        # two substeps suffice, because all substeps but the first are equal, and listing one takes the Warp engine
+        # milliseconds
         step = self.step_phases(min(self.task.frame_skip, 2))
         phases = (*self.reset_phases(randomly=True), *step, *self.read_phases(), *self.restore_phases())
         for phase in phases:
@@ -222,12 +223,12 @@ class Worlds(WorldArrays):
                 phase.run()
 
     def keep_before(self) -> None:
-        """Copy the current state into ``before``, the start of a transition."""
+        """Copy the current state into ``before``, as the start of a transition."""
         if (kernel := self.task.kernels.keep_before) is not None:
             launch_lanes(kernel, self.nworld, [self.after, self.before], self.device)
 
     def act(self) -> None:
-        """Copy the state before the step, and turn actions into controls."""
+        """Copy the state before the step, and convert actions to controls."""
         self.keep_before()
         launch_worlds(self.task.kernels.act, self.nworld, [
             self.after, self.params, self.action, self.ranges, self.scale, self.counters, self.safe_action,
@@ -241,14 +242,14 @@ class Worlds(WorldArrays):
         launch_worlds(kernel, self.nworld, args, self.device)
 
     def _judge_step(self) -> None:
-        """Find faults, advance task memory, and judge the transition."""
+        """Find faults, advance the task's memory, and judge the transition."""
         self.engine.find_faults(self.everyone)
         self.advance_memory()
         keep_reason = not self.autoreset
         self._judge(self.everyone, self.engine.fault, self._action_fault, transition=True, keep_reason=keep_reason)
 
     def advance_memory(self) -> None:
-        """Advance task memory by one step."""
+        """Advance the task's memory by one step."""
         if (advance := self.task.kernels.advance_memory) is not None:
             args = [self.before, self.after, self.params, self.safe_action, self.counters]
             launch_worlds(advance, self.nworld, args, self.device)
@@ -283,7 +284,7 @@ class Worlds(WorldArrays):
             launch_worlds(steps.hold_success, self.nworld, args, self.device)
 
     def _restart(self, mask: wp.array, *, randomly: bool, again: bool = False) -> None:
-        """Put the masked worlds into the task's initial state, fixed or random."""
+        """Set the masked worlds to the task's fixed initial state, or to random initial states."""
         self.engine.reset(mask)
         self._clear(mask, "memory", *self.task.task.cleared, *([] if again else ["metric_sums", "success_counts"]))
         if self.task.kernels.reject_worlds is not None:  # a rejected draw must not change lasting memory
@@ -300,15 +301,15 @@ class Worlds(WorldArrays):
                 launch_rows(state.fill_rows, mask, self._zeros[: array.shape[1]], array)
 
     def _make_nominal(self, mask: wp.array, names: Iterable[str]) -> None:
-        """Set model fields of the masked worlds to their nominal values."""
+        """Set model fields of the masked worlds to nominal values."""
         for name in names:
             launch_rows(state.fill_rows, mask, flat(self.engine.nominal[name])[0], flat(self.engine.arrays[name]))
 
     def _redraw(self, kernel: wp.Kernel, mask: wp.array) -> None:
-        """Redraw the masked worlds' initial states while the task rejects them."""
+        """Redraw the masked worlds' initial states while the task rejects the states."""
         wp.copy(self._rejected, mask)
         for _ in range(self.task.task.draws - 1):
-            # reading the mask would wait for the GPU, so there the remaining launches run even with an empty mask
+            # reading the mask would wait for the GPU, so a GPU runs all launches, even with an empty mask
             if not self.engine.capturable and not self._rejected.numpy().any():
                 return
             self.engine.refresh(self._rejected)
@@ -319,7 +320,7 @@ class Worlds(WorldArrays):
                 self.engine.apply_model(self._rejected)
 
     def _event(self, kernel: wp.Kernel) -> None:
-        """Run the events, and mark the worlds whose physics or memory they changed."""
+        """Run the events, and mark the worlds in which events changed the physics or the task's memory."""
         before = {name: copy for name, copy in self._copies.items() if name in self.task.writes["event"]}
         live = {name: getattr(self.after, name) for name in before}
         before |= self._model_copies
@@ -342,7 +343,7 @@ class Worlds(WorldArrays):
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
 
     def _observe(self, mask: wp.array) -> None:
-        """Observe the masked worlds; all others were already observed while they were judged."""
+        """Observe the masked worlds; judging has already observed all other worlds."""
         kernels, finite, parts = self.task.kernels, self._finite_obs, self._observing
         args = [mask, self.after, self.params, self.counters, self.final_obs, finite, self.obs, parts]
         launch_parts(kernels.observe_worlds, parts, self.nworld, args, self.device)
@@ -352,25 +353,25 @@ class Worlds(WorldArrays):
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         """Compute observations, evaluations and terminations of the masked worlds' states, without a transition."""
-        # a state set without a check may be a fault; its world keeps the last valid observation
+        # a state set without a check may be a fault; a world with a fault keeps the last valid observation
         self.engine.find_faults(self.mask)
         keep_reason = keep_reason and not self.autoreset
         self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)
 
     def _read_state(self) -> None:
-        # with automatic resets done_reason lasts for one step; otherwise it is part of the state
+        # done_reason is part of a state only without automatic resets, and otherwise lasts for one step
         self.pack_state(self._no_fault if self.autoreset else self.outcome.done_reason)
 
-    # used by environments and open-loop rollouts
+    # for environments and rollouts
 
     def judge_transition(self, action: torch.Tensor) -> None:
-        """Judge the transition from ``before`` to the current state under given actions; ignore engine faults."""
+        """Judge the transition from ``before`` to the current state under given actions, ignoring engine faults."""
         torch_view(self.safe_action).copy_(action)
-        self._judged.zero_()  # will hold the faults of this transition
+        self._judged.zero_()  # will contain the transition's faults
         self._judge(self.everyone, self._judged, self._no_fault, transition=True)
 
     def seed_streams(self, seed: int) -> None:
-        """Restart the random streams of the masked worlds, and call the task's ``startup`` in them."""
+        """Restart the random streams of the masked worlds, and call the task's ``startup`` in these worlds."""
         self._seed.fill_(seed)
         args = [self.mask, self._seed, self.first_world, self.counters.key, self.counters.episode]
         wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
@@ -383,7 +384,7 @@ class Worlds(WorldArrays):
             self.engine.apply_model(self.mask)
 
     def update_shared(self) -> None:
-        """Update the memory that all worlds share from the sums, clear these, and observe the worlds again."""
+        """Update the memory that all worlds share from the sums, clear the sums, and observe the worlds again."""
         if (kernel := self.task.kernels.share_memory) is not None:
             launch_worlds(kernel, 1, [self.sums, self._shares, self.params, self.shared], self.device)
             self._observe(self.everyone)

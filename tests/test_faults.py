@@ -252,7 +252,7 @@ def test_an_action_of_another_shape_or_type_is_refused(env: lw.Env, method: str)
 def test_an_action_that_is_not_finite_is_refused(env: lw.Env) -> None:
     action = torch.zeros(N, 3)
     action[2, 1] = np.nan
-    with pytest.raises(ValueError, match="the action 'actuator_1' of world 2 is nan: it .* be finite"):
+    with pytest.raises(ValueError, match="the action 'actuator_1' of world 2 is nan: actions .* be finite"):
         env.set_action(action)
 
 
@@ -267,7 +267,7 @@ def test_a_state_of_another_shape_or_not_finite_is_refused(env: lw.Env) -> None:
     bad[1, env.state_space.parts["qpos"].start] = np.nan
     bad[2, env.state_space.parts["qvel"].start] = -np.inf
     for call in (env.set_state, env.get_obs, env.get_eval, env.get_terminated):
-        with pytest.raises(ValueError, match="the state of world 1 has nan in its 'qpos': it .* be finite"):
+        with pytest.raises(ValueError, match="the state of world 1 has nan in its 'qpos': states .* be finite"):
             call(bad)
     mask = torch.tensor([True, False, True, False])
     with pytest.raises(ValueError, match="the state of world 2 has -inf in its 'qvel'"):
@@ -287,7 +287,7 @@ def test_masks_and_outputs_of_another_shape_or_type_are_refused(env: lw.Env) -> 
     for out in (torch.zeros(N, 10), torch.zeros(N, 11, dtype=torch.float64), np.zeros((N, 11))):
         with pytest.raises(ValueError, match=r"out must be a float32 tensor of shape \(4, 11\), not a "):
             env.get_obs(out=out)
-    with pytest.raises(ValueError, match="give before, action and after, or none of them"):
+    with pytest.raises(ValueError, match="pass before, action and after, or none of the three"):
         env.get_reward(env.get_state())
     with pytest.raises(ValueError, match="action must be"):
         env.get_reward(env.get_state(), torch.zeros(3), env.get_state())

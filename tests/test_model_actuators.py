@@ -42,7 +42,7 @@ def test_a_servo_follows_a_velocity_up_to_its_former_range() -> None:
     ("name", "speed", "message"),
     [
         ("motor", 1.0, "the actuator 'motor' is not a position servo: define it as <position kp="),
-        ("free", 1.0, "the actuator 'free' has no range for its target: set its ctrlrange first"),
+        ("free", 1.0, "the actuator 'free' has no range for its target: set the actuator's ctrlrange first"),
         ("servo", -1.0, "speed must be a positive number of m/s or rad/s, not -1.0"),
     ],
 )

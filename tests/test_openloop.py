@@ -488,5 +488,5 @@ def test_several_states_divide_the_worlds_evenly(engine: str) -> None:
         alone.actions.copy_(loop.actions[:, 2 * i : 2 * i + 2])
         alone.run()
         torch.testing.assert_close(loop.reward[:, 2 * i : 2 * i + 2], alone.reward)
-    with pytest.raises(ValueError, match="nworld=6 cannot be divided among states=4: choose a multiple"):
+    with pytest.raises(ValueError, match="nworld=6 must be a multiple of states=4"):
         OpenLoop(env, 3, states=4)

@@ -30,7 +30,7 @@ from lyceum_warp.options import OPTION_DOCS, OPTIONS, EnvOptions, PhysicsOptions
         ({"integrator": 1}, "no integrator 1: use"),
         ({"cone": "round"}, "there is no friction cone 'round': use 'pyramidal' or 'elliptic'"),
         ({"integrator": "rk5"}, "no integrator 'rk5': use 'euler', 'rk4', 'implicit' or 'implicitfast'"),
-        ({"solver": 4}, r"solver must be a dict of limits, as solver=\{'iterations': 4\}, not 4"),
+        ({"solver": 4}, r"solver must be a dict of limits, such as solver=\{'iterations': 4\}, not 4"),
         ({"solver": {"itrations": 4}}, "solver has no limit 'itrations': it takes 'iterations', 'ls_iterations'"),
         ({"solver": {"iterations": 0}}, "solver's iterations must be a whole number from 1 .*, not 0"),
         ({"deterministic": None}, "deterministic must be True or False, not None"),

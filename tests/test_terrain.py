@@ -137,7 +137,7 @@ def test_the_plane_becomes_the_terrain_and_keeps_its_name_and_friction() -> None
     assert (table[0, 1:].min(), table[1:, 0].max()) == pytest.approx((1 - 4, 2 + 12))
     spec.worldbody.add_geom(name="one", type=plane, size=[1, 1, 1])
     spec.worldbody.add_geom(name="two", type=plane, size=[1, 1, 1])
-    with pytest.raises(ValueError, match="the planes 'one', 'two': delete all but one"):
+    with pytest.raises(ValueError, match="the planes 'one', 'two': delete all planes but one"):
         lw.Terrain({"flat": 1}).add_to(spec)
 
 
@@ -162,7 +162,7 @@ def test_a_table_of_a_missing_or_moving_field_is_refused() -> None:
     body = spec.worldbody.add_body(mass=1, inertia=[1, 1, 1])
     body.add_freejoint()
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="plate", mass=0)
-    with pytest.raises(ValueError, match="'plate' must be the shape of one geom, which is fixed and not turned"):
+    with pytest.raises(ValueError, match="'plate' must be the shape of one fixed and upright geom"):
         height_table(spec.compile(), "plate")
 
 

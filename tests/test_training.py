@@ -56,7 +56,9 @@ def test_a_run_resumed_in_python_gives_identical_numbers(six: Path, tmp_path: Pa
     with pytest.raises(ValueError, match="has gamma 0.995, not 0.9, and a run keeps its settings"):
         config = lw.NPGConfig(**{**vars(CONFIG), "gamma": 0.9})
         lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), folder, iterations=9, resume=True)
-    with pytest.raises(ValueError, match="already has 6 iterations: give more .*, or iterations=12 in Python"):
+    with pytest.raises(
+        ValueError, match="already has 6 iterations: ask for more iterations .*, or iterations=12 in Python"
+    ):
         lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
 
 
@@ -234,7 +236,9 @@ def test_training_ends_at_the_target_return(tmp_path: Path, capsys: pytest.Captu
     assert len(run.rows()) == 2
     resume = ["train", "--resume", str(folder), "--iterations", "4", *QUIET]
     assert cli.main(resume) == 2
-    refused(capsys, f"the run in {folder} is finished: its return reached", "in iteration 2", "give a target return")
+    refused(
+        capsys, f"the run in {folder} is finished: its return reached", "in iteration 2", "use a larger target return"
+    )
     assert cli.main([*resume, "--target-return", "inf"]) == 0
     assert len(run.rows()) == 4
 

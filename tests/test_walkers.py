@@ -124,13 +124,15 @@ def test_models_without_a_base_or_legs_are_refused() -> None:
         walkers.base(arm)
     with pytest.raises(ValueError, match="no joint connects the body 'trunk' of a foot to the base 'trunk'"):
         walkers.leg_of(model, 1)
-    with pytest.raises(ValueError, match="no sensor 'ankle_force' of a contact's force: prepare_walker adds it"):
+    with pytest.raises(
+        ValueError, match="no sensor 'ankle_force' of a contact's force: prepare_walker adds this sensor"
+    ):
         walkers.foot_forces(model, p)
     p.joints = [model.joint("hip_x").id]
     with pytest.raises(ValueError, match="joint 'hip_x' has 0 actuators but needs exactly one"):
         walkers.controls(model, p)
     p.joints = [model.joint("peg").id]
-    with pytest.raises(ValueError, match="servo of the joint 'peg' has no force limit: give action_scale"):
+    with pytest.raises(ValueError, match="servo of the joint 'peg' has no force limit: pass action_scale"):
         walkers.quarter_of_force(model, p)
 
 
@@ -170,7 +172,9 @@ def test_motors_become_critically_damped_servos_with_the_same_limits() -> None:
     assert kp == 40.0 and knee.biasprm[1] == -40.0 and hip.gainprm[0] == 60.0
     inertia = mujoco.MjModel.from_xml_string(XML.format(shape="box")).dof_M0[model.joint("knee").dofadr[0]]
     assert kd == pytest.approx(2 * np.sqrt(kp * inertia))
-    with pytest.raises(ValueError, match="motor of the joint 'peg' has no limit: give it a ctrlrange or a forcerange"):
+    with pytest.raises(
+        ValueError, match="motor of the joint 'peg' has no limit: give the motor a ctrlrange or a forcerange"
+    ):
         walkers.use_servos(spec, ["peg"])
 
 
@@ -201,6 +205,6 @@ def test_round_feet_have_the_lowest_plane_and_the_friction_of_their_boxes() -> N
     # the ends of the capsules touch the sides and the bottom of the box, whose half-sizes are 0.03, 0.04 and 0.02
     np.testing.assert_allclose(sorted(map(tuple, abs(inside).round(9))), 4 * [(0.02, 0.03, 0.01)], atol=1e-9)
     assert (inside[:, 2] < 0.0).all()
-    with pytest.raises(ValueError, match=r"'ankle' is 0\.06 m wide: give a smaller radius"):
+    with pytest.raises(ValueError, match=r"'ankle' is 0\.06 m wide: use a smaller radius"):
         spec.geom("ball").contype = 1
         walkers.round_feet(spec, ["ankle"], radius=0.05)

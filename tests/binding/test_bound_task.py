@@ -127,7 +127,7 @@ def test_a_function_that_warp_cannot_compile_is_explained_in_one_line(
 def test_actions_are_scaled_only_to_controls_with_ranges(tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, f"{tiny_task.TINY}    action_range = (-1.0, 1.0)\n")
     spec = mujoco.MjSpec.from_file(str(DATA / "unlimited.xml"))
-    with pytest.raises(ValueError, match=r"the controls \[0\] have no range in the model: set their ctrlrange"):
+    with pytest.raises(ValueError, match=r"the controls \[0\] have no range in the model: set the actuators"):
         lw.make(file, model=spec)
 
 

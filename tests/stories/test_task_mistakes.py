@@ -120,7 +120,7 @@ def test_a_misspelt_keyword_is_refused_with_a_suggestion() -> None:
 def test_replacing_a_buffer_is_refused_with_the_way_to_write_into_it() -> None:
     env = lw.make("hopper", nworld=2)
     with pytest.raises(
-        AttributeError, match=r"env\.action is a buffer of fixed address: write into it, as env\.action"
+        AttributeError, match=r"env\.action is a buffer at a fixed address: write into the buffer, as env\.action"
     ):
         env.action = torch.zeros(2, 3)
     env.step(torch.zeros(2, 3, requires_grad=True) + 1.0)
