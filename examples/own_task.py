@@ -23,7 +23,7 @@ XML = """<mujoco model="pendulum">
 
 @wp.struct
 class World:  # the fields that the functions read, by MuJoCo's names
-    qpos: Row[float]  # angle in rad; 0 is hanging down
+    qpos: Row[float]  # angle in rad; at 0 the pendulum hangs down
     qvel: Row[float]  # rad/s
 
 
@@ -47,12 +47,13 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
 
 @lw.register
 class Pendulum(lw.Task):
-    model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))  # or a file beside this one: "pendulum.xml"
+    # the name of a file beside this one also works: "pendulum.xml"
+    model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))
     frame_skip, horizon, obs = 20, 250, {"direction": 2, "velocity": 1}  # 20 substeps of 2 ms in a step
 
 
 if __name__ == "__main__":
-    print(check_task(Pendulum, steps=100))  # the rules that the package's own tasks follow
+    print(check_task(Pendulum, steps=100))  # check the rules that the package's own tasks follow
     env = lw.make(Pendulum, nworld=4, effort_weight=0.1)
     env.action[:] = 0.5  # Nm
     env.step()

@@ -18,7 +18,7 @@ def env(shared_env: SharedEnv) -> lw.Env:
     return shared_env(Metered, nworld=4, horizon=10, far=1e3)
 
 
-def test_a_step_gives_all_groups_and_the_buffers(env: lw.Env) -> None:
+def test_step_returns_all_observation_groups_and_the_buffers(env: lw.Env) -> None:
     worlds = RslRlVecEnv(env)
     assert (worlds.num_envs, worlds.num_actions, worlds.max_episode_length) == (4, 1, 10)
     assert worlds.device == env.obs.device and worlds.cfg["task"] == "metered" and worlds.unwrapped is env
@@ -31,12 +31,12 @@ def test_a_step_gives_all_groups_and_the_buffers(env: lw.Env) -> None:
         assert torch.equal(extras["final_obs"][group], env.final_obs_groups[group])
 
 
-def test_a_task_is_made_with_its_options() -> None:
+def test_rsl_rl_env_passes_options_to_the_task() -> None:
     worlds = RslRlVecEnv(Metered, 3, horizon=7, far=2.0)
     assert (worlds.num_envs, worlds.max_episode_length, worlds.cfg["params"]) == (3, 7, {"far": 2.0})
 
 
-def test_observations_survive_the_next_step(env: lw.Env) -> None:
+def test_observations_do_not_change_in_the_next_step(env: lw.Env) -> None:
     """rsl_rl stores the observations of a step only after the next step."""
     worlds = RslRlVecEnv(env)
     first = worlds.get_observations()
@@ -63,12 +63,12 @@ def test_assigned_episode_lengths_move_the_time_limit(env: lw.Env) -> None:
     (torch.zeros(4), "must be whole numbers of shape"),
     (torch.tensor([0, 1, 10, 2]), "must be from 0 to 9, not from 0 to 10"),
 ])  # fmt: skip
-def test_episode_lengths_that_do_not_fit_are_refused(env: lw.Env, steps: torch.Tensor, message: str) -> None:
+def test_invalid_episode_lengths_raise_an_error(env: lw.Env, steps: torch.Tensor, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         RslRlVecEnv(env).episode_length_buf = steps
 
 
-def test_a_fault_is_a_time_out_and_a_termination_is_not(shared_env: SharedEnv) -> None:
+def test_fault_counts_as_time_out_and_termination_does_not(shared_env: SharedEnv) -> None:
     env = shared_env(Metered, nworld=4, horizon=10)
     worlds = RslRlVecEnv(env)
     worlds.episode_length_buf = torch.tensor([0, 0, 9, 9])

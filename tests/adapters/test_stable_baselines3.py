@@ -31,7 +31,7 @@ def hopper() -> StableBaselines3VecEnv:
     return StableBaselines3VecEnv("hopper", N)
 
 
-def test_a_step_returns_the_numbers_of_the_wrapped_environment(full: StableBaselines3VecEnv) -> None:
+def test_step_returns_the_values_of_the_wrapped_environment(full: StableBaselines3VecEnv) -> None:
     twin = lw.make(Full, nworld=N)
     full.seed(9)
     np.testing.assert_array_equal(full.reset(), (twin.rand_reset(9), twin.obs.numpy())[1])
@@ -60,7 +60,7 @@ def test_a_step_returns_the_numbers_of_the_wrapped_environment(full: StableBasel
     assert ends and timeouts
 
 
-def test_results_of_a_step_do_not_change_with_the_next(hopper: StableBaselines3VecEnv) -> None:
+def test_results_of_a_step_do_not_change_in_the_next_step(hopper: StableBaselines3VecEnv) -> None:
     hopper.reset()
     obs, reward, *_ = hopper.step(np.ones((N, 3), dtype=np.float32))
     kept = obs.copy(), reward.copy()
@@ -170,7 +170,7 @@ def test_a_picture_shows_all_worlds() -> None:
         env.close()
 
 
-def test_actions_that_do_not_fit_are_refused(hopper: StableBaselines3VecEnv) -> None:
+def test_actions_of_wrong_shape_or_type_raise_an_error(hopper: StableBaselines3VecEnv) -> None:
     hopper.reset()
     with pytest.raises(ValueError, match=r"float32 array of shape \(4, 3\), not a int64 array of shape \(4, 3\)"):
         hopper.step(np.zeros((N, 3), dtype=int))

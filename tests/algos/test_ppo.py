@@ -218,7 +218,7 @@ def test_hyperparameters_that_are_not_valid_are_refused(words: dict[str, Any], m
         lw.PPOConfig(**words)
 
 
-def test_arguments_that_do_not_fit_are_refused(env: lw.Env) -> None:
+def test_invalid_constructor_arguments_raise_an_error(env: lw.Env) -> None:
     with pytest.raises(ValueError, match="200 mini-batches are more than the 48 samples: give more worlds, or make"):
         made(env, minibatches=200)
     with pytest.raises(ValueError, match="'metered' has no group 'actor' of observations: it has policy, critic"):

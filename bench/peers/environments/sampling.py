@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 KEPT_ACTIONS = 4096
-"""Total number of actions that are drawn before the clock starts; they cover at least 16 steps."""
+"""Total number of actions to draw before the clock starts; at least 16 steps are drawn."""
 
 ENVPOOL = {
     "hopper": "Hopper-v5",
@@ -159,7 +159,7 @@ class Share:
 
 
 class EnvPool:
-    """EnvPool, whose environments all step together."""
+    """EnvPool's environments, which all step together."""
 
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
         import envpool
@@ -194,7 +194,7 @@ CONTESTANTS: dict[str, Callable[..., Any]] = {
 }
 
 PACKAGES = {Gymnasium: ("gymnasium", "mujoco"), DmControl: ("dm_control", "mujoco"), EnvPool: ("envpool",)}
-"""Packages whose versions matter to the result; EnvPool contains its MuJoCo."""
+"""Packages that affect the result; EnvPool includes its own MuJoCo."""
 
 
 def timed(
@@ -203,11 +203,11 @@ def timed(
     """Return the number of steps and the seconds that they took.
 
     Args:
-        step: Takes a step with the actions of an index below ``period``.
+        step: Function that takes a step with the actions of an index below ``period``.
         period: Number of steps after which the actions repeat.
         warm: Number of steps before the clock starts.
         seconds: Duration of the measurement.
-        wait: Waits for the end of asynchronous steps.
+        wait: Function that waits for the end of asynchronous steps.
     """
     for t in range(warm):
         step(t % period)
@@ -221,7 +221,7 @@ def timed(
             count += 1
         wait()
         now = time.perf_counter()
-        if now - began < 0.01:  # otherwise reading the clock would take a noticeable time
+        if now - began < 0.01:  # several steps per reading of the clock, because reading it takes time
             block *= 2
     return count, now - start
 
