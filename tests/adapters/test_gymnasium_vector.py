@@ -371,7 +371,7 @@ def test_seed_that_is_no_whole_number_raises_an_error(seed: Any, hopper: Gymnasi
         ({"ctrl_cost": 1.0}, "no parameter 'ctrl_cost': did you mean ctrl_cost_weight"),
     ],
 )
-def test_invalid_constructor_arguments_raise_an_error(options: dict[str, Any], message: str) -> None:
+def test_invalid_vector_env_arguments_raise_an_error(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         GymnasiumVectorEnv("hopper", **options)
 

@@ -85,7 +85,7 @@ def test_fault_counts_as_time_out_and_termination_does_not(shared_env: SharedEnv
     assert reward[1] == 0.0 and extras["final_obs"]["critic"].isfinite().all()
 
 
-def test_the_log_has_the_mean_metrics_of_recent_episodes(env: lw.Env) -> None:
+def test_log_has_the_mean_metrics_of_recent_episodes(env: lw.Env) -> None:
     worlds = RslRlVecEnv(env)
     worlds.episode_length_buf = torch.tensor([7, 7, 5, 0])
     action = torch.tensor([[0.1], [0.2], [0.3], [0.4]])
@@ -100,7 +100,7 @@ def test_the_log_has_the_mean_metrics_of_recent_episodes(env: lw.Env) -> None:
     assert efforts == pytest.approx([0.0, 0.0, two, two, three, three])
 
 
-def test_the_log_forgets_old_episodes(shared_env: SharedEnv) -> None:
+def test_log_excludes_old_episodes(shared_env: SharedEnv) -> None:
     env = shared_env(Metered, nworld=4, horizon=1, far=1e3)
     worlds = RslRlVecEnv(env)
     for step in range(1, 61):
@@ -116,7 +116,7 @@ def test_the_log_forgets_old_episodes(shared_env: SharedEnv) -> None:
         assert extras["log"]["metrics/effort"].item() == pytest.approx(action)
 
 
-def test_bad_environments_and_actions_are_refused(env: lw.Env, shared_env: SharedEnv) -> None:
+def test_unsuitable_environments_and_actions_raise_an_error(env: lw.Env, shared_env: SharedEnv) -> None:
     with pytest.raises(ValueError, match="the environment has autoreset=False: make it with autoreset=True"):
         RslRlVecEnv(shared_env(Metered, nworld=4, autoreset=False))
     with pytest.raises(ValueError, match="nworld= does not belong to an adapter: num_envs decides"):
@@ -130,7 +130,7 @@ def test_bad_environments_and_actions_are_refused(env: lw.Env, shared_env: Share
 
 
 @pytest.mark.long
-def test_rsl_rls_own_runner_learns(tmp_path: Path) -> None:
+def test_rsl_rl_runner_learns(tmp_path: Path) -> None:
     """The best possible return is about 250; an untrained policy has a negative mean return."""
     from rsl_rl.runners import OnPolicyRunner  # the import takes a second
 
@@ -151,7 +151,7 @@ def test_rsl_rls_own_runner_learns(tmp_path: Path) -> None:
     assert list(tmp_path.glob("model_*.pt"))
 
 
-def test_rsl_rls_writer_gets_the_metrics(env: lw.Env, tmp_path: Path) -> None:
+def test_rsl_rl_writer_receives_the_metrics(env: lw.Env, tmp_path: Path) -> None:
     from rsl_rl.runners import OnPolicyRunner
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

@@ -41,7 +41,7 @@ class Value(DeterministicMixin, Model):
 
 
 def wrapped(*, tensors: bool) -> Any:
-    """Wrap an environment for skrl; tensors use the wrapper that skrl provides for Isaac Lab."""
+    """Wrap an environment for skrl; environments with torch tensors use skrl's wrapper for Isaac Lab."""
     if not tensors:
         return wrap_env(GymnasiumVectorEnv("hopper", N), verbose=False)
     env = GymnasiumVectorEnv(Full, N, torch=True, dict_obs=True)

@@ -1,4 +1,5 @@
-"""Tasks for tests of the planner: the reward is the action times a coin, which is -1 or 1 with equal probability."""
+"""Define tasks for tests of the planner: the reward is the action times a coin, which is -1 or 1 with equal
+probability."""
 
 import warp as wp
 from rail_task import rail

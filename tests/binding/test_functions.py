@@ -15,7 +15,7 @@ MEANT = {
     for name, function in FUNCTIONS.items()
     if name not in ("tally", "share")  # these functions need each other and additional structs
 }
-"""Every function of the table, as written in a task's file."""
+"""Every function of ``task.FUNCTIONS``, as a task's file defines it."""
 
 
 def source_of(folder: Path, text: str) -> TaskSource:
@@ -24,7 +24,7 @@ def source_of(folder: Path, text: str) -> TaskSource:
 
 
 @pytest.mark.parametrize("name", MEANT)
-def test_a_function_written_as_in_the_table_is_found(name: str, tmp_path: Path) -> None:
+def test_function_with_the_signature_in_the_table_is_found(name: str, tmp_path: Path) -> None:
     source = source_of(tmp_path, tiny_task.with_function(MEANT[name]))
     assert [key for key, function in source.functions.items() if function] == sorted(
         {"observe", name}, key=list(FUNCTIONS).index
@@ -32,7 +32,7 @@ def test_a_function_written_as_in_the_table_is_found(name: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", MEANT)
-def test_a_function_with_other_arguments_is_refused_with_the_line_to_write(name: str, tmp_path: Path) -> None:
+def test_error_of_a_function_with_other_arguments_shows_the_correct_line(name: str, tmp_path: Path) -> None:
     text = tiny_task.TINY if name == "observe" else tiny_task.with_function(MEANT[name])
     with pytest.raises(ValueError) as caught:
         source_of(tmp_path, text.replace(f"def {name}(", f"def {name}(more: float, "))
@@ -53,7 +53,7 @@ WRONG_SIGNATURES = {
 
 
 @pytest.mark.parametrize(("function", "message"), WRONG_SIGNATURES.values(), ids=WRONG_SIGNATURES)
-def test_a_function_with_another_result_or_missing_argument_is_refused(
+def test_function_with_wrong_result_or_missing_argument_raises_an_error(
     function: str, message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=message):
@@ -69,7 +69,7 @@ INCOMPLETE = {
 
 
 @pytest.mark.parametrize(("old", "new", "message"), INCOMPLETE.values(), ids=INCOMPLETE)
-def test_an_incomplete_file_says_what_is_missing(old: str, new: str, message: str, tmp_path: Path) -> None:
+def test_error_of_an_incomplete_file_names_the_missing_part(old: str, new: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         source_of(tmp_path, tiny_task.changed((old, new)))
 

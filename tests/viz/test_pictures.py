@@ -57,7 +57,7 @@ def test_a_closed_process_is_restarted(pictures: WorldPictures) -> None:
         np.testing.assert_array_equal(picture, again)
 
 
-def test_invalid_constructor_arguments_raise_an_error(env: lw.Env) -> None:
+def test_invalid_size_or_camera_raises_an_error(env: lw.Env) -> None:
     with pytest.raises(ValueError, match="size must be two even numbers"):
         WorldPictures(env, size=(3, 4))
     with pytest.raises(ValueError, match="there is no camera 'front'"):
