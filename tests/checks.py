@@ -1,4 +1,4 @@
-"""Shared helpers: random states, comparisons with formulas, and checks of random samples."""
+"""Make random states, compare results with formulas, and check random samples."""
 
 import numpy as np
 import torch

@@ -13,7 +13,7 @@ from lyceum_warp.task import FUNCTIONS, Task
 MEANT = {
     name: f"def {function.signature}:\n    {function.default or 'obs[0] = 1.0'}"
     for name, function in FUNCTIONS.items()
-    if name not in ("tally", "share")  # these functions need each other and additional structs
+    if name not in ("tally", "share")  # these functions must be defined together, and need additional structs
 }
 """Every function of ``task.FUNCTIONS``, as a task's file defines it."""
 
@@ -75,7 +75,7 @@ def test_error_of_an_incomplete_file_names_the_missing_part(old: str, new: str, 
 
 
 @pytest.mark.parametrize("name", ["World", "Params"])
-def test_an_ordinary_class_in_place_of_a_struct_is_refused(name: str, tmp_path: Path) -> None:
+def test_ordinary_class_instead_of_a_warp_struct_raises_an_error(name: str, tmp_path: Path) -> None:
     text = tiny_task.TINY.replace("    model =", f"    class {name}:\n        qpos: Row[float]\n\n    model =")
     with pytest.raises(ValueError, match=f"{name} of the task 'tiny' must be a Warp struct: decorate it with @wp.st"):
         source_of(tmp_path, text)
@@ -88,7 +88,7 @@ def test_an_ordinary_class_in_place_of_a_struct_is_refused(name: str, tmp_path: 
         ("horzon = 10", "'horzon' in its class: did you mean horizon"),
     ],
 )
-def test_a_misspelt_attribute_of_the_class_is_refused(line: str, message: str, tmp_path: Path) -> None:
+def test_misspelt_task_attribute_raises_an_error(line: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         source_of(tmp_path, f"{tiny_task.TINY}    {line}\n")
 
@@ -106,7 +106,7 @@ def test_a_subclass_inherits_functions_and_structs(tmp_path: Path) -> None:
     assert (first.world, first.params) == (second.world, second.params)
 
 
-def test_every_function_of_the_table_is_in_the_help_of_task() -> None:
+def test_help_of_task_describes_every_function_in_the_table() -> None:
     assert all(function.signature in str(Task.__doc__) for function in FUNCTIONS.values())
     assert lw.Task is Task
 
@@ -123,7 +123,7 @@ USERS = {
 
 
 @pytest.mark.parametrize("user", USERS)
-def test_an_unlisted_observe_function_must_be_called_in_its_module(user: str, tmp_path: Path) -> None:
+def test_unlisted_observe_function_raises_an_error_if_nothing_calls_it(user: str, tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, tiny_task.changed(("class Tiny", f"{CRITIC}class Tiny")) + USERS[user])
     task = find_task(f"{file}:Tiny")
     source = TaskSource(task, task_name(task))
