@@ -1,5 +1,4 @@
-"""Damage files, command lines and arguments at random; each must work or be refused with an error that gives the
-reason.
+"""Damage files, command lines and arguments at random; each must work or raise a documented error.
 
 A failure names its case and the command that repeats it.
 """
@@ -29,17 +28,18 @@ FEW = {
         "export": 1, "plan": 1, "view": 1, "bench": 1,
     },
 }  # fmt: skip
-"""Numbers of cases of each kind, by attack program."""
+"""Number of cases of each kind, by attack program."""
 _MANY = {"file_attacks.py": 150, "keyword_attacks.py": 200, "command_attacks.py": 50}
 MANY = {program: dict.fromkeys(FEW[program], count) for program, count in _MANY.items()}
-"""The numbers for ``make test-all``."""
+"""Number of cases for ``make test-all``, by attack program."""
 MINIMAL: dict[str, Mapping[str, Any]] = {
     "file_attacks.py": FILES, "keyword_attacks.py": KEYWORDS, "command_attacks.py": COMMANDS,
 }  # fmt: skip
 
 
 def each(names: Mapping[str, Mapping[str, Any]]) -> list[Any]:
-    """Every program with each of its names; make test-all tries the command lines, which take longest."""
+    """Return test parameters for all names of all attack programs; command lines are marked long because they are
+    slow."""
     slow = {"command_attacks.py": pytest.mark.long}
     return [pytest.param(program, name, marks=slow.get(program, ())) for program in names for name in names[program]]
 
@@ -50,7 +50,7 @@ def cases(counts: Mapping[str, int], first: int) -> list[str]:
 
 @pytest.fixture(scope="module")
 def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Return ``outcomes(program, many)``, which runs the many cases of a program, or the few and the minimal ones.
+    """Return ``outcomes(program, many)``, which runs many cases of a program, or a few cases and all minimal cases.
 
     The folder has the same path in every run of the tests.
     """
@@ -70,7 +70,7 @@ def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFacto
 
 @pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.long)], ids=["few", "many"])
 @pytest.mark.parametrize(("program", "kind"), each(FEW))
-def test_random_cases_work_or_are_refused_in_one_line(outcomes: Any, program: str, kind: str, many: bool) -> None:
+def test_random_cases_work_or_raise_a_one_line_error(outcomes: Any, program: str, kind: str, many: bool) -> None:
     count = (MANY if many else FEW)[program][kind]
     found = {case: o for case, o in outcomes(program, many).items() if case.rpartition(" ")[0] == kind}
     assert len(found) == count
@@ -83,6 +83,6 @@ def test_random_cases_work_or_are_refused_in_one_line(outcomes: Any, program: st
 
 
 @pytest.mark.parametrize(("program", "name"), each(MINIMAL))
-def test_minimal_case_is_refused(outcomes: Any, program: str, name: str) -> None:
+def test_minimal_case_raises_a_documented_error(outcomes: Any, program: str, name: str) -> None:
     outcome = outcomes(program, False)[name]
     assert not outcome.problem, f"{outcome.problem}\n    {replay(program, name)}\n{outcome.trace}"

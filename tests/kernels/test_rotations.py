@@ -88,20 +88,20 @@ def check(found: np.ndarray, expected: np.ndarray, tolerance: float = 2e-6) -> N
     np.testing.assert_allclose(found.reshape(expected.shape), expected, atol=tolerance, rtol=tolerance)
 
 
-def test_products_inverses_and_matrices_equal_mujocos(found: dict[str, np.ndarray]) -> None:
+def test_products_inverses_and_matrices_equal_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
     a, b, _, _ = inputs()
     check(found["mul"], mju(mujoco.mju_mulQuat, 4, a, b))
     check(found["inverse"], mju(mujoco.mju_negQuat, 4, a))
     check(found["to_mat"].reshape(N, 9), mju(mujoco.mju_quat2Mat, 9, a))
 
 
-def test_rotated_vectors_equal_mujocos(found: dict[str, np.ndarray]) -> None:
+def test_rotated_vectors_equal_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
     a, _, v, _ = inputs()
     check(found["rotate"], mju(mujoco.mju_rotVecQuat, 3, v, a), 5e-6)
     check(found["rotate_inverse"], mju(mujoco.mju_rotVecQuat, 3, v, mju(mujoco.mju_negQuat, 4, a)), 5e-6)
 
 
-def test_quaternions_from_axis_and_angle_equal_mujocos(found: dict[str, np.ndarray]) -> None:
+def test_quaternions_from_axis_and_angle_equal_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
     _, _, v, angle = inputs()
     length = np.linalg.norm(v.astype(float), axis=1)
     axis = v / np.maximum(length, 1e-30)[:, None]
@@ -110,7 +110,7 @@ def test_quaternions_from_axis_and_angle_equal_mujocos(found: dict[str, np.ndarr
     assert found["from_axis_angle"][0].tolist() == found["from_rotvec"][0].tolist() == [1, 0, 0, 0]
 
 
-def test_rotation_vectors_equal_mujocos(found: dict[str, np.ndarray]) -> None:
+def test_rotation_vectors_equal_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
     a, b, _, _ = inputs()
     check(found["to_rotvec"], mju(lambda row, q: mujoco.mju_quat2Vel(row, q, 1.0), 3, a), 1e-5)
     difference = mju(mujoco.mju_subQuat, 3, a, b)
@@ -129,7 +129,7 @@ def test_small_rotations_do_not_lose_precision(found: dict[str, np.ndarray]) -> 
     np.testing.assert_allclose(found["from_rotvec"][1], [1, 0.5e-6, 0, 0], rtol=1e-6)
 
 
-def test_quaternion_to_matrix_and_back_is_the_identity(found: dict[str, np.ndarray]) -> None:
+def test_conversion_from_quaternion_to_matrix_and_back_is_the_identity(found: dict[str, np.ndarray]) -> None:
     a, _, _, _ = inputs()
     largest = np.abs(a).argmax(axis=1)
     assert set(largest) == {0, 1, 2, 3}
