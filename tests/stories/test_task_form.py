@@ -202,7 +202,7 @@ def test_non_finite_value_of_a_task_function_causes_a_fault_in_its_world(
     assert env.get_reward(before, action, after)[1] != 0  # the fault does not persist after its episode
 
 
-def test_rejected_initial_state_does_not_change_persistent_memory() -> None:
+def test_rejected_initial_state_does_not_change_lasting_memory() -> None:
     env = lw.make(Full, nworld=8)
     tip = env.field("site_xpos")[:, 0, 0]
     for count in range(2, 12):
@@ -211,7 +211,7 @@ def test_rejected_initial_state_does_not_change_persistent_memory() -> None:
         assert (env.obs_groups["critic"][:, 10] == count).all()
 
 
-def test_startup_randomizes_persistent_memory_once_per_world() -> None:
+def test_startup_randomizes_lasting_memory_once_per_world() -> None:
     env = lw.make(Gifted, nworld=8, seed=3)
     drawn = env.obs[:, 1].clone()
     assert drawn.unique().numel() == 8 and (drawn >= 1).all() and (drawn < 2).all()
@@ -223,7 +223,7 @@ def test_startup_randomizes_persistent_memory_once_per_world() -> None:
     assert torch.equal(env.obs[:, 1], drawn)
 
 
-def test_startup_does_not_randomize_persistent_memory_in_a_planner_state() -> None:
+def test_startup_does_not_randomize_lasting_memory_in_a_planner_state() -> None:
     plan = lw.MPPI(Gifted, samples=4, horizon=2)
     columns = plan.env.state_space.parts["practice"]
     assert plan.env.get_state()[0, columns].item() >= 1

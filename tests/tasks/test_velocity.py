@@ -1,5 +1,4 @@
-"""Compare the feet, contacts and forces of every velocity task with MuJoCo's, and check that other joints keep their
-pose."""
+"""Compare the feet, contacts and forces of every velocity task with MuJoCo's."""
 
 import mujoco
 import numpy as np
@@ -42,7 +41,7 @@ def feet(env: lw.Env, world: int) -> tuple[mujoco.MjData, list[bool]]:
 
 
 @pytest.mark.parametrize("task", long_if_alike(ROBOTS))
-def test_heights_and_contacts_of_feet_equal_mujocos(task: str, env: lw.Env) -> None:
+def test_heights_and_contacts_of_feet_equal_those_of_mujoco(task: str, env: lw.Env) -> None:
     n = len(env.task.params["feet"])
     touched = 0
     for _ in range(5):
@@ -58,8 +57,9 @@ def test_heights_and_contacts_of_feet_equal_mujocos(task: str, env: lw.Env) -> N
 
 
 @pytest.mark.parametrize("task", long_if_alike(ROBOTS))
-def test_velocities_of_feet_equal_mujocos(task: str, env: lw.Env) -> None:
-    """Compare the metric: the squared horizontal speed of feet in contact, times the weight and the step's duration."""
+def test_velocities_of_feet_equal_those_of_mujoco(task: str, env: lw.Env) -> None:
+    """The metric foot_slip is the squared horizontal speed of feet in contact, times the weight and the step's
+    duration."""
     random_steps(env, 12, 1.0)
     env.set_params(least_command=-1.0)
     random_steps(env, 1, 1.0)
@@ -79,8 +79,8 @@ def test_velocities_of_feet_equal_mujocos(task: str, env: lw.Env) -> None:
 
 
 @pytest.mark.parametrize("task", long_if_alike(ROBOTS))
-def test_a_standing_robots_feet_carry_its_weight(task: str, env: lw.Env) -> None:
-    """At rest the forces on a robot's feet add up to its weight, and joints without actions keep the home pose."""
+def test_feet_of_a_standing_robot_carry_its_weight(task: str, env: lw.Env) -> None:
+    """At rest the sum of the forces on a robot's feet is its weight, and joints without actions keep the home pose."""
     total = []
     for _ in range(12):
         env.step(torch.zeros(env.action.shape))
@@ -112,7 +112,7 @@ def test_robots_with_equal_sizes_share_their_kernels(task: str, shared_env: Shar
     assert go1.task.kernels is spot.task.kernels
 
 
-def test_tasks_lists_exactly_the_tasks_of_the_familys_modules() -> None:
+def test_velocity_tasks_are_exactly_those_of_the_velocity_modules() -> None:
     assert set(TASKS) <= set(package_task_names())
     for name, module in TASKS.items():
         assert find_task(name).__module__ == f"lyceum_warp.tasks.velocity.{module}"
