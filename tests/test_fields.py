@@ -144,7 +144,7 @@ def test_an_unknown_element_is_refused(name: str, element: str, message: str, mo
         elements(model, name, element)
 
 
-def test_writing_a_field_that_is_no_input_raises_an_error(model: mujoco.MjModel) -> None:
+def test_writing_a_field_that_is_not_an_input_raises_an_error(model: mujoco.MjModel) -> None:
     assert describe(model, "ctrl").written
     assert describe(model, "xfrc_applied", written=True).written
     assert not describe(model, "xfrc_applied").written

@@ -356,7 +356,7 @@ def test_invalid_reset_options_raise_an_error(
 
 
 @pytest.mark.parametrize("seed", [-1, [1, 2, 3, 4], 0.5])
-def test_seed_that_is_no_whole_number_raises_an_error(seed: Any, hopper: GymnasiumVectorEnv) -> None:
+def test_seed_that_is_not_a_whole_number_raises_an_error(seed: Any, hopper: GymnasiumVectorEnv) -> None:
     with pytest.raises(ValueError, match="seed must be a whole number"):
         hopper.reset(seed=seed)
 

@@ -568,7 +568,7 @@ def test_settings_and_buffers_cannot_be_assigned() -> None:
             setattr(plan, name, torch.zeros(3))
 
 
-def test_seed_or_shift_that_is_no_whole_number_raises_an_error() -> None:
+def test_seed_or_shift_that_is_not_a_whole_number_raises_an_error() -> None:
     plan = MPPI("point_mass", horizon=3, samples=2)
     for wrong in (-1, 0.5, "a"):
         with pytest.raises(ValueError, match="seed must be a whole number from 0"):

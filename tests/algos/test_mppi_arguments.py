@@ -81,7 +81,7 @@ def test_invalid_planning_raises_an_error_that_names_task_and_part(planning: Any
     assert "\n" not in str(raised.value)
 
 
-def test_task_planning_entry_that_is_no_dict_raises_an_error() -> None:
+def test_task_planning_entry_that_is_not_a_dict_raises_an_error() -> None:
     with pytest.raises(ValueError, match=r"settings of lw.Planning must be a dict, not \['horizon'\]"):
         Planning(settings=["horizon"])  # type: ignore[arg-type]
 

@@ -99,7 +99,7 @@ def test_unsuitable_policy_raises_a_one_line_error(shared_env: SharedEnv, policy
     assert "\n" not in str(caught.value)
 
 
-def test_network_that_is_no_torch_module_raises_an_error() -> None:
+def test_network_that_is_not_a_torch_module_raises_an_error() -> None:
     with pytest.raises(ValueError, match=r"network must be a module of torch \(torch.nn.Module\), not list"):
         lw.GaussianPolicy(6, 2, network=[64, 64])  # type: ignore[arg-type]
 

@@ -59,7 +59,7 @@ def test_error_of_a_misspelt_task_name_suggests_similar_names() -> None:
 
 
 @pytest.mark.parametrize("task", [3, None, lw.Env])
-def test_object_that_is_no_task_raises_an_error(task: object) -> None:
+def test_object_that_is_not_a_task_raises_an_error(task: object) -> None:
     with pytest.raises(ValueError, match=r"a task is a name, a file or a subclass of lw\.Task, not "):
         find_task(task)  # type: ignore[arg-type]
 

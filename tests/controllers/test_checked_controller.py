@@ -80,7 +80,7 @@ def test_actions_of_coarser_plans_are_held_or_interpolated_and_finer_plans_skip_
     assert applied(env.timestep / 2, 3) == [0, 2, 2]
 
 
-def test_time_step_that_is_no_multiple_of_the_plant_time_step_raises_an_error(env: lw.Env) -> None:
+def test_time_step_that_is_not_a_multiple_of_the_plant_time_step_raises_an_error(env: lw.Env) -> None:
     planner = StepPlanner(env)
     planner.timestep = 1.5 * env.timestep
     with pytest.raises(ValueError, match=r"step of 0.03 s must be a whole multiple of the plant's, 0.02 s, or a whole"):

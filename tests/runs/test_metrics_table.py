@@ -53,7 +53,7 @@ def test_cut_rows_removes_rows_after_the_checkpoint(table: Path) -> None:
     assert [row["iteration"] for row in read_metrics(table)] == [1]
 
 
-def test_file_that_is_no_metrics_table_raises_an_error(table: Path) -> None:
+def test_file_that_is_not_a_metrics_table_raises_an_error(table: Path) -> None:
     table.write_text("iteration,value\n1,apple\n")
     with pytest.raises(ValueError, match=r"metrics\.csv is not a table of metrics: line 2"):
         read_metrics(table)

@@ -1,4 +1,4 @@
-"""Write videos in the viewer."""
+"""Test the videos that the viewer writes."""
 
 import os
 import signal
