@@ -66,17 +66,16 @@ class Options:
     new: tyro.conf.Positional[str] = str(ROOT)
     """The revision or folder to compare with; by default this working tree."""
     tasks: tuple[str, ...] = ()
-    """Tasks; by default all. By default, the parts learners and commands compare only a few of these tasks."""
+    """Tasks to compare; by default all. By default, learners and commands are compared on only a few tasks."""
     engines: tuple[Literal["mujoco", "warp"], ...] = ENGINES
     """Engines."""
     device: str = "cpu"
     """Device of the Warp engine, for example cuda. On a GPU the engine is deterministic."""
     parts: tuple[Part, ...] = PARTS
-    """Parts. env: the compiled model, resets, steps with actions beyond their bounds and short episodes, observations,
-    rewards and evaluations of given states, resets of some worlds, a fault, a rollout of given actions. plans: MPPI,
-    CEM, predictive sampling, plans with knots and for several plants, episodes under lw.control. learners: NPG, and PPO
-    if both checkouts have lw.PPO, with their final networks. commands: lyceum-warp train, with and without an
-    interruption: metrics.csv and the saved policies."""
+    """Parts to compare; by default all. The part env compares models, resets, steps, getters, a fault and a rollout.
+    The part plans compares plans of all planners, and episodes under lw.control. The part learners compares NPG and
+    PPO, with their final networks. The part commands compares the metrics.csv and the policies of lyceum-warp train,
+    with and without an interruption."""
     steps: int = 20
     """Number of steps of an environment."""
     iterations: int = 10
@@ -86,8 +85,8 @@ class Options:
     ignore: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="PATTERN")] = ()
     """Names to ignore, such as '*/metrics.csv/*' or 'plans/hopper/*'; may be repeated."""
     short: bool = False
-    """Compare four tasks, and plans and commands only on the C engine. With a warm kernel cache on two busy cores this
-    takes about three minutes instead of sixteen."""
+    """Compare four tasks, and plans and commands only on the C engine. With a warm kernel cache, the comparison takes
+    about three minutes on two busy cores instead of sixteen."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,7 +150,7 @@ def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] 
         new: The array to compare with it.
         axes: Names of the leading axes.
     """
-    if old.dtype.kind == new.dtype.kind == "U" and old.shape == new.shape:  # string types include a length
+    if old.dtype.kind == new.dtype.kind == "U" and old.shape == new.shape:  # NumPy's string types include a length
         longer = max(old.dtype, new.dtype)
         old, new = old.astype(longer), new.astype(longer)
     if (old.dtype, old.shape) != (new.dtype, new.shape):
@@ -414,7 +413,7 @@ def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
     """Compare two checkouts.
 
     Raises:
-        ValueError: Neither checkout has one of the tasks.
+        ValueError: A task exists in neither checkout.
     """
     for side in sides:
         side.start()

@@ -36,7 +36,7 @@ LABELS = {
 }
 
 WORLDS = {"c": 64, "warp": 64, "native": 64, "envpool": 64, "gym-async": 2, "gym-sync": 16, "dm_control": 8}
-"""Worlds per thread; SyncVectorEnv has one thread."""
+"""Default number of worlds per thread; SyncVectorEnv has one thread."""
 
 GPU_WORLDS = 16_384
 
@@ -85,7 +85,7 @@ def measure(
 
 
 def python_of(contestant: str) -> Path:
-    """Return the Python that runs a library."""
+    """Return the path of the Python interpreter that runs a library."""
     if contestant.startswith("gym") or (contestant == "envpool" and importlib.util.find_spec("envpool")):
         return Path(sys.executable)
     return venvs.python_of(contestant)

@@ -3,7 +3,7 @@
     lyceum-warp bench equivalence --device cuda
 
 The area under a learning curve is the mean return of the episodes sampled over a run. Two one-sided t tests (TOST) at
-the level 0.05 decide whether the areas of 20 seeds on each engine are equivalent. They are equivalent if the 90 %
+the level 0.05 decide whether the areas of 20 seeds on each engine are equivalent. The areas are equivalent if the 90 %
 interval of the difference of the means (Welch) lies within the margin. The margin is one standard deviation between
 seeds, pooled over both engines. The margin, the tasks and the seeds were chosen before the first run.
 """

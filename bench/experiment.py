@@ -127,7 +127,7 @@ class Experiment:
     """Draw the stored results of one machine with matplotlib; return None if there is nothing to draw."""
     options: type[Options] = Options
     packages: tuple[str, ...] = ()
-    """Peers whose versions are stored with the results."""
+    """Other libraries whose versions are stored with the results."""
     apart: bool = False
     """Whether each case runs in a subprocess."""
     parallel: bool = False
@@ -226,12 +226,12 @@ def append(path: Path, row: Row) -> None:
 
 
 def machine(row: Row) -> tuple[Any, ...]:
-    """Return a row's hardware; only numbers of equal hardware are compared."""
+    """Return a row's hardware; only numbers from equal hardware are compared."""
     return tuple(row.provenance.get(name) for name in measurements.HARDWARE)
 
 
 def software(row: Row) -> tuple[Any, ...]:
-    """Return a row's package versions; only numbers of equal versions are compared."""
+    """Return a row's package versions; only numbers from equal versions are compared."""
     return tuple(row.provenance.get(name) for name in SOFTWARE)
 
 

@@ -79,7 +79,7 @@ def vector(task: str, nworld: int, mode: str) -> VectorEnv:
 
 
 def rates(task: str, nworld: int, steps: int) -> dict[str, float]:
-    """Measure steps per second of both vector modes on these cores, with random actions."""
+    """Measure steps per second of Gymnasium's two vector modes with random actions."""
     found = {}
     for mode in ("sync", "async"):
         with contextlib.closing(vector(task, nworld, mode)) as envs:

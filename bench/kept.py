@@ -1,10 +1,10 @@
 """Compare the step times of an environment and its bare engine on the same states.
 
 Environment and bare engine alternate every ten steps. The states before the environment's steps are copied to the bare
-engine, while the clock is stopped. Both therefore step the same states, resets included, under the same machine load.
-The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the same model, controls and
-substeps. ``kept`` is the bare engine's time divided by the environment's, and ``added`` is the environment's time minus
-the bare engine's.
+engine, while the clock is stopped. Environment and bare engine therefore step the same states, resets included, under
+the same machine load. The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the
+same model, controls and substeps. ``kept`` is the bare engine's time divided by the environment's, and ``added`` is the
+environment's time minus the bare engine's.
 """
 
 import statistics

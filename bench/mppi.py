@@ -95,7 +95,7 @@ def cases(options: Options) -> list[Case]:
     usual = [name for name in CONTESTANTS if cuda or name not in ON_WARP]
     contestants = choose(options.contestants, CONTESTANTS, usual, what="contestant")
     if options.jobs > 1 and ("plans" in parts or {*ON_WARP} & {*contestants}):
-        raise ValueError("plans and a GPU are timed alone: give --jobs 1, or --parts episodes")
+        raise ValueError("plans and GPU cases are timed alone: give --jobs 1, or --parts episodes")
     single = [name for name in contestants if name in (*OURS, "python")]
     repeats, count = options.repeats or (1 if short else 5), 2 if short else options.episodes
     seconds = 1.0 if short else options.seconds

@@ -2,8 +2,8 @@
 
     lyceum-warp bench npg --threads 2 --jobs 16
 
-Both NPGs are the same class with the same settings, number of worlds and seeds. They differ only in the environments
-that fill the rollout buffer; Gymnasium uses the faster of its two vector modes. For twelve minutes each,
+Both NPGs are the same class with the same settings, number of worlds and seeds. The two NPGs differ only in the
+environments that fill the rollout buffer; Gymnasium uses the faster of its two vector modes. For twelve minutes each,
 stable-baselines3's PPO and sb3-contrib's TRPO learn with the settings that RL Baselines3 Zoo tuned for these tasks.
 With --device cuda, lw.NPG and lw.PPO learn on the same worlds on a GPU.
 
@@ -95,7 +95,7 @@ TRPO = {"swimmer": _TRPO | {"gamma": 0.9999}, "hopper": _TRPO, "walker2d": _TRPO
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Learning curves of NPG and its peers."""
+    """Learning curves of NPG, PPO and TRPO."""
 
     threads: int | None = 2
     """Cores per case; stable-baselines3's learners and learners on a GPU use only one."""

@@ -6,8 +6,8 @@
 The clock starts before the command, so the seconds include imports, compilation and graph captures. The clock stops
 when the run's config.json says that the target is reached. With a cold cache all kernels are compiled. Before a
 measurement with a warm cache, the same command trains for one iteration while the clock is stopped. A run that lasts
-longer than --seconds is stopped. The same command continues the run; its seconds add up, and include every start of the
-process.
+longer than --seconds is stopped. The same command continues the run; the seconds of all calls are summed, and include
+every start of the process.
 """
 
 import contextlib
@@ -31,9 +31,9 @@ from lyceum_warp.binding.registry import file_name, package_task_names
 from lyceum_warp.runs.folder import Run
 
 WALKING = ("--algorithm", "ppo", "--mean-every", "0")
-"""Flags that compare the target with the mean return of an iteration's episodes, with exploration noise."""
+"""Flags for targets of an iteration's mean return, with exploration noise."""
 NPG = ("--algorithm", "npg", "--mean-every", "5")
-"""Flags that compare the target with the mean policy's return in 16 episodes; the clock includes these evaluations."""
+"""Flags for targets of the mean policy's return in 16 episodes; the clock includes these evaluations."""
 LARGE = ("--samples", "65536")
 SUITE = (*WALKING, "--num-steps", "32", "--gamma", "0.995", "--entropy-coef", "0.001", "--no-clip-value-loss")
 """One setting for all tasks of dm_control's suite."""
@@ -65,7 +65,7 @@ class Options(experiment.Options):
     seconds: float = 540.0
     """Seconds after which a run is stopped; the same command continues the run."""
     runs: Path = Path("runs/records")
-    """Folder for the folders of the runs."""
+    """Folder in which the runs are stored."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +105,7 @@ def command(case: Case, folder: Path, device: str) -> list[str]:
 
 
 def measure(case: Case, options: Options) -> dict[str, Any]:
-    """Train until the target is reached, or raise Skipped once the seconds of this call are over."""
+    """Train until the target is reached; raise Skipped if the time limit of this call is exceeded."""
     name = f"{file_name(case.task)}-{case.device}-{case.cache}-{case.seed}"
     folder, notes = options.runs / name, options.runs / f"{name}.json"
     earlier = json.loads(notes.read_text()) if notes.exists() and (folder / "checkpoint.pt").exists() else [0.0, 0]

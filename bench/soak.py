@@ -1,22 +1,22 @@
-"""Run tasks for very long with and without injected faults, watch the memory, and kill and resume trainings.
+"""Run tasks for a very long time with and without injected faults, measure memory, and kill and resume training runs.
 
     lyceum-warp bench soak --threads 2
     lyceum-warp bench soak --parts random --tasks dm/walker_walk dm/fish_swim --engine mujoco
     lyceum-warp bench soak --parts faults --device cuda --work runs/soak
 
-Part faults: worlds step under random actions, and each world gets a fault every thousand steps on average. Invalid or
-too fast states, and actions that are not finite, are written from outside. For the other faults the program writes a
-variant of the task beside a copy of its source (``VARIANT``), in which an additional action number requests a NaN
-reward, a NaN observation or a negative mass. Every fault must be reported in its world and step, nothing else may be
-reported, and ``env.fault_counts`` must agree. A second environment without faults must give bitwise equal numbers for
-each world until its first fault. Every fourth world gets no faults, so its numbers must always be equal.
+Part faults: worlds step under random actions, and each world gets a fault every thousand steps on average. The program
+writes invalid states, states with excessive velocities, and non-finite actions. For the other faults it writes a
+variant of the task (``VARIANT``), in which an additional action number requests a NaN reward, a NaN observation or a
+negative mass. Every fault must be reported in its world and step, nothing else may be reported, and
+``env.fault_counts`` must agree. A second environment without faults must give bitwise equal numbers for each world
+until its first fault. Every fourth world gets no faults, so its numbers must be equal in both environments throughout.
 
-A run is divided into chunks. A chunk is one result, and ends with a file of the worlds' states in the folder
-``--work``. The next chunk continues from this file, also on another machine with a copy of the folder.
+A run is divided into chunks. Each chunk is one result, and ends by writing the worlds' states to a file in the folder
+``--work``. The next chunk continues from this file, even on another machine with a copy of the folder.
 
 Part random: worlds step under uniformly random actions, without injected faults. The result has the number of faults by
-reason, and the step and world of the first fault. Part memory: environments are made and deleted. Part kills: trainings
-are killed and resumed, and must end like an uninterrupted training.
+reason, and the step and world of the first fault. Part memory: environments are made and deleted. Part kills: training
+runs are killed and resumed, and must end like an uninterrupted run.
 """
 
 import collections

@@ -66,7 +66,7 @@ class Options(experiment.Options):
     """Number of worlds of lyceum_warp and of native C; by default 64 per thread, and 16,384 on a GPU. In the part
     suite, number of worlds of every contestant; by default 2, 16 and 128."""
     policy: str | None = None
-    """Folder of a run whose policy acts in the part kept; by default actions are random."""
+    """Folder of the run whose policy acts in the part kept; by default actions are random."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,7 +215,7 @@ def kept_line(row: Row) -> list[str]:
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    """Draw the ratios of the part ``sampling`` to native C as points on a logarithmic axis."""
+    """Draw the step rates of the part ``sampling``, relative to native C, as points on a logarithmic axis."""
     groups = grouped(rows, "sampling", "task")
     ratios = {task: experiment.paired(same, "env_steps_per_second", "native") for (task,), same in groups.items()}
     names = [name for name in PARTS["sampling"][1:] if any(found.get(name) for found in ratios.values())]

@@ -43,8 +43,8 @@ def run(python: Path, worker: Path, **arguments: Any) -> dict[str, Any]:
 
 @functools.cache
 def _made(name: str) -> tuple[Path, str]:
-    """Make the virtual environment of a library if it does not exist; return its Python, and the error if there was
-    one."""
+    """Make the virtual environment of a library if it does not exist; return the path of its Python, and an error
+    message or ""."""
     requirements = FOLDER / name / "requirements.txt"
     text = "\n".join([requirements.read_text(), sys.version, platform.machine()])
     root = Path(os.environ.get("LYCEUM_WARP_PEERS") or Path.home() / ".cache" / "lyceum_warp" / "peers")
@@ -73,7 +73,7 @@ def _made(name: str) -> tuple[Path, str]:
 
 
 def python_of(name: str) -> Path:
-    """Return the Python of a library's virtual environment, which is made if it does not exist.
+    """Return the path of the Python in a library's virtual environment, which is made if it does not exist.
 
     Raises:
         experiment.Skipped: The environment cannot be made, for example without a network.

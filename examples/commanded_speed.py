@@ -1,6 +1,7 @@
 """Define a cheetah that runs at a commanded speed, with most features of the task form.
 
-``python examples/commanded_speed.py`` checks and steps it; ``lyceum-warp train examples/commanded_speed.py`` trains it.
+Run ``python examples/commanded_speed.py`` to check and step the task, or ``lyceum-warp train
+examples/commanded_speed.py`` to train a policy.
 """
 
 from typing import Any
@@ -144,7 +145,8 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):  # runs at every reset,
 
 
 @wp.func
-def event(s: World, p: Params, rng: Row[wp.uint32]):  # on average a new command every 2 s and a push every second
+# on average a new command every 2 s and a push every second
+def event(s: World, p: Params, rng: Row[wp.uint32]):
     if lw.uniform(rng, 0.0, 2.0) < p.dt:
         s.command[0] = lw.uniform(rng, 0.0, 1.0 + s.level[0] * (p.fastest - 1.0))
     if lw.uniform(rng, 0.0, 1.0) < p.dt:

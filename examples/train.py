@@ -42,7 +42,7 @@ def main(
         if it.iteration == iterations:
             break
 
-    # new episodes without exploration noise: a policy called with observations returns its mean actions
+    # evaluation without exploration noise: a policy called with observations returns its mean actions
     episodes = lw.evaluate(env, npg.policy, 20, seed=seed + 1)
     print(f"mean policy: return {episodes.returns.mean():.1f} in {episodes.lengths.mean():.0f} steps")
 

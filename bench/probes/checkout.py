@@ -1,9 +1,9 @@
 """Compute numbers with a checkout's lyceum_warp, one unit of work after another, for bench/compare.py.
 
 compare.py runs this program once per checkout, with the checkout first on the path. The first answer lists the
-checkout's tasks and learners. Each following line on stdin is a unit (the keyword arguments of one of PARTS as JSON),
-and each line on stdout an answer. The arrays of a unit are written to the file that the program's argument names, in
-the order of their computation.
+checkout's tasks and learners. Each further line on stdin is a unit (the keyword arguments of a function in PARTS as
+JSON), and each line on stdout is an answer. The arrays of a unit are written to the file that the program's argument
+names, in the order of their computation.
 
 The program uses only public names of the package: the two checkouts may differ in everything else.
 """
@@ -65,7 +65,7 @@ class Numbers:
             for i, part in enumerate(value):
                 self.add(f"{name}/{i}", part, *axes, along=along)
         elif value is not None:
-            # copied, because buffers change in place
+            # the array is copied, because buffers change in place
             array = value.detach().cpu().numpy().copy() if isinstance(value, torch.Tensor) else np.array(value)
             self.axes[name] = [*([along] if along else []), *axes]
             if along:
@@ -81,7 +81,7 @@ class Numbers:
 
 
 def make(task: str, engine: str, device: str, **options: Any) -> Any:
-    """Make an environment on an engine; on a GPU its results are reproducible.
+    """Make an environment on an engine; on a GPU the environment is deterministic.
 
     Raises:
         MissingModel: The task needs an extra that is not installed.
@@ -282,7 +282,7 @@ def commands(numbers: Numbers, *, task: str, engine: str, device: str, iteration
     flags = ["--engine", engine, "--device", where["device"], *(["--deterministic"] if where["deterministic"] else [])]
     flags += ["--samples", "1024", "--nworld", "4", "--seed", "7", "--mean-every", "2", "--mean-episodes", "2"]
     quiet = ["--no-video", "--no-plot"]
-    make(task, engine, device)  # raises MissingModel if the model is not installed
+    make(task, engine, device)  # this call raises MissingModel if the model is not installed
     with tempfile.TemporaryDirectory(dir=".") as folder, contextlib.chdir(folder):
         command("train", task, "--iterations", str(iterations), "--out", "whole", *flags, *quiet)
         command("train", task, "--iterations", str(iterations // 2), "--out", "resumed", *flags, *quiet)
@@ -311,7 +311,7 @@ def command(*words: str) -> None:
 
 
 PARTS = {"env": environment, "plans": plans, "learners": learning, "commands": commands}
-"""The parts of the comparison, by the names of --parts."""
+"""The parts of the comparison, by their names in --parts."""
 
 
 # the functions below exchange messages with compare.py

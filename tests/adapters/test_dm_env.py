@@ -23,7 +23,7 @@ class TestOfDmEnv(test_utils.EnvironmentTestMixin, unittest.TestCase):
         return DmEnvironment("hopper", horizon=6)
 
 
-def test_episode_has_step_types_discounts_and_numbers_of_dm_env() -> None:
+def test_episode_has_the_step_types_discounts_and_values_that_dm_env_requires() -> None:
     env, twin = DmEnvironment("hopper", seed=3, horizon=4), lw.make("hopper", seed=3, horizon=4, autoreset=False)
     action = np.array([0.5, -0.5, 1.0], np.float32)
     twin.rand_reset()
@@ -45,7 +45,7 @@ def test_termination_has_discount_zero() -> None:
     assert step.discount == 0.0
 
 
-def test_observations_are_a_dict_of_parts_or_flat() -> None:
+def test_observations_are_a_dict_of_parts_or_a_flat_array() -> None:
     env = DmEnvironment("hopper")
     assert {name: spec.shape for name, spec in env.observation_spec().items()} == {"position": (5,), "velocity": (6,)}
     flat = DmEnvironment(Full, flat_observation=True)

@@ -40,7 +40,7 @@ THEIRS = ("is -infinity. This is probably too low", "is infinity. This is probab
 """Warnings of Gymnasium's checker about unbounded observations, which its own robots also cause."""
 
 
-def test_gymnasiums_checker_accepts_the_adapter(hopper: gymnasium.Env, draws: bool) -> None:
+def test_gymnasium_env_checker_accepts_the_adapter(hopper: gymnasium.Env, draws: bool) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(hopper.unwrapped, skip_render_check=not draws)
@@ -77,7 +77,7 @@ def test_fault_truncates_the_episode_with_the_last_valid_observation(hopper: gym
     np.testing.assert_array_equal(obs, before)
 
 
-def test_gymnasiums_vector_environments_accept_the_adapter() -> None:
+def test_gymnasium_vector_environments_accept_the_adapter() -> None:
     envs = gymnasium.make_vec("lyceum_warp.gym:lyceum/PointMass-v0", num_envs=2, vectorization_mode="sync")
     obs, _ = envs.reset()
     assert (obs[0] != obs[1]).any()

@@ -140,7 +140,7 @@ def test_step_without_copies_returns_the_buffers(vector: Callable[..., Gymnasium
     assert np.shares_memory(obs["policy"], envs.env.obs.numpy())
 
 
-def test_world_after_its_end_waits_for_a_masked_reset_if_autoreset_is_disabled(
+def test_ended_world_waits_for_a_masked_reset_if_autoreset_is_disabled(
     vector: Callable[..., GymnasiumVectorEnv],
 ) -> None:
     envs = vector(autoreset_mode=AutoresetMode.DISABLED)
@@ -255,7 +255,7 @@ OBSERVATION_WRAPPERS = {
     "DtypeObservation": lambda envs: wrappers.vector.DtypeObservation(envs, np.float64),
     "TransformObservation": lambda envs: wrappers.vector.TransformObservation(envs, lambda obs: np.clip(obs, -9, 9)),
 }
-"""Observation wrappers, which Gymnasium refuses in the mode SAME_STEP."""
+"""Observation wrappers, which Gymnasium does not allow in the mode SAME_STEP."""
 
 OTHER_WRAPPERS = {
     "ClipAction": wrappers.vector.ClipAction,

@@ -42,7 +42,7 @@ def test_library_version_outside_the_range_raises_an_error(
         ("stable-baselines3", "stable_baselines3", r"lyceum-warp\[stable-baselines3\]"),
     ],
 )
-def test_an_adapter_refuses_the_next_major_version(
+def test_adapter_rejects_the_next_major_version_of_its_library(
     package: str, module: str, install_hint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     install(tmp_path, package, "99.1")

@@ -162,7 +162,7 @@ def test_rsl_rl_writer_receives_the_metrics(env: lw.Env, tmp_path: Path) -> None
 
 
 @pytest.mark.gpu
-def test_gpu_a_step_does_not_wait_for_the_device() -> None:
+def test_gpu_step_does_not_wait_for_the_device() -> None:
     env = lw.make(Metered, nworld=64, device="cuda:0")
     worlds = RslRlVecEnv(env)
     action = torch.zeros(64, 1, device="cuda:0")

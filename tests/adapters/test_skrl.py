@@ -48,7 +48,7 @@ def wrapped(*, tensors: bool) -> Any:
     return wrap_env(env, wrapper="isaaclab-single-agent", verbose=False)
 
 
-def test_tensors_pass_through_the_wrapper_unchanged() -> None:
+def test_skrl_wrapper_returns_tensors_unchanged() -> None:
     env, twin = wrapped(tensors=True), lw.make(Full, nworld=N)
     env.unwrapped.reset(seed=3)
     env.reset()

@@ -1,4 +1,4 @@
-"""Use many worlds as a Stable-Baselines3 vector environment: returned values, learners, wrappers, errors."""
+"""Use many worlds as a Stable-Baselines3 vector environment, with its learners, wrappers and errors."""
 
 import warnings
 
@@ -91,7 +91,7 @@ def test_off_policy_learner_stores_final_observations_and_no_terminations_at_tim
         assert (buffer.next_observations[step, world] != buffer.observations[step + 1, world]).any()
 
 
-def test_stable_baselines3s_checker_accepts_a_single_world() -> None:
+def test_stable_baselines3_checker_accepts_a_single_world() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(GymnasiumEnv("hopper"), skip_render_check=True)

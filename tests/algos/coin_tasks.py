@@ -67,12 +67,12 @@ class TossedAfter(lw.Task):
 
 
 class TossedAfterWithControl(TossedAfter):
-    """``TossedAfter`` with a ``control``, so that rollouts run step by step."""
+    """``TossedAfter`` with a ``control`` function, so that rollouts run step by step."""
 
     control = copied
 
 
 class TossedBefore(TossedAfter):
-    """The reward's coin was tossed in the previous step, and is stored in memory."""
+    """The reward's coin is tossed in the previous step, and stored in memory."""
 
     reward = paid_by_coin_before_action

@@ -101,7 +101,7 @@ def test_other_networks_use_autograd(kind: str) -> None:
         assert DensePolicy.of(lw.GaussianPolicy(5, 2, network=OTHERS[kind]())) is None
 
 
-def test_a_policy_subclass_or_frozen_layers_use_autograd() -> None:
+def test_policy_subclass_and_frozen_layers_use_autograd() -> None:
     class Policy(lw.GaussianPolicy):
         pass
 

@@ -45,7 +45,7 @@ class Weighed(Varied):
 
 
 def place(obs: torch.Tensor) -> torch.Tensor:
-    """Return a value of point_mass that is low far from the target and at high speed."""
+    """Return a value function of point_mass that is low far from the target and at high speed."""
     return -2 * (obs[:, 0] - obs[:, 4]).abs() - 0.1 * obs[:, 2] * obs[:, 3]
 
 
@@ -180,7 +180,7 @@ def same(a: list[torch.Tensor], b: list[torch.Tensor]) -> bool:
 
 
 @pytest.mark.parametrize("update", ["mppi", *UPDATES])
-def test_equal_seeds_give_equal_plans_and_a_reset_restarts_the_noise(update: str) -> None:
+def test_equal_seeds_give_equal_plans_before_and_after_a_reset(update: str) -> None:
     words = UPDATES.get(update, {})
     plan, twin, other = (MPPI("reach", seed=seed, horizon=8, samples=10, **words) for seed in (4, 4, 5))
     _, state = reached(0)
@@ -242,7 +242,7 @@ def test_planning_in_drawn_models_ignores_the_model_fields_of_the_state() -> Non
     assert torch.equal(light(state), heavy(changed)) and torch.equal(light.model_returns, heavy.model_returns)
 
 
-def test_a_sample_that_fails_in_one_model_fails() -> None:
+def test_sample_counts_as_failed_if_it_fails_in_one_model() -> None:
     plan = MPPI(Varied, horizon=3, samples=4, models=2)
     plan.model_fields["body_mass"][1, 1] = torch.nan
     plan(plan.state_of())
@@ -347,7 +347,7 @@ def test_plans_shift_by_the_elapsed_steps(fill: Any) -> None:
 
 @pytest.mark.parametrize("spline", ["zero", "linear", "cubic"])
 @pytest.mark.parametrize("knots", [1, 3, 5, 8, 12])
-def test_a_shifted_plan_with_knots_keeps_its_actions(knots: int, spline: Any) -> None:
+def test_shifted_plan_with_knots_keeps_its_actions(knots: int, spline: Any) -> None:
     """The actions of the remaining steps do not change, even if the shift is smaller than the distance between two
     knots."""
     plan = MPPI("point_mass", horizon=12, samples=4, knots=knots, spline=spline, fill="repeat", noise=0.3, seed=1)

@@ -100,7 +100,7 @@ REACH = task_config(find_task("reach"))
         ("reach", MPPIConfig(horizon=3, samples=8), {"samples": 7}, MPPIConfig(horizon=3, samples=7)),
     ],
 )
-def test_keyword_settings_override_config_which_overrides_planning(
+def test_keyword_settings_override_config_and_config_overrides_planning(
     task: str, config: MPPIConfig | None, words: dict[str, Any], expected: MPPIConfig
 ) -> None:
     assert arguments(task, config, **words)[0] == expected.completed()

@@ -66,7 +66,7 @@ def test_smoothing_with_poles_outside_the_unit_circle_raises_an_error(smoothing:
         MPPIConfig(smoothing=smoothing)
 
 
-def test_arrays_and_tensors_become_tuples_of_floats() -> None:
+def test_arrays_and_tensors_are_converted_to_tuples_of_floats() -> None:
     config = MPPIConfig(
         horizon=np.int64(3), noise=torch.eye(2), smoothing=[1, 0, 0], fill=np.array([1, 2])  # type: ignore[arg-type]
     )  # fmt: skip

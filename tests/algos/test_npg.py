@@ -86,7 +86,7 @@ def test_learning_does_not_depend_on_the_scale_of_rewards(env: lw.Env) -> None:
     assert plain[-1].explained_variance > 0.5
 
 
-def test_one_extreme_reward_is_bounded_and_counted(env: lw.Env) -> None:
+def test_extreme_reward_is_bounded_and_counted(env: lw.Env) -> None:
     def outlier(reward: torch.Tensor, iteration: int) -> None:
         if iteration == 3:
             reward[5, 2] = -1e10
@@ -190,7 +190,8 @@ def test_rollout_segments_continue_the_previous_episodes(env: lw.Env) -> None:
 
 @pytest.mark.parametrize(("min_restarts", "begun"), [(None, 1), (2.0, 3), (0.0, 0)])
 def test_worlds_restart_if_too_few_begin_an_episode(min_restarts: float | None, begun: int) -> None:
-    """With evenly spread time limits, 40 * 5 / 128 = 1.6 worlds would begin an episode in an iteration of 5 steps."""
+    """If time limits were evenly spread, 40 * 5 / 128 = 1.6 worlds would begin an episode in an iteration of 5
+    steps."""
     env = lw.make("point_mass", nworld=40, horizon=128)
     config = lw.NPGConfig(samples=40 * 5, hidden=(8,), value_hidden=(8,), mean_every=0, min_restarts=min_restarts)
     npg = lw.NPG(env, config=config)
@@ -359,8 +360,8 @@ def on_gpu(**changes: object) -> lw.NPG:
 
 
 @pytest.mark.gpu
-def test_gpu_an_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All synchronizing calls but one raise an error."""
+def test_gpu_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The test makes all synchronizing calls except for one raise an error."""
     npg = on_gpu(normalize=True, min_restarts=2.0)
     copies = []
 
@@ -381,7 +382,7 @@ def test_gpu_an_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.gpu
-def test_gpu_a_resumed_run_continues() -> None:
+def test_gpu_learner_continues_after_loading_a_state() -> None:
     """A captured value fit contains the addresses of the optimizer's moments, so loading a state must capture it
     again."""
     npg = on_gpu()
@@ -394,7 +395,7 @@ def test_gpu_a_resumed_run_continues() -> None:
     assert again.gradient_norm == pytest.approx(first.gradient_norm, rel=1e-2)
 
 
-@pytest.mark.parametrize("kl_limit", [1.0, 1.5])  # the limit of 1.0 shortens many steps
+@pytest.mark.parametrize("kl_limit", [1.0, 1.5])  # a KL limit of 1.0 shortens many steps
 def test_optimized_iterations_equal_iterations_with_autograd(kl_limit: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The plain version uses autograd, all rounds of the line search, and a value fit after the policy's step."""
     threads, learned = torch.get_num_threads(), []

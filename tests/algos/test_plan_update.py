@@ -14,7 +14,7 @@ ENGINES = ["mujoco", "warp"]
 
 
 class EliteMean(lw.PlanUpdate):
-    """Take the mean of the best samples, and keep the noise."""
+    """A plan update that takes the mean of the best samples, and does not change the noise."""
 
     def __init__(self, elites: int) -> None:
         self.elites = elites
@@ -44,7 +44,7 @@ class TorchCEM(EliteMean):
 
 
 class HalfWay(EliteMean):
-    """Move from the previous plan halfway to the mean of the best samples."""
+    """A plan update that moves the plan halfway to the mean of the best samples."""
 
     def fit(self, samples: lw.PlanSamples) -> None:
         samples.plan.lerp_(samples.nominal, 0.5)
@@ -58,7 +58,7 @@ def weigh_first(returns: wp.array2d[float], weights: wp.array2d[float], summary:
 
 
 class First(lw.PlanUpdate):
-    """Choose the first sample, in a Warp kernel."""
+    """A plan update that chooses the first sample in a Warp kernel."""
 
     capturable = True
 
@@ -96,7 +96,7 @@ def test_user_written_cem_in_torch_gives_the_same_plans(more: dict[str, Any], en
 def test_fit_may_change_the_plan(knots: int | None) -> None:
     half, whole = (lw.Planner(update=kind(3), knots=knots, **POINT) for kind in (HalfWay, EliteMean))
     state = half.state_of(qpos=[0.1, 0.2, -0.5, 0.3])
-    torch.testing.assert_close(half(state), 0.5 * whole(state))  # the first plan was zero
+    torch.testing.assert_close(half(state), 0.5 * whole(state))  # the first plan starts from zero actions
     torch.testing.assert_close(half.actions, 0.5 * whole.actions)
 
 

@@ -16,7 +16,7 @@ from lyceum_warp.runs.folder import Run
 
 
 class Net(nn.Module):
-    """A network with an additional function, ``change``, of its output."""
+    """A network that applies the function ``change`` to its output."""
 
     def __init__(self, change: Callable[[torch.Tensor], object] = lambda mean: mean) -> None:
         super().__init__()

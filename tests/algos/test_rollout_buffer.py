@@ -75,7 +75,7 @@ class Settling(Metered):
 @pytest.mark.parametrize(("task", "engine", "spread"), [
     (Metered, "warp", True), (Settling, "mujoco", True), (Settling, "warp", False),
 ])  # fmt: skip
-def test_episodes_are_not_staggered_if_all_worlds_wait_for_a_world_that_settles(
+def test_stagger_is_skipped_if_all_worlds_wait_for_a_world_that_settles(
     task: type[lw.Task], engine: str, spread: bool
 ) -> None:
     rollout = lw.Rollout(lw.make(task, nworld=4, horizon=50, engine=engine), 1)

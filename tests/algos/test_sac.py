@@ -52,7 +52,7 @@ def test_sac_learns_for_a_fixed_seed(shared_env: SharedEnv) -> None:
 
 
 class Plain(torch.nn.Module):
-    """One of the twin critics, in plain torch with float64."""
+    """One of the twin critics, written in plain torch with float64."""
 
     def __init__(self, twin: lw.TwinCritic, k: int) -> None:
         super().__init__()
@@ -197,7 +197,7 @@ def test_resumed_run_uses_the_replay_buffer_in_its_folder(tmp_path: Path) -> Non
         lw.train(made(sac.env), tmp_path / "parts", iterations=7, resume=True)
 
 
-def test_given_networks_are_trained_further(env: lw.Env) -> None:
+def test_training_continues_from_given_networks(env: lw.Env) -> None:
     sac = made(env)
     for _ in range(2):
         next(sac)

@@ -95,7 +95,7 @@ def test_a_symmetric_run_resumes_bit_for_bit(symmetry: str, tmp_path: Path) -> N
         lw.train(lw.PPO(lw.make("point_mass", nworld=8), config=CONFIG), halves.folder, iterations=9, resume=True)
 
 
-def test_mirrored_samples_have_the_gradient_of_the_mirrored_task(env: lw.Env) -> None:
+def test_mirrored_samples_add_the_gradient_of_the_mirrored_task(env: lw.Env) -> None:
     """If policy and value function are symmetric, mirrored samples add the mirror image of the gradient."""
     ppo = learner(env, "augment", hidden=(), value_hidden=(), normalize=False)
     with torch.no_grad():

@@ -15,7 +15,7 @@ from lyceum_warp.algos.value_fit import ValueFit
 def test_hand_written_value_steps_equal_autograd(activation: Any) -> None:
     """The second fit continues with the optimizer moments of the first fit."""
     generator = torch.Generator().manual_seed(2)
-    data = [torch.randn(50, 6, generator=generator) for _ in range(2)]  # the last mini-batch is smaller
+    data = [torch.randn(50, 6, generator=generator) for _ in range(2)]  # the last mini-batch is smaller than the others
     fits = []
     for written_out in (False, True):
         init = torch.Generator().manual_seed(0)
@@ -51,7 +51,7 @@ def test_user_value_network_is_fitted_by_autograd() -> None:
 @pytest.mark.gpu
 def test_gpu_a_captured_fit_learns_the_same_as_plain_launches() -> None:
     """The first fit captures a graph between two mini-batches; the second fit only replays it, on different samples."""
-    samples, batch = 1000, 96  # the last mini-batch is smaller
+    samples, batch = 1000, 96  # the last mini-batch is smaller than the others
     generator = torch.Generator("cuda").manual_seed(2)
     data = [torch.randn(samples, 6, generator=generator, device="cuda") for _ in range(2)]
     fits = []

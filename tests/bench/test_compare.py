@@ -32,7 +32,8 @@ QUICK: dict[str, Any] = {"engines": ("mujoco",), "parts": ("env",), "steps": 3}
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Compare with a copy in which one task exits, one raises an error, and point_mass has a changed reward."""
+    """Compare the working tree with a copy in which one task exits, one raises an error, and point_mass has a changed
+    reward."""
     changes = {
         "tasks/point_mass.py": ("return 1.0 - distance(s1)", "return 2.0 - distance(s1)"),
         "tasks/cartpole_swingup.py": ("import warp as wp\n", "import os\nos._exit(3)\n"),
@@ -124,7 +125,7 @@ def test_shape_type_and_text_are_compared() -> None:
     assert compare.difference("a", np.array("ab"), np.array("ab")) is None
 
 
-def test_names_in_only_one_checkout_are_added_or_removed() -> None:
+def test_names_in_only_one_checkout_are_reported_as_added_or_removed() -> None:
     zero = np.zeros(1)
     found = compare.differences("u", {"both": zero, "gone": zero}, {"new": zero, "both": zero}, {})
     assert [(each.name, each.kind) for each in found] == [("u/gone", "removed"), ("u/new", "added")]
@@ -144,7 +145,7 @@ def test_revision_equals_itself_in_every_part(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_both_processes_and_removes_the_folders(number: signal.Signals, tmp_path: Path) -> None:
+def test_signal_ends_both_processes_and_removes_their_folders(number: signal.Signals, tmp_path: Path) -> None:
     program = subprocess.Popen(
         [sys.executable, PROGRAM, str(ROOT), "--tasks", "point_mass"], stdout=subprocess.PIPE, text=True,
         env=environment(tmp_path),

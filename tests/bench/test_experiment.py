@@ -148,7 +148,7 @@ def test_results_file_with_invalid_lines_raises_an_error(
         ("throughput", "--tasks hoper", "there is no task 'hoper': did you mean hopper?"),
         ("throughput", "--parts one", "there is no part 'one': there are sampling, suite, single, cores, worlds, kept"),
         ("throughput", "--device cuda:99", "there is no GPU for --device cuda:99"),
-        ("mppi", "--jobs 2", "plans and a GPU are timed alone: give --jobs 1, or --parts episodes"),
+        ("mppi", "--jobs 2", "plans and GPU cases are timed alone: give --jobs 1, or --parts episodes"),
         ("mppi", "--block 0", "episodes, block and repeats must be at least 1"),
         ("npg", "--jobs 1000", "1000 jobs with 2 threads need 2000 cores"),
         ("fidelity", "--nworld 0", "--nworld"),

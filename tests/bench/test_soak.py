@@ -55,7 +55,8 @@ def test_soak_run_continues_on_another_machine_with_the_state_folder(
 ) -> None:
     words = (*FAULTS, "--steps", "1600", "--work", str(work))
     first = run(tmp_path / "here.jsonl", *words)
-    assert run(tmp_path / "there.jsonl", *words)[0]["found"] == first[1]["found"]  # the last row may be lost
+    # an interruption may lose the last row
+    assert run(tmp_path / "there.jsonl", *words)[0]["found"] == first[1]["found"]
     for file in work.glob("*.pt"):
         file.unlink()
     (tmp_path / "here.jsonl").write_text((tmp_path / "here.jsonl").read_text().splitlines(keepends=True)[0])

@@ -49,7 +49,7 @@ def shared(folder: Path, skip: int) -> Path:
     return tiny_task.write(folder, SHARED)
 
 
-def test_a_task_imports_modules_beside_it(tmp_path: Path) -> None:
+def test_task_can_import_modules_from_its_folder(tmp_path: Path) -> None:
     path = list(sys.path)
     assert find_task(shared(tmp_path, 3)).frame_skip == 3
     assert sys.path == path and not list(tmp_path.rglob("__pycache__"))

@@ -26,7 +26,7 @@ def ball(option: str = "") -> mujoco.MjSpec:
 # sources
 
 
-def test_a_compiled_model_is_refused() -> None:
+def test_compiled_model_raises_an_error() -> None:
     with pytest.raises(ValueError, match="must be a file or an MjSpec, not a compiled MjModel: give its MjSpec"):
         load_spec(ball().compile())
 
@@ -107,7 +107,7 @@ PAIRS = """<mujoco model="pairs"><worldbody>
 
 
 def test_contact_pair_that_is_listed_twice_creates_one_contact(caplog: pytest.LogCaptureFixture) -> None:
-    """MuJoCo would create two contacts and MuJoCo Warp one."""
+    """Otherwise MuJoCo would create two contacts, and MuJoCo Warp only one."""
     assert mujoco.MjModel.from_xml_string(PAIRS).npair == 2
     with caplog.at_level("INFO"):
         model = compile_model(mujoco.MjSpec.from_string(PAIRS), (), PHYSICS)

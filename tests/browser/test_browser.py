@@ -373,7 +373,7 @@ def test_a_recorded_page_plays_without_a_server(browser: Browser, tmp_path: Path
 
 
 @pytest.mark.long
-def test_another_browser_controls_after_one_is_closed_or_killed(
+def test_another_browser_gets_control_after_the_first_is_closed_or_killed(
     viewer: Viewer, launch: Callable[[], Browser], context: BrowserContext, shared_tab: Tab
 ) -> None:
     shared_tab.page.goto("about:blank")

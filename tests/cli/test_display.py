@@ -95,7 +95,7 @@ def test_final_table_has_at_most_15_rows_and_prefers_rows_with_evaluations() -> 
 
 
 def test_final_table_omits_empty_columns(first: lw.Iteration) -> None:
-    row = first.row()  # HalfCheetah has no success, and no episode has ended
+    row = first.row()  # HalfCheetah defines no success, and no episode has ended
     shown = table([row])
     assert "reward" in shown and f"{first.reward_mean:.3g}" in shown
     assert not any(word in shown for word in ("success", "return", "policy"))

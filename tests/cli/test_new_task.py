@@ -86,7 +86,7 @@ def test_a_new_task_observes_the_state_and_the_sensors_that_measure_it(folder: P
     assert env.reward.tolist() == [0.0, 0.0]
 
 
-def test_a_model_whose_sensors_measure_every_joint_is_observed_only_through_them(folder: Path) -> None:
+def test_new_task_observes_only_sensors_if_they_measure_every_joint(folder: Path) -> None:
     task = find_task(new("sensed", SENSED))
     assert task.obs == {"sensors": 7}
     unsensed = SENSED.replace('<gyro site="imu"/>', '<gyro site="end"/>')  # no sensor measures the floating body
@@ -113,7 +113,8 @@ def test_new_task_for_any_model_follows_the_rules(model: str, engine: str, folde
 
 
 def package_models() -> list[Path]:
-    """Models that gymnasium, dm_control and MuJoCo Warp ship, except those without actuators or without their files."""
+    """Return the models in gymnasium, dm_control and MuJoCo Warp, except for models without actuators or with missing
+    files."""
     folders = {"gymnasium": "envs/mujoco/assets", "dm_control": "suite", "mujoco_warp": "test_data"}
     found: list[Path] = []
     for package, within in folders.items():

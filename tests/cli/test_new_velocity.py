@@ -147,7 +147,7 @@ def test_option_feet_without_the_template_prints_an_error(folder: Path, capsys: 
 
 
 @pytest.mark.parametrize("task", ["spot_velocity", pytest.param("g1_velocity", marks=pytest.mark.long)])
-def test_robots_of_menagerie_become_tasks(task: str, folder: Path) -> None:
+def test_new_velocity_accepts_robots_of_menagerie(task: str, folder: Path) -> None:
     model = {"g1_velocity": "unitree_g1/scene_mjx.xml", "spot_velocity": "boston_dynamics_spot/scene.xml"}[task]
     assert new("walk", "--model", f"menagerie:{model}") == 0
     found, own = lw.make("walk.py").task, lw.make(task).task

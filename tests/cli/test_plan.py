@@ -97,11 +97,11 @@ def test_plant_keeps_its_rate_with_real_time(tmp_path: Path, capsys: pytest.Capt
     assert "async" in capsys.readouterr().out
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["mode"] == "async" and report["deadline_ms"] == pytest.approx(20.0)
-    assert 0.5 < report["real_time_factor"] < 1.01  # 40 steps of 20 ms; a busy machine may be late
+    assert 0.5 < report["real_time_factor"] < 1.01  # the 40 steps take 20 ms each, and a busy machine may be slower
 
 
 def measured_by(microseconds: float) -> Any:
-    """Return a replacement for the measurement: its planning times are proportional to samples and horizon."""
+    """Return a function that replaces the measurement; its planning times are proportional to samples and horizon."""
     return lambda plant, planner: 1e-6 * microseconds * planner.samples * planner.horizon
 
 

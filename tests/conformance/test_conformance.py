@@ -47,8 +47,7 @@ def options(task: str, engine: str) -> dict[str, int]:
     return {"steps": 100 if every else 40, "frame_skip": min(2, find_task(task).frame_skip)}
 
 
-# a task with contacts, a robot with events and randomized dynamics, a task without contacts, and a task for planners;
-# the last case is also a task for planners, on the Warp engine
+# these cases cover contacts, events, randomized dynamics, tasks without contacts, and tasks for planners
 @pytest.mark.quick(
     "mujoco-half_cheetah", "mujoco-go1_velocity", "mujoco-cartpole_swingup", "mujoco-reach",
     "warp-go1_velocity", "warp-half_cheetah", "warp-point_mass",

@@ -23,7 +23,7 @@ Function = Callable[..., Any]
 
 
 def then(extra: Callable[[Any], object]) -> Callable[[Function], Function]:
-    """Return a decorator for a method that calls a function after each call."""
+    """Return a decorator that calls a function after each call of the decorated method."""
 
     def wrap(method: Function) -> Function:
         def longer(self: Any, *args: Any, **kwargs: Any) -> Any:
@@ -162,7 +162,7 @@ BREAKS: list[Break] = [
     ("bad_warmstart", MujocoEngine, "__init__", then(keep_warm_start)),
     ("not_finite", lw.Env, "step", then(spoil_rewards)),
 ]
-"""By rule: patches of hopper's functions that violate it."""
+"""Patches that violate each rule, for hopper."""
 
 FULL_BREAKS: list[Break] = [
     ("groups", lw.Env, "step", then(another_critic)),
@@ -180,12 +180,12 @@ FULL_BREAKS: list[Break] = [
     ("keyframe", MujocoEngine, "__init__", then(from_the_default)),
     ("rejection", Worlds, "_redraw", nothing),
 ]
-"""By rule: patches that violate it, for the task with every feature."""
+"""Patches that violate each rule, for the task with every feature."""
 
 SETTLED_BREAKS: list[Break] = [
     ("settle", MujocoEngine, "settle", at_once),
 ]
-"""By rule: patches that violate it, for a variant of the task that settles after a reset."""
+"""Patches that violate each rule, for a variant of the task that settles after a reset."""
 
 ALL_BREAKS = [
     *(("hopper", *broken) for broken in BREAKS),

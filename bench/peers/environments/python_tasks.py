@@ -1,8 +1,8 @@
 """Define tasks for Gymnasium and dm_control with the formulas and models of lyceum_warp's tasks.
 
 Gymnasium contains all these tasks except cartpole and herb_reach, and dm_control contains cartpole and its suite. This
-file defines the missing tasks in NumPy, as a user of these libraries would. It runs in the other libraries' virtual
-environments, and does not import lyceum_warp.
+file defines the missing tasks in NumPy, as a user of these libraries would. This file runs in the other libraries'
+virtual environments, and does not import lyceum_warp.
 """
 
 from pathlib import Path
@@ -128,8 +128,8 @@ def dm_control_env(task: str, seed: int) -> Any:
             return suite.load(domain, name, task_kwargs={"random": seed})
 
     class FromGymnasium(control.Task):
-        """A dm_control task with the observation, reward and end of a Gymnasium environment, on dm_control's model and
-        data."""
+        """A dm_control task with the observations, rewards and terminations of a Gymnasium environment, on dm_control's
+        model and data."""
 
         def __init__(self, env: Any, physics: Any) -> None:
             self.env, self.position = env, POSITIONS.get(task, lambda env: env.data.qpos[0])
@@ -161,7 +161,8 @@ def dm_control_env(task: str, seed: int) -> Any:
             return 0.0 if ends and not self.env.is_healthy else None
 
     class FromStep(FromGymnasium):
-        """A task that calls Gymnasium's step function, without its physics, on the new state only."""
+        """A task that computes observation and reward from the new state by Gymnasium's step function, without its
+        physics."""
 
         def __init__(self, env: Any, physics: Any) -> None:
             super().__init__(env, physics)

@@ -1,8 +1,8 @@
 """Measure environment steps per second of other libraries, as a worker of bench/venvs.py.
 
-The program reads a JSON object (contestant, task, envs, threads, seconds, warm, seed) and prints another. Actions are
-uniform within their bounds and drawn before the clock starts. An episode restarts within its last step if the library
-supports it.
+The program reads a JSON object (contestant, task, envs, threads, seconds, warm, seed) and prints a JSON object. Actions
+are uniform within their bounds and drawn before the clock starts. An episode restarts within its last step if the
+library supports it.
 """
 
 import json
@@ -41,7 +41,7 @@ ENVPOOL = {
 
 
 def draw(low: np.ndarray, high: np.ndarray, envs: int, seed: int) -> np.ndarray:
-    """Draw actions for several steps, (steps, envs, nact), which are then repeated."""
+    """Draw actions, (steps, envs, nact), for several steps; the caller repeats them."""
     return np.random.default_rng(seed).uniform(low, high, (max(16, KEPT_ACTIONS // envs), envs, *low.shape))
 
 
@@ -174,7 +174,7 @@ class EnvPool:
         return self.env.step(self.actions[t])[-1]["elapsed_step"]
 
     def transition_share(self) -> float:
-        """Return the share of environment steps that are transitions, measured over 200 additional steps.
+        """Return the fraction of environment steps that are transitions, measured over 200 additional steps.
 
         The step after the end of an episode ignores its action and returns the first observation of the next episode.
         """
@@ -221,7 +221,7 @@ def timed(
             count += 1
         wait()
         now = time.perf_counter()
-        if now - began < 0.01:  # several steps per reading of the clock, because reading it takes time
+        if now - began < 0.01:  # read the clock only every few steps, because reading it takes time
             block *= 2
     return count, now - start
 
