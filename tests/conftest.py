@@ -113,8 +113,8 @@ def settle() -> None:
     """Exempt all live objects from garbage collection, because scanning a million objects of imports and kernels is
     slow.
 
-    Later objects are collected and counted as usual. Do not call this function while an object is alive that a test
-    must free.
+    Objects that are created later are collected and counted as usual. Do not call this function while an object is
+    alive that a test must free.
     """
     gc.collect()
     gc.freeze()

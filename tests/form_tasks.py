@@ -202,7 +202,7 @@ def draw_practice(s: PracticedWorld, p: PuckParams, rng: Row[wp.uint32]):
 
 
 class Gifted(Practiced):
-    """``Practiced`` with randomized initial practice in each world; all worlds share the model."""
+    """``Practiced`` with a randomized initial practice in each world; all worlds share the model."""
 
     World = PracticedWorld
     Params = PuckParams

@@ -75,7 +75,7 @@ class HeadlessViewer(viewer_protocol.Viewer):
 
 
 class Bench:
-    """A panel in a separate viewer without a window. It stores the messages that the panel sends."""
+    """A panel in a separate viewer without a window. The screen stores the messages that the panel sends."""
 
     def __init__(self, model: mujoco.MjModel, scene: Scene, **options: Any) -> None:
         self.model, self.data = model, mujoco.MjData(model)

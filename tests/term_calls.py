@@ -35,7 +35,7 @@ KERNELS = {
     name: [(each, kernel_of(each, i)) for i, each in enumerate(overloads(getattr(terms, name)))]
     for name in terms.__all__
 }
-"""By function name: the function's overloads, each with its kernel."""
+"""Overloads of each function, by name; each has a kernel."""
 
 
 @dataclasses.dataclass
@@ -47,10 +47,9 @@ class Call:
 
 
 def call(name: str, overload: int = 0, **values: Any) -> Call:
-    """Call a function with a value for each argument, which all worlds share or which has one entry for each of the N
-    worlds.
+    """Call a function in N worlds; an argument is one value for all worlds, or has one entry per world.
 
-    Each world has its own stream ``rng``. If several overloads take these arguments, ``overload`` selects one.
+    Each world has its own stream ``rng``. If several overloads accept the arguments, ``overload`` selects one.
     """
     matching = [
         (function, kernel) for function, kernel in KERNELS[name] if {*function.input_types} - {"rng"} == {*values}

@@ -34,8 +34,7 @@ def distance(place: float, target: float) -> float:
 
 
 @wp.func
-# arguments: a field of World, and a default
-def fast(qvel: Row[float], scale: float = 2.0) -> float:
+def fast(qvel: Row[float], scale: float = 2.0) -> float:  # arguments: a field of World, and a default
     return scale * wp.abs(qvel[0])
 
 

@@ -117,7 +117,7 @@ def test_trajectory_describes_settings_by_json_values(env: lw.Env, tmp_path: Pat
     assert Trajectory.load(episode.save(tmp_path / "a.npz")).controller == episode.controller
 
 
-def test_controller_accepts_a_task_with_several_action_numbers(shared_env: SharedEnv) -> None:
+def test_controller_accepts_a_task_with_a_multidimensional_action(shared_env: SharedEnv) -> None:
     env = shared_env("go1_velocity", engine="mujoco", autoreset=False)
     trajectory = control(env, lambda state, obs: torch.zeros(12), steps=2, seed=0)
     assert trajectory.actions.shape == (2, 12)

@@ -92,7 +92,7 @@ def test_on_abort_is_not_called_before_the_first_step(run: Run, env: lw.Env) -> 
         run(env, fails, on_abort=lambda part: pytest.fail("on_abort was called before the first step"))
 
 
-def test_an_interrupted_step_is_omitted(env: lw.Env, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trajectory_omits_an_interrupted_step(env: lw.Env, monkeypatch: pytest.MonkeyPatch) -> None:
     step, calls, parts = env.step, [], []
 
     def stop() -> None:

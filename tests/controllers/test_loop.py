@@ -46,7 +46,7 @@ def test_first_state_and_actions_replay_the_episode_exactly(env: lw.Env) -> None
         assert env.reward[0] == episode.rewards[k] and env.eval[0] == episode.evals[k]
 
 
-def test_the_seed_determines_the_episode(env: lw.Env) -> None:
+def test_equal_seeds_give_equal_episodes(env: lw.Env) -> None:
     one, same, other = (control(env, towards, seed=seed, steps=3) for seed in (1, 1, 2))
     assert torch.equal(one.states, same.states) and not torch.equal(one.states, other.states)
 

@@ -28,8 +28,8 @@ def test_actions_of_a_fast_planner_are_one_step_old(env: lw.Env) -> None:
     assert episode.times.tolist() == pytest.approx([0, 1, 2, 3, 4, 5])
     assert episode.age_steps.tolist() == [0, 1, 1, 1, 1, 1]
     assert episode.ages.tolist() == pytest.approx([0, 1, 1, 1, 1, 1])
-    assert hundredths(episode.actions[:, 0]) == [0, 0, 1, 2, 3, 4]  # the step from which the plan started
-    assert hundredths(episode.actions[:, 1]) == [0, 1, 1, 1, 1, 1]  # index of the applied action in its plan
+    assert hundredths(episode.actions[:, 0]) == [0, 0, 1, 2, 3, 4]  # the step from which the plan started.
+    assert hundredths(episode.actions[:, 1]) == [0, 1, 1, 1, 1, 1]  # Index of the applied action in its plan
     assert episode.wall_seconds == pytest.approx(6)
     report = control_report(episode)
     assert (report.misses, report.late_ticks, report.age_steps_max, report.deadline_ms) == (0, 0, 1, 1000)
@@ -39,7 +39,7 @@ def test_actions_of_a_fast_planner_are_one_step_old(env: lw.Env) -> None:
 
 def test_a_slow_planner_misses_its_deadlines(env: lw.Env) -> None:
     episode = simulated_run(env, seconds=2.5, steps=9)
-    # the plan from state 1 ends at 3.5; the next plan starts from the newest state and lasts from 3.5 to 6
+    # the plan from state 1 is ready at 3.5 s; the next plan starts from the newest state and is ready at 6 s
     assert episode.plan_of.tolist() == [0, 0, 0, 0, 1, 1, 2, 2, 2]
     assert episode.plan_steps[:3].tolist() == [0, 1, 3]
     assert episode.ages.tolist() == pytest.approx([0, 1, 2, 3, 3, 4, 3, 4, 5])
@@ -90,7 +90,7 @@ def test_a_slow_planner_in_a_thread_plans_while_the_plant_steps(env: lw.Env) -> 
         assert torch.equal(env.get_state()[0], episode.states[k + 1])
 
 
-def test_mppi_makes_the_same_plans_in_a_thread(env: lw.Env) -> None:
+def test_mppi_gives_the_same_plans_in_a_thread(env: lw.Env) -> None:
     mppi = lw.MPPI("point_mass", horizon=6, samples=4, nthread=1)
     episode = control_async(env, mppi, period=0.004, seed=5)
     mppi.reset(5)

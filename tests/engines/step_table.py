@@ -284,7 +284,7 @@ def is_refused(case: Case) -> bool:
 
 
 def singles() -> Iterator[Case]:
-    """Yield each level of each factor combined with the first levels of the other factors."""
+    """Yield a case for each level of each factor; the other factors have their first levels."""
     for name, levels in FACTORS.items():
         for level in levels:
             case = PLAIN | {name: level}
@@ -293,7 +293,7 @@ def singles() -> Iterator[Case]:
 
 @functools.cache
 def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
-    """Return cases that together contain each combination of one, two, three, ... levels of different factors.
+    """Return cases that together contain each combination of a given number of levels of different factors.
 
     The search is greedy: each case starts with a missing combination, and the other factors take the levels that add
     the most missing combinations. Combinations that an engine rejects are omitted.

@@ -151,7 +151,7 @@ def test_view_of_a_field_stays_valid_after_its_environment_is_deleted(engine: st
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_additional_fields_do_not_change_the_simulation(file: Path, engine: str) -> None:
-    """Only the state becomes larger, by the field of the acceleration stage."""
+    """Only the size of the state changes, by the additional field of the acceleration stage."""
     plain = lw.make(file, engine=engine, nworld=2, seed=3)
     other = lw.make(file, engine=engine, nworld=2, seed=3, fields=["qacc_warmstart", "xpos", "qacc"])
     parts = list(plain.state_space.parts)
@@ -253,7 +253,7 @@ def test_contact_buffer_has_room_for_one_world_with_all_contacts() -> None:
 
 
 def test_partial_and_full_forward_passes_give_equal_results(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forward passes of only the restarting worlds give the same numbers as passes of all worlds."""
+    """Forward passes of only the restarting worlds give the same results as passes of all worlds."""
     runs = []
     for partial in (True, False):
         monkeypatch.setattr(WarpEngine, "partial_refresh", partial)

@@ -97,7 +97,7 @@ def check(case: Case, device: wp.Device) -> None:
     last = {name: getattr(d, name).numpy().copy() for name in names}
     set_state(m, d, found)
     plain(mjw.forward, m, d)
-    if "energy" in names:  # if the model has an energy sensor, MuJoCo Warp's forward pass loses the kinetic energy
+    if "energy" in names:  # MuJoCo Warp's forward pass loses the kinetic energy if the model has an energy sensor
         mjw.energy_pos(m, d)
         mjw.energy_vel(m, d)
     late = np.setdiff1d(np.arange(model.nsensordata), early_sensor_columns(model))
@@ -165,7 +165,7 @@ OF_ANOTHER_MODEL = {
     "tendon_solref_fri": {"tendons": "friction"}, "tendon_solimp_fri": {"tendons": "friction"},
     "pair_solreffriction": {"cone": "elliptic"},
 }  # fmt: skip
-"""By field: levels that give the field an effect, in addition to ``DRAWN``."""
+"""Levels that give a field an effect, in addition to ``DRAWN``, by field."""
 
 
 def touching(model: mujoco.MjModel) -> np.ndarray:

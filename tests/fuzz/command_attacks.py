@@ -53,7 +53,7 @@ FIRST = {"tasks": "", "new": "my_task", "eval": "good", "export": "good"} | dict
 """Arguments that follow a command; by default the name of a task."""
 
 _OMIT = ("--help", "--video", "--video-every", "--view", "--frame-skip")
-"""Flags that print or start other processes, and a flag with which a single native call can take hours."""
+"""Omitted flags: some print or start other processes, and with one of them a single native call can take hours."""
 
 
 @functools.cache

@@ -149,7 +149,7 @@ READERS: dict[str, Callable[[], object]] = {
     "table": lambda: lw.make(SLIDE_PY, motion=CASE / "table.npy").step(),
 }  # fmt: skip
 WITHOUT = {"load alone": "run/policy.pt", "resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}
-"""Files to delete, so that a reader uses another file."""
+"""Files to delete, so that a reader must use another file."""
 SLIDE_PY = str(BASE / "slide.py")
 _NEW = ("--trust", "--out", "case/new", "--iterations", "1", "--no-video", "--no-plot")
 

@@ -1,6 +1,6 @@
 """Damage files, command lines and arguments at random; each must work or raise a documented error.
 
-A failure names its case and the command that repeats it.
+The message of a failure names the case and the command that repeats it.
 """
 
 import functools
@@ -52,7 +52,7 @@ def cases(counts: Mapping[str, int], first: int) -> list[str]:
 def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Return ``outcomes(program, many)``, which runs many cases of a program, or a few cases and all minimal cases.
 
-    The folder has the same path in every run of the tests.
+    The folder of the cases has the same path in every run of the tests.
     """
     cache = getattr(pytestconfig, "cache", None)
     parent = cache.mkdir("fuzz") if cache else tmp_path_factory.mktemp("fuzz")

@@ -118,7 +118,7 @@ def run(env: lw.Env, steps: int) -> list[torch.Tensor]:
 
 
 def test_deleted_torch_graph_does_not_break_a_capture() -> None:
-    """Any garbage collection may delete the graph, which CUDA forbids during a capture."""
+    """Garbage collection may delete the torch graph at any time, and CUDA forbids this during a capture."""
     env = lw.make("hopper", nworld=8, device=CUDA)
     env.step()
     graph, x = torch.cuda.CUDAGraph(), torch.zeros(4, device=CUDA)
@@ -228,7 +228,7 @@ def test_restarting_worlds_get_the_fields_of_a_full_forward_pass(deterministic: 
 
 
 def test_fault_of_one_of_a_few_humanoids_does_not_change_the_others() -> None:
-    """The contact pool has room for an out-of-range world even if there are only a few worlds."""
+    """The contact buffer has room for a world with excessive contacts even if there are only a few worlds."""
     from lyceum_warp.testing import CHECKS
 
     checks = [check for check in CHECKS if check.__name__ in ("check_bad_state", "check_bad_action")]

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.gpu
 
 DRAWN = "body_mass body_inertia geom_friction geom_quat dof_damping dof_armature actuator_gear gravity".split()
 N = 200
-CHOSEN = [0, 3, *range(50, 150)]  # there are more worlds than in one refresh group
+CHOSEN = [0, 3, *range(50, 150)]  # the number of worlds exceeds the size of a refresh group
 
 
 def draws(model: mujoco.MjModel, turn: int) -> dict[str, np.ndarray]:

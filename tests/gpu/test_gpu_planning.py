@@ -92,7 +92,7 @@ def test_actions_are_on_the_device_of_the_states(of_plants: str, of_plan: str) -
 
 
 @pytest.mark.parametrize("update", UPDATES)
-def test_every_update_gives_equal_results_on_gpu_and_cpu_for_equal_returns(update: str) -> None:
+def test_plan_updates_with_equal_returns_are_equal_on_gpu_and_cpu(update: str) -> None:
     """The returns of the first iteration differ by rounding, which may swap samples that are almost equal."""
     gpu, cpu = (
         lw.MPPI("reach", device=device, engine=engine, samples=200, seed=3, **UPDATES[update])

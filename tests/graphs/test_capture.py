@@ -177,7 +177,7 @@ def test_phases_are_called_directly_if_graphs_are_disabled() -> None:
     assert calls == tuple(phase.run for phase in phases)
 
 
-def test_forget_captures_changed_launches_again() -> None:
+def test_changed_launches_are_captured_again_after_forget() -> None:
     digits, made = Digits(), graphs()
     digit = [1]
     calls = made.sequence([Phase("digit", lambda: wp.launch(append, 1, [digit[0], digits.number], device="cpu"))])
@@ -189,7 +189,7 @@ def test_forget_captures_changed_launches_again() -> None:
 
 
 def test_unused_objects_are_deleted_after_a_capture() -> None:
-    """A capture fails if a torch graph is deleted during it."""
+    """A capture fails if a torch graph is deleted at the same time."""
     digits, captures, deleted = Digits(), 0, []
 
     class Unused:
@@ -202,7 +202,7 @@ def test_unused_objects_are_deleted_after_a_capture() -> None:
     def run() -> None:
         nonlocal captures
         captures += 1
-        [[] for _ in range(10_000)]  # enough new objects to trigger a collection
+        [[] for _ in range(10_000)]  # create enough new objects to trigger a collection
         captures += 1
 
     calls = Graphs(wp.get_device("cpu"), enabled=True).sequence([digits.phase(1), Phase("run", run)])

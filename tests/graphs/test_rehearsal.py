@@ -46,7 +46,7 @@ def launch(mask: wp.array, row: wp.array, rows: wp.array) -> None:
 
 @pytest.fixture
 def arrays() -> tuple[wp.array, wp.array, wp.array]:
-    """Return a mask, a row of ones and three rows of zeros."""
+    """Return arrays for the test kernel: a mask, a row of ones and three rows of zeros."""
     mask = wp.full(3, True, dtype=bool, device="cpu")
     return mask, wp.full(2, 1, dtype=wp.float64, device="cpu"), wp.zeros((3, 2), dtype=wp.float64, device="cpu")
 

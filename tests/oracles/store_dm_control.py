@@ -72,7 +72,7 @@ def round_target(domain: str, physics: Any) -> None:
 
 
 def stored(domain: str, task: str) -> dict[str, Any]:
-    """Return the stored arrays of a task: (starts, segments, size), or (resets, size) for initial states."""
+    """Return the arrays of a task to store: (starts, segments, size), or (resets, size) for initial states."""
     env = suite.load(domain, task, task_kwargs={"random": 0})
     physics, spec = env.physics, env.action_spec()
     rng = np.random.default_rng(0)

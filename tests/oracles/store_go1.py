@@ -51,7 +51,8 @@ def model_arrays(model: mujoco.MjModel) -> dict[str, Any]:
     bodies = names(model, kind.mjOBJ_BODY, model.nbody)
     geoms = names(model, kind.mjOBJ_GEOM, model.ngeom)
     rows = {
-        "body": [i for i, name in enumerate(bodies) if name != "terrain"],  # an additional body, fixed to the world
+        # the model has an additional body, which is fixed to the world
+        "body": [i for i, name in enumerate(bodies) if name != "terrain"],
         "geom": [i for i, name in enumerate(geoms) if name],
         "actuator": actuators(model),
     }

@@ -44,7 +44,8 @@ def test_model_has_the_masses_joints_and_motor_of_dm_control(
 
 
 class Physics:
-    """The interface of dm_control's cartpole physics; its own class (1.0.50) does not support MuJoCo 4 models."""
+    """A class with the interface of dm_control's cartpole physics, because dm_control's own class (1.0.50) does not
+    support MuJoCo 4."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model, self.data = model, mujoco.MjData(model)

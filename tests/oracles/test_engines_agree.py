@@ -38,8 +38,8 @@ PARAMS: dict[str, dict[str, Any]] = {
     "go1_velocity": {"fall_angle": 0.5},
     "soft_ball": {"reach": 0.15},
 }
-"""By task: parameters with which random field values end some episodes. Some robots get higher solver limits, because
-the engines agree up to rounding only if the solver converges."""
+"""Parameters by task. With these parameters, random field values end some episodes. Some robots get higher solver
+limits, because the engines agree up to rounding only if the solver converges."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +119,7 @@ ONE_STEP |= {name: SUITE_ONE_STEP[module.removeprefix("dm_")] for name, module i
 
 @dataclasses.dataclass
 class Engines:
-    """One task on both engines, with one substep per step, and states that both can represent."""
+    """A task on both engines with one substep per step, and states that both engines can represent."""
 
     task: str
     c: lw.Env
@@ -221,7 +221,7 @@ def judge(env: lw.Env, before: Outcome, action: torch.Tensor, after: Outcome) ->
 
 
 def test_both_engines_have_the_same_spaces(engines: Engines) -> None:
-    """A state of one engine can be set on the other."""
+    """The state of one engine can be set on the other engine."""
     assert engines.c.state_space == engines.warp.state_space
     assert engines.c.obs_space == engines.warp.obs_space
     assert engines.c.timestep == engines.warp.timestep
@@ -301,8 +301,7 @@ def test_engines_differ_only_by_rounding_after_one_substep(engines: Engines) -> 
 def test_engines_agree_over_fifty_steps_with_inputs_and_randomized_models(
     task: type[lw.Task], params: dict[str, float], device: str
 ) -> None:
-    """The function ``control`` writes inputs, masses, frictions and gravity are random, and the fifty steps take 150
-    substeps."""
+    """Masses, frictions and gravity are random, ``control`` writes inputs, and the fifty steps take 150 substeps."""
     c = lw.make(task, nworld=8, seed=1, **params)
     warp = lw.make(task, nworld=8, seed=1, engine="warp", device=device, **params)
     start, rng, worst, far = positions_of(c), np.random.default_rng(0), 0.0, 0.0

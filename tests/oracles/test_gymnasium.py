@@ -1,8 +1,8 @@
 """Compare tasks with their Gymnasium environments on the C engine.
 
-Both environments run the same C code in float64. From equal states and warm starts, their observations and rewards
-differ only by rounding to float32. The tests read the tasks' attribute ``gymnasium`` and Gymnasium's registry and
-signatures, so they include new tasks automatically.
+Both environments run the same C code in float64. From equal states and warm starts, observations and rewards of both
+environments differ only by rounding to float32. The tests read the tasks' attribute ``gymnasium`` and Gymnasium's
+registry and signatures, so they include new tasks automatically.
 """
 
 import dataclasses
@@ -42,7 +42,7 @@ def has(task: str, function: str) -> bool:
     return function in find_task(task).scope
 
 
-# tasks with contact forces are compared with SensorStage below
+# tasks with contact forces are compared with SensorStage
 WITH_FORCES = [task for task in TASKS if "cfrc_ext" in fields(task)]
 
 
@@ -208,7 +208,7 @@ def test_every_gymnasium_id_of_a_task_is_registered() -> None:
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_thousand_steps_equal_those_of_gymnasium(task: str) -> None:
+def test_a_thousand_steps_equal_those_of_gymnasium(task: str) -> None:
     """Some random actions exceed the control range."""
     pair = Pair(make_ours(task), make_theirs(task))
     assert pair.ours.timestep == pytest.approx(pair.theirs.dt, rel=1e-12)
@@ -221,7 +221,7 @@ def test_thousand_steps_equal_those_of_gymnasium(task: str) -> None:
     obs_error, reward_error = max(step.obs_error for step in steps), max(step.reward_error for step in steps)
     ends = sum(step.gym_terminated for step in steps)
     # pytest -rP shows this line
-    print(f"{task}: obs error {obs_error:.1e}, reward within {reward_error:.1e}, {ends} ends")
+    print(f"{task}: error of observations {obs_error:.1e} and rewards {reward_error:.1e}, {ends} terminations")
     check(steps)
     assert ends >= 10 if has(task, "terminated") else ends == 0
     for step in steps:
@@ -287,7 +287,7 @@ def test_pushed_cylinder_moves_as_in_gymnasium() -> None:
         start = pair.theirs.data.qpos[7:9].copy()
         check([pair.step() for _ in range(10)])
         moved.append(np.linalg.norm(pair.theirs.data.qpos[7:9] - start))
-    assert min(moved) > 5e-4  # in m; an untouched cylinder does not move
+    assert min(moved) > 5e-4  # distance in m; an untouched cylinder does not move
 
 
 @pytest.mark.quick("ant")
@@ -305,7 +305,7 @@ def test_unchanged_gymnasium_class_differs_only_in_contact_forces(task: str) -> 
     for step in steps:
         assert relative_error(np.delete(step.obs, forces), np.delete(step.gym_obs, forces)) <= 1e-5
         assert step.reward_error <= 1e-4
-    # if the contact forces agree one day, remove the note in tasks/humanoid.py
+    # if this assertion fails because contact forces agree, remove the note in tasks/humanoid.py
     assert max(relative_error(step.obs[forces], step.gym_obs[forces]) for step in steps) > 1e-3
 
 

@@ -30,7 +30,7 @@ IDS = {
     for name in lw.task_names()
     if (task := find_task(name)).__module__.startswith("lyceum_warp.tasks.")
 }
-"""By task: the id of its Gymnasium environment."""
+"""Ids of Gymnasium environments by task."""
 
 ENTRIES = {
     name: str(spec.entry_point)
@@ -209,7 +209,7 @@ SPECIAL = {
     "adroit_pen": [pen(61.0, 0.1, 0.0), pen(10.9, 0.38, 0.0), pen(0.8, 0.1, 0.2), pen(-5.6, 2.0, -0.2)],
     "adroit_relocate": [ball(0.0, 0.035, 0.15), ball(0.8, 0.2, 0.15), ball(10.9, 0.2, 0.08), ball(30.9, 0.2, 0.01)],
 }
-"""By task: states with reward bonuses or success."""
+"""States with reward bonuses or success, by task."""
 
 
 @pytest.fixture(params=TASKS)
@@ -222,8 +222,8 @@ MakePair = Callable[..., Pair]
 
 @pytest.fixture
 def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
-    """Return ``make_pair(theirs, sparse=True)``, which pairs an environment of this package with Gymnasium-Robotics'
-    (by default the oracle)."""
+    """Return ``make_pair(theirs, sparse=True)``, which pairs an environment of this package with one of
+    Gymnasium-Robotics."""
 
     def make(theirs: Any = None, **params: Any) -> Pair:
         ours = shared_env(task, autoreset=False, horizon=0, nthread=1, **params)
@@ -305,7 +305,7 @@ KINDS = {
     "site": mujoco.mjtObj.mjOBJ_SITE, "tendon": mujoco.mjtObj.mjOBJ_TENDON,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR, "sensor": mujoco.mjtObj.mjOBJ_SENSOR, "dof": None, "wrap": None,
 }  # fmt: skip
-"""Kinds of elements, with the types for looking up their names."""
+"""Kinds of elements, with the MuJoCo types for looking up their names."""
 
 
 def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, str]]:

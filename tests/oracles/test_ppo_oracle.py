@@ -44,7 +44,7 @@ def samples(ppo: lw.PPO) -> dict[str, torch.Tensor]:
 
 
 def theirs(ppo: lw.PPO, given: dict[str, torch.Tensor]) -> Any:
-    """Return rsl_rl's PPO with the same weights, and a storage with the samples."""
+    """Return rsl_rl's PPO with the same weights, and an rsl_rl storage with the samples."""
     env = ppo.env
     other = OnPolicyRunner(RslRlVecEnv(env), runner_config(env, ppo.config), None, "cpu").alg
     for network in (other.actor, other.critic):

@@ -90,7 +90,7 @@ def test_flipped_bit_of_a_tensor_raises_an_error(run: Run) -> None:
 
 @pytest.mark.parametrize("every", [61, pytest.param(7, marks=pytest.mark.long)])
 def test_checkpoint_with_a_flipped_bit_has_the_same_content_or_raises_an_error(run: Run, every: int) -> None:
-    """The tested bits include one that marks a zip entry as a folder, so that torch reads no numbers."""
+    """One of the tested bits marks a zip entry as a folder, so that torch reads no numbers."""
     data = run.checkpoint.read_bytes()
     saved = read_checkpoint(run.checkpoint)
     weights = saved["policy"].pop("state")
@@ -120,7 +120,7 @@ def test_a_policy_of_any_class_is_saved_without_a_value_function(tmp_path: Path)
 
 
 def test_network_of_the_package_is_recreated_from_its_class_and_shape(tmp_path: Path) -> None:
-    """The value function in place of a policy represents policies of later releases."""
+    """A value function that is stored as a policy represents an unknown policy class of a later release."""
     run = Run.create(tmp_path / "run", {})
     run.save(policy_content(1, ValueFunction(3, (4,))), {})
     loaded = load(run)

@@ -41,7 +41,7 @@ def test_learner_is_recreated_from_its_configuration(kind: str) -> None:
 @pytest.mark.parametrize(
     ("saved", "options"),
     [
-        (None, PhysicsOptions()),  # a run from before this option existed
+        (None, PhysicsOptions()),  # the run was made before this option existed
         ({"integrator": None, "solver": {}, "deterministic": False, "unroll": False}, PhysicsOptions()),
         (
             {"integrator": "euler", "solver": {"iterations": 7}, "deterministic": True, "unroll": False},
@@ -68,7 +68,7 @@ def test_options_in_the_parameters_of_earlier_releases_are_read_as_options() -> 
     }  # fmt: skip
 
 
-def test_configuration_of_a_user_learner_has_no_hyperparameters() -> None:
+def test_configuration_of_a_user_defined_learner_has_no_hyperparameters() -> None:
     found = read(BASE | {"algorithm": "mine"})
     assert found.hyperparameters is None and found.options.nworld == 3
 

@@ -1,4 +1,4 @@
-"""Load, evaluate and resume runs of earlier releases."""
+"""Test that runs of earlier releases are loaded, evaluated and resumed."""
 
 import shutil
 from pathlib import Path
@@ -33,7 +33,7 @@ def test_old_run_is_evaluated_with_its_own_physics(old_run: Path, capsys: pytest
     assert "hopper: 2 episodes of the mean policy" in capsys.readouterr().out
 
 
-def test_an_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["train", "--resume", str(old_run), "--iterations", "3", *QUIET]
     assert main(arguments) == 0
     assert [row["iteration"] for row in Run.open(old_run).rows()] == [1, 2, 3]
@@ -61,8 +61,8 @@ def test_value_function_of_an_old_run_has_the_scale_of_its_release(gamma: float,
 
 @pytest.fixture(params=["command", "python", "task_file"])
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A run of two iterations by release 0.1. It was started from the command line, from Python with a user's model, or
-    with a task file whose model, mesh and table exist only in the run's copy."""
+    """A run of two iterations by release 0.1. The run was started from the command line, from Python with a user's
+    model, or with a task file whose model, mesh and table exist only in the run's copy."""
     return Path(shutil.copytree(DATA / "runs_0_1" / request.param, tmp_path / "run"))
 
 

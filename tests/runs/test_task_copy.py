@@ -294,7 +294,7 @@ def test_run_of_a_task_without_a_file_is_evaluated_with_a_given_task(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=SMALL), tmp_path / "run", iterations=1)
-    Run.open(tmp_path / "run").amend(task=None)  # for a class in a notebook, the configuration has no task
+    Run.open(tmp_path / "run").amend(task=None)  # the configuration has no task if the task is a class in a notebook
     assert cli.main(["eval", str(tmp_path / "run")]) == 2
     refused(
         capsys,

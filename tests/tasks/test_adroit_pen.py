@@ -72,7 +72,7 @@ def test_task_succeeds_after_more_than_20_steps_at_the_goal() -> None:
 
 def test_a_smaller_target_range_gives_smaller_angles() -> None:
     env = lw.make("adroit_pen", engine="mujoco", nworld=200, target_range=np.linspace(0.01, 0.4, 200), seed=2)
-    upright = env.obs[:, 38].numpy()  # the cosine of the tilt is the product of both cosines
+    upright = env.obs[:, 38].numpy()  # the cosine of the tilt is the product of the cosines of both angles
     assert (upright >= np.cos(np.linspace(0.01, 0.4, 200)) ** 2 - 1e-6).all()
     assert 0.7 < upright.min() < 0.95
 

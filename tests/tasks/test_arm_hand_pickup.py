@@ -60,7 +60,7 @@ def test_arm_starts_above_the_ball_and_stands_still_with_zero_actions(shared_env
 
 
 def test_observation_and_reward_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
-    """The ball is in the hand, at its edge, or far away."""
+    """In the compared states, the ball is in the hand, at the hand's edge, or far away."""
     env = shared_env("arm_hand_pickup", nworld=64, autoreset=False)
     rng = np.random.default_rng(0)
     state = env.get_state()
