@@ -46,7 +46,7 @@ def python_of(page: Path) -> str:
 
 
 PROGRAMS = [page for page in PAGES if page not in WALKTHROUGHS and python_of(page).strip()]
-"""Pages with Python and without commands."""
+"""Pages that contain Python but no commands."""
 
 
 def quickly(pages: list[Path], *long: str) -> list[object]:

@@ -42,7 +42,7 @@ def test_pickling_or_copying_an_environment_raises_an_error(spoil: Any) -> None:
 
 
 def _use(env: lw.Env, plan: lw.MPPI, loop: lw.OpenLoop, state: torch.Tensor, connection: Connection) -> None:
-    """Send the error messages of all calls that raise RuntimeError."""
+    """Send the parent process the error messages of all calls that raise RuntimeError."""
     messages = []
     for call in (env.step, env.reset, env.get_state, lambda: env.engine.step(1), loop.run, lambda: plan(state)):
         try:

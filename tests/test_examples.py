@@ -87,7 +87,7 @@ def test_plan_reaches_the_target_in_each_episode(run) -> None:
 
 @pytest.mark.long
 def test_own_task_follows_the_rules_and_runs() -> None:
-    # in a subprocess, because the task is registered and its module is __main__
+    # this runs in a subprocess, because the task is registered and its module is __main__
     command = [sys.executable, str(EXAMPLES / "own_task.py")]
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)

@@ -61,7 +61,7 @@ ALLOWED = (
     r"catch_warnings\(record=True\)",  # Python's
     r'"record": list\(self\.rows\)',  # an argument of MuJoCo's Batch.rollout
     r'self\.control, record=\["qpos", "qvel"\]',
-    r"\bRecorder\b",  # of a video, viz/video.py
+    r"\bRecorder\b",  # the class Recorder of viz/video.py
     r'"record": "graphs"',  # a hint for users of earlier releases, and its tests
     r'\("record", "did you mean graphs\?"\)',
     r'\(\{"record": False\}, "no parameter \'record\': did you mean graphs"\)',

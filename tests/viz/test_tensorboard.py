@@ -1,4 +1,4 @@
-"""Write curves for TensorBoard, and read them with TensorBoard's own reader."""
+"""Test the curves for TensorBoard by reading them with TensorBoard's own reader."""
 
 import dataclasses
 import inspect

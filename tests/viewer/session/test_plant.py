@@ -109,7 +109,7 @@ def test_a_slow_plan_does_not_delay_commands(shared_env: SharedEnv) -> None:
     while slow.inside:
         time.sleep(0.01)
     time.sleep(0.1)
-    assert len(slow.log) == calls  # calls of earlier runs fail
+    assert len(slow.log) == calls  # a session that has ended makes no further calls
     assert "reset within a call" not in slow.log
 
 

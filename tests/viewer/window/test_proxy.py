@@ -267,7 +267,7 @@ def test_link_with_the_token_on_another_page_opens_the_viewer(proxy: Proxy, upst
     "host", ["127.0.0.1", "127.0.0.1:9000", "localhost:9000", "Localhost:80", "[::1]:9000", "192.168.0.7:8080"]
 )
 def test_addresses_of_this_machine_are_accepted_at_any_port(proxy: Proxy, host: str) -> None:
-    """The port may differ because it may be forwarded."""
+    """The port in a request may differ, because ports may be forwarded."""
     assert status(get(proxy, "/PATH/", f"Origin: http://{host.lower()}", host=host)) == 200
 
 
