@@ -1,7 +1,7 @@
 """Define a cheetah that runs at a commanded speed, with most features of the task form.
 
-Run ``python examples/commanded_speed.py`` to check and step the task, or ``lyceum-warp train
-examples/commanded_speed.py`` to train a policy.
+``python examples/commanded_speed.py`` checks the task; ``lyceum-warp train examples/commanded_speed.py`` trains a
+policy.
 """
 
 from typing import Any

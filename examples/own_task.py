@@ -1,7 +1,6 @@
 """Define a task and its model in one file: a pendulum that must swing up with a weak motor.
 
-Run ``python examples/own_task.py`` to check and step the task; docs/own_task.md shows the command line and models in
-files.
+``python examples/own_task.py`` checks and steps the task; docs/own_task.md shows the command line and model files.
 """
 
 import mujoco
@@ -48,8 +47,7 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
 
 @lw.register
 class Pendulum(lw.Task):
-    # model may also be the name of a file in the same folder, such as "pendulum.xml"
-    model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))
+    model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))  # or the name of a file in the same folder
     frame_skip, horizon, obs = 20, 250, {"direction": 2, "velocity": 1}  # 20 substeps of 2 ms in a step
 
 
