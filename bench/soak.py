@@ -54,7 +54,7 @@ KINDS = {"state": Done.NAN, "speed": Done.NAN, "action": Done.ACTION, "reward": 
 """Kinds of faults by where they are injected, numbered from 1, with the reasons that must be reported."""
 NBIT = len(Done)
 EVERY = 16
-"""Number of steps between writes of invalid states; each write affects this many times more worlds."""
+"""Number of steps between writes of invalid states; each write affects more worlds by the same factor."""
 SAMPLES = 5
 """Memory samples per chunk."""
 TASKS = {

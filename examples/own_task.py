@@ -47,7 +47,7 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
 
 @lw.register
 class Pendulum(lw.Task):
-    model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))  # or the name of a file in the same folder
+    model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))  # the model may also be a file name
     frame_skip, horizon, obs = 20, 250, {"direction": 2, "velocity": 1}  # 20 substeps of 2 ms in a step
 
 

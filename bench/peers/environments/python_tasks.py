@@ -1,8 +1,8 @@
 """Define tasks for Gymnasium and dm_control with the formulas and models of lyceum_warp's tasks.
 
-Gymnasium contains all these tasks except cartpole and herb_reach, and dm_control contains cartpole and its suite. This
-file defines the missing tasks in NumPy, as a user of these libraries would. This file runs in the other libraries'
-virtual environments, and does not import lyceum_warp.
+Gymnasium contains all tasks of the comparison except cartpole and herb_reach, and dm_control contains cartpole and its
+own suite. This file defines the missing tasks in NumPy, as a user of these libraries would. This file runs in the other
+libraries' virtual environments, and does not import lyceum_warp.
 """
 
 from pathlib import Path
