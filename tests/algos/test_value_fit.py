@@ -49,7 +49,7 @@ def test_user_value_network_is_fitted_by_autograd() -> None:
 
 
 @pytest.mark.gpu
-def test_gpu_a_captured_fit_learns_the_same_as_plain_launches() -> None:
+def test_gpu_captured_value_fit_equals_plain_launches() -> None:
     """The first fit captures a graph between two mini-batches; the second fit only replays it, on different samples."""
     samples, batch = 1000, 96  # the last mini-batch is smaller than the others
     generator = torch.Generator("cuda").manual_seed(2)

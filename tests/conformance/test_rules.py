@@ -240,7 +240,7 @@ def test_all_violated_rules_are_reported_together(monkeypatch: pytest.MonkeyPatc
     assert [line.split("'")[1] for line in str(caught.value).splitlines()[::2]] == ["reset", "masked_reset"]
 
 
-def test_single_world_and_zero_steps_raise_errors() -> None:
+def test_check_task_with_one_world_or_zero_steps_raises_an_error() -> None:
     with pytest.raises(ValueError, match="compare worlds with one another: nworld must be at least 2, not 1"):
         check_task("hopper", nworld=1)
     with pytest.raises(ValueError, match="steps must be a whole number from 1 to .*, not -5"):
