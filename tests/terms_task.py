@@ -34,7 +34,7 @@ def distance(place: float, target: float) -> float:
 
 
 @wp.func
-def fast(qvel: Row[float], scale: float = 2.0) -> float:  # arguments: a field of World, and a default
+def fast(qvel: Row[float], scale: float = 2.0) -> float:  # takes a field of World, and an argument with a default
     return scale * wp.abs(qvel[0])
 
 

@@ -99,7 +99,7 @@ def doubled(v: wp.vec3) -> wp.vec3:
 @wp.func
 def right(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):
     total = 0.0
-    for i in range(3):  # Warp unrolls the loop, because it changes a constant
+    for i in range(3):  # Warp unrolls this loop, because the loop changes a constant
         total += s.qpos[i] * p.gains[i]
     obs[0] = total
     obs[1] = s.qpos[-1] + s.site_xpos[1][2] + s.site_xpos[-1].x + s.xmat[0][1, 2] + s.xmat[0][-1][0]

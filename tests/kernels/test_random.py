@@ -27,7 +27,7 @@ def draw(
 
 @wp.kernel(enable_backward=False)
 def draw_vectors(rng_inout: wp.array2d[wp.uint32], one_out: wp.array2d[float], many_out: wp.array2d[float]):
-    """Draw five numbers one by one, and the same five as two vectors from a copy of the stream."""
+    """Draw five numbers one by one, and the same numbers as two vectors from a copy of the stream."""
     i = wp.tid()
     for k in range(5):
         one_out[i, k] = uniform(rng_inout[2 * i], float(-k), float(k + 1))
