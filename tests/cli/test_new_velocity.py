@@ -145,7 +145,8 @@ def test_feet_without_the_template_are_refused(folder: Path, capsys: pytest.Capt
     assert "--feet and --joints belong to --template velocity" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("task", ["spot_velocity", pytest.param("g1_velocity", marks=pytest.mark.long)])
+@pytest.mark.quick("spot_velocity")
+@pytest.mark.parametrize("task", ["spot_velocity", "g1_velocity"])
 def test_robots_of_menagerie_become_tasks(task: str, folder: Path) -> None:
     model = {"g1_velocity": "unitree_g1/scene_mjx.xml", "spot_velocity": "boston_dynamics_spot/scene.xml"}[task]
     assert new("walk", "--model", f"menagerie:{model}") == 0

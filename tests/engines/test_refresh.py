@@ -153,10 +153,7 @@ class WholeWarpEngine(WarpEngine):
     partial_refresh = False
 
 
-@pytest.fixture(
-    params=[MujocoEngine, WarpEngine, pytest.param(WholeWarpEngine, marks=pytest.mark.long)],
-    ids=["mujoco", "warp", "whole_warp"],
-)
+@pytest.fixture(params=[MujocoEngine, WarpEngine, WholeWarpEngine], ids=["mujoco", "warp", "whole_warp"])
 def kind(request: pytest.FixtureRequest) -> type[Engine]:
     engine: type[Engine] = request.param
     return engine
@@ -212,6 +209,7 @@ def test_a_refresh_on_warp_runs_no_collisions_and_no_constraints(sensors: str, m
         begin(engine, only(engine, 1), 1)
 
 
+@pytest.mark.quick("mujoco", "warp")
 @pytest.mark.parametrize("sensors", ["mixed", "histories"])
 def test_sensors_of_the_acceleration_stage_keep_their_values_from_the_last_substep(
     kind: type[Engine], sensors: str
@@ -240,6 +238,7 @@ def test_sensors_of_the_acceleration_stage_keep_their_values_from_the_last_subst
     np.testing.assert_array_equal(shown(engine)["sensordata"][1], left[1])
 
 
+@pytest.mark.quick("mujoco", "warp")
 def test_no_refresh_adds_to_a_sensors_history(kind: type[Engine]) -> None:
     engine = make(kind, "histories")
     parts = mujoco.mj_stateSize(engine.model, mujoco.mjtState.mjSTATE_HISTORY.value)
@@ -263,6 +262,7 @@ def test_no_refresh_adds_to_a_sensors_history(kind: type[Engine]) -> None:
     np.testing.assert_array_equal(state_of(engine), state_of(fresh))
 
 
+@pytest.mark.quick("mujoco", "warp")
 def test_a_refresh_uses_the_equality_constraints_of_each_world(kind: type[Engine]) -> None:
     engine = make(kind, "mixed", '<joint joint1="knee" polycoef="-.3 0 0 0 0"/>')
     held = shown(engine)["sensordata"]
@@ -274,6 +274,7 @@ def test_a_refresh_uses_the_equality_constraints_of_each_world(kind: type[Engine
     assert (shown(engine)["sensordata"] != held).any(axis=1).tolist() == [False, True, False, False]
 
 
+@pytest.mark.quick("mujoco", "warp")
 def test_a_limit_sensor_is_zero_after_the_limit_is_left(kind: type[Engine]) -> None:
     engine = make(kind, "limits")
     knee = int(engine.model.joint("knee").qposadr[0])

@@ -25,8 +25,7 @@ DATA = Path(__file__).parent.parent / "data" / "dm_control"
 LAST_SUBSTEP = ("touch", "imu", "force_torque")
 """Parts of observations that the last substep computed, and that therefore are not functions of the state."""
 RESETS = 512
-QUICK = ("dm/cartpole_swingup", "dm/finger_turn_hard", "dm/manipulator_bring_ball", "dm/walker_walk")
-EVERY = [pytest.param(task, marks=() if task in QUICK else pytest.mark.long) for task in TASKS]
+quick = pytest.mark.quick("dm/cartpole_swingup", "dm/finger_turn_hard", "dm/manipulator_bring_ball", "dm/walker_walk")
 
 
 @functools.cache
@@ -103,7 +102,8 @@ def dm_controls_model(task: str) -> mujoco.MjModel:
         return mujoco.MjModel.from_xml_string(xml if isinstance(xml, str) else xml.decode(), assets)
 
 
-@pytest.mark.parametrize("task", EVERY)
+@quick
+@pytest.mark.parametrize("task", TASKS)
 def test_the_model_is_the_one_that_dm_controls_python_makes(shared_env: SharedEnv, task: str) -> None:
     ours, theirs = shared_env(task, nworld=len(rows(task, "qpos")), autoreset=False).model, dm_controls_model(task)
     for field in FIELDS:
@@ -130,7 +130,8 @@ def test_the_model_is_the_one_that_dm_controls_python_makes(shared_env: SharedEn
     assert without_sensors == theirs.opt.disableflags
 
 
-@pytest.mark.parametrize("task", EVERY)
+@quick
+@pytest.mark.parametrize("task", TASKS)
 def test_a_task_has_dm_controls_sizes_and_times(shared_env: SharedEnv, task: str) -> None:
     env, theirs = shared_env(task, nworld=len(rows(task, "qpos")), autoreset=False), stored(task)
     sizes = {name: part.stop - part.start for name, part in env.obs_space.parts.items()}
@@ -143,7 +144,8 @@ def test_a_task_has_dm_controls_sizes_and_times(shared_env: SharedEnv, task: str
     assert (theirs["step_type"] == [0, *(env.task.task.horizon - 1) * [1], 2]).all() and (theirs["discount"] == 1).all()
 
 
-@pytest.mark.parametrize("task", EVERY)
+@quick
+@pytest.mark.parametrize("task", TASKS)
 def test_observations_and_rewards_are_dm_controls_on_its_states(shared_env: SharedEnv, task: str) -> None:
     env = segments(shared_env, task)
     state, columns = env.get_state(), current_columns(task)
@@ -154,7 +156,8 @@ def test_observations_and_rewards_are_dm_controls_on_its_states(shared_env: Shar
     np.testing.assert_allclose(rewards, rows(task, "reward"), rtol=1e-5, atol=2e-6)
 
 
-@pytest.mark.parametrize("task", EVERY)
+@quick
+@pytest.mark.parametrize("task", TASKS)
 def test_a_step_from_dm_controls_state_gives_its_next_state_observation_and_reward(
     shared_env: SharedEnv, task: str
 ) -> None:
@@ -186,7 +189,8 @@ def test_forty_steps_from_each_of_dm_controls_states_end_as_its_own(shared_env: 
     check_positions(env, rows(task, "end_qpos"), "qpos")
 
 
-@pytest.mark.parametrize("task", EVERY)
+@quick
+@pytest.mark.parametrize("task", TASKS)
 def test_episodes_start_as_dm_controls(shared_env: SharedEnv, task: str) -> None:
     """Each number of the initial state has the same distribution, by the two-sample test of Kolmogorov and Smirnov."""
     theirs = stored(task)

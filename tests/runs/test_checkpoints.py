@@ -88,7 +88,8 @@ def test_every_flipped_bit_of_a_tensor_is_refused(run: Run) -> None:
         assert read_or_refused(run.checkpoint, data, first + random.randrange(8 * len(weights))) is None
 
 
-@pytest.mark.parametrize("every", [61, pytest.param(7, marks=pytest.mark.long)])
+@pytest.mark.quick("61")
+@pytest.mark.parametrize("every", [61, 7])
 def test_a_file_with_a_flipped_bit_has_the_same_content_or_is_refused(run: Run, every: int) -> None:
     """One of every seven bits marks a zip entry as a folder, so that torch reads no numbers."""
     data = run.checkpoint.read_bytes()

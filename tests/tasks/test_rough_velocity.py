@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from conftest import SharedEnv, long_if_alike
+from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp.tasks.velocity.rough import TERRAIN
@@ -112,7 +112,8 @@ def test_an_episode_ends_outside_the_field(task: str, env: lw.Env) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("task", long_if_alike(TASKS))
+@pytest.mark.quick("go1_rough_velocity")
+@pytest.mark.parametrize("task", TASKS)
 def test_a_robot_that_falls_on_rough_ground_is_not_thrown_away_by_mujoco_warp(task: str, shared_env: SharedEnv) -> None:
     """The G1's own soles are boxes, for which MuJoCo Warp finds contacts with normals that point down."""
     env = shared_env(task, engine="warp", nworld=24)
