@@ -19,13 +19,12 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.binding.registry import find_task
-from lyceum_warp.cli import display
 from lyceum_warp.cli.algorithms import Hyperparameters
 from lyceum_warp.cli.arguments import given
 from lyceum_warp.cli.train import EnvFlags, Train
 from lyceum_warp.runs.configuration import ALGORITHMS, Configuration
 from lyceum_warp.runs.folder import Run, load
-from lyceum_warp.viz import drawing
+from lyceum_warp.viz import drawing, policy_videos
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +82,7 @@ def test_a_video_that_fails_prints_one_line_and_the_run_succeeds(
     def fail(*args: object, **words: object) -> None:
         raise OSError(28, "No space left on\ndevice")
 
-    monkeypatch.setattr(display, "write_video", fail)
+    monkeypatch.setattr(policy_videos, "write_video", fail)
     monkeypatch.setattr(drawing, "libraries", lambda: ["nonsense"])
     out = tmp_path / "run"
     options = [*TINY, "--horizon", "6", "--no-plot", "--iterations", "1", "--video-every", "1"]
@@ -153,7 +152,7 @@ def physics(env: lw.Env) -> tuple[int, int, int, bool]:
 def test_a_run_keeps_its_physics(
     tmp_path: Path, made_envs: list[lw.Env], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(display, "write_video", lambda env, states, path, **options: path)
+    monkeypatch.setattr(policy_videos, "write_video", lambda env, states, path, **options: path)
     out = tmp_path / "run"
     options = ["--integrator", "euler", "--solver", "iterations=7", "--solver", "ls_iterations=9", "--deterministic"]
     assert train(out, "--iterations", "1", "--no-transfer", *options, task="hopper") == 0  # its own integrator is RK4
