@@ -4,7 +4,7 @@ import functools
 import gc
 import hashlib
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,30 +16,9 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.support.warp_log import start_warp
-from lyceum_warp.tasks.dm import TASKS as SUITE
 
 # one torch thread suffices for the tests' small batches; on a busy machine several threads would wait for each other
 torch.set_num_threads(1)
-
-SAME_FUNCTIONS = (
-    "g1_full_velocity", "g1_rough_velocity", "h1_velocity", "humanoid_walk", "spot_velocity", "t1_velocity",
-    *(name for name in SUITE if name not in ("dm/manipulator_bring_ball", "dm/cheetah_run")),
-)  # fmt: skip
-"""Tasks that share their functions with ``go1_velocity``, ``g1_velocity``, ``go1_rough_velocity`` or
-``humanoid_stand``, and tasks of dm_control's suite, which have simple functions."""
-SAME_MODELS = (
-    "dm/cheetah_run", "dm/manipulator_bring_ball",
-    "adroit_door", "adroit_hammer", "adroit_relocate", "aloha_lift", "arm_hand_pickup", "herb_reach", "humanoid_get_up",
-    "humanoid_standup", "inverted_double_pendulum", "pusher", "reacher", "swimmer", "walker2d",
-)  # fmt: skip
-"""Tasks whose models have no unique features, so that they need no quick tests on the Warp engine."""
-
-
-def long_if_alike(tasks: Iterable[str], *more: str) -> list[Any]:
-    """Return test parameters for all tasks; tasks in ``SAME_FUNCTIONS`` and in ``more`` are marked long."""
-    alike = (*SAME_FUNCTIONS, *more)
-    return [pytest.param(task, marks=pytest.mark.long) if task in alike else task for task in tasks]
-
 
 SharedEnv = Callable[..., lw.Env]
 TaskFile = Callable[[str, str], Path]
@@ -163,13 +142,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _mark_long(items: list[pytest.Item]) -> None:
-    """Mark the cases ``long`` that the mark ``quick`` of their test does not name."""
+    """Mark the cases ``long`` that their test's mark ``quick`` does not name, by their id or by a part of it."""
     cases: dict[tuple[str, ...], set[str]] = {}
     for item in items:
         if (mark := item.get_closest_marker("quick")) is not None:
             case = item.callspec.id  # type: ignore[attr-defined]
-            cases.setdefault((item.nodeid.partition("[")[0], *mark.args), set()).add(case)
-            if case not in mark.args:
+            named = {name for name in mark.args if f"-{name}-" in f"-{case}-"}
+            cases.setdefault((item.nodeid.partition("[")[0], *mark.args), set()).update(named or [case])
+            if not named:
                 item.add_marker(pytest.mark.long)
     for (test, *quick), found in cases.items():
         # a command line may select single cases

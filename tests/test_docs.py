@@ -49,12 +49,9 @@ PROGRAMS = [page for page in PAGES if page not in WALKTHROUGHS and python_of(pag
 """Pages that contain Python but no commands."""
 
 
-def quickly(pages: list[Path], *long: str) -> list[object]:
-    """Return test parameters; pages whose programs other tests cover are marked long."""
-    return [pytest.param(page, marks=pytest.mark.long if page.stem in long else (), id=name_of(page)) for page in pages]
-
-
-@pytest.mark.parametrize("page", quickly(PROGRAMS, "terrain"))
+# other tests cover the program of terrain.md
+@pytest.mark.quick(*(name_of(page) for page in PROGRAMS if page.stem != "terrain"))
+@pytest.mark.parametrize("page", PROGRAMS, ids=name_of)
 def test_python_blocks_of_a_page_run_in_order(page: Path, task_file: TaskFile) -> None:
     if page.stem == "dm_suite":
         pytest.importorskip("dm_control", reason="dm_control brings the models")
@@ -163,7 +160,8 @@ def empty_folder(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("page", quickly(WALKTHROUGHS, "policies", "physics", "sac", "deployment", "viewer"))
+@pytest.mark.quick("learners.md", "own_task.md", "ppo.md", "runs.md")
+@pytest.mark.parametrize("page", WALKTHROUGHS, ids=name_of)
 def test_commands_and_python_blocks_of_a_page_run_in_order(
     page: Path, empty_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

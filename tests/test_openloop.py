@@ -216,16 +216,11 @@ def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None
         assert len(env.final_obs.unique(dim=0)) == env.nworld, "all worlds are the same, so nothing was tested"
 
 
-def on_engines(task: str) -> list[object]:
-    """Return a task's cases on both engines; most of them are marked long."""
-    alike = task.startswith("dm/") or (task.endswith("_velocity") and task != "go1_velocity")
-    return [
-        pytest.param(task, "mujoco", marks=[pytest.mark.long] if alike else []),
-        pytest.param(task, "warp", marks=[pytest.mark.long] if task != "reach" else []),
-    ]
+DIFFERENT = [name for name in PACKAGE if not name.startswith("dm/") and not name.endswith("_velocity")]
 
 
-@pytest.mark.parametrize("task, engine", [case for task in PACKAGE for case in on_engines(task)])
+@pytest.mark.quick(*(f"{task}-mujoco" for task in (*DIFFERENT, "go1_velocity")), "reach-warp")
+@pytest.mark.parametrize("task, engine", [(task, engine) for task in PACKAGE for engine in ENGINES])
 def test_rollout_of_a_task_equals_steps(task: str, engine: str) -> None:
     steps = 3 if task == "humanoid" or task.startswith("adroit") else 5
     # on the CPU a substep of the Warp engine consists of hundreds of launches, so the test uses two substeps

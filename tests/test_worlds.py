@@ -13,7 +13,7 @@ from lyceum_warp import worlds
 from lyceum_warp.engines.c import mujoco_engine
 from lyceum_warp.graphs import capture
 from lyceum_warp.graphs.workers import Workers
-from lyceum_warp.kernels import steps
+from lyceum_warp.kernels.step_types import OUTCOMES
 from lyceum_warp.tasks.point_mass import PointMass
 
 ENGINES = ["mujoco", "warp"]
@@ -49,7 +49,7 @@ def outcomes_with_faults(
         env.step()
         groups = [*own.obs_groups.values(), *own.final_obs_groups.values()]
         metrics = [wp.to_torch(own.metrics), wp.to_torch(own.episode_metrics)]
-        outcome = [own.buffers[name] for name in steps.OUTCOMES]
+        outcome = [own.buffers[name] for name in OUTCOMES]
         kept += [array.clone() for array in (*groups, *metrics, *outcome, own.changed_view, env.get_state())]
     assert own.changed_view.any(), "no event changed a world"
     return kept, {kind: count for kind, count in env.fault_counts.items() if count}

@@ -107,16 +107,12 @@ PPO = ["--algorithm", "ppo", "--nworld", "12", "--num-steps", "20", "--minibatch
 """Settings with unfinished episodes, a normaliser, an adaptive learning rate, leftover samples and an evaluation."""
 
 
+@pytest.mark.quick("npg")
 @pytest.mark.parametrize(
     ("settings", "tolerance"),
-    [
-        pytest.param(OPTIONS, 2e-4, id="npg"),
-        # Adam turns rounding errors of small gradients into steps
-        pytest.param(PPO, 2e-3, id="ppo", marks=pytest.mark.long),
-        pytest.param(
-            [*PPO, "--whiten-minibatches", "--std-type", "log"], 2e-3, id="whitened ppo", marks=pytest.mark.long
-        ),
-    ],
+    # Adam turns rounding errors of small gradients into steps
+    [(OPTIONS, 2e-4), (PPO, 2e-3), ([*PPO, "--whiten-minibatches", "--std-type", "log"], 2e-3)],
+    ids=["npg", "ppo", "whitened ppo"],
 )
 def test_two_processes_make_the_same_update_as_one(settings: list[str], tolerance: float, tmp_path: Path) -> None:
     two, one = tmp_path / "two", tmp_path / "one"

@@ -60,10 +60,8 @@ def test_exported_policy_gives_the_same_actions(name: str, run: Run, tmp_path: P
     compare(policy, path, run)
 
 
-@pytest.mark.parametrize(
-    "activation",
-    [pytest.param(name, marks=pytest.mark.long if k else ()) for k, name in enumerate(get_args(Activation))],
-)
+@pytest.mark.quick("tanh")
+@pytest.mark.parametrize("activation", get_args(Activation))
 def test_every_activation_is_exported_without_warnings(
     activation: Activation, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

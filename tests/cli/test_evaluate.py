@@ -11,9 +11,9 @@ from training_runs import interrupted, refused, train
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.cli import display
 from lyceum_warp.controllers.saved_episodes import episode_env, load_episodes
 from lyceum_warp.runs.folder import load
+from lyceum_warp.viz import policy_videos
 from lyceum_warp.viz.cameras import find_camera
 
 
@@ -112,7 +112,7 @@ def test_video_is_made_with_the_named_camera(
         cameras.append(find_camera(env.model, options["camera"]))
         return path
 
-    monkeypatch.setattr(display, "write_video", write_video)
+    monkeypatch.setattr(policy_videos, "write_video", write_video)
     for words in (["0"], ["free"], ["azimuth=30", "track=agent"]):
         flags = [flag for word in words for flag in ("--camera", word)]
         assert cli.main(["eval", str(trained), "--episodes", "1", "--horizon", "9", "--video", *flags]) == 0

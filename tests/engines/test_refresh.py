@@ -152,10 +152,7 @@ class WholeWarpEngine(WarpEngine):
     partial_refresh = False
 
 
-@pytest.fixture(
-    params=[MujocoEngine, WarpEngine, pytest.param(WholeWarpEngine, marks=pytest.mark.long)],
-    ids=["mujoco", "warp", "whole_warp"],
-)
+@pytest.fixture(params=[MujocoEngine, WarpEngine, WholeWarpEngine], ids=["mujoco", "warp", "whole_warp"])
 def kind(request: pytest.FixtureRequest) -> type[Engine]:
     engine: type[Engine] = request.param
     return engine
@@ -213,6 +210,7 @@ def test_refresh_on_warp_computes_no_collisions_and_no_constraints(
         begin(engine, only(engine, 1), 1)
 
 
+@pytest.mark.quick("mujoco", "warp")
 @pytest.mark.parametrize("sensors", ["mixed", "histories"])
 def test_acceleration_sensors_keep_their_values_from_the_last_substep(kind: type[Engine], sensors: str) -> None:
     engine = make(kind, sensors)
@@ -239,6 +237,7 @@ def test_acceleration_sensors_keep_their_values_from_the_last_substep(kind: type
     np.testing.assert_array_equal(shown(engine)["sensordata"][1], left[1])
 
 
+@pytest.mark.quick("mujoco", "warp")
 def test_refresh_does_not_extend_the_history_of_a_sensor(kind: type[Engine]) -> None:
     engine = make(kind, "histories")
     parts = mujoco.mj_stateSize(engine.model, mujoco.mjtState.mjSTATE_HISTORY.value)
@@ -262,6 +261,7 @@ def test_refresh_does_not_extend_the_history_of_a_sensor(kind: type[Engine]) -> 
     np.testing.assert_array_equal(state_of(engine), state_of(fresh))
 
 
+@pytest.mark.quick("mujoco", "warp")
 def test_a_refresh_uses_the_equality_constraints_of_each_world(kind: type[Engine]) -> None:
     engine = make(kind, "mixed", '<joint joint1="knee" polycoef="-.3 0 0 0 0"/>')
     held = shown(engine)["sensordata"]
@@ -273,6 +273,7 @@ def test_a_refresh_uses_the_equality_constraints_of_each_world(kind: type[Engine
     assert (shown(engine)["sensordata"] != held).any(axis=1).tolist() == [False, True, False, False]
 
 
+@pytest.mark.quick("mujoco", "warp")
 def test_limit_sensor_is_zero_after_the_joint_leaves_its_limit(kind: type[Engine]) -> None:
     engine = make(kind, "limits")
     knee = int(engine.model.joint("knee").qposadr[0])

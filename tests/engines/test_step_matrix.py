@@ -3,7 +3,6 @@
 import copy
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -180,16 +179,11 @@ def touching(model: mujoco.MjModel) -> np.ndarray:
     return np.tile(state, (N, 1))
 
 
-def drawn_fields() -> list[Any]:
-    """Return all model fields; fields without derived constants are marked long."""
-    return [name if constants else pytest.param(name, marks=pytest.mark.long) for name, constants in _FIELDS.items()]
-
-
 @pytest.mark.quick(
-    "cpu-body_mass", "cpu-body_inertia", "cpu-body_ipos", "cpu-qpos0", "cpu-dof_armature", "cpu-actuator_gear",
-    "cpu-geom_size", "cpu-geom_gap", "cpu-cam_pos", "cpu-tendon_armature",
+    "body_mass", "body_inertia", "body_ipos", "qpos0", "dof_armature", "actuator_gear", "geom_size", "geom_gap",
+    "cam_pos", "tendon_armature",
 )  # fmt: skip
-@pytest.mark.parametrize("name", drawn_fields())
+@pytest.mark.parametrize("name", _FIELDS)
 def test_randomized_field_has_the_same_effect_as_an_edited_model(name: str, device: wp.Device) -> None:
     """Some model fields are zero by default. Results are bitwise equal if no constants are derived from the field."""
     case = DRAWN | OF_ANOTHER_MODEL.get(name, {})

@@ -37,11 +37,9 @@ MINIMAL: dict[str, Mapping[str, Any]] = {
 }  # fmt: skip
 
 
-def each(names: Mapping[str, Mapping[str, Any]]) -> list[Any]:
-    """Return test parameters for all names of all attack programs; command lines are marked long because they are
-    slow."""
-    slow = {"command_attacks.py": pytest.mark.long}
-    return [pytest.param(program, name, marks=slow.get(program, ())) for program in names for name in names[program]]
+def each(names: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """Return every program with each of its names."""
+    return [(program, name) for program in names for name in names[program]]
 
 
 def cases(counts: Mapping[str, int], first: int) -> list[str]:
@@ -68,7 +66,9 @@ def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFacto
     return run
 
 
-@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.long)], ids=["few", "many"])
+# command lines take longest
+@pytest.mark.quick(*(f"{program}-{kind}-few" for program, kind in each(FEW) if program != "command_attacks.py"))
+@pytest.mark.parametrize("many", [False, True], ids=["few", "many"])
 @pytest.mark.parametrize(("program", "kind"), each(FEW))
 def test_random_cases_work_or_raise_a_one_line_error(outcomes: Any, program: str, kind: str, many: bool) -> None:
     count = (MANY if many else FEW)[program][kind]
@@ -82,6 +82,7 @@ def test_random_cases_work_or_raise_a_one_line_error(outcomes: Any, program: str
     assert not bad, "\n".join([f"{len(bad)} of {count} cases", *bad])
 
 
+@pytest.mark.quick("file_attacks.py", "keyword_attacks.py")
 @pytest.mark.parametrize(("program", "name"), each(MINIMAL))
 def test_minimal_case_raises_a_documented_error(outcomes: Any, program: str, name: str) -> None:
     outcome = outcomes(program, False)[name]

@@ -24,8 +24,7 @@ DATA = Path(__file__).parent.parent / "data" / "dm_control"
 LAST_SUBSTEP = ("touch", "imu", "force_torque")
 """Parts of observations that the last substep computes, so that they are not functions of the state."""
 RESETS = 512
-QUICK = ("dm/cartpole_swingup", "dm/finger_turn_hard", "dm/manipulator_bring_ball", "dm/walker_walk")
-EVERY = [pytest.param(task, marks=() if task in QUICK else pytest.mark.long) for task in TASKS]
+quick = pytest.mark.quick("dm/cartpole_swingup", "dm/finger_turn_hard", "dm/manipulator_bring_ball", "dm/walker_walk")
 
 
 @functools.cache
@@ -102,7 +101,8 @@ def dm_controls_model(task: str) -> mujoco.MjModel:
         return mujoco.MjModel.from_xml_string(xml if isinstance(xml, str) else xml.decode(), assets)
 
 
-@pytest.mark.parametrize("task", EVERY)
+@quick
+@pytest.mark.parametrize("task", TASKS)
 def test_model_equals_the_model_that_dm_control_makes(shared_env: SharedEnv, task: str) -> None:
     ours, theirs = shared_env(task, nworld=len(rows(task, "qpos")), autoreset=False).model, dm_controls_model(task)
     for field in FIELDS:
@@ -130,7 +130,8 @@ def test_model_equals_the_model_that_dm_control_makes(shared_env: SharedEnv, tas
     assert without_sensors == theirs.opt.disableflags
 
 
-@pytest.mark.parametrize("task", EVERY)
+@quick
+@pytest.mark.parametrize("task", TASKS)
 def test_task_has_the_sizes_and_time_steps_of_dm_control(shared_env: SharedEnv, task: str) -> None:
     env, theirs = shared_env(task, nworld=len(rows(task, "qpos")), autoreset=False), stored(task)
     sizes = {name: part.stop - part.start for name, part in env.obs_space.parts.items()}
@@ -144,7 +145,8 @@ def test_task_has_the_sizes_and_time_steps_of_dm_control(shared_env: SharedEnv, 
     assert (theirs["step_type"] == [0, *(env.task.task.horizon - 1) * [1], 2]).all() and (theirs["discount"] == 1).all()
 
 
-@pytest.mark.parametrize("task", EVERY)
+@quick
+@pytest.mark.parametrize("task", TASKS)
 def test_observations_and_rewards_in_stored_states_equal_those_of_dm_control(shared_env: SharedEnv, task: str) -> None:
     env = segments(shared_env, task)
     state, columns = env.get_state(), current_columns(task)
@@ -155,7 +157,8 @@ def test_observations_and_rewards_in_stored_states_equal_those_of_dm_control(sha
     np.testing.assert_allclose(rewards, rows(task, "reward"), rtol=1e-5, atol=2e-6)
 
 
-@pytest.mark.parametrize("task", EVERY)
+@quick
+@pytest.mark.parametrize("task", TASKS)
 def test_step_from_a_stored_state_gives_the_next_state_observation_and_reward_of_dm_control(
     shared_env: SharedEnv, task: str
 ) -> None:
@@ -189,7 +192,8 @@ def test_forty_steps_from_each_stored_state_give_the_final_state_of_dm_control(
     check_positions(env, rows(task, "end_qpos"), "qpos")
 
 
-@pytest.mark.parametrize("task", EVERY)
+@quick
+@pytest.mark.parametrize("task", TASKS)
 def test_initial_states_have_the_distribution_of_dm_control(shared_env: SharedEnv, task: str) -> None:
     """The two-sample Kolmogorov-Smirnov test compares the distribution of each number of the initial state."""
     theirs = stored(task)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import SAME_MODELS, SharedEnv, long_if_alike
+from conftest import SharedEnv
 from form_tasks import Drawn, Pushed
 
 import lyceum_warp as lw
@@ -23,8 +23,11 @@ from lyceum_warp.tasks.velocity import TASKS as VELOCITY
 
 NWORLD = 32
 TASKS = package_task_names()
-LARGE = ("adroit_pen", "ant", "g1_velocity", "go1_rough_velocity", "humanoid", "humanoid_stand", "panda_lift")
-"""Tasks whose models take seconds to simulate on the Warp engine; make test-all runs them."""
+# small models that together have most features
+quick = pytest.mark.quick(
+    "cartpole", "cartpole_swingup", "go1_velocity", "half_cheetah", "hopper", "inverted_pendulum", "point_mass",
+    "reach", "soft_ball",
+)  # fmt: skip
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 FORCE_PARTS = ("contact_force", "touch", "imu", "force_torque")
@@ -161,7 +164,7 @@ def device(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-@pytest.fixture(scope="module", params=long_if_alike(TASKS, *SAME_MODELS, *LARGE))
+@pytest.fixture(scope="module", params=TASKS)
 def engines(request: pytest.FixtureRequest, device: str, shared_env: SharedEnv) -> Iterator[Engines]:
     task = request.param
     options = {"nworld": NWORLD, "cone": "elliptic", "frame_skip": 1, "autoreset": False, "horizon": 0}
@@ -220,6 +223,7 @@ def judge(env: lw.Env, before: Outcome, action: torch.Tensor, after: Outcome) ->
     return result
 
 
+@quick
 def test_both_engines_have_the_same_spaces(engines: Engines) -> None:
     """The state of one engine can be set on the other engine."""
     assert engines.c.state_space == engines.warp.state_space
@@ -227,6 +231,7 @@ def test_both_engines_have_the_same_spaces(engines: Engines) -> None:
     assert engines.c.timestep == engines.warp.timestep
 
 
+@quick
 def test_equal_field_values_give_equal_results_on_both_engines(engines: Engines) -> None:
     """The field values are random, and close to values in simulated states."""
     rng = torch.Generator().manual_seed(0)
@@ -252,6 +257,7 @@ def test_equal_field_values_give_equal_results_on_both_engines(engines: Engines)
     assert 0 < fallen < 4 * NWORLD or engines.c.task.functions["terminated"] is None
 
 
+@quick
 def test_equal_positions_and_velocities_give_equal_observations_on_both_engines(engines: Engines) -> None:
     """Each engine computes all other fields from positions and velocities."""
     parts = {name: part for name, part in engines.c.obs_space.parts.items() if name in FORCE_PARTS}
@@ -270,6 +276,7 @@ def test_equal_positions_and_velocities_give_equal_observations_on_both_engines(
     assert largest >= 1.0 or not parts, "no state has a contact, so nothing was compared"
 
 
+@quick
 def test_engines_differ_only_by_rounding_after_one_substep(engines: Engines) -> None:
     """Both engines get equal states and actions, and ONE_STEP contains the bounds."""
     assert engines.task in ONE_STEP, f"add bounds of {engines.task} to ONE_STEP; pytest -rP shows the differences"

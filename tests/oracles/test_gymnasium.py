@@ -358,13 +358,14 @@ def test_first_observation_equals_that_of_gymnasium_in_the_same_state(task: str)
 
 
 RESETS = [
-    pytest.param(task, times, marks=() if times == 1.0 else pytest.mark.long)
+    (task, times)
     for task in TASKS
     for times in (1.0, 3.0)
     if times == 1.0 or "reset_noise_scale" in inspect.signature(unchanged(task)).parameters
 ]
 
 
+@pytest.mark.quick("1.0")
 @pytest.mark.parametrize(("task", "times"), RESETS)
 def test_random_resets_have_the_distribution_of_gymnasium(task: str, times: float) -> None:
     """Both environments reset 2,000 times, with Gymnasium's noise scale and with three times this scale."""
@@ -440,21 +441,12 @@ def variants(default: Any) -> list[Any]:
     return [2.5 * default, 0.3 * default]
 
 
-def cases() -> list[Any]:
-    """Return (task, parameter, variant) for every parameter.
-
-    All variants after the first are marked long, as are those of the humanoids, whose parameters are similar to the
-    ant's.
-    """
-    found = []
-    for task in TASKS:
-        for name, default in keywords(task).items():
-            if name == "reset_noise_scale":
-                continue  # the tests of reset distributions cover this parameter
-            for i, variant in enumerate(variants(default)):
-                marks = pytest.mark.long if i or task.startswith("humanoid") else ()
-                found.append(pytest.param(task, name, variant, marks=marks))
-    return found
+PARAMETERS = [
+    (task, name, variants(default))
+    for task in TASKS
+    for name, default in keywords(task).items()
+    if name != "reset_noise_scale"  # the tests of distributions above cover this parameter
+]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -518,7 +510,11 @@ def test_every_gymnasium_parameter_exists_with_the_same_default(task: str) -> No
             assert isinstance(value, bool) == isinstance(default, bool), name
 
 
-@pytest.mark.parametrize(("task", "name", "variant"), cases())
+# the humanoids' parameters are similar to the ant's
+@pytest.mark.quick(*(f"{task}-{name}-{first}" for task, name, (first, *_) in PARAMETERS if "humanoid" not in task))
+@pytest.mark.parametrize(
+    ("task", "name", "variant"), [(task, name, value) for task, name, values in PARAMETERS for value in values]
+)
 def test_parameter_has_the_same_effect_as_in_gymnasium(task: str, name: str, variant: Any) -> None:
     """Compare the effect on results and on the size of the observation.
 

@@ -88,7 +88,8 @@ def test_flipped_bit_of_a_tensor_raises_an_error(run: Run) -> None:
         assert read_or_refused(run.checkpoint, data, first + random.randrange(8 * len(weights))) is None
 
 
-@pytest.mark.parametrize("every", [61, pytest.param(7, marks=pytest.mark.long)])
+@pytest.mark.quick("61")
+@pytest.mark.parametrize("every", [61, 7])
 def test_checkpoint_with_a_flipped_bit_has_the_same_content_or_raises_an_error(run: Run, every: int) -> None:
     """One of the tested bits marks a zip entry as a folder, so that torch reads no numbers."""
     data = run.checkpoint.read_bytes()

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import long_if_alike
 from training_runs import refused
 
 import lyceum_warp as lw
@@ -19,7 +18,8 @@ from lyceum_warp.runs.pretrained_runs import pretrained_run, pretrained_tasks, p
 TASKS = pretrained_tasks()
 
 
-@pytest.mark.parametrize("task", long_if_alike(TASKS))
+@pytest.mark.quick("cartpole_swingup", "g1_velocity", "go1_rough_velocity", "go1_velocity", "hopper")
+@pytest.mark.parametrize("task", TASKS)
 def test_pretrained_policy_matches_its_task_and_reaches_its_return(task: str) -> None:
     if task.startswith("dm/"):
         pytest.importorskip("dm_control", reason="dm_control brings the models")

@@ -45,14 +45,8 @@ def walking_policy(env: lw.Env) -> lw.GaussianPolicy:
     return policy.requires_grad_(False)
 
 
-@pytest.mark.parametrize(
-    ("task", "steps"),
-    [
-        ("go1_velocity", 25),
-        pytest.param("spot_velocity", 25, marks=pytest.mark.long),
-        pytest.param("g1_velocity", 10, marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.quick("go1_velocity")
+@pytest.mark.parametrize(("task", "steps"), [("go1_velocity", 25), ("spot_velocity", 25), ("g1_velocity", 10)])
 def test_control_loop_in_the_documentation_equals_the_environment(
     page: dict[str, Any], task: str, steps: int, tmp_path: Path
 ) -> None:

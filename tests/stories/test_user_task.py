@@ -209,7 +209,8 @@ def test_user_task_follows_the_rules(module: ModuleType, engine: str) -> None:
     check_task("follow_target", engine=engine, steps=100, frame_skip=2, gain=np.array([0.5, 1.0, 1.5, 2.0]))
 
 
-@pytest.mark.parametrize("engine", ["mujoco", pytest.param("warp", marks=pytest.mark.long)])
+@pytest.mark.quick("mujoco")
+@pytest.mark.parametrize("engine", ENGINES)
 def test_user_task_with_scaled_actions_and_rk4_follows_the_rules(module: ModuleType, path: Path, engine: str) -> None:
     spec = mujoco.MjSpec.from_string(module.XML)
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4

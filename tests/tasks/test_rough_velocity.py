@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from conftest import SharedEnv, long_if_alike
+from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp.tasks.velocity.rough import TERRAIN
@@ -113,7 +113,8 @@ def test_an_episode_ends_outside_the_field(task: str, env: lw.Env) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("task", long_if_alike(TASKS))
+@pytest.mark.quick("go1_rough_velocity")
+@pytest.mark.parametrize("task", TASKS)
 def test_falling_robot_on_rough_ground_has_bounded_velocities_under_mujoco_warp(
     task: str, shared_env: SharedEnv
 ) -> None:

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from conftest import SharedEnv, long_if_alike
+from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task, package_task_names
@@ -40,7 +40,8 @@ def feet(env: lw.Env, world: int) -> tuple[mujoco.MjData, list[bool]]:
     return data, [any(int(model.site_bodyid[foot]) in found for found in bodies) for foot in env.task.params["feet"]]
 
 
-@pytest.mark.parametrize("task", long_if_alike(ROBOTS))
+@pytest.mark.quick("g1_velocity")
+@pytest.mark.parametrize("task", ROBOTS)
 def test_heights_and_contacts_of_feet_equal_those_of_mujoco(task: str, env: lw.Env) -> None:
     n = len(env.task.params["feet"])
     touched = 0
@@ -56,7 +57,8 @@ def test_heights_and_contacts_of_feet_equal_those_of_mujoco(task: str, env: lw.E
     assert 0.1 < touched / (5 * NWORLD * n) < 0.99
 
 
-@pytest.mark.parametrize("task", long_if_alike(ROBOTS))
+@pytest.mark.quick("g1_velocity")
+@pytest.mark.parametrize("task", ROBOTS)
 def test_velocities_of_feet_equal_those_of_mujoco(task: str, env: lw.Env) -> None:
     """The metric foot_slip is the squared horizontal speed of feet in contact, times the weight and the step's
     duration."""
@@ -78,7 +80,8 @@ def test_velocities_of_feet_equal_those_of_mujoco(task: str, env: lw.Env) -> Non
     assert np.count_nonzero(found) > NWORLD / 4
 
 
-@pytest.mark.parametrize("task", long_if_alike(ROBOTS))
+@pytest.mark.quick("g1_velocity")
+@pytest.mark.parametrize("task", ROBOTS)
 def test_feet_of_a_standing_robot_carry_its_weight(task: str, env: lw.Env) -> None:
     """At rest the sum of the forces on a robot's feet is its weight, and joints without actions keep the home pose."""
     total = []
@@ -96,7 +99,8 @@ def test_feet_of_a_standing_robot_carry_its_weight(task: str, env: lw.Env) -> No
         assert np.abs(env.field("qpos").numpy()[:, at] - home).max() < 0.15
 
 
-@pytest.mark.parametrize("task", long_if_alike(ROBOTS))
+@pytest.mark.quick("g1_velocity")
+@pytest.mark.parametrize("task", ROBOTS)
 def test_resets_put_the_robot_above_the_ground(task: str, env: lw.Env) -> None:
     env.reset()
     critic = env.obs_spaces["critic"].split(env.obs_groups["critic"])

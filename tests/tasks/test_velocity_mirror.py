@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from conftest import SharedEnv, long_if_alike
+from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp import walkers
@@ -105,7 +105,8 @@ MEMORY = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("task", long_if_alike(ROBOTS, "g1_velocity"))
+@pytest.mark.quick("go1_velocity")
+@pytest.mark.parametrize("task", ROBOTS)
 def test_observations_of_mirrored_states_are_mirrored(task: str, shared_env: SharedEnv) -> None:
     bound(task)
     noises = ("linear_velocity", "angular_velocity", "gravity", "joint_position", "joint_velocity")

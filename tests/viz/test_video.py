@@ -17,9 +17,10 @@ import video_frames
 from varied_task import Varied, ball
 
 import lyceum_warp as lw
+from lyceum_warp.algos.evaluation import evaluation_worlds
+from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.viz import drawing, video
 from lyceum_warp.viz.cameras import FreeCamera
-from lyceum_warp.viz.policy_videos import policy_states
 from lyceum_warp.viz.render import Shot
 
 SMALL = (96, 64)
@@ -52,7 +53,9 @@ def still(obs: torch.Tensor) -> torch.Tensor:
 
 
 def episode(env: lw.Env, policy: Callable[[torch.Tensor], torch.Tensor], **words: Any) -> torch.Tensor:
-    return policy_states(env, policy, **words)[1]  # type: ignore[arg-type]
+    one = evaluation_worlds(env, 1, autoreset=False)
+    (found,) = policy_episodes(one, policy, 1, **words)
+    return found.states
 
 
 def test_episode_returns_all_states(env: lw.Env) -> None:
