@@ -38,9 +38,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PROBE = ROOT / "bench" / "probes" / "checkout.py"
 PACKAGE = "lyceum_warp"
 PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "numpy")
-"""Packages whose versions --out stores; both checkouts use the same ones."""
+"""Packages that both checkouts share; --out stores their versions."""
 LINES = 12
-"""Maximum number of differences printed per unit; the file of --out holds all of them."""
+"""Maximum number of differences that are printed per unit; --out writes all of them."""
 
 Part = Literal["env", "plans", "learners", "commands"]
 PARTS: tuple[Part, ...] = ("env", "plans", "learners", "commands")
@@ -48,12 +48,13 @@ ENGINES = ("mujoco", "warp")
 
 EVERY_VARIANT = ("MPPI", "CEM", "PredictiveSampling", "knots", "plants", "control")
 MANY_PLANNERS = ("point_mass", "reach", "hopper")
-"""Tasks on which all planners are compared; on other tasks only MPPI is."""
+"""Tasks on which all planners are compared; other tasks compare only MPPI."""
 LEARNING = {"mujoco": ("point_mass", "hopper", "go1_velocity"), "warp": ("hopper",)}
 """Tasks on which learners are compared, by engine."""
 COMMANDS = {"mujoco": ("hopper",), "warp": ("point_mass",)}
 SHORT = ("point_mass", "reach", "hopper", "go1_velocity")
-"""Tasks of --short: without contacts, with a mocap body, with early ends of episodes, and with all other features."""
+"""Tasks of --short: one without contacts, one with a mocap body, one whose episodes end early, and one with all other
+features."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,18 +66,16 @@ class Options:
     new: tyro.conf.Positional[str] = str(ROOT)
     """The revision or folder to compare with; by default this working tree."""
     tasks: tuple[str, ...] = ()
-    """Tasks; by default all. The parts learners and commands compare only a few tasks by default; if none of these few
-    is given, they compare the given tasks."""
+    """Tasks to compare; by default all. By default, learners and commands are compared on only a few tasks."""
     engines: tuple[Literal["mujoco", "warp"], ...] = ENGINES
     """Engines."""
     device: str = "cpu"
     """Device of the Warp engine, for example cuda. On a GPU the engine is deterministic."""
     parts: tuple[Part, ...] = PARTS
-    """Parts. env: the compiled model, resets, steps with actions beyond their bounds and short episodes, observations,
-    rewards and evaluations of given states, resets of some worlds, a fault, a rollout of given actions. plans: MPPI,
-    CEM, predictive sampling, plans with knots and for several plants, episodes under lw.control. learners: NPG, and PPO
-    if both checkouts have lw.PPO, with their final networks. commands: lyceum-warp train, with and without an
-    interruption: metrics.csv and the saved policies."""
+    """Parts to compare; by default all. The part env compares models, resets, steps, getters, a fault and a rollout.
+    The part plans compares plans of all planners, and episodes under lw.control. The part learners compares NPG and
+    PPO, with their final networks. The part commands compares the metrics.csv and the policies of lyceum-warp train,
+    with and without an interruption."""
     steps: int = 20
     """Number of steps of an environment."""
     iterations: int = 10
@@ -86,8 +85,8 @@ class Options:
     ignore: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="PATTERN")] = ()
     """Names to ignore, such as '*/metrics.csv/*' or 'plans/hopper/*'; may be repeated."""
     short: bool = False
-    """Compare four tasks, and plans and commands only on the C engine. With a warm kernel cache on two busy cores this
-    takes about three minutes instead of sixteen."""
+    """Compare four tasks, and plans and commands only on the C engine. With a warm kernel cache, the comparison takes
+    about three minutes on two busy cores instead of sixteen."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,16 +107,16 @@ class Unit:
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """A difference between the old and the new array of a name, or a failure of a checkout."""
+    """A difference between the old and the new array with the same name, or a failure of a checkout."""
 
     name: str
     kind: Literal["numbers", "form", "added", "removed", "failure"]
     text: str
     """A description in one line."""
     first: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """Index of the first different element, by axis name."""
+    """Index of the first different element, as a dict from axis names."""
     old: str = ""
-    """The old value at this index."""
+    """The old value at the index ``first``."""
     new: str = ""
     largest: float | None = None
     """The largest absolute difference; None if it is not finite."""
@@ -137,7 +136,7 @@ def digest(array: np.ndarray) -> str:
 
 
 def unequal(old: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Return which elements of two arrays of equal type and shape differ in any bit, flattened."""
+    """Return a flat mask of the elements that differ in any bit between two arrays of equal type and shape."""
     rows = [np.ascontiguousarray(a).reshape(-1).view(np.uint8).reshape(a.size, a.itemsize) for a in (old, new)]
     return (rows[0] != rows[1]).any(axis=1)
 
@@ -151,7 +150,7 @@ def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] 
         new: The array to compare with it.
         axes: Names of the leading axes.
     """
-    if old.dtype.kind == new.dtype.kind == "U" and old.shape == new.shape:  # string types include a length
+    if old.dtype.kind == new.dtype.kind == "U" and old.shape == new.shape:  # NumPy's string types include a length
         longer = max(old.dtype, new.dtype)
         old, new = old.astype(longer), new.astype(longer)
     if (old.dtype, old.shape) != (new.dtype, new.shape):
@@ -177,7 +176,7 @@ def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] 
 def differences(
     unit: str, old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray], axes: Mapping[str, Sequence[str]]
 ) -> Iterator[Difference]:
-    """Yield the differences between the arrays of a unit, in the order of their computation."""
+    """Yield the differences between a unit's old and new arrays, in the order in which they were computed."""
     names = [*old, *(name for name in new if name not in old)]
     for name in names:
         whole = f"{unit}/{name}"
@@ -190,7 +189,7 @@ def differences(
 
 
 def below(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """Return the arrays whose names begin with a prefix, without the prefix."""
+    """Return the arrays whose names begin with a prefix; the returned names omit it."""
     return {name.removeprefix(f"{prefix}/"): array for name, array in arrays.items() if name.startswith(f"{prefix}/")}
 
 
@@ -199,10 +198,10 @@ def below(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray
 
 @contextlib.contextmanager
 def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
-    """Provide a folder with a checkout, and its description.
+    """Provide the folder of a checkout and a text that describes it.
 
     Args:
-        given: A folder, or a git revision whose package is unpacked.
+        given: A folder with a checkout, or a git revision, which is then unpacked.
         folder: An empty folder for the checkout.
 
     Raises:
@@ -230,7 +229,7 @@ class Side:
     Args:
         name: "old" or "new".
         root: The checkout.
-        folder: An empty folder for its files.
+        folder: An empty folder for the files of the subprocess.
     """
 
     def __init__(self, name: str, root: Path, folder: Path) -> None:
@@ -240,18 +239,18 @@ class Side:
 
     def start(self) -> None:
         path = os.pathsep.join([str(self.root), *filter(None, [os.environ.get("PYTHONPATH")])])
-        # if the process is killed, Warp's compiler leaves temporary files
+        # Warp's compiler leaves temporary files here if the process is killed
         own = {"PYTHONPATH": path, "TMPDIR": str(self.folder), "CUBLAS_WORKSPACE_CONFIG": ":4096:8"}
         with self._log.open("w") as log:
-            # -P omits bench/ from the path, because its modules could shadow others; a new session can be killed as a
-            # whole
+            # -P omits bench/ from the path, because its modules could shadow others. A separate process group can be
+            # killed as a whole
             self._process = subprocess.Popen(
                 [sys.executable, "-P", str(PROBE), str(self._file)], cwd=self.folder, env=os.environ | own, text=True,
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, start_new_session=True,
             )  # fmt: skip
 
     def contents(self) -> dict[str, Any]:
-        """Return the tasks and learners of the checkout once its process has started, or a failure."""
+        """Start the checkout's process; return its tasks and learners, or a failure."""
         found = self.answer()
         if "file" in found and not Path(found["file"]).is_relative_to(self.root):
             text = f"imports {found['file']} instead of {self.root}"
@@ -264,11 +263,11 @@ class Side:
             self.start()
             self.answer()
         assert self._process is not None and self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # the answer then gives the reason
+        with contextlib.suppress(BrokenPipeError):  # if the process has ended, answer() reports it
             print(json.dumps(unit), file=self._process.stdin, flush=True)
 
     def answer(self) -> dict[str, Any]:
-        """Return the process's answer, or how it ended."""
+        """Return the answer of the process, or a failure if the process ended."""
         assert self._process is not None and self._process.stdout is not None
         if line := self._process.stdout.readline():
             return json.loads(line)
@@ -341,14 +340,14 @@ class Report:
     units: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     found: list[Difference] = dataclasses.field(default_factory=list)
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Skipped units, with the missing extra of each."""
+    """Names of skipped units, with the extra that each one lacks."""
     arrays: int = 0
     """Number of compared arrays."""
     ignored: int = 0
-    """Number of names that a pattern excluded."""
+    """Number of arrays that --ignore excluded."""
 
     def kept(self, name: str) -> bool:
-        """Return whether a name is compared, and count it as ignored otherwise."""
+        """Return whether --ignore leaves a name in the comparison; count the names that it excludes."""
         if any(fnmatch.fnmatchcase(name, pattern) for pattern in self.ignore):
             self.ignored += 1
             return False
@@ -374,8 +373,8 @@ class Report:
 
 
 def failures(name: str, answers: Mapping[str, Mapping[str, Any]]) -> list[Difference]:
-    """Return a unit's failures, with the checkout in their text. A failure in both is listed, because nothing was
-    compared."""
+    """Return a unit's failures; each text names the checkout. If both checkouts fail, the failure is listed, because
+    nothing was compared."""
     failed = {side: answer["failure"] for side, answer in answers.items() if "failure" in answer}
     for failure in failed.values():
         print(failure["trace"], file=sys.stderr)
@@ -414,7 +413,7 @@ def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
     """Compare two checkouts.
 
     Raises:
-        ValueError: Neither checkout has one of the tasks.
+        ValueError: A task exists in neither checkout.
     """
     for side in sides:
         side.start()
@@ -444,7 +443,7 @@ def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
 
 
 def written(report: Report, options: Options, checkouts: Mapping[str, str], seconds: float) -> dict[str, Any]:
-    """Return the content for the file that --out names."""
+    """Return the content of the file that --out writes."""
     return {
         "checkouts": checkouts,
         "options": dataclasses.asdict(options) | {"out": str(options.out)},

@@ -38,7 +38,7 @@ def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     statistics = np.stack([_welch(both[first], both[~first]) for first in chosen])
     observed = _welch(a, b)
     largest = statistics.max(axis=1)
-    # the observed split is one of them, and must not count as smaller than itself because of rounding
+    # the factor is a tolerance for rounding: the observed split must count as equal to itself
     return (largest[:, None] >= observed * (1.0 - 1e-9)).mean(axis=0)
 
 

@@ -36,7 +36,7 @@ LABELS = {
 }
 
 WORLDS = {"c": 64, "warp": 64, "native": 64, "envpool": 64, "gym-async": 2, "gym-sync": 16, "dm_control": 8}
-"""Worlds per thread; SyncVectorEnv has one thread."""
+"""Default number of worlds per thread; SyncVectorEnv has one thread."""
 
 GPU_WORLDS = 16_384
 
@@ -66,7 +66,7 @@ def measure(
         device: Device of the Warp engine.
         seed: Seed of actions and initial states.
         seconds: Duration of the measurement.
-        warm: Number of steps before it.
+        warm: Number of steps before the measurement.
 
     Raises:
         experiment.Skipped: The contestant is not installed, or there are too few cores.
@@ -85,7 +85,7 @@ def measure(
 
 
 def python_of(contestant: str) -> Path:
-    """Return the Python that runs a library."""
+    """Return the path of the Python interpreter that runs a library."""
     if contestant.startswith("gym") or (contestant == "envpool" and importlib.util.find_spec("envpool")):
         return Path(sys.executable)
     return venvs.python_of(contestant)
@@ -109,14 +109,14 @@ class LyceumWarp:
 
 
 def actions(env: lw.Env, seed: int) -> list[torch.Tensor]:
-    """Return a list of actions for several steps, (nworld, nact) each; indexing a tensor would cost time."""
+    """Return actions for several steps as a list of (nworld, nact) arrays; indexing a tensor would cost time."""
     low, high = (np.nan_to_num(x, posinf=1.0, neginf=-1.0) for x in (env.action_space.low, env.action_space.high))
     drawn = sampling.draw(np.asarray(low), np.asarray(high), env.nworld, seed)
     return list(torch.as_tensor(drawn, dtype=torch.float32, device=env.obs.device))
 
 
 class Native:
-    """``mujoco.rollout`` without a task, with one call for each environment step.
+    """``mujoco.rollout`` without a task; each environment step is one call.
 
     Each step starts in the same state as lyceum_warp's environment, with the same controls, substeps and restarts, but
     computes no observations or rewards.
@@ -159,4 +159,4 @@ class Native:
         )
 
     def wait(self) -> None:
-        """Does nothing, because steps are synchronous."""
+        """Do nothing, because steps are synchronous."""

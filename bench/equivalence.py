@@ -2,10 +2,10 @@
 
     lyceum-warp bench equivalence --device cuda
 
-The area under a learning curve is the mean return of the episodes sampled over a run. Two one-sided t tests (TOST, at
-5 %) decide whether the areas of 20 seeds on each engine are equivalent: whether the 90 % interval of the difference of
-their means (Welch) lies within the margin. The margin is one standard deviation between seeds, pooled over both
-engines. The margin, the tasks and the seeds were chosen before the first run.
+The area under a learning curve is the mean return of the episodes sampled over a run. Two one-sided t tests (TOST) at
+the level 0.05 decide whether the areas of 20 seeds on each engine are equivalent. The areas are equivalent if the 90 %
+interval of the difference of the means (Welch) lies within the margin. The margin is one standard deviation between
+seeds, pooled over both engines. The margin, the tasks and the seeds were chosen before the first run.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from lyceum_warp.engines.placement import find_device
 from lyceum_warp.support.intervals import student_quantile
 
 SAMPLES = {"inverted_double_pendulum": 100_000, "hopper": 200_000, "half_cheetah": 200_000}
-"""The tasks, and the samples of a run."""
+"""Tasks, with the number of samples of a run."""
 
 ENGINES = {"mujoco": "C engine", "warp": "Warp engine"}
 SEEDS, NWORLD, PER_ITERATION = 20, 10, 10_000
@@ -84,10 +84,10 @@ def equivalence(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
 
     Args:
         a: Areas of one engine, at least two.
-        b: Areas of the other.
+        b: Areas of the other engine, at least two.
 
     Returns:
-        The difference of the means, b minus a, its 90 % interval, the margin, and the verdict: equivalent, different
+        The difference of the means (b minus a), its 90 % interval, the margin, and the verdict: equivalent, different
         (the interval lies outside the margin) or not shown.
     """
     parts = a.var(ddof=1) / len(a), b.var(ddof=1) / len(b)

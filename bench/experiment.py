@@ -38,7 +38,7 @@ NAMES = ("throughput", "npg", "learning", "records", "gate", "mppi", "latency", 
 """Names of the experiments."""
 
 SOFTWARE = ("python", "mujoco", "mujoco_warp", "warp_lang", "torch", "numpy", "gymnasium")
-"""Versions that must be equal, together with the hardware, before results are compared."""
+"""Packages; results are compared only if their versions and the hardware are equal."""
 
 STYLES = (
     ("#D55E00", "o", "-"), ("#0072B2", "s", "--"), ("#009E73", "^", "-."), ("#CC79A7", "D", ":"),
@@ -48,7 +48,7 @@ STYLES = (
 
 
 class Skipped(Exception):  # noqa: N818
-    """A case cannot be measured on this machine; the message gives the reason in one line."""
+    """This machine cannot measure a case; the message gives the reason in one line."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Options:
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One result, which is a line of the file."""
+    """One result, stored as a line of the results file."""
 
     case: dict[str, Any]
     """The measured case."""
@@ -127,7 +127,7 @@ class Experiment:
     """Draw the stored results of one machine with matplotlib; return None if there is nothing to draw."""
     options: type[Options] = Options
     packages: tuple[str, ...] = ()
-    """Peers whose versions are stored with the results."""
+    """Other libraries whose versions are stored with the results."""
     apart: bool = False
     """Whether each case runs in a subprocess."""
     parallel: bool = False
@@ -143,7 +143,7 @@ def load(name: str) -> Experiment:
 
 
 def choose(given: Sequence[str], known: Iterable[str], default: Sequence[str] = (), *, what: str) -> tuple[str, ...]:
-    """Return the given names, or else the default names, or else all known names.
+    """Return the given names; if none are given, the default names, or all known names.
 
     Raises:
         ValueError: A name is unknown.
@@ -175,7 +175,7 @@ def installed(module: str, requirement: str) -> Any:
 
 
 def stored(names: Sequence[str], results: Path) -> dict[str, Path]:
-    """Return a folder's results files by experiment, for the given experiments or for all that have results.
+    """Return a folder's results files by experiment, for the given experiments or for all experiments with results.
 
     Raises:
         ValueError: A name is unknown.
@@ -226,12 +226,12 @@ def append(path: Path, row: Row) -> None:
 
 
 def machine(row: Row) -> tuple[Any, ...]:
-    """Return the hardware that must be equal before numbers are compared."""
+    """Return a row's hardware; only numbers from equal hardware are compared."""
     return tuple(row.provenance.get(name) for name in measurements.HARDWARE)
 
 
 def software(row: Row) -> tuple[Any, ...]:
-    """Return the versions that must be equal before numbers are compared."""
+    """Return a row's package versions; only numbers from equal versions are compared."""
     return tuple(row.provenance.get(name) for name in SOFTWARE)
 
 
@@ -282,7 +282,7 @@ def key(case: Mapping[str, Any]) -> str:
 
 
 def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[float]]:
-    """Return the ratios of a quantity to the reference contestant's in the same repeat, by contestant.
+    """Return each contestant's ratios of a quantity to the reference contestant, within the same repeat.
 
     Args:
         rows: Rows whose cases differ only in contestant and ``repeat``.
@@ -297,7 +297,7 @@ def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[floa
 
 
 def median_and_range(values: Sequence[float], form: str = ".2f") -> str:
-    """Format the median, with the smallest and largest value in parentheses; empty if there are no values."""
+    """Format the median, with the smallest and largest value in parentheses; return "" if there are no values."""
     if not values:
         return ""
     middle = format(statistics.median(values), form)
@@ -313,7 +313,7 @@ def cores(number: int | None) -> Iterator[None]:
     """
     before = sorted(os.sched_getaffinity(0))
     if number is not None and number > len(before):
-        raise Skipped(f"{number} threads need as many cores, and {len(before)} are here")
+        raise Skipped(f"{number} threads need {number} cores, and this process has {len(before)}")
     os.sched_setaffinity(0, before[:number])
     try:
         yield
@@ -413,7 +413,7 @@ def outcomes(
 
     def alone(case: Any) -> tuple[Any, dict[str, Any] | Exception, float]:
         began, place = time.perf_counter(), places.get()
-        os.sched_setaffinity(0, place)  # the affinity of this thread, which the subprocess inherits
+        os.sched_setaffinity(0, place)  # the subprocess inherits this thread's affinity
         try:
             with concurrent.futures.ProcessPoolExecutor(1, context) as process:
                 result = process.submit(_measure_apart, experiment.measure, case, options).result()
@@ -435,7 +435,8 @@ def outcomes(
 
 def _measure_apart(measure: Callable[[Any, Any], Any], case: Any, options: Options) -> Any:
     """Measure a case in this subprocess, and end on SIGTERM or with the parent process."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # KeyboardInterrupt also ends its subprocesses
+    # SIGTERM must raise KeyboardInterrupt, so that the subprocesses of the case also end
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     threading.Thread(target=_interrupt_after_parent, daemon=True).start()
     return measure(case, options)
 

@@ -5,10 +5,10 @@
 Worlds of both engines start in the same float32 states and get the same random actions. The C engine (float64) is
 compared with the Warp engine (float32), with itself when its state is rounded to float32 after every step, and with
 itself from an initial state perturbed by float32 rounding. Chaos separates any two trajectories, so the last two
-comparisons are the scale: if the Warp engine does not diverge earlier, it is as accurate as float32 allows. A
-difference is the largest difference of a world's observations, relative to the larger of 1 and the value. Contact
-forces are excluded, because a solver is accurate only to its tolerance. Worlds continue after the end of an episode,
-and are dropped at a fault.
+comparisons are the scale: if the Warp engine does not diverge earlier, it is as accurate as float32 allows. The
+difference between two states of a world is the largest difference of their observations, relative to the larger of 1
+and the value. Contact forces are excluded, because a solver is accurate only to its tolerance. Worlds continue after
+the end of an episode, and are dropped at a fault.
 """
 
 import dataclasses
@@ -29,16 +29,16 @@ from lyceum_warp.spaces import COUNTERS
 from lyceum_warp.support.validate import whole_number
 
 SHOWN = (1, 10, 100)
-"""Steps whose differences are stored, together with the last step."""
+"""Steps at which differences are stored; the last step is always stored."""
 
 SETTLING = 20
-"""Steps before the trajectories start, so that there are contacts."""
+"""Number of steps before the trajectories start, which bring robots into contact with the ground."""
 
 ROUNDING = 2.0**-24
-"""Largest relative error of rounding to float32."""
+"""Largest relative rounding error of float32."""
 
 APART = 0.01
-"""Difference of observations above which two trajectories have diverged."""
+"""Two trajectories have diverged if their observations differ by more than this number."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +84,7 @@ def rounded(env: lw.Env, state: torch.Tensor) -> torch.Tensor:
 
 
 def moved(env: lw.Env, state: torch.Tensor, seed: int) -> torch.Tensor:
-    """Perturb positions and velocities by at most the float32 rounding of the larger of 1 and the value."""
+    """Perturb positions and velocities by at most ``EPSILON`` times the larger of 1 and the value."""
     generator, near = torch.Generator().manual_seed(seed), state.clone()
     for name in ("qpos", "qvel"):
         values = near[:, env.state_space.parts[name]]
@@ -145,7 +145,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def quantiles(error: torch.Tensor, shown: Sequence[int]) -> dict[str, list[float | None]]:
-    """Return the median and the 99 % quantile over worlds after given numbers of steps."""
+    """Return the median and the 99 % quantile of the worlds' differences after given numbers of steps."""
     rows = error[[t - 1 for t in shown]].double()
     found = {name: rows.nanquantile(q, dim=1).tolist() for name, q in (("median", 0.5), ("p99", 0.99))}
     return {name: [value if math.isfinite(value) else None for value in values] for name, values in found.items()}

@@ -4,11 +4,12 @@
     lyceum-warp bench gate --policy runs/go1-1 runs/go1-2
 
 The mean policy plays on the C engine under the task's exact physics. A Unitree G1 must pass nanoG1's gate
-(kingjulio8238/nanoG1, eval.py): six commands from four noisy starts each, for 20 s, and 2,000 steps at 0.5 m/s whose
-gait is measured, all without noise, pushes and differences between robots. nanoG1 clips actions to 1 and multiplies
-them by 0.25 rad; here the change of a servo's target, divided by 0.25 rad, counts as the change of the action. Other
-robots play 100 episodes of 20 s with noise and differences between robots as in training: ten commands, from ten starts
-each, once without and once with pushes. After a fall, a world returns to its start.
+(kingjulio8238/nanoG1, eval.py). The gate has six commands of 20 s, from four noisy starts each, and 2,000 steps at 0.5
+m/s in which it measures the gait. The gate plays without noise, pushes and differences between robots. In nanoG1,
+actions are clipped to 1 and multiplied by 0.25 rad. Here the change of a servo's target, divided by 0.25 rad, counts as
+the change of the action. Other robots play 100 episodes of 20 s, with noise and with differences between robots as in
+training. These robots get ten commands from ten starts each, once without and once with pushes. After a fall, a world
+returns to its start.
 """
 
 import dataclasses
@@ -35,7 +36,7 @@ STEPS = 1000
 BATTERY = ((0.8, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.3, 0.0, 1.0), (0.3, 0.0, -1.0), (0.0, 0.4, 0.0), (0.0, 0.0, 0.0))
 """nanoG1's commands: forward and lateral velocity, m/s, and yaw rate, rad/s."""
 GAIT = (0.5, 0.0, 0.0)
-"""The command under which nanoG1's gate measures the gait, for twice as many steps."""
+"""The command for nanoG1's measurement of the gait, which takes twice as many steps."""
 COMMANDS = (
     (1.0, 0.0, 0.0), (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0),
     (0.5, 0.0, 0.5), (0.5, 0.0, -0.5), (0.5, 0.3, 0.0), (0.0, 0.0, 0.0),
@@ -74,9 +75,9 @@ class Options(experiment.Options):
     policy: tuple[Path, ...] = ()
     """Folders of runs on a velocity task, for example g1_velocity."""
     which: str = "last"
-    """Which policy of each run: last, best, or the number of a saved iteration."""
+    """Policy of each run: last, best, or the number of a saved iteration."""
     task: str | None = None
-    """A velocity task to judge on, with its own parameters, instead of the run's task."""
+    """Velocity task that replaces the run's task, with its own parameters."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +110,7 @@ def digest(folder: Path, options: Options) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Steps:
-    """Outcomes of each step in each world."""
+    """Results of each step in each world."""
 
     velocity_error: torch.Tensor
     """(steps, nworld), m/s."""
@@ -166,7 +167,7 @@ def calm(env: lw.Env) -> dict[str, Any]:
 
 
 def home(env: lw.Env) -> torch.Tensor:
-    """Return the task's fixed initial state, but without pushes."""
+    """Return the task's fixed initial state without pushes."""
     env.reset()
     state = env.get_state()
     env.state_space.split(state)["push_timer"][:] = NEVER

@@ -15,11 +15,11 @@ from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.rollout_buffer import Rollout
 
 TASKS = {"swimmer": "Swimmer-v5", "hopper": "Hopper-v5", "walker2d": "Walker2d-v5"}
-"""Gymnasium's names of our tasks."""
+"""Gymnasium's names of this package's tasks."""
 
 
 class GymnasiumRollout(Rollout):
-    """Fill NPG's rollout buffer from a Gymnasium vector environment, as ``Rollout`` does from an ``Env``.
+    """Fill NPG's rollout buffer from a Gymnasium vector environment; ``Rollout`` fills it from an ``Env``.
 
     When an episode ends, the next one begins within the same step. The first episodes start at the step counts of
     ``env``.
@@ -32,7 +32,7 @@ class GymnasiumRollout(Rollout):
         self.elapsed = torch.zeros(env.nworld)
         if segments:
             self.elapsed.copy_(env.episode_step)
-            # the time limit is the outermost wrapper in AsyncVectorEnv, too
+            # the time limit is also the outermost wrapper in AsyncVectorEnv
             envs.set_attr("_elapsed_steps", env.episode_step.tolist())
             self.running_return.masked_fill_(self.elapsed > 0, torch.nan)
 
@@ -42,10 +42,10 @@ class GymnasiumRollout(Rollout):
         self.running_return.zero_()
 
     def stagger(self, generator: torch.Generator, team: Team | None = None) -> None:
-        raise NotImplementedError("the clocks of Gymnasium's environments are set only once")
+        raise NotImplementedError("the step counts of Gymnasium's environments can be set only once")
 
     def restart_some(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
-        raise NotImplementedError("worlds of Gymnasium's environments restart at the end of their episodes alone")
+        raise NotImplementedError("Gymnasium's environments can restart only at the end of an episode")
 
     @torch.no_grad()
     def collect(self, policy: GaussianPolicy | DensePolicy, noise: torch.Tensor) -> None:
@@ -74,12 +74,12 @@ def vector(task: str, nworld: int, mode: str) -> VectorEnv:
     made = [functools.partial(gymnasium.make, TASKS[task], disable_env_checker=True)] * nworld
     if mode == "sync":
         return SyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP)
-    # Gymnasium's default on Linux; a new interpreter per world would import this whole program
+    # fork is Gymnasium's default on Linux; with spawn each world would import this whole program
     return AsyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP, context="fork")
 
 
 def rates(task: str, nworld: int, steps: int) -> dict[str, float]:
-    """Measure steps per second of both vector modes on these cores, with random actions."""
+    """Measure steps per second of Gymnasium's two vector modes with random actions."""
     found = {}
     for mode in ("sync", "async"):
         with contextlib.closing(vector(task, nworld, mode)) as envs:

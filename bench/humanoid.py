@@ -4,8 +4,8 @@
     lyceum-warp bench humanoid --tasks humanoid_stand --contestants real_time --repeats 20
 
 Starts and pushes are constants of this program. An episode lasts 20 s. ``real_time``: the plant keeps its rate, and
-the planner plans as often as it can (``lw.control_async``). ``in_turn``: the plant waits for each plan. Run the
-real-time episodes on idle cores: other work on them delays plans.
+the planner plans as often as it can (``lw.control_async``). ``in_turn``: the plant waits until each plan is ready. Run
+the real-time episodes on idle cores, because other processes delay plans.
 """
 
 import dataclasses
@@ -24,8 +24,9 @@ from lyceum_warp.controllers.control_report import wilson
 from lyceum_warp.support.machine import cpu_cores
 
 SECONDS = 20.0
-STARTS = dict(start_noise=0.02)  # noise of every joint, uniform, rad and rad/s
-PUSHES = dict(push_times=[5.0, 10.0, 15.0], push_impulse=[10.0, 20.0])  # s; N s, in uniformly drawn directions
+STARTS = dict(start_noise=0.02)  # uniform noise of every joint, in rad and rad/s
+# times in s, and impulses in N s with uniformly drawn directions
+PUSHES = dict(push_times=[5.0, 10.0, 15.0], push_impulse=[10.0, 20.0])
 TASKS = {
     "humanoid_stand": PUSHES, "humanoid_walk": PUSHES, "humanoid_get_up": dict(push_times=[15.0]),
 }  # fmt: skip
@@ -39,7 +40,7 @@ CONTESTANTS = {"real_time": "in real time", "in_turn": "the plant waits"}
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """A humanoid under a planner in real time."""
+    """A humanoid controlled by a planner in real time."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Case:
     seconds: float
     threads: int
     settings: str
-    """The planner's settings that are not defaults."""
+    """Planner settings that differ from the defaults."""
 
 
 @functools.cache

@@ -1,9 +1,10 @@
-"""Compare the time of an environment's step with the bare engine's time, on the same states.
+"""Compare the step times of an environment and its bare engine on the same states.
 
 Environment and bare engine alternate every ten steps. The states before the environment's steps are copied to the bare
-engine, outside the clock, so that both step the same states, resets included, under the same machine load. The bare
-engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the same model, controls and substeps.
-``kept`` is bare time divided by environment time; ``added`` is the difference.
+engine, while the clock is stopped. Environment and bare engine therefore step the same states, resets included, under
+the same machine load. The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the
+same model, controls and substeps. ``kept`` is the bare engine's time divided by the environment's, and ``added`` is the
+environment's time minus the bare engine's.
 """
 
 import statistics
@@ -25,7 +26,7 @@ from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.support.arrays import launch_worlds
 
 BLOCK = 10
-"""Steps after which environment and bare engine alternate."""
+"""Number of steps that environment and bare engine take per turn."""
 
 
 def next_controls(env: lw.Env) -> torch.Tensor:
@@ -138,7 +139,7 @@ def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **pl
             env.step()
 
     whole, alone = [], []
-    # the steps capture graphs and leave the initial states; a robot walks only after two seconds
+    # warm-up: graphs are captured, and the worlds leave their initial states; a robot needs two seconds until it walks
     warm = max(2 if policy is None else 20, env.horizon // 500)
     for repetition in range(warm + blocks):
         choose_actions()

@@ -7,9 +7,9 @@
 Each case is one cell of the table: a task, the physics of the planner's worlds, a number of samples, a horizon, an
 engine and its device. Episodes run in real time (``lw.control_async``) until their steps take ``--seconds``: the plant
 keeps its rate, and the planner plans as often as it can. A plan meets its deadline if it takes at most a step of the
-plant. Run this on idle cores: other work on them delays plans. Without --samples and --horizons, cells whose plans take
-long on two cores are omitted. With --own, each task has one cell, with the samples and the horizon that it suggests for
-planners.
+plant. Run this on idle cores, because other processes delay plans. Without --samples and --horizons, cells whose plans
+take long on two cores are omitted. With --own, each task has one cell, with the samples and the horizon that it
+suggests for planners.
 """
 
 import dataclasses
@@ -31,16 +31,17 @@ COST = {
     ("point_mass", "own"): 2.0, ("reach", "own"): 6.0, ("cartpole_swingup", "own"): 2.0, ("half_cheetah", "own"): 15.0,
     ("humanoid", "fast"): 9.0, ("humanoid", "exact"): 120.0, ("adroit_pen", "own"): 95.0,
 }  # fmt: skip
-"""Microseconds of a sample's step on two cores, by task and planning physics; the default tasks."""
+"""Microseconds per step of a sample on two cores, by task and planning physics; its keys are the default tasks."""
 LONGEST = 0.2
-"""Longest expected plan of a cell, in seconds, unless its samples or horizon are given."""
+"""Maximum expected duration of a plan, in seconds; cells with longer plans run only if samples or horizons are
+given."""
 SAMPLES, HORIZONS = (16, 64, 256, 1024), (16, 32, 64)
 CONTESTANTS = {"mujoco": "C engine", "warp": "Warp engine"}
 
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Planning in real time, by task, samples, horizon, engine and device."""
+    """Planning times in real time, by task, samples, horizon, engine and device."""
 
     samples: tuple[int, ...] = ()
     """Numbers of samples; by default 16, 64, 256 and 1024."""
@@ -49,8 +50,8 @@ class Options(experiment.Options):
     own: bool = False
     """Whether to use the samples and the horizon that each task suggests."""
     physics: tuple[str, ...] = ()
-    """Names of the planner's physics: exact, or names that a task defines. By default the physics that the task
-    suggests, and exact if the suggestion has a name."""
+    """Names of the planner's physics: exact, or a name that the task defines. The default is the physics that the task
+    suggests; if the suggestion has a name, exact physics also runs."""
     seconds: float = 10.0
     """Seconds of a case; the 99.9 % quantile needs a thousand plans."""
 

@@ -6,8 +6,8 @@
 The time includes graph captures, sampling and updates, and excludes kernel compilation and evaluations. The mean
 return is taken over the last 100 episodes, without each world's first episode, which starts at a random step. If
 iterations are too short for whole episodes, the mean is taken over 16 separate episodes of the stochastic policy every
-few iterations. On go1_velocity a robot that stands still reaches high returns, too. So on this task the mean policy
-also walks for 10 s in new worlds, with noise and pushes, and its tracking errors and falls are measured.
+few iterations. On go1_velocity a robot that stands still also reaches high returns. On this task the program therefore
+also measures the tracking errors and falls of the mean policy, over 10 s in new worlds with noise and pushes.
 """
 
 import collections
@@ -34,13 +34,15 @@ TARGETS: dict[str, tuple[str, float, int, int | None, int]] = {
     "half_cheetah": ("npg", 5000.0, 4096, 65_536, 5),
     "humanoid": ("npg", 4500.0, 8192, 131_072, 5),
 }
-"""Algorithm, target, worlds, samples per iteration, iterations between evaluations (0: use the last 100 episodes)."""
+"""Algorithm, target, worlds, samples per iteration, and iterations between evaluations (0 uses the last 100
+episodes)."""
 
 SETTINGS: dict[str, dict[str, Any]] = {"default": {}, "desired_kl 0.01": {"desired_kl": 0.01}}
 """Hyperparameters that differ from the algorithm's defaults."""
 
 JUDGED, RECENT, WALKED = 16, 100, (256, 500)
-"""Episodes per evaluation, episodes in a run's mean return, and (worlds, steps) of the walking test."""
+"""Number of episodes per evaluation, number of episodes in a run's mean return, and (worlds, steps) of the walking
+test."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Options(experiment.Options):
     """Time until NPG or PPO reaches a target return."""
 
     algorithm: Literal["npg", "ppo"] | None = None
-    """Algorithm; by default an algorithm for each task."""
+    """Algorithm; by default each task has its own."""
     settings: tuple[str, ...] = ("default",)
     """Names of the settings to run: default, or "desired_kl 0.01" (PPO only)."""
     seconds: float = 300.0
@@ -102,7 +104,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     seconds, curve, mean = 0.0, [], -math.inf
     while seconds < case.seconds and mean < case.target:
         began = time.perf_counter()
-        it = next(made)  # an iteration ends with a copy to the host: the device has finished
+        it = next(made)  # the device has finished, because an iteration ends with a copy to the host
         seconds += time.perf_counter() - began
         if judge is None:
             returns = made.rollout.episode_return[made.rollout.done]

@@ -3,12 +3,12 @@
     lyceum-warp bench mppi --threads 16
     lyceum-warp bench mppi --parts episodes --threads 1 --jobs 16
 
-``episodes``: the paper's planning tasks with its settings and its 75 steps; success and time. ``plans``: the time of a
-plan from given states.
+``episodes``: success and time of 75 steps on the paper's planning tasks, with the paper's settings. ``plans``: the time
+of a plan from given states.
 
 The Python planner (python_mppi.py) sends one message per plan to each process. All planners control the same plant, and
-take turns in blocks of episodes. The contestants "a set at a time" run last: one planner controls the plants of all
-episodes of a set. With --jobs, blocks run at the same time, each in a subprocess on separate cores. ``mppi_fast`` plans
+take turns in blocks of episodes. The contestants "a set at a time" run last; they use one planner for the plants of all
+episodes in a set. With --jobs, blocks run at the same time, each in a subprocess on separate cores. ``mppi_fast`` plans
 with the physics that a task names "fast"; the plant keeps the exact physics.
 """
 
@@ -33,7 +33,7 @@ from lyceum_warp.controllers.control_report import wilson
 
 EPISODES = {"reach": 75, "adroit_pen": 75, "herb_reach": 150, "panda_lift": 150, "aloha_lift": 150,
             "arm_hand_pickup": 300}  # fmt: skip
-"""Steps of an episode; the paper's two tasks are the default."""
+"""Tasks and the steps of their episodes; the default is the paper's two tasks."""
 PAPER = ("reach", "adroit_pen")
 PLANS = ("reach", "half_cheetah", "adroit_pen")
 TASKS = ("reach", "half_cheetah", "adroit_pen", "herb_reach", "panda_lift", "aloha_lift", "arm_hand_pickup")
@@ -87,7 +87,7 @@ class Case:
 
 
 def cases(options: Options) -> list[Case]:
-    """List plans, then episodes; contestants to compare are adjacent."""
+    """List the cases: plans, then episodes; compared contestants are adjacent."""
     short, cuda = options.short, options.device.startswith("cuda")
     threads = options.threads or len(os.sched_getaffinity(0)) // max(options.jobs, 1)
     parts = choose(options.parts, ("plans", "episodes"), what="part")
@@ -95,7 +95,7 @@ def cases(options: Options) -> list[Case]:
     usual = [name for name in CONTESTANTS if cuda or name not in ON_WARP]
     contestants = choose(options.contestants, CONTESTANTS, usual, what="contestant")
     if options.jobs > 1 and ("plans" in parts or {*ON_WARP} & {*contestants}):
-        raise ValueError("plans and a GPU are timed alone: give --jobs 1, or --parts episodes")
+        raise ValueError("plans and GPU cases are timed alone: give --jobs 1, or --parts episodes")
     single = [name for name in contestants if name in (*OURS, "python")]
     repeats, count = options.repeats or (1 if short else 5), 2 if short else options.episodes
     seconds = 1.0 if short else options.seconds
@@ -128,7 +128,7 @@ def estimate(case: Case) -> float:
 
 @functools.cache
 def planner(task: str, contestant: str, threads: int, device: str, plants: int = 1) -> lw.MPPI:
-    """Make one of our planners."""
+    """Make a planner of this package."""
     if contestant in ON_WARP:
         return lw.MPPI(task, engine="warp", device=device, plants=plants)
     physics = "fast" if contestant == "mppi_fast" else "exact"
@@ -201,7 +201,7 @@ def episodes_together(
     return success.tolist(), returns.tolist(), [seconds] * case.count
 
 
-# plans of all planners from the same states
+# all planners plan from the same states
 
 
 @functools.cache

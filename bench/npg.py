@@ -1,15 +1,15 @@
-"""Compare NPG's learning on lyceum_warp's and Gymnasium's environments, and with PPO and TRPO (the paper's figure 2).
+"""Compare NPG on lyceum_warp's environments with NPG, PPO and TRPO on Gymnasium's (the paper's figure 2).
 
     lyceum-warp bench npg --threads 2 --jobs 16
 
-Both NPGs are the same class with the same settings, number of worlds and seeds. The two differ in the environments that
-fill the rollout buffer; Gymnasium uses the faster of its two vector modes. For twelve minutes each, stable-baselines3's
-PPO and sb3-contrib's TRPO learn with the settings that RL Baselines3 Zoo tuned for these tasks. With --device cuda,
-lw.NPG and lw.PPO learn on the same worlds on a GPU.
+Both NPGs are the same class with the same settings, number of worlds and seeds. The two NPGs differ only in the
+environments that fill the rollout buffer; Gymnasium uses the faster of its two vector modes. For twelve minutes each,
+stable-baselines3's PPO and sb3-contrib's TRPO learn with the settings that RL Baselines3 Zoo tuned for these tasks.
+With --device cuda, lw.NPG and lw.PPO learn on the same worlds on a GPU.
 
-All policies are evaluated in the same way: the mean action, in single Gymnasium environments, from the same initial
-states. The clock stops during evaluations, and starts after kernels are compiled and environments are made. Each case
-runs in a subprocess on separate cores; runs on a GPU need --jobs 1.
+All policies are evaluated by their mean actions in single Gymnasium environments, from the same initial states. The
+clock stops during evaluations, and starts after kernels are compiled and environments are made. Each case runs in a
+subprocess on separate cores; runs on a GPU need --jobs 1.
 """
 
 import contextlib
@@ -52,7 +52,7 @@ CONTESTANTS = {
     "trpo_sb3": "TRPO, sb3-contrib",
     "npg_gpu": "NPG, lyceum_warp on a GPU",
     "ppo_gpu": "PPO, lyceum_warp on a GPU",
-    # this contestant exists only in stored results of an earlier commit
+    # only stored results of an earlier commit have this contestant
     "ppo_rsl_rl": "rsl_rl's PPO, lyceum_warp on a GPU",
 }
 ON_CPU, ON_GPU, YARDSTICKS = tuple(CONTESTANTS)[:4], tuple(CONTESTANTS)[4:6], ("ppo_sb3", "trpo_sb3")
@@ -63,10 +63,10 @@ EVERY_100K = tuple(range(100_000, 1_000_001, 100_000))
 """Numbers of samples at which the curves are compared."""
 
 LIMITS = dict.fromkeys(YARDSTICKS, 720.0) | dict.fromkeys(ON_GPU, 30.0)
-"""Seconds of learning after which a run ends at the latest."""
+"""Maximum learning time of a run in seconds."""
 
 EVALUATIONS, EPISODES = 20, 16
-"""Evaluations of a run after the first, and episodes per evaluation."""
+"""Number of evaluations of a run after the first, and number of episodes per evaluation."""
 
 _TUNED_NETWORK = {"log_std_init": -2.0, "ortho_init": False, "activation_fn": torch.nn.ReLU,
                   "net_arch": {"pi": [256, 256], "vf": [256, 256]}}  # fmt: skip
@@ -95,7 +95,7 @@ TRPO = {"swimmer": _TRPO | {"gamma": 0.9999}, "hopper": _TRPO, "walker2d": _TRPO
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Learning curves of NPG and its peers."""
+    """Learning curves of NPG, PPO and TRPO."""
 
     threads: int | None = 2
     """Cores per case; stable-baselines3's learners and learners on a GPU use only one."""
@@ -126,7 +126,7 @@ class Case:
 
 
 def cases(options: Options) -> list[Case]:
-    """List the runs: contestants to compare are adjacent, and runs on a GPU come last."""
+    """List the runs: compared contestants are adjacent, and runs on a GPU come last."""
     short, cuda = options.short, options.device.startswith("cuda")
     contestants = choose(options.contestants, ON_CPU + ON_GPU, ON_CPU + (ON_GPU if cuda else ()), what="contestant")
     for name in contestants:
@@ -204,7 +204,7 @@ class Curve:
         return self.ended(samples) or self._evaluations(samples) >= self._next
 
     def _evaluations(self, samples: int) -> float:
-        """Return the progress of the run as a number of evaluations."""
+        """Return the progress of the run in evaluations."""
         progress = max(samples / (self.case.samples or math.inf), self.seconds() / self.case.limit)
         return (2 if self.case.short else EVALUATIONS) * progress
 
@@ -377,7 +377,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def ends(found: dict[str, dict[str, list[Row]]]) -> Table:
-    """Tabulate how the runs ended, and when they reached 90 % of the final return of NPG on Gymnasium."""
+    """Make a table of the runs' final results, and the time until 90 % of the final return of NPG on Gymnasium."""
     lines = []
     for task, same in found.items():
         ours = {row.case["seed"]: row for row in same.get("npg", ())}

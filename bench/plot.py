@@ -13,9 +13,9 @@ class Options:
     """Draw a figure for each experiment and machine with stored results."""
 
     names: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Experiments; by default all with results."""
+    """Names of the experiments; by default all that have results."""
     results: Path = experiment.RESULTS
-    """Folder with the results, to which the figures are written."""
+    """Folder with the results; the figures are written to it."""
 
 
 def main(options: Options) -> int:

@@ -1,6 +1,6 @@
 """Plan with MPPI in Python, with single Gymnasium environments in subprocesses.
 
-``PythonMPPI`` does not use this package's worlds: each subprocess has an environment and gets one message per plan;
+``PythonMPPI`` does not use this package's worlds. Each subprocess has an environment and gets one message per plan, and
 NumPy computes noise and weights. It has the settings of an ``lw.MPPI`` and controls the same plant.
 """
 
@@ -41,12 +41,12 @@ class ReachEnv:
 
 
 class GymnasiumEnv:
-    """Adapt an environment of Gymnasium or Gymnasium-Robotics, so that it can be set to a state of our task.
+    """Let an environment of Gymnasium or Gymnasium-Robotics be set to a state of this package's task.
 
     Args:
         name: Gymnasium's name.
-        model: Our model, which defines the states.
-        target: A body with a constant orientation in Gymnasium's model, and a mocap body in ours.
+        model: The model of this package's task, which defines the states.
+        target: Name of a body with a constant orientation in Gymnasium's model, which is a mocap body in ``model``.
     """
 
     def __init__(self, name: str, model: mujoco.MjModel, target: str | None = None) -> None:
@@ -79,11 +79,11 @@ ENVS: dict[str, Callable[[mujoco.MjModel], Any]] = {
     "half_cheetah": lambda model: GymnasiumEnv("HalfCheetah-v5", model),
     "adroit_pen": lambda model: GymnasiumEnv("AdroitHandPen-v1", model, "target"),
 }
-"""Environments by our tasks' names; their actions are bounded by -1 and 1."""
+"""Environments by the names of this package's tasks; their actions are bounded by -1 and 1."""
 
 
 def smoothed(noise: np.ndarray, smoothing: tuple[float, float, float]) -> np.ndarray:
-    """Smooth noise, (samples, horizon, nact), over time from the third step on, in place."""
+    """Smooth noise, (samples, horizon, nact), over time in place; the first two steps stay unchanged."""
     for t in range(2, noise.shape[1]):
         noise[:, t] = smoothing[0] * noise[:, t] + smoothing[1] * noise[:, t - 1] + smoothing[2] * noise[:, t - 2]
     return noise
@@ -94,7 +94,7 @@ class PythonMPPI:
 
     Args:
         task: A name in ``ENVS``.
-        plan: Planner whose settings are used.
+        plan: Planner of this package, whose settings are used.
         count: Number of subprocesses.
     """
 
@@ -108,13 +108,13 @@ class PythonMPPI:
             pipe, other = context.Pipe()
             settings = (task, int(share), config.horizon, config.noise, config.smoothing, i)
             context.Process(target=_roll_out, args=(other, *settings), daemon=True).start()
-            other.close()  # close this end, so that recv raises EOFError if the subprocess has ended
+            other.close()  # close the child's end here, so that recv raises EOFError if the subprocess has ended
             self.pipes.append(pipe)
         for pipe in self.pipes:
             pipe.recv()
 
     def reset(self, seed: int | None) -> None:
-        """Clear the plan, and seed the noise."""
+        """Clear the plan and seed the noise."""
         self.plan[:] = 0.0
         for pipe in self.pipes:
             pipe.send(seed)

@@ -2,10 +2,11 @@
 
     lyceum-warp bench rank_loss half_cheetah hopper
 
-Each line of results/rank-loss.jsonl is a task and a setting: the rank correlations of ``lyceum-warp tune --planning``,
-and returns of the same episodes in the task's own physics, planned at every step with these physics, with the setting,
-and without a plan. With these three returns R_exact, R_setting and R_none, the loss is (R_exact - R_setting) / (R_exact
-- R_none). Plans wait for nothing, so a busy machine changes no number.
+Each line of results/rank-loss.jsonl holds the numbers of a task and a setting. These numbers are the rank correlations
+of ``lyceum-warp tune --planning``, and three returns of the same episodes in the task's own physics: planned with these
+physics, planned with the setting, and without a plan. With these three returns R_exact, R_setting and R_none, the loss
+is (R_exact - R_setting) / (R_exact
+- R_none). Episodes do not run in real time, so a busy machine changes no number.
 """
 
 import dataclasses
@@ -82,7 +83,7 @@ def returns(task: str, study: Study, physics: Any, *, planned: bool = True) -> n
 
 
 def main(tasks: tyro.conf.Positional[tuple[str, ...]]) -> None:
-    """Measure the settings of some tasks that are not stored yet.
+    """Measure the settings of tasks, except for those that are already stored.
 
     Args:
         tasks: Names of tasks.

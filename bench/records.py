@@ -3,10 +3,11 @@
     lyceum-warp bench records --device cuda --tasks go1_velocity g1_velocity --seeds 42 43 44
     lyceum-warp bench records --tasks hopper --cache cold
 
-The clock starts before the command does, so the seconds include imports, compilation and graph captures; it stops when
-the run's config.json says that the target is reached. With a cold cache all kernels are compiled; before a measurement
-with a warm cache, the same command trains for one iteration, off the clock. A run that lasts longer than --seconds is
-stopped. The same command continues it; the seconds add up and include every further start.
+The clock starts before the command, so the seconds include imports, compilation and graph captures. The clock stops
+when the run's config.json says that the target is reached. With a cold cache all kernels are compiled. Before a
+measurement with a warm cache, the same command trains for one iteration while the clock is stopped. A run that lasts
+longer than --seconds is stopped. The same command continues the run; the seconds of all calls are summed, and include
+every start of the process.
 """
 
 import contextlib
@@ -30,9 +31,9 @@ from lyceum_warp.binding.registry import file_name, package_task_names
 from lyceum_warp.runs.folder import Run
 
 WALKING = ("--algorithm", "ppo", "--mean-every", "0")
-"""Flags under which the target is the mean return of an iteration's episodes, with exploration noise."""
+"""Flags for targets of an iteration's mean return, with exploration noise."""
 NPG = ("--algorithm", "npg", "--mean-every", "5")
-"""Flags under which the target is the mean policy's return in 16 episodes; the clock includes the evaluations."""
+"""Flags for targets of the mean policy's return in 16 episodes; the clock includes these evaluations."""
 LARGE = ("--samples", "65536")
 SUITE = (*WALKING, "--num-steps", "32", "--gamma", "0.995", "--entropy-coef", "0.001", "--no-clip-value-loss")
 """One setting for all tasks of dm_control's suite."""
@@ -62,9 +63,9 @@ class Options(experiment.Options):
     cache: tuple[Literal["warm", "cold"], ...] = ("warm",)
     """State of the cache of compiled kernels."""
     seconds: float = 540.0
-    """Seconds after which a run is stopped; the same command continues it."""
+    """Seconds after which a run is stopped; the same command continues the run."""
     runs: Path = Path("runs/records")
-    """Folder for the folders of the runs."""
+    """Folder in which the runs are stored."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,11 +76,11 @@ class Case:
     cache: str
     device: str
     flags: str
-    """Flags of the command, without those that all runs have."""
+    """Flags of the command, without the flags that all runs have."""
 
 
 def cases(options: Options) -> list[Case]:
-    """List the runs of the tasks that have a recipe for the device."""
+    """List the runs of all tasks with a recipe for the device."""
     kind = options.device.partition(":")[0]
     tasks = choose(options.tasks, RECORDS, ("hopper",) if options.short else (), what="task")
     for task in options.tasks:
@@ -93,7 +94,7 @@ def cases(options: Options) -> list[Case]:
 
 
 def command(case: Case, folder: Path, device: str) -> list[str]:
-    """The command that starts a run, or that continues it if the folder has a checkpoint."""
+    """Return the command that starts a run, or that continues the run if the folder has a checkpoint."""
     train = [sys.executable, "-m", "lyceum_warp.cli", "train"]
     if (folder / "checkpoint.pt").exists():
         return [*train, "--resume", str(folder), *COMMON]
@@ -104,12 +105,12 @@ def command(case: Case, folder: Path, device: str) -> list[str]:
 
 
 def measure(case: Case, options: Options) -> dict[str, Any]:
-    """Train until the target is reached, or raise Skipped once the seconds of this call are over."""
+    """Train until the target is reached; raise Skipped if the time limit of this call is exceeded."""
     name = f"{file_name(case.task)}-{case.device}-{case.cache}-{case.seed}"
     folder, notes = options.runs / name, options.runs / f"{name}.json"
     earlier = json.loads(notes.read_text()) if notes.exists() and (folder / "checkpoint.pt").exists() else [0.0, 0]
     if not earlier[1]:
-        shutil.rmtree(folder, ignore_errors=True)  # the folder of a call that was killed
+        shutil.rmtree(folder, ignore_errors=True)  # an earlier call was killed and left this folder
     options.runs.mkdir(parents=True, exist_ok=True)
     with cache(case, options, folder) as environment:
         reached, seconds = timed(command(case, folder, options.device), folder, environment, options.seconds)
@@ -128,7 +129,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def cache(case: Case, options: Options, folder: Path) -> Iterator[dict[str, str]]:
-    """The environment variables of the command, with an empty cache of kernels or with a filled one."""
+    """Return the command's environment variables, which name an empty or a filled kernel cache."""
     if case.cache == "warm":
         if not folder.exists():
             with tempfile.TemporaryDirectory() as spare:
@@ -148,7 +149,8 @@ def run(words: Sequence[str], environment: dict[str, str]) -> "subprocess.Popen[
 def timed(
     words: Sequence[str], folder: Path, environment: dict[str, str], limit: float
 ) -> tuple[dict[str, Any] | None, float]:
-    """Run the command until its run reaches the target, or for ``limit`` seconds; return the entry and the seconds.
+    """Run the command until its run reaches the target, or for ``limit`` seconds; return the run's entry and the
+    seconds.
 
     Raises:
         RuntimeError: The command failed.
@@ -167,14 +169,14 @@ def timed(
         if code is not None:
             raise RuntimeError(f"{' '.join(words)} ended with code {code} before its target")
         if seconds > limit:
-            process.send_signal(signal.SIGTERM)  # the run is saved after the iteration
+            process.send_signal(signal.SIGTERM)  # the process saves the run after the current iteration
             process.wait()
             return None, time.perf_counter() - began
         time.sleep(0.05)
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    """One line for each task, cache and flags, over the seeds."""
+    """Make a table with a line for each task, cache and set of flags, over the seeds."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         kind = tuple(row.case[name] for name in ("task", "target", "device", "cache", "flags"))

@@ -1,22 +1,22 @@
-"""Run tasks for very long with and without injected faults, watch the memory, and kill and resume trainings.
+"""Run tasks for a very long time with and without injected faults, measure memory, and kill and resume training runs.
 
     lyceum-warp bench soak --threads 2
     lyceum-warp bench soak --parts random --tasks dm/walker_walk dm/fish_swim --engine mujoco
     lyceum-warp bench soak --parts faults --device cuda --work runs/soak
 
-Part faults: worlds step under random actions, and every thousandth step of a world gets a fault. Invalid or too fast
-states, and actions that are not finite, are written from outside. For the other faults the program writes a variant of
-the task beside a copy of its source (``VARIANT``), in which an additional action number requests a NaN reward, a NaN
-observation or a negative mass. Every fault must be reported in its world and step, nothing else may be reported, and
+Part faults: worlds step under random actions, and each world gets a fault every thousand steps on average. The program
+writes invalid states, states with excessive velocities, and non-finite actions. For the other faults it writes a
+variant of the task (``VARIANT``), in which an additional action number requests a NaN reward, a NaN observation or a
+negative mass. Every fault must be reported in its world and step, nothing else may be reported, and
 ``env.fault_counts`` must agree. A second environment without faults must give bitwise equal numbers for each world
-until its first fault. Every fourth world gets no faults, so its numbers must always be equal.
+until its first fault. Every fourth world gets no faults, so its numbers must be equal in both environments throughout.
 
-A run is divided into chunks. A chunk is one result, and ends with a file of the worlds' states in the folder
-``--work``. The next chunk continues from this file, also on another machine with a copy of the folder.
+A run is divided into chunks. Each chunk is one result, and ends by writing the worlds' states to a file in the folder
+``--work``. The next chunk continues from this file, even on another machine with a copy of the folder.
 
 Part random: worlds step under uniformly random actions, without injected faults. The result has the number of faults by
-reason, and step and world of the first. Part memory: environments are made and deleted. Part kills: trainings are
-killed and resumed, and must end like an uninterrupted training.
+reason, and the step and world of the first fault. Part memory: environments are made and deleted. Part kills: training
+runs are killed and resumed, and must end like an uninterrupted run.
 """
 
 import collections
@@ -51,10 +51,10 @@ from lyceum_warp.support.validate import whole_number
 PARTS = ("faults", "random", "memory", "kills")
 KINDS = {"state": Done.NAN, "speed": Done.NAN, "action": Done.ACTION, "reward": Done.REWARD,
          "observation": Done.OBSERVATION, "model": Done.MODEL}  # fmt: skip
-"""Kinds of faults by the place of injection, numbered from 1, with the reasons that must be reported."""
+"""Kinds of faults by where they are injected, numbered from 1, with the reasons that must be reported."""
 NBIT = len(Done)
 EVERY = 16
-"""Number of steps between changes of states; each change affects this many times more worlds."""
+"""Number of steps between writes of invalid states; each write affects more worlds by the same factor."""
 SAMPLES = 5
 """Memory samples per chunk."""
 TASKS = {
@@ -62,13 +62,14 @@ TASKS = {
     "panda_lift": (256, 10**6, 10, 250.0), "adroit_relocate": (256, 10**6, 10, 250.0),
     "humanoid": (256, 10**6, 10, 300.0), "go1_velocity": (256, 10**6, 10, 300.0),
 }  # fmt: skip
-"""Worlds, steps per chunk, chunks, and seconds for a million steps on two cores."""
+"""By task: worlds, steps per chunk, chunks, and seconds per million steps on two cores."""
 OTHERS = (256, 10**6, 1, 300.0)
-"""The same values for all other tasks."""
+"""Worlds, steps per chunk, chunks, and seconds per million steps of all other tasks."""
 SHORT = (64, 20_000, 2, 0.0)
 GPU_TASKS = {"half_cheetah": (16_384, 10**8, 10, 0.5)}
 SAME_BITS = {"half_cheetah": (4096, 10**6, 10, 20.0)}
-"""The same values for the deterministic mode, which makes a GPU's results reproducible bit for bit."""
+"""Worlds, steps per chunk, chunks, and seconds per million steps in the deterministic mode, which makes a GPU's results
+reproducible bit for bit."""
 TRAININGS = {
     "hopper": "--iterations 400 --nthread 2",
     "point_mass": "--algorithm ppo --iterations 300 --nworld 256 --nthread 2",
@@ -124,7 +125,7 @@ class Soak({parent}):
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Very long runs with injected faults, memory checks, and kills."""
+    """Very long runs with injected faults, memory checks and kills."""
 
     parts: tuple[str, ...] = ()
     """Parts: faults, random, memory, kills; by default all."""
@@ -135,9 +136,9 @@ class Options(experiment.Options):
     steps: int | None = None
     """Number of steps per chunk, summed over worlds; by default the task's."""
     kill_every: float = 40.0
-    """Mean seconds of training between two kills."""
+    """Mean training time between two kills, in seconds."""
     work: Path = Path("runs/soak")
-    """Folder of task variants, of states between chunks, and of trainings."""
+    """Folder for task variants, for states between chunks, and for training runs."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -213,7 +214,7 @@ def cases(options: Options) -> list[Any]:
             steps = whole_number("--steps", options.steps or sizes[1], low=nworld * SAMPLES)
             chunks = [Faults(task, chunk, steps, nworld, options.engine, options.device, compared,
                              1e-2 if short else 1e-3, seed) for chunk in range(sizes[2])]  # fmt: skip
-            # a machine that gets another machine's folder continues from its last state
+            # a copy of the folder on another machine continues from the last state
             done = max((i for i in range(1, len(chunks) + 1) if chunks[0].state(options.work, i).exists()), default=1)
             found += chunks[done - 1 :]
         for task, sizes, _ in runs if "random" in parts else ():
@@ -248,8 +249,8 @@ def measure(case: Any, options: Options) -> dict[str, Any]:
 
 
 def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
-    """Write a task's variant, whose last action number requests a fault; return it with the range of the other
-    actions."""
+    """Write a variant of a task whose last action number requests a fault; return the variant and the range of the
+    other actions."""
     parent, plain = find_task(task), lw.make(task, nworld=1, engine="mujoco")
     own = TaskSource(parent, task)
     functions, nact = own.functions, plain.action.shape[1]
@@ -337,7 +338,7 @@ def tally(
 
 
 def inject(case: Faults, options: Options) -> dict[str, Any]:
-    """Step a task for a chunk with injected faults, together with a twin without faults."""
+    """Step a task for a chunk with injected faults, and a second environment without faults."""
     torch.set_num_threads(1)
     gc.collect()  # free the environments of the previous chunk
     before = case.state(options.work, case.chunk)
@@ -457,7 +458,7 @@ def memory(device: torch.device) -> tuple[int, int]:
 
 
 def slope(samples: Sequence[Sequence[int]], column: int) -> float:
-    """Return the memory's growth per step, or per environment, without the first sample."""
+    """Return the growth of the memory per step, or per environment, from the second sample on."""
     points = np.array(samples[1:], dtype=float)
     return float(np.polyfit(points[:, 0], points[:, column], 1)[0])
 
@@ -480,7 +481,7 @@ def make_and_delete(case: Memory, options: Options) -> dict[str, Any]:
 
 
 def kill(case: Kills, options: Options) -> dict[str, Any]:
-    """Train without interruption and with kills, each after some progress, and compare the results."""
+    """Train without interruption and with kills, and compare the results; some progress precedes each kill."""
     straight, killed = (options.work / f"{case.task}-{case.seed}-{name}" for name in ("straight", "killed"))
     for folder in (straight, killed):
         shutil.rmtree(folder, ignore_errors=True)

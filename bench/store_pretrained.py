@@ -1,6 +1,6 @@
 """Store the policies of runs in the package: lyceum-warp bench store_pretrained RUN...
 
-Each run becomes lyceum_warp/pretrained/TASK with its settings, the policy's weights in float16, and the return of the
+Each run is stored in lyceum_warp/pretrained/TASK: its settings, the policy's weights in float16, and the return of the
 stored policy.
 """
 
@@ -20,7 +20,7 @@ from lyceum_warp.runs.folder import Run
 FOLDER = Path(lw.__file__).parent / "pretrained"
 KEPT = ("format", "algorithm", "task", "params", "physics", "options", "nworld", "threads", "seed")
 EPISODES, SEED = 32, 1
-FEW, FIRST = 4, 60  # worlds and steps of the test of a stored policy
+FEW, FIRST = 4, 60  # number of worlds and steps in the test of a stored policy
 
 
 def store(folder: Path, which: str) -> Path:

@@ -15,9 +15,9 @@ class Options:
     """Write a page of tables for each experiment with stored results."""
 
     names: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Experiments; by default all with results."""
+    """Names of the experiments; by default all that have results."""
     results: Path = experiment.RESULTS
-    """Folder with the results, to which the pages are written."""
+    """Folder with the results; the pages are written to it."""
 
 
 def main(options: Options) -> int:

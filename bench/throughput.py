@@ -4,10 +4,10 @@
     lyceum-warp bench throughput --parts worlds kept --device cuda
 
 Six parts. ``sampling``: many worlds on all threads, relative to native C, which is ``mujoco.rollout`` with the same
-substeps on all threads. ``suite``: tasks of dm_control's suite with equal numbers of worlds, relative to dm_control
-itself. ``single``: one world on one thread, relative to Gymnasium. ``cores``: as ``sampling``, on 1, 2, 4, ... cores.
+substeps on all threads. ``suite``: tasks of dm_control's suite with equal numbers of worlds, relative to dm_control.
+``single``: one world on one thread, relative to Gymnasium. ``cores``: the part ``sampling`` on 1, 2, 4, ... cores.
 ``worlds``: lyceum_warp with 1 to 131,072 worlds. ``kept``: an environment compared with its bare engine (kept.py).
-contestants.py defines a sample, and how each contestant takes it.
+The module contestants.py defines what counts as a sample, and runs each contestant.
 """
 
 import dataclasses
@@ -46,7 +46,7 @@ PARTS = {
     "worlds": ("warp", "c"),
     "kept": ("c", "warp"),
 }
-"""Contestants of each part. The Warp engine takes part on a GPU, or if it is requested by name."""
+"""Contestants of each part. The Warp engine runs only on a GPU, or if --contestants names it."""
 UNITS = {"sampling": "native", "suite": "dm_control", "single": "gymnasium", "cores": "native"}
 """The reference contestant of each part."""
 WORLDS = {"warp": (1, 8, 64, 512, 2_048, 8_192, 16_384, 32_768, 65_536, 131_072), "c": (1, 8, 64, 512, 4_096)}
@@ -63,10 +63,10 @@ class Options(experiment.Options):
     seconds: float = 1.0
     """Duration of each measurement in seconds."""
     worlds: int | None = None
-    """Number of worlds of lyceum_warp and of native C; by default 64 per thread, and 16,384 on a GPU. In the part suite
-    of all contestants; by default 2, 16 and 128."""
+    """Number of worlds of lyceum_warp and of native C; by default 64 per thread, and 16,384 on a GPU. In the part
+    suite, number of worlds of every contestant; by default 2, 16 and 128."""
     policy: str | None = None
-    """Folder of a run whose policy acts in the part kept; by default actions are random."""
+    """Folder of the run whose policy acts in the part kept; by default actions are random."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,8 +150,8 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def grouped(rows: Sequence[Row], part: str, *by: str) -> dict[tuple[Any, ...], list[Row]]:
-    """Group the rows of a part by the given entries of their cases; sort the groups in the order of TASKS, then by
-    size."""
+    """Group the rows of a part by the given entries of their cases; sort the groups by task (in the order of TASKS),
+    then by size."""
     found: dict[tuple[Any, ...], list[Row]] = {}
     order = {task: place for place, task in enumerate(TASKS)}
     mine = [row for row in rows if row.case["part"] == part]
@@ -215,7 +215,7 @@ def kept_line(row: Row) -> list[str]:
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    """Draw the ratios of the part ``sampling`` to native C as points on a logarithmic axis."""
+    """Draw the step rates of the part ``sampling``, relative to native C, as points on a logarithmic axis."""
     groups = grouped(rows, "sampling", "task")
     ratios = {task: experiment.paired(same, "env_steps_per_second", "native") for (task,), same in groups.items()}
     names = [name for name in PARTS["sampling"][1:] if any(found.get(name) for found in ratios.values())]

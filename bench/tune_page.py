@@ -1,4 +1,4 @@
-"""Write results/tune.md, tables of the rows that `lyceum-warp tune --out results/tune-MACHINE.jsonl` appended."""
+"""Write results/tune.md with tables of the results that `lyceum-warp tune --out results/tune-MACHINE.jsonl` stored."""
 
 import json
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ TEXT = "# tune\n\nFaster physics at equal returns. Written by `lyceum-warp bench
 
 
 def searches(name: str) -> list[list[dict[str, Any]]]:
-    """Read the searches in a file: for each, a row per setting, fastest first, with the verdict on that setting."""
+    """Read the searches in a file; each search has a row with a verdict for every setting, fastest first."""
     found: dict[str, list[dict[str, Any]]] = {}
     for line in (RESULTS / name).read_text().splitlines():
         row = json.loads(line)

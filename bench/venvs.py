@@ -1,7 +1,7 @@
-"""Run peers' programs, in separate virtual environments if they need other versions of our packages.
+"""Run programs of other libraries, in separate virtual environments if they need other package versions.
 
-``peers/NAME/requirements.txt`` pins the packages that a peer needs. The peer's environment is made at first use in
-``~/.cache/lyceum_warp/peers`` (or ``$LYCEUM_WARP_PEERS``), one per set of requirements and Python version.
+``peers/NAME/requirements.txt`` pins the packages that a library needs. The library's virtual environment is made at
+first use in ``~/.cache/lyceum_warp/peers`` (or ``$LYCEUM_WARP_PEERS``), one per set of requirements and Python version.
 """
 
 import fcntl
@@ -23,13 +23,13 @@ FOLDER = experiment.FOLDER / "peers"
 
 
 def run(python: Path, worker: Path, **arguments: Any) -> dict[str, Any]:
-    """Run a worker that reads a JSON object from stdin and prints one as its last line.
+    """Run a worker that reads a JSON object from stdin, and prints a JSON object as its last line.
 
     Raises:
         experiment.Skipped: A package of the worker is missing.
         RuntimeError: The worker failed.
     """
-    # a peer's environment must not find our packages
+    # the other virtual environment must not import packages of this one
     hidden = () if python == Path(sys.executable) else ("PYTHONPATH", "PYTHONHOME")
     env = {name: value for name, value in os.environ.items() if name not in hidden}
     command = [str(python), str(worker)]
@@ -43,7 +43,8 @@ def run(python: Path, worker: Path, **arguments: Any) -> dict[str, Any]:
 
 @functools.cache
 def _made(name: str) -> tuple[Path, str]:
-    """Make a peer's environment if it does not exist; return its Python, and the reason if that failed."""
+    """Make the virtual environment of a library if it does not exist; return the path of its Python, and an error
+    message or ""."""
     requirements = FOLDER / name / "requirements.txt"
     text = "\n".join([requirements.read_text(), sys.version, platform.machine()])
     root = Path(os.environ.get("LYCEUM_WARP_PEERS") or Path.home() / ".cache" / "lyceum_warp" / "peers")
@@ -56,7 +57,7 @@ def _made(name: str) -> tuple[Path, str]:
             return python, ""
         print(f"making a virtual environment for {name}: {folder}", flush=True)
         shutil.rmtree(folder, ignore_errors=True)
-        # this pip installs into the environment; installing pip there would take seconds
+        # this process's pip installs into the new environment, because installing pip there would take seconds
         pip = [sys.executable, "-m", "pip", "--python", str(python), "--disable-pip-version-check", "--retries", "1"]
         for command in (
             [sys.executable, "-m", "venv", "--without-pip", str(folder)],
@@ -72,7 +73,7 @@ def _made(name: str) -> tuple[Path, str]:
 
 
 def python_of(name: str) -> Path:
-    """Return the Python of a peer's environment, and make the environment if it does not exist.
+    """Return the path of the Python in a library's virtual environment, which is made if it does not exist.
 
     Raises:
         experiment.Skipped: The environment cannot be made, for example without a network.

@@ -1,6 +1,7 @@
 """Define a cheetah that runs at a commanded speed, with most features of the task form.
 
-``python examples/commanded_speed.py`` checks and steps it; ``lyceum-warp train examples/commanded_speed.py`` trains it.
+``python examples/commanded_speed.py`` checks the task; ``lyceum-warp train examples/commanded_speed.py`` trains a
+policy.
 """
 
 from typing import Any
@@ -32,7 +33,7 @@ class World:
     qpos: Row[float]
     qvel: Row[float]
     sensordata: Row[float]
-    gravity: Row[float]  # this and the next three are model fields; startup and randomize write them per world
+    gravity: Row[float]  # four model fields, which startup and randomize write per world
     body_mass: Row[float]
     geom_friction: Row[wp.vec3]
     actuator_gainprm: Row[lw.vec10]
@@ -129,12 +130,12 @@ def difficulty(level: Row[float]) -> float:
 
 
 @wp.func
-def startup(s: World, p: Params, rng: Row[wp.uint32]):  # run once for each world
+def startup(s: World, p: Params, rng: Row[wp.uint32]):  # runs once for each world, when the environment is made
     s.gravity[2] = s.gravity[2] * lw.uniform(rng, 0.95, 1.05)
 
 
 @wp.func
-def randomize(s: World, p: Params, rng: Row[wp.uint32]):  # run at every reset, from nominal values
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):  # runs at every reset, from nominal values
     for i in range(1, 8):
         s.body_mass[i] = s.body_mass[i] * lw.uniform(rng, 0.8, 1.2)
     for i in range(6):
@@ -144,7 +145,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):  # run at every reset, 
 
 
 @wp.func
-def event(s: World, p: Params, rng: Row[wp.uint32]):  # on average a new command every 2 s and a push every second
+def event(s: World, p: Params, rng: Row[wp.uint32]):  # draws a command every 2 s and a push every second, on average
     if lw.uniform(rng, 0.0, 2.0) < p.dt:
         s.command[0] = lw.uniform(rng, 0.0, 1.0 + s.level[0] * (p.fastest - 1.0))
     if lw.uniform(rng, 0.0, 1.0) < p.dt:
@@ -159,7 +160,7 @@ def substep(s: World, p: Params):
 
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
-    well = tracking(s0, s1, p) > 0.7  # the level, and with it the commands, rises
+    well = tracking(s0, s1, p) > 0.7  # a higher level gives faster commands
     s1.level[0] = wp.clamp(s0.level[0] + wp.where(well, 1e-3, -1e-3), 0.0, 1.0)
 
 

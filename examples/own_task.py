@@ -1,6 +1,6 @@
-"""Define a task and its model in one file: swing up a pendulum whose motor is too weak to lift it directly.
+"""Define a task and its model in one file: a pendulum that must swing up with a weak motor.
 
-``python examples/own_task.py`` checks and steps it; docs/own_task.md shows the command line and models in files.
+``python examples/own_task.py`` checks and steps the task; docs/own_task.md shows the command line and model files.
 """
 
 import mujoco
@@ -23,8 +23,8 @@ XML = """<mujoco model="pendulum">
 
 @wp.struct
 class World:  # the fields that the functions read, by MuJoCo's names
-    qpos: Row[float]  # angle in rad; 0 is hanging down
-    qvel: Row[float]  # rad/s
+    qpos: Row[float]  # angle in rad (0 hangs down), and velocity in rad/s
+    qvel: Row[float]
 
 
 @wp.struct
@@ -47,12 +47,12 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
 
 @lw.register
 class Pendulum(lw.Task):
-    model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))  # or a file beside this one: "pendulum.xml"
+    model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))  # the model may also be a file name
     frame_skip, horizon, obs = 20, 250, {"direction": 2, "velocity": 1}  # 20 substeps of 2 ms in a step
 
 
 if __name__ == "__main__":
-    print(check_task(Pendulum, steps=100))  # the rules that the package's own tasks follow
+    print(check_task(Pendulum, steps=100))  # this checks the rules that the package's own tasks follow
     env = lw.make(Pendulum, nworld=4, effort_weight=0.1)
     env.action[:] = 0.5  # Nm
     env.step()

@@ -21,7 +21,7 @@ def main(
     """Control a task with MPPI.
 
     Args:
-        task: Name of a task, or a file with one.
+        task: Name of a task, or a file that defines one.
         episodes: Number of episodes.
         steps: Number of steps in an episode; by default the task's horizon.
         samples: Number of samples per plan; by default the task's setting.

@@ -1,4 +1,4 @@
-"""Write a learner for lw.train: augmented random search with a linear policy (Mania et al. 2018).
+"""Define a learner for lw.train: augmented random search with a linear policy (Mania et al. 2018).
 
     python examples/random_search.py
     python examples/random_search.py --task hopper --nworld 64 --iterations 300 --video-every 100
@@ -20,7 +20,7 @@ class SearchConfig:
     """Hyperparameters."""
 
     step: float = 1.0
-    """Step size along a direction if its two returns differ by one standard deviation of all returns."""
+    """Step size along a direction whose two returns differ by one standard deviation of all returns."""
     noise: float = 0.5
     """Standard deviation of the perturbations of the weights."""
 

@@ -1,4 +1,4 @@
-"""Write an off-policy learner with lw.Replay: twin delayed DDPG (TD3; Fujimoto et al. 2018).
+"""Define an off-policy learner with lw.Replay: twin delayed DDPG (TD3; Fujimoto et al. 2018).
 
     python examples/td3.py
     python examples/td3.py --task half_cheetah --nworld 8 --iterations 200
@@ -18,13 +18,13 @@ import lyceum_warp as lw
 
 @dataclasses.dataclass(frozen=True)
 class TD3Config:
-    """Hyperparameters; noise is in unit actions, between -1 and 1."""
+    """Hyperparameters; noise is in units of scaled actions, which lie between -1 and 1."""
 
     hidden: tuple[int, ...] = (64, 64)
     num_steps: int = 125
-    """Steps of every world per iteration."""
+    """Steps of each world per iteration."""
     warmup: int = 1000
-    """Samples with random actions."""
+    """Number of samples with random actions, which are taken first."""
     batch: int = 256
     n_step: int = 1
     gamma: float = 0.99
@@ -40,7 +40,7 @@ class TD3Config:
 
 
 class TD3(lw.Learner):
-    """Learns a deterministic policy from a replay buffer, with the smaller of two critics as the target."""
+    """A learner of a deterministic policy from a replay buffer, whose targets use the smaller of two critics."""
 
     algorithm = "td3"
 
@@ -79,7 +79,7 @@ class TD3(lw.Learner):
         )  # fmt: skip
 
     def update(self) -> torch.Tensor:
-        """Update the critics, and every second time the actor and the targets; return the critics' loss."""
+        """Update the critics, and in every second call the actor and the target networks; return the critics' loss."""
         config, (actor, critic), (actor_step, critic_step) = self.config, self.targets, self.optimizers
         batch = self.replay.sample(config.batch, n_step=config.n_step, gamma=config.gamma, generator=self.generator)
         obs, next_obs = batch.obs["policy"], batch.next_obs["policy"]
@@ -100,7 +100,7 @@ class TD3(lw.Learner):
         return loss.detach()
 
     def normal(self, like: torch.Tensor) -> torch.Tensor:
-        """Draw standard normal numbers."""
+        """Draw standard normal noise."""
         return torch.randn(like.shape, generator=self.generator, device=like.device)
 
     def state_dict(self) -> dict:
@@ -119,7 +119,7 @@ class TD3(lw.Learner):
 
 
 def descend(optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:
-    """Make a step of gradient descent."""
+    """Take a step of gradient descent."""
     optimizer.zero_grad()
     loss.backward()
     optimizer.step()

@@ -29,17 +29,18 @@ def main(nworld: int = 256, iterations: int = 100, steps: int = 32, device: str 
             obs = env.obs.clone()  # env.obs changes in place
             with torch.no_grad():
                 action = torch.normal(actor(obs), log_std.exp())
-            env.step(action)  # copies the action into env.action; a world that is done starts a new episode
+            env.step(action)  # the step copies the action into env.action; a world whose episode ends starts a new one
             with torch.no_grad():
                 # env.obs may already belong to a new episode; env.final_obs is the observation after this step.
-                # Bootstrap from its value unless the task terminated: a time limit only truncates the episode.
+                # Bootstrap from the value of env.final_obs unless the task terminated: a time limit only truncates the
+                # episode.
                 next_value = critic(env.final_obs) * ~env.terminated
             outcome = env.reward.clone(), env.done.clone(), env.eval.clone()
             samples.append((obs, action, next_value, *outcome))
 
         obs, action, next_value, reward, done, distance = map(torch.stack, zip(*samples, strict=True))
         target = reward + gamma * next_value
-        for t in reversed(range(steps - 1)):  # returns within these samples, up to the end of each episode
+        for t in reversed(range(steps - 1)):  # returns of these samples, each up to the end of its episode
             target[t] = torch.where(done[t], target[t], reward[t] + gamma * target[t + 1])
         value = critic(obs.flatten(0, 1))
         advantage = target.flatten() - value.detach()

@@ -3,7 +3,7 @@
     python examples/train.py
     python examples/train.py --task half_cheetah --nworld 64 --iterations 100
 
-The command line does the same and more: ``lyceum-warp train hopper`` can resume, and makes a plot and a video.
+The command line has more options: ``lyceum-warp train hopper`` can resume, and makes a plot and a video.
 """
 
 from pathlib import Path
@@ -26,7 +26,7 @@ def main(
     """Train a policy.
 
     Args:
-        task: Name of a task, or a file with one.
+        task: Name of a task, or a file that defines one.
         nworld: Number of worlds; use thousands on a GPU.
         iterations: Number of updates of the policy.
         samples: Transitions per iteration.
@@ -37,12 +37,12 @@ def main(
     env = lw.make(task, nworld=nworld, device=device, seed=seed)
     npg = lw.NPG(env, config=lw.NPGConfig(samples=samples), seed=seed)
 
-    for it in npg:  # endless: each iteration samples, updates the policy, and yields statistics
+    for it in npg:  # this iterator never ends: each iteration samples, updates the policy, and yields statistics
         print(f"iteration {it.iteration:3d}  return {it.return_mean:7.1f}  {it.samples_per_second:8,.0f} samples/s")
         if it.iteration == iterations:
             break
 
-    # new episodes without exploration noise: a policy called with observations returns its mean actions
+    # evaluation without exploration noise: a policy called with observations returns its mean actions
     episodes = lw.evaluate(env, npg.policy, 20, seed=seed + 1)
     print(f"mean policy: return {episodes.returns.mean():.1f} in {episodes.lengths.mean():.0f} steps")
 

@@ -20,7 +20,7 @@ from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.placement import bytes_per_world, find_device, open_engine, options_for_few_worlds
 from lyceum_warp.fields import describe, elements, has_several_rows
 from lyceum_warp.graphs.compile_ahead import compile_ahead
-from lyceum_warp.kernels import steps
+from lyceum_warp.kernels import step_types, steps
 from lyceum_warp.model_fields import describe_model_field, is_model_field, put_rows
 from lyceum_warp.options import OPTION_DOCS, EnvOptions, signature_of_options
 from lyceum_warp.spaces import Space
@@ -32,7 +32,7 @@ from lyceum_warp.task import Task
 from lyceum_warp.world_arrays import own_bytes_per_world
 from lyceum_warp.worlds import Worlds
 
-_BUFFERS = (*steps.OUTCOMES, "obs", "final_obs", "action")
+_BUFFERS = (*step_types.OUTCOMES, "obs", "final_obs", "action")
 
 _ARGUMENTS = """Args:
     task: Name of a task, a file with one (path/to/file.py, or path/to/file.py:Class), or its class.

@@ -11,7 +11,7 @@ from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.parts import sizes
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
-from lyceum_warp.kernels import state, steps
+from lyceum_warp.kernels import state, step_types, transitions
 from lyceum_warp.spaces import OWN_PARTS, Space, action_space, control_ranges, control_scale, state_space
 from lyceum_warp.support.arrays import flat, launch_rows, shared_rows, torch_view, with_memory
 from lyceum_warp.support.validate import check_tensor
@@ -106,7 +106,7 @@ class WorldArrays:
         layouts = self.task.shared
         shared, sums = (sum(sizes(layouts.get(name, {})).values()) for name in ("Shared", "Sums"))
         self.shared, self.sums = wp.zeros((1, shared), dtype=float), wp.zeros(sums, dtype=wp.int64)
-        """Shared memory, (1, size), and sums in units of 1 / ``steps.UNIT``, (size of Sums,)."""
+        """Shared memory, (1, size), and sums in units of 1 / ``kernels.steps.UNIT``, (size of Sums,)."""
         self._shares = wp.zeros((self.nworld, sums), dtype=float)
         if layouts:
             for batch in (self.after, self.before):
@@ -115,9 +115,9 @@ class WorldArrays:
     def _allocate_outcome(self) -> None:
         """Allocate rewards, ends of episodes, metrics and observations."""
         n, kernels = self.nworld, self.task.kernels
-        self.outcome = steps.Outcome()
+        self.outcome = step_types.Outcome()
         self.buffers: dict[str, torch.Tensor] = {}
-        for name, dtype in steps.OUTCOMES.items():
+        for name, dtype in step_types.OUTCOMES.items():
             setattr(self.outcome, name, wp.zeros(n, dtype=dtype))
             self.buffers[name] = torch_view(getattr(self.outcome, name))
         self.metrics: wp.array = wp.zeros((n, len(self.task.metrics)), dtype=float)
@@ -126,9 +126,9 @@ class WorldArrays:
         """The metrics summed over the episode up to the last step."""
         self.outcome.metrics = self.metrics  # type: ignore[assignment]
         self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
-        parts = int(steps.OBSERVE_FIRST) + len(self.obs_spaces)
-        self._judging = parts if self.device.is_cuda else 1  # number of threads per world for judging
-        self._found = steps.Findings()
+        parts = int(transitions.OBSERVE_FIRST) + len(self.obs_spaces)
+        self._judging = parts if self.device.is_cuda else 1  # number of threads that judge a world
+        self._found = step_types.Findings()
         self._found.reward, self._found.eval = wp.zeros(n, dtype=float), wp.zeros(n, dtype=float)
         self._found.terminated, self._found.success = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
         self._found.fault = wp.zeros((parts, n), dtype=int)  # type: ignore[assignment]
@@ -153,7 +153,7 @@ class WorldArrays:
     def _allocate_counters(self) -> None:
         """Allocate counters, random streams and faults."""
         n = self.nworld
-        self.counters = steps.Counters()
+        self.counters = step_types.Counters()
         self.counters.step, self.counters.episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
         self.counters.key = wp.zeros(n, dtype=wp.uint32)
         self.counters.rng = wp.zeros((len(self.obs_spaces) * n, 1), dtype=wp.uint32)  # type: ignore[assignment]

@@ -262,7 +262,7 @@ class Worlds(WorldArrays):
     def _judge(
         self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool, keep_reason: bool = False
     ) -> None:
-        """Compute the masked worlds' rewards, metrics, evaluations, ends and observations; see ``kernels.steps``."""
+        """Compute rewards, metrics, evaluations, ends and observations of worlds; see ``kernels.transitions``."""
         kernels = self.task.kernels
         if kernels.check_memory is not None:
             launch_lanes(kernels.check_memory, self.nworld, [mask, self.before, self.after, fault], self.device)

@@ -1,4 +1,4 @@
-"""Models in XML with every kind of element, and the rules whose results depend on the model."""
+"""Define XML models with every kind of element, and list the rules whose results depend on the model."""
 
 from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import episode_rules as episodes
@@ -105,7 +105,7 @@ MOVING = {
     ),
     "sleep": text(BALL.format(z=0.1) + ARM, option='<flag sleep="enable"/>'),
 }
-"""Models on which rules check the physics."""
+"""Models for the rules that check the physics."""
 
 SENSING = {
     "position sensors": text(
@@ -136,7 +136,7 @@ SENSING = {
     ),
     "no sensors": text(ARM),
 }
-"""Models on which rules check the sensors."""
+"""Models for the rules that check the sensors."""
 
 PLUGINS = {
     "it cannot evaluate SDF plugins": text(
@@ -161,4 +161,4 @@ PLUGINS = {
         ARM, actuated('<orientation name="aim" site="tip" refsite="here" kp="1"/>', '<motor joint="wrist"/>')
     ),
 }
-"""Models that only the C engine supports, by the Warp engine's error message."""
+"""Models that only the C engine supports, with the Warp engine's error message for each."""

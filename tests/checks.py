@@ -1,4 +1,4 @@
-"""Shared helpers: random states, comparisons with formulas, and checks of random samples."""
+"""Make random states, compare results with formulas, and check random samples."""
 
 import numpy as np
 import torch
@@ -7,7 +7,7 @@ import lyceum_warp as lw
 
 
 def put_at_random(env: lw.Env, rng: np.random.Generator, position: float, velocity: float) -> torch.Tensor:
-    """Put every world into a random state with qpos and qvel up to the given sizes; return the states."""
+    """Put every world into a random state with qpos and qvel within the given bounds; return the states."""
     state = env.get_state()
     parts = env.state_space.split(state)
     for name, size in (("qpos", position), ("qvel", velocity)):

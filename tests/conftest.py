@@ -1,10 +1,10 @@
-"""Fixtures for all tests: shared environments, task files, and skips on machines without a GPU."""
+"""Define fixtures for shared environments and task files, and skip GPU tests on machines without a GPU."""
 
 import functools
 import gc
 import hashlib
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,30 +16,9 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.support.warp_log import start_warp
-from lyceum_warp.tasks.dm import TASKS as SUITE
 
-# the tests' batches are too small to parallelise, and on a busy machine torch's threads wait for each other
+# one torch thread suffices for the tests' small batches; on a busy machine several threads would wait for each other
 torch.set_num_threads(1)
-
-SAME_FUNCTIONS = (
-    "g1_full_velocity", "g1_rough_velocity", "h1_velocity", "humanoid_walk", "spot_velocity", "t1_velocity",
-    *(name for name in SUITE if name not in ("dm/manipulator_bring_ball", "dm/cheetah_run")),
-)  # fmt: skip
-"""Tasks that share their functions with ``go1_velocity``, ``g1_velocity``, ``go1_rough_velocity`` or
-``humanoid_stand``; and the tasks of dm_control's suite, whose functions are simple."""
-SAME_MODELS = (
-    "dm/cheetah_run", "dm/manipulator_bring_ball",
-    "adroit_door", "adroit_hammer", "adroit_relocate", "aloha_lift", "arm_hand_pickup", "herb_reach", "humanoid_get_up",
-    "humanoid_standup", "inverted_double_pendulum", "pusher", "reacher", "swimmer", "walker2d",
-)  # fmt: skip
-"""Tasks whose models have no unique features, so that they need no quick tests on the Warp engine."""
-
-
-def long_if_alike(tasks: Iterable[str], *more: str) -> list[Any]:
-    """Return test parameters for all tasks; tasks in ``SAME_FUNCTIONS`` and in ``more`` are marked long."""
-    alike = (*SAME_FUNCTIONS, *more)
-    return [pytest.param(task, marks=pytest.mark.long) if task in alike else task for task in tasks]
-
 
 SharedEnv = Callable[..., lw.Env]
 TaskFile = Callable[[str, str], Path]
@@ -47,7 +26,8 @@ TaskFile = Callable[[str, str], Path]
 
 @pytest.fixture(scope="session", autouse=True)
 def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Store the list of trusted runs in a temporary directory instead of the user's, also for subprocesses."""
+    """Store the list of trusted runs in a temporary directory instead of the user's, for this process and its
+    subprocesses."""
     with pytest.MonkeyPatch.context() as patched:
         folder = tmp_path_factory.mktemp("state")
         patched.setenv("XDG_STATE_HOME", str(folder))
@@ -56,9 +36,9 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="session", autouse=True)
 def known_sizes(pytestconfig: pytest.Config) -> Iterator[None]:
-    """Keep the probed sizes of contact buffers between runs of the tests, as Warp keeps kernels.
+    """Cache the probed sizes of contact buffers between runs of the tests.
 
-    A probe takes seconds for a large model. Another release of MuJoCo or another probe begins without sizes.
+    A probe takes seconds for a large model. For another release of MuJoCo or another probe, the cache starts empty.
     """
     sizes, cache = sys.modules.get("lyceum_warp.engines.warp.sizes"), getattr(pytestconfig, "cache", None)
     if sizes is None or cache is None:
@@ -68,15 +48,15 @@ def known_sizes(pytestconfig: pytest.Config) -> Iterator[None]:
     key = f"lyceum_warp/sizes-{mujoco.__version__}-{source}"
     sizes._known.update({model: tuple(found) for model, found in cache.get(key, {}).items()})
     yield
-    cache.set(key, cache.get(key, {}) | sizes._known)  # another process may have stored some
+    cache.set(key, cache.get(key, {}) | sizes._known)  # another process may have stored sizes
 
 
 @pytest.fixture(scope="module")
 def shared_env() -> Iterator[SharedEnv]:
-    """Call ``lw.make`` once per file for the same arguments, as in ``shared_env("hopper", engine="warp", nworld=4)``.
+    """Make environments that the tests of a file share; equal arguments of ``lw.make`` give the same environment.
 
     Every call resets the worlds with ``rand_reset(0)``, so a test may leave them in any state. A test that changes
-    parameters or attributes, or that needs many worlds, makes its own environment, which is freed with it.
+    parameters or attributes, or that needs many worlds, calls ``lw.make`` itself.
     """
     made: dict[tuple[Any, ...], lw.Env] = {}
 
@@ -109,9 +89,11 @@ def task_file(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFact
 
 
 def settle() -> None:
-    """Exempt all live objects from garbage collection: imports and kernels are a million objects to scan.
+    """Exempt all live objects from garbage collection, because scanning a million objects of imports and kernels is
+    slow.
 
-    Later objects are collected and counted as usual. Do not call it while an object is alive that a test must free.
+    Objects that are created later are collected and counted as usual. Do not call this function while an object is
+    alive that a test must free.
     """
     gc.collect()
     gc.freeze()
@@ -119,7 +101,7 @@ def settle() -> None:
 
 @pytest.fixture
 def freed() -> Iterator[None]:
-    """Collect garbage after the test: environments contain reference cycles, and one with many worlds is large."""
+    """Collect garbage after the test, because environments contain reference cycles and may be large."""
     yield
     gc.collect()
 
@@ -143,10 +125,9 @@ def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
     return made
 
 
-@pytest.hookimpl(tryfirst=True)  # before pytest deselects by marks
+@pytest.hookimpl(tryfirst=True)  # this hook must run before pytest deselects tests by marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the rest of a matrix ``long``, skip tests marked ``gpu`` without a GPU, and tests of models that are not
-    installed."""
+    """Mark cases ``long`` that the mark ``quick`` omits, and skip tests whose GPU or models are missing."""
     _mark_long(items)
     for item in items:
         if (missing := _missing_model(_task(item))) is not None:
@@ -161,13 +142,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _mark_long(items: list[pytest.Item]) -> None:
-    """Mark the cases ``long`` that their test's mark ``quick`` does not name."""
+    """Mark the cases ``long`` that their test's mark ``quick`` does not name, by their id or by a part of it."""
     cases: dict[tuple[str, ...], set[str]] = {}
     for item in items:
         if (mark := item.get_closest_marker("quick")) is not None:
             case = item.callspec.id  # type: ignore[attr-defined]
-            cases.setdefault((item.nodeid.partition("[")[0], *mark.args), set()).add(case)
-            if case not in mark.args:
+            named = {name for name in mark.args if f"-{name}-" in f"-{case}-"}
+            cases.setdefault((item.nodeid.partition("[")[0], *mark.args), set()).update(named or [case])
+            if not named:
                 item.add_marker(pytest.mark.long)
     for (test, *quick), found in cases.items():
         # a command line may select single cases
@@ -184,7 +166,7 @@ def _task(item: pytest.Item) -> str | None:
 
 @functools.cache
 def _missing_model(task: str | None) -> str | None:
-    """Return why a task's model is missing and how to install it; None if it is installed."""
+    """Return why a task's model is missing and how to install it, or None if it is installed."""
     if task is None:
         return None
     try:

@@ -1,4 +1,4 @@
-"""Tasks with pushes and randomized dynamics, with small models on which both engines agree up to rounding."""
+"""Define tasks with pushes and randomized dynamics on small models, for which both engines agree up to rounding."""
 
 import mujoco
 import warp as wp
@@ -185,7 +185,7 @@ def count_steps(s0: PracticedWorld, action: Row[float], s1: PracticedWorld, p: P
 
 
 class Practiced(lw.Task):
-    """A task in which the puck starts further away the longer a world has practiced; the practice is observed."""
+    """A task in which the puck's initial distance grows with the practice of its world, which is observed."""
 
     model = Drawn.model
     frame_skip = 3
@@ -202,7 +202,7 @@ def draw_practice(s: PracticedWorld, p: PuckParams, rng: Row[wp.uint32]):
 
 
 class Gifted(Practiced):
-    """``Practiced`` with initial practice that is randomized once per world; all worlds share the model."""
+    """``Practiced`` with a randomized initial practice in each world; all worlds share the model."""
 
     World = PracticedWorld
     Params = PuckParams

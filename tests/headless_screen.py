@@ -1,4 +1,4 @@
-"""Run the panel in studio's viewer without a browser or window."""
+"""Run the panel in MuJoCo Studio's viewer without a browser or window."""
 
 from typing import Any
 
@@ -75,7 +75,7 @@ class HeadlessViewer(viewer_protocol.Viewer):
 
 
 class Bench:
-    """A panel in a separate viewer. Stores the messages that the panel sends."""
+    """A panel in a separate viewer without a window. The screen stores the messages that the panel sends."""
 
     def __init__(self, model: mujoco.MjModel, scene: Scene, **options: Any) -> None:
         self.model, self.data = model, mujoco.MjData(model)
@@ -107,7 +107,7 @@ class Bench:
         return given
 
     def show(self, status: Status) -> None:
-        """Draw a frame with this status, and drop earlier messages."""
+        """Draw a frame with the given status, and discard earlier messages."""
         self.draw(frame_of(self.model, self.data, status))
         self.sent.clear()
 

@@ -1,4 +1,4 @@
-"""Replace the window process by an object that collects frames and sends the commands of a test."""
+"""Replace the window process by an object that collects frames and sends a test's commands."""
 
 import time
 from collections import deque
@@ -14,7 +14,8 @@ class MemoryWindow:
     """A window that collects frames without showing them.
 
     Args:
-        script: Called after each frame with the frame and its number; returns commands, or None to close the window.
+        script: Function that is called after each frame with the frame and its number; returns commands, or None to
+            close the window.
         seconds: Time limit of the test.
     """
 
@@ -50,7 +51,8 @@ class MemoryWindow:
 
 
 def run(session: Session, *script: Iterable[Command] | Callable[[Frame], bool]) -> MemoryWindow:
-    """Run a session, and send the script's commands, one entry per frame; an entry may be a condition to wait for."""
+    """Run a session, and send the script's commands, one entry per frame; an entry may also be a condition to wait
+    for."""
     entries = list(script)
 
     def after(frame: Frame, number: int) -> Iterable[Command] | None:

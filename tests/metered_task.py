@@ -1,4 +1,5 @@
-"""A task with metrics and observation groups: a ball on a rail; the episode ends if it leaves the rail."""
+"""Define a task with metrics and observation groups: a ball on a rail, whose episode ends if the ball leaves the
+rail."""
 
 import warp as wp
 from rail_task import rail

@@ -1,4 +1,4 @@
-"""MPPI, CEM and predictive sampling by their definitions, in NumPy, stepping all worlds one step at a time."""
+"""Plan with MPPI, CEM and predictive sampling in NumPy, directly from their definitions."""
 
 from collections.abc import Callable
 from fractions import Fraction
@@ -12,7 +12,7 @@ import lyceum_warp as lw
 
 
 def smoothed(noise: np.ndarray, betas: tuple[float, ...]) -> np.ndarray:
-    """Smooth noise over time, (horizon, ...): from the third step on, each step mixes with the previous two."""
+    """Smooth noise over time, (horizon, ...); from the third step on, each step is mixed with the previous two."""
     result = noise.copy()
     for t in range(2, len(noise)):
         result[t] = betas[0] * noise[t] + betas[1] * result[t - 1] + betas[2] * result[t - 2]
@@ -27,17 +27,18 @@ def hermite(before: Any, left: Any, right: Any, after: Any, f: float) -> Any:
 
 
 class Grid:
-    """Knots at fixed times: with K knots over H steps, knot j is at step j H / K."""
+    """A grid of knots at fixed times: with K knots over H steps, knot j is at step j H / K."""
 
     def __init__(self, horizon: int, knots: int, spline: str) -> None:
         self.horizon, self.distance, self.spline, self.now = horizon, Fraction(horizon, knots), spline, 0
 
     def first(self) -> int:
-        """Return the number of the first knot that the plan depends on."""
+        """Return the index of the first knot on which the plan depends."""
         return self.now // self.distance - (self.spline == "cubic")
 
     def actions(self, knots: np.ndarray) -> np.ndarray:
-        """Interpolate the actions of all steps. The first row of ``knots``, (n, ...), is knot number ``first()``."""
+        """Interpolate the actions of all steps. The first row of ``knots``, (n, ...), is the knot with the index
+        ``first()``."""
         result = []
         for t in range(self.horizon):
             place = (self.now + t) / self.distance
@@ -52,12 +53,12 @@ class Grid:
 
 
 class Plain:
-    """A planner by its definition, in float64; the caller gives the standard normal numbers.
+    """A planner in float64 that follows the definitions; the caller passes the standard normal numbers.
 
     Args:
         knots: Number of knots over the horizon, or None for an independent number at each step.
         count: Number of knots in a plan.
-        fields: Rows of model fields by name, (models, size), which worlds use in turn.
+        fields: Model fields by name, (models, size); world i uses row i modulo the number of models.
     """
 
     def __init__(
@@ -103,7 +104,7 @@ class Plain:
             self.smoothing = (1.0, 0.0, 0.0)
         self.knots = np.tile(np.clip(self.fill, self.low, self.high), (count or horizon, 1))
         self.deviation = np.tile(np.diag(self.factor), (len(self.knots), 1))
-        # the standard deviation of smoothed independent noise, from the impulse response
+        # compute the standard deviation of smoothed independent noise from the impulse response
         self.spread = np.sqrt((smoothed(np.eye(len(self.knots)), self.smoothing) ** 2).sum(1))[:, None]
 
     @property
@@ -164,7 +165,7 @@ class Plain:
         return result
 
     def roll_out(self, state: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the rewards and ends of each step, and the values of the states after the last one."""
+        """Return the rewards and terminations of each step, and the values of the states after the last step."""
         env = self.env
         states = state.repeat(env.nworld, 1)
         for name, rows in self.fields.items():

@@ -11,11 +11,11 @@ from lyceum_warp.binding.sources import is_row, overloads, run_source
 
 N = 256
 MODULE = wp.Module("term_calls", None)
-"""All kernels, so that Warp compiles them together."""
+"""A Warp module for all kernels, so that Warp compiles them together."""
 
 
 def kernel_of(function: wp.Function, number: int) -> wp.Kernel:
-    """Make a kernel that calls a function in every world; its arrays have a leading axis of worlds."""
+    """Make a kernel that calls a function in every world; the kernel's arrays have a leading axis of worlds."""
     kinds = {
         argument: wp.array(dtype=kind.dtype, ndim=2) if is_row(kind) else wp.array(dtype=kind, ndim=1)
         for argument, kind in function.input_types.items()
@@ -35,7 +35,7 @@ KERNELS = {
     name: [(each, kernel_of(each, i)) for i, each in enumerate(overloads(getattr(terms, name)))]
     for name in terms.__all__
 }
-"""The overloads of each function, with their kernels, by name."""
+"""Overloads of each function, by name; each has a kernel."""
 
 
 @dataclasses.dataclass
@@ -47,9 +47,9 @@ class Call:
 
 
 def call(name: str, overload: int = 0, **values: Any) -> Call:
-    """Call a function with a value for each argument: one for all worlds, or one for each of the N worlds.
+    """Call a function in N worlds; an argument is one value for all worlds, or has one entry per world.
 
-    Each world has its own stream ``rng``. If several overloads take these arguments, ``overload`` selects one.
+    Each world has its own stream ``rng``. If several overloads accept the arguments, ``overload`` selects one.
     """
     matching = [
         (function, kernel) for function, kernel in KERNELS[name] if {*function.input_types} - {"rng"} == {*values}

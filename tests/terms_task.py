@@ -1,4 +1,4 @@
-"""A task for tests of terms: a ball on a rail with rewards for its speed and its position."""
+"""Define a task for tests of terms: a ball on a rail with rewards for its speed and its position."""
 
 from typing import Any
 
@@ -34,7 +34,7 @@ def distance(place: float, target: float) -> float:
 
 
 @wp.func
-def fast(qvel: Row[float], scale: float = 2.0) -> float:  # arguments: a field of World, and a default
+def fast(qvel: Row[float], scale: float = 2.0) -> float:  # takes a field of World, and an argument with a default
     return scale * wp.abs(qvel[0])
 
 

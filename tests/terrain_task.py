@@ -1,4 +1,4 @@
-"""A task on rough ground: a ball with velocity servos along x and y, a height scan, and levels by distance."""
+"""Define a task on rough ground: a ball with velocity servos, a height scan, and levels that depend on the distance."""
 
 import mujoco
 import warp as wp
@@ -50,7 +50,7 @@ class Params:
     patch: float = TERRAIN.patch
     command: float = 1.0  # m/s
     seconds: float = 5.0  # in an episode
-    spread: float = 0.5  # offset of starts from the centre of a patch, m
+    spread: float = 0.5  # offset of initial positions from the centre of a patch, m
 
 
 @wp.struct

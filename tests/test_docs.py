@@ -1,4 +1,4 @@
-"""Run the commands and the Python of pages, and check links and file names in documents."""
+"""Run the commands and the Python blocks of pages, and check links and file names in documents."""
 
 import dataclasses
 import json
@@ -24,8 +24,8 @@ from lyceum_warp.viz.video import NoVideoError, check_video
 ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 WALKTHROUGHS = [page for page in PAGES if "\n```sh\n" in page.read_text()]
-"""Pages with commands. The blocks of a page run in order in one folder; a block with a title is written to a file of
-that name."""
+"""Pages with commands. The code blocks of a page run in order in one folder; a block with a title is written to a file
+with this name."""
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 
 
@@ -34,7 +34,7 @@ def name_of(path: Path) -> str:
 
 
 def python_of(page: Path) -> str:
-    """Return a page's Python with its original line numbers, so that a traceback points into the page."""
+    """Return a page's Python code with its original line numbers, so that a traceback points into the page."""
     lines, language = [], None
     for line in page.read_text().splitlines():
         if line.startswith("```"):
@@ -46,16 +46,13 @@ def python_of(page: Path) -> str:
 
 
 PROGRAMS = [page for page in PAGES if page not in WALKTHROUGHS and python_of(page).strip()]
-"""Pages with Python and without commands."""
+"""Pages that contain Python but no commands."""
 
 
-def quickly(pages: list[Path], *long: str) -> list[object]:
-    """Return test parameters; pages whose programs other tests cover are marked long."""
-    return [pytest.param(page, marks=pytest.mark.long if page.stem in long else (), id=name_of(page)) for page in pages]
-
-
-@pytest.mark.parametrize("page", quickly(PROGRAMS, "terrain"))
-def test_python_of_a_page_runs_in_order(page: Path, task_file: TaskFile) -> None:
+# other tests cover the program of terrain.md
+@pytest.mark.quick(*(name_of(page) for page in PROGRAMS if page.stem != "terrain"))
+@pytest.mark.parametrize("page", PROGRAMS, ids=name_of)
+def test_python_blocks_of_a_page_run_in_order(page: Path, task_file: TaskFile) -> None:
     if page.stem == "dm_suite":
         pytest.importorskip("dm_control", reason="dm_control brings the models")
     # Warp compiles functions only from a source file
@@ -67,7 +64,7 @@ MISTAKES = WRONG.findall((ROOT / "docs" / "warp_for_python.md").read_text())
 
 
 @pytest.mark.parametrize("number", range(len(MISTAKES)))
-def test_mistakes_in_warp_for_python_md_give_the_messages_shown_there(number: int, task_file: TaskFile) -> None:
+def test_errors_in_warp_for_python_md_give_the_messages_on_the_page(number: int, task_file: TaskFile) -> None:
     function, message = MISTAKES[number]
     task = python_of(ROOT / "docs" / "warp_for_python.md")
     assert task.count("class Measured") == 1
@@ -89,7 +86,7 @@ QUICK = {
     "tune": ["--nworld", "8", "--episodes", "4"],
     "plan": ["--steps", "3", "--samples", "4", "--no-video"],
 }
-"""Options added to a page's commands, so that they are quick."""
+"""Options that are added to a page's commands to make them quick."""
 
 
 class Walkthrough:
@@ -119,7 +116,7 @@ class Walkthrough:
 
     def command(self, words: list[str]) -> None:
         match words:
-            case ["git", "clone", address]:  # a checkout with one robot, whose model is replaced by another one
+            case ["git", "clone", address]:  # make a checkout with one robot, whose model is replaced by another one
                 robot = self.folder / Path(address).name / "unitree_go1" / "scene.xml"
                 robot.parent.mkdir(parents=True)
                 robot.write_text(lw.gymnasium_model("ant.xml").spec().to_xml())
@@ -134,7 +131,7 @@ class Walkthrough:
                 more = QUICK.get(kind, []) if self.quick else []
                 assert cli.main([command, *options, *more]) == 0, words
             case _:
-                pytest.fail(f"{words} is a command that this test does not know")
+                pytest.fail(f"this test does not know the command {words}")
 
 
 @pytest.fixture(autouse=True)
@@ -149,7 +146,7 @@ def short_views(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True)
 def short_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let tune measure speeds for milliseconds."""
+    """Limit tune's speed measurements to milliseconds."""
     monkeypatch.setattr(search, "SHORT", dataclasses.replace(search.SHORT, repeats=2, block_seconds=0.005, steps=40))
 
 
@@ -163,8 +160,9 @@ def empty_folder(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("page", quickly(WALKTHROUGHS, "policies", "physics", "sac", "deployment", "viewer"))
-def test_commands_and_python_of_a_page_run_in_order(
+@pytest.mark.quick("learners.md", "own_task.md", "ppo.md", "runs.md")
+@pytest.mark.parametrize("page", WALKTHROUGHS, ids=name_of)
+def test_commands_and_python_blocks_of_a_page_run_in_order(
     page: Path, empty_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Walkthrough(empty_folder, monkeypatch, quick=True).run(page)
@@ -184,7 +182,7 @@ def test_tasks_in_own_task_md_pass_check_task(empty_folder: Path, monkeypatch: p
 
 
 def generated(folder: str, kind: str) -> list[str]:
-    """Return the words of the comments that docs/conf.py replaces by generated sections, in the pages of a folder."""
+    """Return the words in those comments of a folder's pages that docs/conf.py replaces by generated sections."""
     pages = sorted((ROOT / "docs" / folder).glob("*.md"))
     return [word for page in pages for word in words_of(page, kind)]
 
@@ -199,7 +197,7 @@ def anchors(document: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)
-def test_links_of_a_document_lead_to_files_and_headings(document: Path) -> None:
+def test_links_of_a_document_point_to_existing_files_and_headings(document: Path) -> None:
     for link in re.findall(r"\]\(([^)\s]+)\)", document.read_text()):
         if "://" in link:
             continue
@@ -210,7 +208,7 @@ def test_links_of_a_document_lead_to_files_and_headings(document: Path) -> None:
 
 
 @pytest.mark.parametrize("document", [ROOT / "docs" / "architecture.md"], ids=name_of)
-def test_files_that_a_document_names_exist(document: Path) -> None:
+def test_files_named_in_a_document_exist(document: Path) -> None:
     named = set(re.findall(r"`([\w./-]+(?:\.py|\.md|/))`", document.read_text())) - {"path/to/file.py"}
     places = (ROOT, ROOT / "lyceum_warp")
     assert not sorted(name for name in named if not any((place / name).exists() for place in places))
@@ -220,7 +218,7 @@ def test_the_reference_has_every_public_name_once() -> None:
     assert sorted(generated("reference", "names")) == sorted(lw.__all__)
 
 
-def test_the_pages_of_tasks_have_every_task_of_the_package_once() -> None:
+def test_task_pages_have_every_task_of_the_package_once() -> None:
     assert sorted(generated("tasks", "tasks")) == sorted(package_task_names())
 
 
@@ -230,8 +228,8 @@ def test_notebooks_are_stored_without_output() -> None:
         assert cells and not any(cell["outputs"] or cell["execution_count"] for cell in cells), path.name
 
 
-def test_the_gallery_is_current_and_its_pictures_are_small() -> None:
-    """``python docs/gallery.py`` draws the pictures and writes the page."""
+def test_gallery_is_up_to_date_and_its_pictures_are_small() -> None:
+    """The program ``python docs/gallery.py`` draws the pictures and writes the page."""
     page, folder = ROOT / "docs" / "gallery.md", ROOT / "docs" / "images" / "gallery"
     results = json.loads((folder / "results.json").read_text())
     assert runpy.run_path(str(ROOT / "docs" / "gallery.py"))["page"](results) == page.read_text()
@@ -240,19 +238,19 @@ def test_the_gallery_is_current_and_its_pictures_are_small() -> None:
     assert max(sizes.values()) < 100_000 and sum(sizes.values()) < 4_000_000
 
 
-def test_the_map_of_the_rooms_is_current() -> None:
-    """``python docs/rooms.py`` generates it from the docstrings."""
+def test_map_of_the_rooms_is_up_to_date() -> None:
+    """The program ``python docs/rooms.py`` generates the map from the docstrings."""
     page = (ROOT / "docs" / "architecture.md").read_text()
     assert runpy.run_path(str(ROOT / "docs" / "rooms.py"))["written"](page) == page
 
 
-def test_the_tables_of_terms_are_current() -> None:
-    """``python docs/terms_table.py`` writes them from the docstrings."""
+def test_tables_of_terms_are_up_to_date() -> None:
+    """The program ``python docs/terms_table.py`` writes the tables from the docstrings."""
     page = (ROOT / "docs" / "terms.md").read_text()
     assert runpy.run_path(str(ROOT / "docs" / "terms_table.py"))["written"](page) == page
 
 
-def test_the_workflow_runs_the_checks_on_every_supported_python() -> None:
+def test_workflow_runs_the_checks_on_every_supported_python() -> None:
     yaml = pytest.importorskip("yaml")
     workflow = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())
     job = workflow["jobs"]["check"]
@@ -263,7 +261,7 @@ def test_the_workflow_runs_the_checks_on_every_supported_python() -> None:
     assert job["strategy"]["matrix"]["python"] == classifiers
 
 
-def test_the_citation_names_this_release_and_the_paper() -> None:
+def test_citation_names_this_release_and_the_paper() -> None:
     citation = pytest.importorskip("yaml").safe_load((ROOT / "CITATION.cff").read_text())
     assert citation["version"] == lw.__version__
     (paper,) = citation["references"]

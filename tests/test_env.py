@@ -15,7 +15,7 @@ import torch
 import lyceum_warp as lw
 
 
-def test_a_field_that_is_not_kept_is_refused_with_a_suggestion() -> None:
+def test_error_of_an_unavailable_field_suggests_a_fix() -> None:
     env = lw.make("hopper")
     size = env.state_space.size
     with pytest.raises(
@@ -30,7 +30,7 @@ def test_a_field_that_is_not_kept_is_refused_with_a_suggestion() -> None:
     assert lw.make("reach", fields=["xpos"]).field("xpos").shape[2] == 3
 
 
-def test_time_and_controls_are_always_kept() -> None:
+def test_time_and_controls_are_always_available() -> None:
     env = lw.make("hopper", nworld=2)
     env.step(torch.full((2, 3), 0.5))
     assert torch.equal(env.time, torch.full((2,), env.timestep))
@@ -38,13 +38,13 @@ def test_time_and_controls_are_always_kept() -> None:
 
 
 @pytest.mark.parametrize("spoil", [pickle.dumps, copy.copy, copy.deepcopy])
-def test_an_environment_is_not_pickled_or_copied(spoil: Any) -> None:
+def test_pickling_or_copying_an_environment_raises_an_error(spoil: Any) -> None:
     with pytest.raises(TypeError, match=r"cannot be pickled or copied: use env.replicate"):
         spoil(lw.make("hopper"))
 
 
 def _use(env: lw.Env, plan: lw.MPPI, loop: lw.OpenLoop, state: torch.Tensor, connection: Connection) -> None:
-    """Send the messages of all calls that raise RuntimeError."""
+    """Send the parent process the error messages of all calls that raise RuntimeError."""
     messages = []
     for call in (env.step, env.reset, env.get_state, lambda: env.engine.step(1), loop.run, lambda: plan(state)):
         try:
@@ -87,7 +87,7 @@ def _make_another(connection: Connection) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no fork")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_a_deleted_environment_frees_its_engine_before_a_fork(engine: str) -> None:
+def test_engine_of_a_deleted_environment_is_freed_before_a_fork(engine: str) -> None:
     gc.disable()  # reference cycles would keep the engine alive
     try:
         env = lw.make("hopper", nworld=64, engine=engine)
@@ -108,7 +108,7 @@ def test_a_deleted_environment_frees_its_engine_before_a_fork(engine: str) -> No
         gc.enable()
 
 
-def test_follow_copies_parameters_given_to_either_environment() -> None:
+def test_follow_copies_parameters_between_environments() -> None:
     first = lw.make("hopper", nworld=2, healthy_reward=3.0)
     second = first.replicate(nworld=4, ctrl_cost_weight=0.5)
     second.follow(first)
@@ -117,7 +117,7 @@ def test_follow_copies_parameters_given_to_either_environment() -> None:
         second.follow(3)  # type: ignore[arg-type]
 
 
-def test_scratch_worlds_follow_changed_parameters() -> None:
+def test_getters_use_changed_parameters() -> None:
     env = lw.make("hopper", nworld=2)
     before = env.get_state()
     env.step(torch.ones_like(env.action))
@@ -128,12 +128,12 @@ def test_scratch_worlds_follow_changed_parameters() -> None:
     assert torch.allclose(judged - changed, torch.full((2,), 3 * (1.0 - 1e-3)))
 
 
-def test_an_option_passed_to_set_params_is_reported_as_an_option() -> None:
+def test_error_of_an_option_passed_to_set_params_names_it_as_an_option() -> None:
     with pytest.raises(ValueError, match=r"'nworld' is an option, not a parameter .* env.replicate\(nworld=...\)"):
         lw.make("hopper").set_params(nworld=3)
 
 
-def test_a_mask_without_out_is_refused_by_get_state() -> None:
+def test_get_state_with_a_mask_but_without_out_raises_an_error() -> None:
     env = lw.make("hopper", nworld=2)
     with pytest.raises(ValueError, match="pass out as well"):
         env.get_state(mask=torch.tensor([True, False]))

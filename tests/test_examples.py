@@ -37,7 +37,7 @@ def numbers(pattern: str, lines: list[str]) -> list[float]:
 def test_train_improves_and_saves_the_policy(run, tmp_path: Path) -> None:
     lines = run("train.py", "--iterations", "5", "--samples", "2000")
     returns = numbers(r"return +(-?[\d.]+)", lines)
-    assert len(returns) == 6  # five iterations and the mean policy
+    assert len(returns) == 6  # one number for each of five iterations, and one for the mean policy
     assert returns[-1] > 2 * returns[0] > 0
     assert lines[-1] == "saved in policy.pt: 5126 parameters"
     assert (tmp_path / "policy.pt").is_file()
@@ -47,16 +47,16 @@ def test_train_improves_and_saves_the_policy(run, tmp_path: Path) -> None:
 def test_own_policy_improves(run) -> None:
     lines = run("own_policy.py", "--iterations", "8")
     returns = numbers(r"return +(-?[\d.]+)", lines)
-    assert len(returns) == 9  # eight iterations and the mean policy
+    assert len(returns) == 9  # one number for each of eight iterations, and one for the mean policy
     assert returns[-1] > max(returns[:3]) + 50
     assert lines[-1].endswith("370 parameters")
 
 
 @pytest.mark.long
-def test_random_search_gets_a_complete_run_folder(run, tmp_path: Path) -> None:
+def test_random_search_writes_a_complete_run_folder(run, tmp_path: Path) -> None:
     """The run has a folder, resumes bit for bit, and can be evaluated and exported."""
     once = numbers(r"return (-?[\d.]+)", run("random_search.py", "--out", "once", "--iterations", "6"))
-    assert max(once) == 200.0 > 1.5 * once[0]  # the policy earns a reward in every step
+    assert max(once) == 200.0 > 1.5 * once[0]  # the robot gets a reward in every step
     run("random_search.py", "--out", "twice", "--iterations", "3")
     run("random_search.py", "--out", "twice", "--iterations", "6", "--resume", "--seed", "0")
     rows = [Run.open(tmp_path / name).rows() for name in ("once", "twice")]
@@ -64,13 +64,14 @@ def test_random_search_gets_a_complete_run_folder(run, tmp_path: Path) -> None:
     assert cli.main(["eval", "twice", "--which", "best", "--episodes", "4"]) == 0
     assert cli.main(["export", "twice", "--to", "policy.pt2"]) == 0
     assert torch.export.load("policy.pt2").module()(torch.zeros(3, 4)).shape == (3, 1)
-    assert cli.main(["train", "--resume", "twice", "--iterations", "9"]) == 2  # the class is defined in a script
+    # the learner's class is defined in a script
+    assert cli.main(["train", "--resume", "twice", "--iterations", "9"]) == 2
 
 
-@pytest.mark.long  # tests of SAC and of random_search.py cover its parts
+@pytest.mark.long  # tests of SAC and of random_search.py cover the parts of TD3
 def test_td3_learns_and_resumes_with_its_replay_buffer(run, tmp_path: Path) -> None:
     ended = numbers(r": (\d+) episodes", run("td3.py", "--out", "once", "--iterations", "4"))
-    assert ended[0] > 50 > 25 > ended[-1]  # the policy keeps the pole up for longer
+    assert ended[0] > 50 > 25 > ended[-1]  # the trained policy keeps the pole up for longer
     run("td3.py", "--out", "twice", "--iterations", "2")
     lines = run("td3.py", "--out", "twice", "--iterations", "4", "--resume")
     assert numbers(r"return ([\d.]+)", lines)[0] > 10.0
@@ -85,8 +86,8 @@ def test_plan_reaches_the_target_in_each_episode(run) -> None:
 
 
 @pytest.mark.long
-def test_own_task_keeps_the_rules_and_steps() -> None:
-    # in a subprocess, because the task is registered and its module is __main__
+def test_own_task_follows_the_rules_and_runs() -> None:
+    # this runs in a subprocess, because the task is registered and its module is __main__
     command = [sys.executable, str(EXAMPLES / "own_task.py")]
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)
@@ -99,7 +100,7 @@ def test_own_task_keeps_the_rules_and_steps() -> None:
 
 
 @pytest.mark.long
-def test_commanded_speed_keeps_the_rules_on_both_engines() -> None:
+def test_commanded_speed_follows_the_rules_on_both_engines() -> None:
     command = [sys.executable, str(EXAMPLES / "commanded_speed.py")]
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=900)
@@ -113,7 +114,7 @@ def test_commanded_speed_keeps_the_rules_on_both_engines() -> None:
 
 
 @pytest.mark.long
-def test_commanded_speed_trains_with_its_terms_as_curves(tmp_path: Path) -> None:
+def test_commanded_speed_trains_and_records_its_terms(tmp_path: Path) -> None:
     options = ["--iterations", "2", "--samples", "8000", "--nworld", "16"]
     assert train(tmp_path / "run", *options, task=str(EXAMPLES / "commanded_speed.py")) == 0
     for row in Run.open(tmp_path / "run").rows():

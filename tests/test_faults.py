@@ -1,8 +1,8 @@
 """Check that a fault affects only its world, and that errors for wrong arguments name the value and the fix.
 
-The conformance suite covers NaN, infinite and out-of-range states and actions for every task and engine. These faults
-need particular models, and both engines can produce every kind. The C engine has no shared contact pool, so only the
-Warp engine's contact overflow affects other worlds.
+The conformance suite covers NaN, infinite and out-of-range states and actions for every task and engine. The faults in
+this file need particular models, and both engines can produce every kind of fault. Only the Warp engine has a contact
+buffer that worlds share, so only its contact overflows affect other worlds.
 """
 
 import gc
@@ -61,9 +61,10 @@ def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
 
 
 def test_exhausted_memory_of_the_c_engine_is_reported_as_a_fault() -> None:
-    """As memory shrinks, MuJoCo drops constraints, then contacts; in between it raises an error.
+    """With less and less memory, MuJoCo first drops constraints, then raises an error, and finally drops contacts.
 
-    Which size causes which fault depends on the MuJoCo version; all three must occur and be reported.
+    The memory sizes of the three faults depend on the MuJoCo version, so the test tries many sizes; all faults must be
+    reported.
     """
     found = Done(0)
     for memory in range(3000, 14_000, 1000):
@@ -80,15 +81,15 @@ def test_exhausted_memory_of_the_c_engine_is_reported_as_a_fault() -> None:
     assert Done.ENGINE_WARNING in found
 
 
-def test_a_constraint_overflow_of_the_warp_engine_is_a_fault_of_one_world() -> None:
+def test_constraint_overflow_of_the_warp_engine_causes_a_fault_in_one_world() -> None:
     env, clean = (hopper("warp", nconmax=16, njmax=8) for _ in range(2))
     lay_down(env, BAD)
     assert step_both(env, clean, 5) == Done.CONSTRAINT_OVERFLOW
     assert env.fault_counts.pop("constraint_overflow") == sum(env.fault_counts.values()) == 1
 
 
-def test_a_contact_overflow_of_the_warp_engine_faults_every_world_whose_contacts_do_not_fit() -> None:
-    """All worlds share one contact pool, and each world without room is flagged."""
+def test_contact_overflow_of_the_warp_engine_causes_a_fault_in_every_world_that_loses_contacts() -> None:
+    """All worlds share one contact buffer, and every world whose contacts exceed it has a fault."""
     env = hopper("warp", nconmax=1, njmax=64)
     lay_down(env, BAD)
     before = env.obs.clone()
@@ -104,8 +105,8 @@ def test_a_contact_overflow_of_the_warp_engine_faults_every_world_whose_contacts
         assert torch.isfinite(env.get_state()).all()
 
 
-def test_another_overflow_of_the_warp_engine_is_an_engine_warning() -> None:
-    """A contact sensor has more matches than its buffer holds."""
+def test_overflow_of_a_contact_sensor_in_the_warp_engine_is_an_engine_warning() -> None:
+    """A contact sensor has more matches than fit into its buffer."""
 
     def make() -> lw.Env:
         spec = lw.gymnasium_model("hopper.xml").spec()
@@ -116,7 +117,8 @@ def test_another_overflow_of_the_warp_engine_is_an_engine_warning() -> None:
         env = hopper("warp", model=spec, nconmax=16, njmax=64)
         opt = env.engine.m.opt  # type: ignore[attr-defined]
         opt.contact_sensor_maxmatch = 1
-        opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # sensors are off, because the task needs none
+        # sensors are disabled, because the task needs none
+        opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         return env
 
     env, clean = make(), make()
@@ -126,7 +128,7 @@ def test_another_overflow_of_the_warp_engine_is_an_engine_warning() -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_faults_print_nothing_over_300_steps(
+def test_faults_print_and_log_nothing_over_300_steps(
     engine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """A NaN in one world every five steps does not affect the other worlds or the console."""
@@ -141,7 +143,7 @@ def test_faults_print_nothing_over_300_steps(
             state[BAD, start + i % 6] = (np.nan, np.inf, 1e200, -1e15)[i % 4]
             env.set_state(state, only, check=False)
             assert torch.isfinite(env.obs).all() and not env.done[BAD]  # the next step detects the fault
-            assert Done.NAN in step_both(env, clean, 5)  # other faults of such a state may accompany it
+            assert Done.NAN in step_both(env, clean, 5)  # the state may also cause other faults
     assert env.fault_counts["nan"] == 60
     assert sum(clean.fault_counts.values()) == 0
     printed = capfd.readouterr()
@@ -151,7 +153,7 @@ def test_faults_print_nothing_over_300_steps(
 
 @pytest.mark.parametrize("autoreset", [True, False])
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_bad_warm_start_ends_with_its_episode(engine: str, autoreset: bool) -> None:
+def test_invalid_warm_start_is_cleared_at_the_end_of_its_episode(engine: str, autoreset: bool) -> None:
     """Resetting only positions and velocities would keep the warm start, and every step would have a fault."""
     env, clean = (hopper(engine, autoreset=autoreset) for _ in range(2))
     for each in (env, clean):
@@ -200,12 +202,12 @@ def test_only_a_fault_restarts_a_world_without_automatic_resets(engine: str) -> 
     ],
     ids=lambda value: "-".join(f"{k}={v}" for k, v in value.items()) if isinstance(value, dict) else "",
 )  # fmt: skip
-def test_make_refuses_wrong_arguments(options: dict[str, Any], message: str) -> None:
+def test_make_with_invalid_arguments_raises_an_error(options: dict[str, Any], message: str) -> None:
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         lw.make(**{"task": "hopper", "nworld": N, **options})
 
 
-def test_a_model_that_mujoco_refuses_is_named(tmp_path: Path) -> None:
+def test_error_of_an_invalid_model_names_the_model(tmp_path: Path) -> None:
     file = tmp_path / "broken.xml"
     file.write_text("<mujoco><worldbody><body></worldbody></mujoco>")
     with pytest.raises(ValueError, match=r"MuJoCo can't read the model .*broken.xml: "):
@@ -218,7 +220,7 @@ def test_a_model_that_mujoco_refuses_is_named(tmp_path: Path) -> None:
         lw.make("hopper", model=lw.gymnasium_model("hopper.xml").spec().compile())
 
 
-def test_a_model_that_mujoco_warp_refuses_runs_on_the_c_engine() -> None:
+def test_model_that_mujoco_warp_does_not_support_runs_on_the_c_engine() -> None:
     spec = lw.gymnasium_model("hopper.xml").spec()
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     for i in range(60):
@@ -236,7 +238,7 @@ def env() -> lw.Env:
 
 
 @pytest.mark.parametrize("method", ["step", "set_action"])
-def test_an_action_of_another_shape_or_type_is_refused(env: lw.Env, method: str) -> None:
+def test_action_of_wrong_shape_or_type_raises_an_error(env: lw.Env, method: str) -> None:
     call = getattr(env, method)
     wanted = r"action must be a float32 tensor of shape \(4, 3\), not "
     with pytest.raises(ValueError, match=wanted + r"a float32 tensor of shape \(3,\)"):
@@ -249,14 +251,14 @@ def test_an_action_of_another_shape_or_type_is_refused(env: lw.Env, method: str)
         call(1.0)
 
 
-def test_an_action_that_is_not_finite_is_refused(env: lw.Env) -> None:
+def test_non_finite_action_raises_an_error(env: lw.Env) -> None:
     action = torch.zeros(N, 3)
     action[2, 1] = np.nan
     with pytest.raises(ValueError, match="the action 'actuator_1' of world 2 is nan: actions .* be finite"):
         env.set_action(action)
 
 
-def test_a_state_of_another_shape_or_not_finite_is_refused(env: lw.Env) -> None:
+def test_state_of_wrong_shape_or_with_non_finite_values_raises_an_error(env: lw.Env) -> None:
     state = env.get_state()
     wanted = r"state must be a float64 tensor of shape \(4, \d+\), not a "
     with pytest.raises(ValueError, match=wanted + r"float64 tensor of shape \(2, \d+\)"):
@@ -277,7 +279,7 @@ def test_a_state_of_another_shape_or_not_finite_is_refused(env: lw.Env) -> None:
     assert torch.equal(env.get_state(), state)
 
 
-def test_masks_and_outputs_of_another_shape_or_type_are_refused(env: lw.Env) -> None:
+def test_masks_and_outputs_of_wrong_shape_or_type_raise_an_error(env: lw.Env) -> None:
     state = env.get_state()
     calls = (env.reset, lambda mask: env.rand_reset(mask=mask), lambda mask: env.set_state(state, mask))
     for mask in (torch.ones(3, dtype=torch.bool), torch.ones(N), np.ones(N, bool), [True] * N):
@@ -295,7 +297,7 @@ def test_masks_and_outputs_of_another_shape_or_type_are_refused(env: lw.Env) -> 
         env.rand_reset(-3)
 
 
-def test_dropped_environments_are_freed() -> None:
+def test_deleted_environments_are_freed() -> None:
     made = []
     for _ in range(3):
         env = lw.make("point_mass", nworld=2)
@@ -308,7 +310,7 @@ def test_dropped_environments_are_freed() -> None:
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_an_absurd_speed_has_one_reason_on_both_engines(engine: str) -> None:
+def test_excessive_velocity_causes_the_same_fault_on_both_engines(engine: str) -> None:
     env = lw.make("hopper", nworld=6, engine=engine)
     state = env.get_state()
     state[:, env.state_space.parts["qvel"]] += 1e11 * torch.eye(6, dtype=state.dtype)

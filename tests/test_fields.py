@@ -1,4 +1,4 @@
-"""Test the simulator's fields: their types, the stages that compute them, and their named elements."""
+"""Test the types, stages and named elements of the simulator's fields."""
 
 import mujoco
 import numpy as np
@@ -48,7 +48,7 @@ def model() -> mujoco.MjModel:
         ("energy", (2,), wp.float32),
     ],
 )
-def test_a_field_has_mujocos_shape_with_vectors_as_elements(
+def test_field_has_the_shape_of_mujoco_with_vectors_as_elements(
     name: str, shape: tuple[int, ...], dtype: type, model: mujoco.MjModel
 ) -> None:
     field = describe(model, name)
@@ -56,13 +56,13 @@ def test_a_field_has_mujocos_shape_with_vectors_as_elements(
     assert field.size == np.size(getattr(mujoco.MjData(model), name))
 
 
-def test_an_unknown_field_is_refused_with_similar_ones(model: mujoco.MjModel) -> None:
+def test_error_of_an_unknown_field_suggests_similar_names(model: mujoco.MjModel) -> None:
     with pytest.raises(ValueError, match="there is no field 'site_xpoz': did you mean site_xpos"):
         describe(model, "site_xpoz")
 
 
 @pytest.mark.parametrize("name", ["subtree_linvel"])
-def test_a_field_that_needs_a_sensor_is_refused_without_one(name: str, model: mujoco.MjModel) -> None:
+def test_field_that_needs_a_sensor_raises_an_error_without_one(name: str, model: mujoco.MjModel) -> None:
     with pytest.raises(ValueError, match=f"MuJoCo computes the field {name!r} only for a sensor, .*fields="):
         describe(model, name)
 
@@ -101,7 +101,7 @@ def test_a_field_that_needs_a_sensor_is_refused_without_one(name: str, model: mu
         ("mocap_pos", "target", slice(0, 1)),
     ],
 )
-def test_a_named_element_has_the_indices_of_its_rows(
+def test_named_element_has_the_indices_of_its_rows(
     name: str, element: str, where: slice, model: mujoco.MjModel
 ) -> None:
     assert elements(model, name, element) == where
@@ -123,7 +123,7 @@ def test_a_named_element_has_the_indices_of_its_rows(
         (lw.mocap("target"), 0),
     ],
 )
-def test_a_function_for_defaults_names_an_element(element: Element, place: int, model: mujoco.MjModel) -> None:
+def test_default_of_a_parameter_may_be_a_named_element(element: Element, place: int, model: mujoco.MjModel) -> None:
     assert elements(model, element.field, element.name).start == place
 
 
@@ -144,7 +144,7 @@ def test_an_unknown_element_is_refused(name: str, element: str, message: str, mo
         elements(model, name, element)
 
 
-def test_only_inputs_may_be_written_before_a_step(model: mujoco.MjModel) -> None:
+def test_writing_a_field_that_is_not_an_input_raises_an_error(model: mujoco.MjModel) -> None:
     assert describe(model, "ctrl").written
     assert describe(model, "xfrc_applied", written=True).written
     assert not describe(model, "xfrc_applied").written

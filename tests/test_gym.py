@@ -22,7 +22,7 @@ def test_every_task_of_the_package_has_an_id() -> None:
 
 
 @pytest.mark.long
-def test_registering_imports_no_task_and_gives_no_warning() -> None:
+def test_registration_imports_no_task_and_prints_no_warning() -> None:
     program = """
 import sys, warnings
 warnings.simplefilter("error")
@@ -32,27 +32,27 @@ assert not [name for name in sys.modules if name.startswith("lyceum_warp.tasks."
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_a_class_gets_an_id() -> None:
+def test_register_returns_the_id_of_a_task_class() -> None:
     assert register(Full) == register(Full) == "lyceum/Full-v0"
     envs = gymnasium.make_vec("lyceum/Full-v0", num_envs=2, noise=0.25)
     assert isinstance(envs, GymnasiumVectorEnv)
     assert envs.env.given_params == {"noise": 0.25} and envs.spec is not None and envs.spec.kwargs["noise"] == 0.25
 
 
-def test_a_file_gets_an_id(task_file: TaskFile) -> None:
+def test_register_returns_the_id_of_a_task_file(task_file: TaskFile) -> None:
     id = register(task_file("tiny_of_gymnasium.py", TINY))
     assert id == "lyceum/Tiny-v0"
     assert gymnasium.make_vec(id, num_envs=3).single_observation_space.shape == (1,)
 
 
-def test_an_unknown_task_gets_no_id(tmp_path: Path) -> None:
+def test_registering_an_unknown_task_raises_an_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="there is no task 'hoper': did you mean hopper"):
         register("hoper")
     with pytest.raises(gymnasium.error.NameNotFound, match="Hopper"):
         gymnasium.make("lyceum_warp.gym:lyceum/Hoper-v0")
 
 
-def test_making_a_task_whose_package_is_missing_raises_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_make_raises_an_error_if_the_package_of_the_model_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     class Missing(Full):
         """A task with a model from a package that is not installed."""
 

@@ -36,13 +36,13 @@ LEVELS = {
     "adapters": 13, "viewer": 13,
     "cli": 14, "gym": 14,
 }  # fmt: skip
-"""The level of every room: a room imports only from lower levels and from itself."""
+"""Level of every room; a room imports only from lower levels and from itself."""
 
 TESTED_BY = {
     "done": "test_faults.py", "task": "binding", "testing": "conformance",
     "world_arrays": "test_worlds.py",
 }  # fmt: skip
-"""Tests of rooms without tests of the same name."""
+"""Test files or folders of rooms that have no tests with the same name."""
 
 ACROSS = {"browser", "conformance", "fuzz", "gpu", "oracles", "stories"}
 """Folders of tests that belong to no single room."""
@@ -101,13 +101,14 @@ def test_imports_point_to_lower_rooms() -> None:
             assert imports()[name] - family <= public, f"{name} imports more than the public package and its family"
 
 
-def test_no_module_imports_itself_through_others() -> None:
+def test_no_module_imports_itself_indirectly() -> None:
     finished: set[str] = set()
 
     def visit(name: str, path: tuple[str, ...]) -> None:
         assert name not in path, " imports ".join([*path[path.index(name) :], name])
         if name not in finished:
-            for other in imports()[name] - {"lyceum_warp"}:  # only tasks import it, and nothing imports tasks
+            # only task modules import this room, and no module imports tasks
+            for other in imports()[name] - {"lyceum_warp"}:
                 visit(other, (*path, name))
             finished.add(name)
 
@@ -115,7 +116,7 @@ def test_no_module_imports_itself_through_others() -> None:
         visit(name, ())
 
 
-def test_the_viewers_window_imports_neither_torch_nor_warp_nor_other_rooms() -> None:
+def test_viewer_window_does_not_import_torch_warp_or_other_rooms() -> None:
     """The window runs in a subprocess, which must start quickly and stay small."""
     window = sorted(name for name in MODULES if name.startswith("lyceum_warp.viewer.window"))
     code = f"import sys, {', '.join(window)}; print(*sys.modules)"
@@ -125,7 +126,7 @@ def test_the_viewers_window_imports_neither_torch_nor_warp_nor_other_rooms() -> 
     assert own == {"lyceum_warp", "lyceum_warp.viewer", "lyceum_warp.viewer.protocol", *window}
 
 
-def test_the_viewers_session_imports_nothing_of_its_window() -> None:
+def test_viewer_session_imports_nothing_of_the_window() -> None:
     session = [name for name in MODULES if name.startswith("lyceum_warp.viewer.session")]
     imported = {other for name in session for other in imports()[name]}
     assert session and not [name for name in imported if name.startswith("lyceum_warp.viewer.window")]
@@ -209,14 +210,14 @@ def private_names_of_others(tree: ast.AST) -> Iterator[str]:
             yield ast.unparse(node)
 
 
-def test_only_upstream_uses_private_names_of_other_packages() -> None:
+def test_only_upstream_modules_use_private_names_of_other_packages() -> None:
     found = {name: names for name, tree in trees().items() if (names := set(private_names_of_others(tree)))}
     modules = ("collision_convex", "collision_primitive", "collision_sdf", "forward", "util_pkg")
     known = {"wp._src", *(f"mujoco_warp._src.{module}" for module in modules)}
     assert found == {UPSTREAM: known}, f"reach private names in {UPSTREAM}"
 
 
-def test_public_names_are_the_same_for_type_checkers_and_at_run_time() -> None:
+def test_type_checkers_see_the_same_public_names_as_at_run_time() -> None:
     public = {
         alias.name: str(node.module)
         for block in trees()["lyceum_warp"].body
@@ -238,11 +239,12 @@ def in_new_process(program: str) -> str:
 
 
 def test_no_submodule_has_a_public_name() -> None:
-    """Importing such a submodule would set an attribute of the package, which would hide the function of that name."""
+    """An import of such a submodule would set an attribute of the package, which would hide the function with the same
+    name."""
     assert not {room(name) for name in MODULES} & set(lw.__all__)
 
 
-def test_importing_the_package_loads_neither_torch_nor_warp_nor_mujoco() -> None:
+def test_importing_the_package_does_not_import_torch_warp_or_mujoco() -> None:
     program = """
         import sys, lyceum_warp
         print([name for name in ("torch", "warp", "mujoco", "numpy") if name in sys.modules])
@@ -252,7 +254,7 @@ def test_importing_the_package_loads_neither_torch_nor_warp_nor_mujoco() -> None
 
 @pytest.mark.long
 def test_warp_prints_nothing_if_a_task_file_imports_it_first() -> None:
-    """``tests/support/test_warp_log.py`` imports the package first."""
+    """In the tests of ``tests/support/test_warp_log.py`` the package is imported before Warp."""
     program = """
         import warp as wp
         import lyceum_warp as lw
@@ -261,7 +263,7 @@ def test_warp_prints_nothing_if_a_task_file_imports_it_first() -> None:
     assert in_new_process(program) == "1\n"
 
 
-def test_every_room_has_tests_of_its_name() -> None:
+def test_every_room_has_tests_with_the_same_name() -> None:
     for own in {room(name) for name in MODULES} - {"__init__"}:
         places = [TESTS / TESTED_BY[own]] if own in TESTED_BY else [TESTS / own, TESTS / f"test_{own}.py"]
         assert any(place.exists() for place in places), f"no tests of {own}: none of {', '.join(map(str, places))}"

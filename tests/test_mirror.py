@@ -14,12 +14,12 @@ def test_mirror_combines_reflections_of_parts() -> None:
 
 
 @pytest.mark.parametrize("part", [(1, 2), ([0, 2], [1, 1]), ([1, 2, 0], [1, 1, 1]), ([1, 0], [1, -1])])
-def test_mirror_refuses_reflections_that_are_not_their_own_inverse(part: tuple[object, ...]) -> None:
+def test_reflections_that_are_not_their_own_inverse_raise_an_error(part: tuple[object, ...]) -> None:
     with pytest.raises(ValueError, match=r"the reflection 'x' of lw.Mirror must be its own inverse"):
         lw.Mirror({"x": part})
 
 
-def test_mirror_names_parts_without_a_reflection() -> None:
+def test_error_of_mirror_names_parts_without_a_reflection() -> None:
     with pytest.raises(ValueError, match="'walker' has no reflection for 'foot_height', which has 2 columns"):
         lw.Mirror({"gravity": (1, -1, 1)}).columns(PARTS, task="walker")
     with pytest.raises(ValueError, match="has a reflection of 2 columns for 'gravity', which has 3"):

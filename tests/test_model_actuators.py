@@ -16,7 +16,7 @@ XML = """
 """
 
 
-def test_a_servo_follows_a_velocity_up_to_its_former_range() -> None:
+def test_velocity_servo_stops_at_the_limits_of_its_former_range() -> None:
     spec = mujoco.MjSpec.from_string(XML)
     for name in ("free", "motor"):
         spec.delete(spec.actuator(name))
@@ -46,7 +46,7 @@ def test_a_servo_follows_a_velocity_up_to_its_former_range() -> None:
         ("servo", -1.0, "speed must be a positive number of m/s or rad/s, not -1.0"),
     ],
 )
-def test_invalid_actuators_and_speeds_are_refused_and_nothing_changes(name: str, speed: float, message: str) -> None:
+def test_invalid_actuators_and_speeds_raise_an_error_and_change_nothing(name: str, speed: float, message: str) -> None:
     spec = mujoco.MjSpec.from_string(XML)
     before = spec.to_xml()
     with pytest.raises(ValueError, match=message):

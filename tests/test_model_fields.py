@@ -21,7 +21,7 @@ ANT = gymnasium_model("ant.xml").spec().compile()
         ("tendon_stiffness", (0,), wp.float32, 0),
     ],
 )
-def test_a_model_field_has_the_type_of_an_element(name: str, shape: tuple[int, ...], dtype: type, size: int) -> None:
+def test_model_field_has_the_type_of_its_elements(name: str, shape: tuple[int, ...], dtype: type, size: int) -> None:
     field = describe_model_field(ANT, name)
     assert (field.shape, field.dtype, field.size) == (shape, dtype, size)
     assert field.value(ANT).size == size
@@ -45,7 +45,7 @@ def test_constants_are_derived_from_the_fields_that_mujoco_reads() -> None:
     assert {field.name for field in fields if field.constants} == {field.name for field in fields} & read
 
 
-def test_an_unknown_model_field_is_refused_with_close_names() -> None:
+def test_error_of_an_unknown_model_field_suggests_similar_names() -> None:
     with pytest.raises(ValueError, match="no model field 'body_mas' .* did you mean body_mass"):
         describe_model_field(ANT, "body_mas")
 
@@ -59,19 +59,19 @@ def test_an_unknown_model_field_is_refused_with_close_names() -> None:
         ("actuator_ctrlrange", "controls are clipped to the model's own ranges"),
     ],
 )
-def test_a_field_that_all_worlds_share_is_refused(name: str, reason: str) -> None:
+def test_randomizing_a_field_that_all_worlds_share_raises_an_error(name: str, reason: str) -> None:
     with pytest.raises(ValueError, match=f"{name!r} cannot differ between worlds: .*{reason}"):
         describe_model_field(ANT, name)
 
 
-def test_a_shared_field_is_read_if_it_has_rows_of_numbers() -> None:
+def test_world_may_read_a_shared_field_with_rows_of_numbers() -> None:
     assert describe_model_field(ANT, "actuator_ctrlrange", varies=False).dtype is wp.vec2
     for name, reason in (("nq", "make it a parameter"), ("opt", "rows"), ("timestep", "dt"), ("geom_type", "rows")):
         with pytest.raises(ValueError, match=f"{name!r} cannot be read in World: .*{reason}"):
             describe_model_field(ANT, name, varies=False)
 
 
-def test_geoms_with_wrapped_tendons_have_constants() -> None:
+def test_geom_positions_affect_constants_if_tendons_wrap_around_geoms() -> None:
     xml = """<mujoco><worldbody><geom name="g" size=".1"/><site name="a" pos="-1 0 0"/>
     <body pos="1 0 0"><joint axis="0 1 0"/><geom size=".1"/><site name="b"/></body></worldbody>
     <tendon><spatial><site site="a"/><geom geom="g"/><site site="b"/></spatial></tendon></mujoco>"""
@@ -80,7 +80,7 @@ def test_geoms_with_wrapped_tendons_have_constants() -> None:
     assert Constants.INERTIAL not in describe_model_field(ANT, "geom_pos").constants
 
 
-def test_the_inertial_frame_of_a_simple_body_cannot_move() -> None:
+def test_randomizing_the_inertial_frame_of_a_simple_body_raises_an_error() -> None:
     ball = mujoco.MjModel.from_xml_string(
         "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
     )

@@ -35,7 +35,7 @@ def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     return made
 
 
-def test_a_checkout_of_menagerie_precedes_the_packages(
+def test_checkout_of_menagerie_takes_precedence_over_packages(
     sources: dict[str, Path], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "lyceum_warp")
@@ -48,12 +48,12 @@ def test_a_checkout_of_menagerie_precedes_the_packages(
     assert f"the model leg/scene.xml is read from {sources['checkout']}" in caplog.text
 
 
-def test_the_package_mujoco_menagerie_provides_robots_that_no_other_source_has(
+def test_package_mujoco_menagerie_provides_robots_that_other_sources_lack(
     sources: dict[str, Path],
 ) -> None:
     robot = mujoco_menagerie.get("anybotics_anymal_c")
     scene = write_robot(mujoco_menagerie.Cache().model_path(robot))
-    scene.with_name(".complete").write_text("{}")  # the files that a download creates
+    scene.with_name(".complete").write_text("{}")  # create the files of a download
     assert lw.menagerie_model("anybotics_anymal_c/scene.xml").path() == scene
     assert lw.menagerie_model("arm/scene.xml").path() == sources["arm"]
     with pytest.raises(FileNotFoundError, match=r"mujoco-menagerie can't provide 'unitree_g0': .* 'unitree_g1'"):
@@ -62,12 +62,12 @@ def test_the_package_mujoco_menagerie_provides_robots_that_no_other_source_has(
         lw.menagerie_model("agility_cassie/scene.xml").path()
 
 
-def test_a_missing_file_of_menagerie_is_named_with_similar_ones(sources: dict[str, Path]) -> None:
+def test_error_of_a_missing_menagerie_file_suggests_similar_names(sources: dict[str, Path]) -> None:
     with pytest.raises(FileNotFoundError, match=r"no model file 'leg/scone\.xml' in .*; it has leg/scene\.xml, arm"):
         lw.menagerie_model("leg/scone.xml").spec()
 
 
-def test_a_robot_without_a_source_is_named_with_the_three_ways_to_install_it(
+def test_error_of_a_robot_without_a_source_names_three_ways_to_install_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv("MENAGERIE_ROOT", raising=False)
@@ -80,7 +80,7 @@ def test_a_robot_without_a_source_is_named_with_the_three_ways_to_install_it(
         lw.menagerie_model("leg/scene.xml").spec()
 
 
-def test_a_wrong_menagerie_root_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_of_an_invalid_menagerie_root_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = lw.menagerie_model("leg/scene.xml")
     monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path / "nowhere"))
     with pytest.raises(FileNotFoundError, match=r"MENAGERIE_ROOT is '.*nowhere', which is not a folder"):
@@ -90,7 +90,7 @@ def test_a_wrong_menagerie_root_is_named(tmp_path: Path, monkeypatch: pytest.Mon
         model.spec()
 
 
-def test_a_model_of_another_package_is_read_without_importing_it() -> None:
+def test_model_of_another_package_is_read_without_importing_the_package() -> None:
     code = (
         "import sys, lyceum_warp as lw\n"
         "spec = lw.package_model('gymnasium', 'envs/mujoco/assets/ant.xml').spec()\n"
@@ -99,12 +99,12 @@ def test_a_model_of_another_package_is_read_without_importing_it() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_a_missing_package_is_named_with_the_command_that_installs_it() -> None:
+def test_error_of_a_missing_package_names_the_install_command() -> None:
     with pytest.raises(FileNotFoundError, match=r"the package no-robots, which .*: pip install 'no-robots==3'$"):
         lw.package_model("no_robots", "arm.xml", install="no-robots==3").path()
 
 
-def test_an_unsupported_python_is_named_with_a_command_that_works_there() -> None:
+def test_error_on_an_unsupported_python_names_a_command_that_works() -> None:
     here = f"{sys.version_info.major}.{sys.version_info.minor}"
     with pytest.raises(FileNotFoundError, match="which is not installed: pip install 'lyceum-warp.robots.'$"):
         lw.package_model("no_robots", "arm.xml", install="lyceum-warp[robots]", before_python="3.99").path()
@@ -130,7 +130,7 @@ def test_a_subclass_of_a_task_does_not_inherit_its_gymnasium_environment() -> No
     assert find_task("hopper").gymnasium == "Hopper-v5" and Light.gymnasium is None
 
 
-def test_a_task_edits_its_model_once_from_any_source() -> None:
+def test_edit_model_runs_once_for_a_model_from_any_source() -> None:
     light, whole = lw.make(Light), lw.make("hopper")
     half = 0.5 * whole.model.body_mass[1:].sum()
     copy = light.replicate(nworld=2)
@@ -146,7 +146,7 @@ def test_a_task_edits_its_model_once_from_any_source() -> None:
         (lambda spec: spec.body("tail").pos, "edit_model of the task 'light' fails on the model 'hopper': Attribute"),
     ],
 )
-def test_a_wrong_edit_is_named(edit, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_of_a_failing_model_edit_names_the_task(edit, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Light, "edit_model", staticmethod(edit))
     with pytest.raises(ValueError, match=message):
         lw.make(Light)

@@ -1,4 +1,4 @@
-"""Test that open-loop rollouts and steps give identical numbers on both engines."""
+"""Test that open-loop rollouts and steps give identical results on both engines."""
 
 from typing import Any
 
@@ -52,7 +52,7 @@ class Arm:
     qvel: Row[float]
     ctrl: Row[float]
     site_xpos: Row[wp.vec3]
-    kept: Row[float] = lw.memory(2)  # memory: a sum over the steps, and the last step's random draw
+    kept: Row[float] = lw.memory(2)  # the memory contains a sum over the steps, and the random number of the last step
 
 
 @wp.struct
@@ -123,7 +123,7 @@ def reward_of_sensors(s0: SensingArm, action: Row[float], s1: SensingArm, p: Arm
 
 
 class Forgetful(lw.Task):
-    """A task whose actions are controls, so that the C engine rolls out a horizon in one native call."""
+    """A task whose actions are controls, so that the C engine computes a rollout in one native call."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
     frame_skip = 3
@@ -149,7 +149,7 @@ class Servo(Forgetful):
 
 
 class Sensing(lw.Task):
-    """A task with two sensors: the velocity belongs to the state, the acceleration to the last substep."""
+    """A task with two sensors: the velocity belongs to the state, and the acceleration to the last substep."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
     frame_skip = 2
@@ -171,7 +171,7 @@ def rollouts(task: str | type[lw.Task], steps: int, *, engine: str, nworld: int 
 
 
 def random_actions(env: lw.Env, steps: int, seed: int) -> torch.Tensor:
-    """Return actions, many of which exceed the bounds (-1 and 1 if there are none)."""
+    """Return actions, many of which exceed the bounds (-1 and 1 for unbounded actions)."""
     generator = torch.Generator().manual_seed(seed)
     bounds = (torch.from_numpy(bound) for bound in (env.action_space.low, env.action_space.high))
     low, high = (bound.nan_to_num(neginf=-1.0, posinf=1.0) for bound in bounds)
@@ -197,7 +197,8 @@ def run(loop: OpenLoop, state: torch.Tensor, actions: torch.Tensor) -> dict[str,
 
 
 def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None:
-    """Compare several rollouts, each from a different state with different actions; the later ones replay graphs."""
+    """Compare several rollouts with steps, from different states with different actions; later rollouts replay
+    graphs."""
     for seed in range(rounds):
         state, actions = some_state(env, seed), random_actions(env, loop.horizon, 10 + seed)
         low, high = env.action_space.low, env.action_space.high
@@ -215,17 +216,12 @@ def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None
         assert len(env.final_obs.unique(dim=0)) == env.nworld, "all worlds are the same, so nothing was tested"
 
 
-def on_engines(task: str) -> list[object]:
-    """Return a task's cases on both engines, most of them long."""
-    alike = task.startswith("dm/") or (task.endswith("_velocity") and task != "go1_velocity")
-    return [
-        pytest.param(task, "mujoco", marks=[pytest.mark.long] if alike else []),
-        pytest.param(task, "warp", marks=[pytest.mark.long] if task != "reach" else []),
-    ]
+DIFFERENT = [name for name in PACKAGE if not name.startswith("dm/") and not name.endswith("_velocity")]
 
 
-@pytest.mark.parametrize("task, engine", [case for task in PACKAGE for case in on_engines(task)])
-def test_a_rollout_gives_the_numbers_of_stepping(task: str, engine: str) -> None:
+@pytest.mark.quick(*(f"{task}-mujoco" for task in (*DIFFERENT, "go1_velocity")), "reach-warp")
+@pytest.mark.parametrize("task, engine", [(task, engine) for task in PACKAGE for engine in ENGINES])
+def test_rollout_of_a_task_equals_steps(task: str, engine: str) -> None:
     steps = 3 if task == "humanoid" or task.startswith("adroit") else 5
     # on the CPU a substep of the Warp engine consists of hundreds of launches, so the test uses two substeps
     options = {"frame_skip": min(2, find_task(task).frame_skip)} if engine == "warp" else {}
@@ -265,10 +261,11 @@ def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     ],
     ids="memory worlds one_substep rk4 keepsake control control_worlds sensors".split(),
 )
-def test_every_kind_of_task_gives_the_numbers_of_stepping(
+def test_rollout_of_every_kind_of_task_equals_steps(
     task: type[lw.Task], native: bool, options: dict[str, Any], engine: str, native_calls: list[int]
 ) -> None:
-    """Cases: memory with draws, per-world parameters, RK4 with derived fields, controls of the task, sensors."""
+    """The tasks have random memory, per-world parameters, RK4 with derived fields, a ``control`` function, or
+    sensors."""
     loop = rollouts(task, 6, engine=engine, **options)
     check_against_stepping(loop, lw.make(task, engine=engine, nworld=4, autoreset=False, **options))
     assert len(native_calls) == (3 if native and engine == "mujoco" else 0)
@@ -276,7 +273,7 @@ def test_every_kind_of_task_gives_the_numbers_of_stepping(
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_parameters_may_change_between_rollouts(engine: str) -> None:
-    """After graphs were captured, a parameter may change from one number to one per world."""
+    """After graphs were captured, a parameter may change from a shared number to one number per world."""
     loop, env = rollouts(Forgetful, 3, engine=engine), lw.make(Forgetful, engine=engine, nworld=4, autoreset=False)
     check_against_stepping(loop, env)
     for params in ({"cost": 5.0}, {"gain": np.array([1.0, 2.0, 3.0, 4.0]), "bound": -1.0}):
@@ -288,8 +285,8 @@ def test_parameters_may_change_between_rollouts(engine: str) -> None:
 @pytest.mark.quick("Forgetful-mujoco", "Servo-warp")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Forgetful, Servo])
-def test_worlds_draw_from_the_given_keys(task: type[lw.Task], engine: str) -> None:
-    """The draws equal the draws of steps from states with these keys."""
+def test_worlds_draw_random_numbers_from_the_given_keys(task: type[lw.Task], engine: str) -> None:
+    """The random numbers equal those of steps from states with these keys."""
     env = lw.make(task, engine=engine, nworld=4, autoreset=False)
     numbers = np.array([5, 2**32 - 1, 77, 1234567890], dtype=np.uint32)
     keys = wp.zeros(4, dtype=wp.uint32, device="cpu")
@@ -307,7 +304,7 @@ def test_worlds_draw_from_the_given_keys(task: type[lw.Task], engine: str) -> No
         assert torch.equal(found["final_obs"], env.final_obs)
 
 
-def test_keys_that_do_not_fit_are_refused(shared_env: SharedEnv) -> None:
+def test_keys_of_wrong_shape_or_type_raise_an_error(shared_env: SharedEnv) -> None:
     env = shared_env("point_mass", nworld=2, autoreset=False)
     for wrong in (wp.zeros(3, dtype=wp.uint32, device="cpu"), wp.zeros(2, dtype=int, device="cpu")):
         with pytest.raises(ValueError, match=r"keys must be a wp.array of shape \(2,\) and type uint32 on cpu, not of"):
@@ -316,8 +313,8 @@ def test_keys_that_do_not_fit_are_refused(shared_env: SharedEnv) -> None:
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
-def test_terminated_is_judged_for_each_state_separately(engine: str) -> None:
-    """The arm swings out and back in; only the states outside are terminal."""
+def test_terminated_is_computed_for_each_state_separately(engine: str) -> None:
+    """The arm swings out and back in, and only the states outside are terminal."""
     loop = rollouts(Forgetful, 40, engine=engine, nworld=2, bound=0.05)
     loop.env.reset()
     actions = torch.zeros(40, 2, 2)
@@ -336,8 +333,8 @@ BAD = 1
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Forgetful, Servo])
 @pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_an_action_that_is_not_finite_is_a_fault_of_its_world(task: type[lw.Task], engine: str, number: float) -> None:
-    """The action is replaced by zero; other worlds keep their numbers, and the next rollout has no fault."""
+def test_non_finite_action_causes_a_fault_in_its_world(task: type[lw.Task], engine: str, number: float) -> None:
+    """The action is replaced by zero, the results of other worlds do not change, and the next rollout has no fault."""
     loop = rollouts(task, 5, engine=engine)
     state, actions = some_state(loop.env, 0), random_actions(loop.env, 5, 0)
     zeroed, wrong = actions.clone(), actions.clone()
@@ -420,10 +417,12 @@ class PushedRunaway(Runaway):
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("how", ["native", "rk4", "control"])
 @pytest.mark.parametrize("size, step", [(1e9, 1), (1e9, 5), (1e13, 1)])  # MuJoCo ignores controls beyond 1e10
-def test_a_world_that_diverges_has_a_fault_and_changes_no_other(size: float, how: str, step: int, engine: str) -> None:
-    """The next rollouts have no fault.
+def test_diverging_world_has_a_fault_and_does_not_change_other_worlds(
+    size: float, how: str, step: int, engine: str
+) -> None:
+    """Rollouts after the diverging one have no fault.
 
-    On the C engine such a world stops and keeps its last finite numbers, so only the fault marks them as meaningless.
+    On the C engine a diverging world stops with its last finite values, and only the fault marks them as invalid.
     """
     task = PushedRunaway if how == "control" else Runaway
     model = mujoco.MjSpec.from_string(RUNAWAY.format('integrator="RK4"' if how == "rk4" else ""))
@@ -450,7 +449,7 @@ def test_a_world_that_diverges_has_a_fault_and_changes_no_other(size: float, how
 
 @pytest.mark.quick("PushedRunaway")
 @pytest.mark.parametrize("task", [Runaway, PushedRunaway])
-def test_a_fault_in_the_middle_is_reported_at_the_end(task: type[lw.Task]) -> None:
+def test_fault_within_a_rollout_is_reported_at_its_end(task: type[lw.Task]) -> None:
     """A ball is pushed into the floor, which overflows the constraint buffer, and then flies up again."""
     loop = rollouts(task, 20, engine="warp", nworld=3, nconmax=8, njmax=2)
     loop.env.reset()
@@ -464,7 +463,7 @@ def test_a_fault_in_the_middle_is_reported_at_the_end(task: type[lw.Task]) -> No
     assert not run(loop, state, torch.full_like(actions, 9.81e-4))["fault"].any()
 
 
-def test_automatic_resets_and_bad_horizons_are_refused(shared_env: SharedEnv) -> None:
+def test_rollout_with_automatic_resets_or_an_invalid_horizon_raises_an_error(shared_env: SharedEnv) -> None:
     with pytest.raises(ValueError, match=r"worlds that do not reset: make\(..., autoreset=False\)"):
         OpenLoop(shared_env("point_mass"), 5)
     env = shared_env("point_mass", autoreset=False)
@@ -475,7 +474,7 @@ def test_automatic_resets_and_bad_horizons_are_refused(shared_env: SharedEnv) ->
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_several_states_divide_the_worlds_evenly(engine: str) -> None:
+def test_several_initial_states_divide_the_worlds_evenly(engine: str) -> None:
     env = lw.make("hopper", engine=engine, nworld=6, autoreset=False, seed=1)
     starts = lw.make("hopper", nworld=3, seed=5, autoreset=False).get_state()
     loop, alone = OpenLoop(env, 3, states=3), OpenLoop(lw.make("hopper", engine=engine, nworld=2, autoreset=False), 3)

@@ -1,4 +1,4 @@
-"""Check options of environments and physics, separate them from parameters, and suggest similar names."""
+"""Test that options of environments and physics are checked, and separated from parameters."""
 
 import dataclasses
 import inspect
@@ -40,27 +40,27 @@ from lyceum_warp.options import OPTION_DOCS, OPTIONS, EnvOptions, PhysicsOptions
         ({"physics": 3}, "physics must be of type PhysicsOptions, as lw.PhysicsOptions.*, not int 3"),
     ],
 )  # fmt: skip
-def test_an_option_out_of_range_is_refused_with_its_value(options: dict[str, object], message: str) -> None:
+def test_error_of_an_option_out_of_range_names_its_value(options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         EnvOptions.split(options)
     with pytest.raises(ValueError, match=message):
         lw.make("hopper", **options)
 
 
-def test_a_flat_call_is_split_into_options_physics_and_parameters() -> None:
+def test_keyword_arguments_are_split_into_options_physics_and_parameters() -> None:
     options, params = EnvOptions.split({"nworld": 4, "cone": "elliptic", "ctrl_cost_weight": 0.1})
     assert options == EnvOptions(nworld=4, physics=PhysicsOptions(cone="elliptic"))
     assert params == {"ctrl_cost_weight": 0.1}
     assert options.given() == {"nworld": 4, "cone": "elliptic"}
 
 
-def test_options_of_another_type_are_refused() -> None:
+def test_options_of_a_wrong_type_raise_an_error() -> None:
     for make in (lw.make, lw.Env):
         with pytest.raises(ValueError, match=r"options must be .* as lw.EnvOptions\(nworld=64\), not dict"):
             make("hopper", {"nworld": 3})
 
 
-def test_an_options_object_and_keyword_options_make_equal_environments() -> None:
+def test_options_object_and_keyword_options_give_equal_environments() -> None:
     options = EnvOptions(nworld=2, horizon=5, physics=PhysicsOptions(integrator="euler"))
     for env in (lw.Env("hopper", options), lw.Env("hopper", EnvOptions(horizon=5), nworld=2, integrator="euler")):
         assert env.options == options
@@ -71,7 +71,7 @@ FAST = PhysicsOptions(integrator="implicitfast", timestep=0.004, frame_skip=2)
 Fast = type("Fast", (find_task("hopper"),), {"physics": {"fast": FAST}})
 
 
-def test_named_physics_set_options_that_other_arguments_override() -> None:
+def test_other_arguments_override_the_options_of_named_physics() -> None:
     env = lw.make(Fast, physics="fast")
     assert env.options.physics == FAST and env.options.given() == FAST.given() and env.timestep == 0.008
     assert env.model.opt.timestep == 0.004 and env.replicate(physics="exact").options.physics == PhysicsOptions()
@@ -84,7 +84,7 @@ def test_named_physics_set_options_that_other_arguments_override() -> None:
         PhysicsOptions(base=3)  # type: ignore[arg-type]
 
 
-def test_a_planner_takes_named_physics_from_its_arguments_or_the_tasks_planning() -> None:
+def test_planner_uses_named_physics_from_its_arguments_or_from_task_planning() -> None:
     assert lw.MPPI(Fast, horizon=2, samples=2, physics="fast").settings["timestep"] == 0.004
     planned = type("Planned", (Fast,), {"planning": lw.Planning(options={"physics": "fast"})})
     plan = lw.MPPI(planned, horizon=2, samples=2)
@@ -95,12 +95,12 @@ def test_a_planner_takes_named_physics_from_its_arguments_or_the_tasks_planning(
         lw.MPPI(planned)
 
 
-def test_a_replica_has_the_options_of_the_original_except_for_the_changes() -> None:
+def test_replica_has_the_options_of_the_original_except_for_given_changes() -> None:
     env = lw.make("hopper", nworld=2, horizon=5, integrator="euler", solver={"iterations": 4}, seed=3)
     replica = env.replicate(nworld=3, horizon=6)
     assert replica.options.given() == {
         "nworld": 3, "horizon": 6, "integrator": "euler", "solver": {"iterations": 4},
-        "model": env.task.spec,  # the loaded spec, even if its file has changed
+        "model": env.task.spec,  # the replica has the loaded spec, even if the file has changed since
     }  # fmt: skip
 
 
@@ -114,13 +114,13 @@ def test_a_replica_has_the_options_of_the_original_except_for_the_changes() -> N
         ("qqq", ""),
     ],
 )
-def test_suggestion_knows_every_option_and_names_of_other_packages(word: str, expected: str) -> None:
+def test_suggestion_covers_every_option_and_names_of_other_packages(word: str, expected: str) -> None:
     assert suggestion(word) == expected
 
 
 def test_every_option_is_in_the_help_and_the_signature_of_make() -> None:
     names = [field.name for kind in (EnvOptions, PhysicsOptions) for field in dataclasses.fields(kind)]
-    names.remove("base")  # given as physics="fast"
+    names.remove("base")  # the argument physics="fast" sets this option
     assert list(OPTIONS) == names
     for name in names:
         assert f"    {name}: " in OPTION_DOCS

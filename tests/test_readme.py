@@ -9,7 +9,7 @@ import lyceum_warp as lw
 README = Path(__file__).parent.parent / "README.md"
 
 
-def test_every_python_block_runs(task_file: TaskFile, capsys: pytest.CaptureFixture) -> None:
+def test_every_python_block_of_the_readme_runs(task_file: TaskFile, capsys: pytest.CaptureFixture) -> None:
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     assert len(blocks) == 3
     # Warp compiles functions only from a source file
@@ -22,7 +22,7 @@ def test_every_python_block_runs(task_file: TaskFile, capsys: pytest.CaptureFixt
     assert planned.startswith("success: True")
 
 
-def test_the_readmes_hopper_is_shorter_than_the_papers_listing() -> None:
+def test_hopper_in_the_readme_is_shorter_than_the_listing_in_the_paper() -> None:
     """The paper's listing of Hopper takes 39 lines without comments."""
     source = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)[1]
     lines = [line for line in source.splitlines() if line.strip() and not line.strip().startswith("#")]

@@ -1,4 +1,4 @@
-"""Test memory that all worlds share: sums over worlds, updates, and everything that copies it."""
+"""Test memory that all worlds share: its sums over worlds, its updates and its copies."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -102,14 +102,14 @@ def steps(env: lw.Env, count: int) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.stack(angles), torch.stack(ended)
 
 
-def test_share_gets_the_sums_over_worlds_and_steps(env: lw.Env) -> None:
+def test_share_receives_the_sums_over_worlds_and_steps(env: lw.Env) -> None:
     env.rand_reset(seed=1)
     env.set_shared(torch.zeros_like(env.get_shared()))
     level = env.state_space.split(env.get_state())["level"][:, 0].long()
     for _ in range(2):
         before = env.shared["falls"].clone()
         angles, ended = steps(env, 30)
-        assert torch.equal(env.shared["falls"], before)  # steps only add to the sums
+        assert torch.equal(env.shared["falls"], before)  # steps only change the sums
         env.update_shared()
         falls = torch.zeros(3).index_add_(0, level, ended.sum(0).float())
         assert falls.sum() > 5
@@ -142,7 +142,7 @@ def test_states_do_not_contain_shared_memory(env: lw.Env) -> None:
     assert torch.equal(env.get_shared(), 2.0 * kept)
 
 
-def test_scratch_worlds_replicas_and_planners_see_shared_memory(env: lw.Env) -> None:
+def test_scratch_worlds_replicas_and_planners_use_shared_memory(env: lw.Env) -> None:
     env.rand_reset(seed=5)
     env.shared["falls"].copy_(torch.tensor([1.0, 2.0, 3.0]))
     env.shared["mean_angle"].fill_(0.5)
@@ -157,7 +157,7 @@ def test_scratch_worlds_replicas_and_planners_see_shared_memory(env: lw.Env) -> 
     for other in (planner, few):
         assert torch.equal(other.shared["falls"], env.shared["falls"])
     steps(planner, 3)
-    assert not planner.get_shared()[4:].any()  # nothing is summed without automatic resets
+    assert not planner.get_shared()[4:].any()  # without automatic resets, the sums do not change
     before = planner.get_state()
     planner.step(torch.zeros(8, 1))
     expected = 1.0 - (planner.field("qpos")[:, 1] - 0.5).abs()
@@ -187,7 +187,7 @@ def test_training_updates_shared_memory_and_resumes_bit_for_bit(tmp_path: Path, 
     assert torch.equal(env.get_shared(), expected)
 
 
-def test_sums_are_added_over_processes(env: lw.Env) -> None:
+def test_sums_of_shared_memory_are_added_over_processes(env: lw.Env) -> None:
     env.rand_reset(seed=7)
     env.set_shared(torch.zeros_like(env.get_shared()))
     _, ended = steps(env, 30)
@@ -195,11 +195,11 @@ def test_sums_are_added_over_processes(env: lw.Env) -> None:
     assert env.shared["falls"].sum() == ended.sum()
 
 
-def test_a_task_with_shared_memory_keeps_the_rules() -> None:
+def test_task_with_shared_memory_follows_the_rules() -> None:
     check_task(Balance, nworld=4, steps=20)
 
 
-def test_only_share_may_write_shared_memory() -> None:
+def test_writing_shared_memory_outside_share_raises_an_error() -> None:
     @wp.func
     def writes(s0: World, action: Row[float], s1: World, p: Params) -> float:
         s1.shared.falls[0] = 1.0
@@ -210,7 +210,7 @@ def test_only_share_may_write_shared_memory() -> None:
 
 
 @pytest.mark.parametrize(("name", "row"), [("tally", "sums"), ("share", "shared")])
-def test_writes_beyond_shared_memory_are_refused_when_an_environment_is_made(name: str, row: str) -> None:
+def test_make_raises_an_error_for_writes_beyond_shared_memory(name: str, row: str) -> None:
     @wp.func
     def beyond_sums(s0: World, action: Row[float], s1: World, p: Params, ended: bool, sums: Sums):
         sums.falls[3] = 1.0
@@ -224,7 +224,7 @@ def test_writes_beyond_shared_memory_are_refused_when_an_environment_is_made(nam
         lw.make(type("Beyond", (Balance,), {name: function}))
 
 
-def test_share_without_tally_is_refused(tmp_path: Path) -> None:
+def test_share_without_tally_raises_an_error(tmp_path: Path) -> None:
     file = write(tmp_path, with_function("def share(shared: World, sums: World, p: Params):\n    pass"))
     with pytest.raises(ValueError, match="needs a struct Shared, listed in World as shared: Shared, a struct Sums"):
         lw.make(str(file))

@@ -25,13 +25,13 @@ def model(second: str = LIMITED) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(XML.format(second))
 
 
-def test_parts_lie_one_after_another() -> None:
+def test_parts_of_a_space_are_consecutive() -> None:
     space = Space.of({"position": 2, "velocity": 3})
     assert space.parts == {"position": slice(0, 2), "velocity": slice(2, 5)}
     assert (space.size, space.shape) == (5, (5,))
 
 
-def test_split_gives_views_of_the_parts() -> None:
+def test_split_returns_views_of_the_parts() -> None:
     values = torch.arange(10.0).view(2, 5)
     parts = Space.of({"position": 2, "velocity": 3}).split(values)
     assert [list(part.shape) for part in parts.values()] == [[2, 2], [2, 3]]
@@ -39,7 +39,7 @@ def test_split_gives_views_of_the_parts() -> None:
     assert values.tolist() == [[0.0, 1.0, 0.0, 0.0, 0.0], [5.0, 6.0, 0.0, 0.0, 0.0]]
 
 
-def test_actions_have_the_actuators_names_and_ranges() -> None:
+def test_actions_have_the_names_and_ranges_of_the_actuators() -> None:
     space = action_space(model(), None)
     assert list(space.parts) == ["push", "actuator_1"]
     assert space.low is not None and space.high is not None
@@ -63,7 +63,7 @@ MANY = """
 """
 
 
-def test_an_actuator_has_as_many_actions_as_controls_and_its_own_name() -> None:
+def test_actuator_has_an_action_per_control_and_a_unique_name() -> None:
     space = action_space(mujoco.MjModel.from_xml_string(MANY), None)
     assert space.parts == {"actuator_2": slice(0, 1), "aim": slice(1, 4), "actuator_2_": slice(4, 5)}
     assert space.low is not None
@@ -76,7 +76,7 @@ def test_actions_without_a_range_are_unbounded() -> None:
     assert (space.low[1], space.high[1]) == (-np.inf, np.inf)
 
 
-def test_an_action_range_replaces_the_control_ranges() -> None:
+def test_action_range_replaces_the_control_ranges() -> None:
     space = action_space(model(), (-1.0, 1.0))
     assert space.low is not None and space.high is not None
     assert (space.low.tolist(), space.high.tolist()) == ([-1.0, -1.0], [1.0, 1.0])
@@ -96,7 +96,7 @@ def test_actions_of_a_task_have_bounds_only_with_an_action_range() -> None:
     np.testing.assert_array_equal([free.low, free.high], [[-np.inf], [np.inf]])
 
 
-def test_a_state_holds_the_integration_state_snapshots_counters_and_memory() -> None:
+def test_state_contains_integration_state_snapshots_counters_and_memory() -> None:
     compiled = model()
     space = state_space(compiled, [describe(compiled, "qacc")], [], {"memory": 4})
     assert space.dtype == torch.float64

@@ -1,4 +1,4 @@
-"""Check the shapes of terrains, contacts with them on both engines, height scans, and levels."""
+"""Test the shapes of terrains, contacts on both engines, height scans, and levels."""
 
 import mujoco
 import numpy as np
@@ -21,7 +21,7 @@ def patch(kind: str, *, level: int = 0, levels: int = 1, **options: object) -> n
 
 
 def row_of(kind: str, **options: object) -> np.ndarray:
-    """Make the heights from the centre of a patch to its outline along x, (41,)."""
+    """Make the heights from the centre of a patch to its edge along x, (41,)."""
     return patch(kind, **options)[40, 40:]
 
 
@@ -38,7 +38,7 @@ def test_slopes_and_stairs_are_pyramids_with_a_flat_top() -> None:
 
 
 @pytest.mark.parametrize(("width", "cells"), [(0.4, 4), (0.3, 3), (0.25, 3)])
-def test_stones_have_gaps_of_the_given_width_rounded_up(width: float, cells: int) -> None:
+def test_stones_have_gaps_of_the_given_width(width: float, cells: int) -> None:
     heights = patch("stones", scale={"stones": width})
     assert set(np.unique(heights)) == {-0.5, 0.0}
     for row in (heights[40, 51:-1], heights[1:30, 40]):  # beyond the platform
@@ -55,19 +55,19 @@ def test_other_terrains_reach_their_full_height_and_depth(kind: str, amount: flo
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "flat"])
-def test_patches_are_harder_at_higher_levels_and_flat_along_their_outline(kind: str) -> None:
+def test_patches_are_harder_at_higher_levels_and_flat_at_their_edges(kind: str) -> None:
     sizes = [abs(patch(kind, level=level, levels=4)).sum() for level in range(4)]
     assert (np.diff(sizes) > 0.0).all() and (sizes[0] > 0.0 or kind == "stones")
     heights = patch(kind)
     assert not heights[[0, -1]].any() and not heights[:, [0, -1]].any()
 
 
-def test_a_seed_repeats_the_field_and_another_column_leaves_the_rest_unchanged() -> None:
+def test_equal_seeds_give_equal_fields_and_a_new_column_does_not_change_others() -> None:
     field = lw.Terrain({"rough": 1, "steps": 1}, levels=2, seed=3).heights
     np.testing.assert_array_equal(lw.Terrain({"rough": 1, "steps": 1}, levels=2, seed=3).heights, field)
     assert (lw.Terrain({"rough": 1, "steps": 1}, levels=2, seed=4).heights != field).any()
     more = lw.Terrain({"rough": 1, "steps": 1, "flat": 2}, levels=3, seed=3, scale={"rough": 0.12, "steps": 0.3})
-    # amounts scaled by 1.5 on levels 0 and 1 of 3 equal the original amounts on levels 0 and 1 of 2
+    # levels 0 and 1 of 3 with amounts scaled by 1.5 equal levels 0 and 1 of 2 with the original amounts
     np.testing.assert_allclose(more.heights[40:200, 40:200], field[40:200, 40:200], atol=1e-12)
 
 
@@ -97,7 +97,7 @@ def test_a_custom_function_makes_patches() -> None:
         ({"scale": {"ruogh": 0.1}}, "no kind of terrain 'ruogh': use rough"),
     ],
 )
-def test_a_terrain_that_cannot_be_made_is_refused(arguments: dict[str, object], message: str) -> None:
+def test_invalid_terrain_raises_an_error(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         lw.Terrain(**{"kinds": {"rough": 1}, **arguments})
 
@@ -111,7 +111,7 @@ def model_of(terrain: lw.Terrain, spec: mujoco.MjSpec | None = None) -> mujoco.M
     return spec.compile()
 
 
-def test_the_compiled_model_has_the_heights_and_origins_of_the_description() -> None:
+def test_compiled_model_has_the_heights_and_origins_of_the_terrain() -> None:
     terrain = lw.Terrain({"stairs_up": 2, "rough": 1}, levels=2, patch=3.0, border=0.5)
     model = model_of(terrain)
     table = height_table(model, "terrain")
@@ -124,7 +124,7 @@ def test_the_compiled_model_has_the_heights_and_origins_of_the_description() -> 
     assert np.ptp(terrain.origins[0, :, 0]) == pytest.approx(6.0) and terrain.origins[1, 0, 1] == pytest.approx(1.5)
 
 
-def test_the_plane_becomes_the_terrain_and_keeps_its_name_and_friction() -> None:
+def test_terrain_replaces_the_plane_and_has_its_name_and_friction() -> None:
     spec = mujoco.MjSpec()
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     spec.worldbody.add_geom(name="floor", type=plane, size=[1, 1, 1], friction=[0.3, 0.01, 0.001], pos=[1, 2, 0.5])
@@ -148,12 +148,12 @@ def test_cameras_stay_near_the_robot() -> None:
     assert model_of(lw.Terrain({"rough": 4}), spec).stat.extent == extent
 
 
-def test_level_ground_everywhere_is_a_valid_field() -> None:
+def test_completely_flat_field_is_valid() -> None:
     table = height_table(model_of(lw.Terrain({"flat": 1}, levels=1)), "terrain")
     assert not table[1:, 1:].any()
 
 
-def test_a_table_of_a_missing_or_moving_field_is_refused() -> None:
+def test_height_table_of_a_missing_or_moving_field_raises_an_error() -> None:
     model = model_of(lw.Terrain({"flat": 1}, levels=1))
     with pytest.raises(ValueError, match="no height field 'floor'; it has: terrain"):
         height_table(model, "floor")
@@ -170,7 +170,7 @@ def test_a_table_of_a_missing_or_moving_field_is_refused() -> None:
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_a_ball_rests_on_every_kind_of_patch_at_the_height_from_the_table(shared_env: SharedEnv, engine: str) -> None:
+def test_ball_rests_on_every_kind_of_patch_at_the_height_in_the_table(shared_env: SharedEnv, engine: str) -> None:
     env = shared_env(OnTerrain, engine=engine, nworld=96, spread=1.8)
     for _ in range(75):
         env.step()
@@ -180,23 +180,24 @@ def test_a_ball_rests_on_every_kind_of_patch_at_the_height_from_the_table(shared
     obs = env.obs.cpu().numpy().astype(float)
     away = (lw.scan_grid(0.1, 0.1, spacing=0.005) ** 2).sum(axis=1)
     nearest = np.sqrt(away + obs[:, 4:] ** 2).min(axis=1)
-    # tolerance of the ball's radius: MuJoCo Warp drops a contact of a ball between two walls
+    # the tolerance is the ball's radius, because MuJoCo Warp drops a contact of a ball between two walls
     np.testing.assert_allclose(nearest, 0.05, atol=2e-3 if engine == "mujoco" else 5e-3)
     assert np.median(abs(nearest - 0.05)) < 5e-4
     assert np.ptp(obs[:, 2]) > 0.4
-    # the range that the engine's sensor measures downwards; at x = 16 m and a slope of 5, 32 bits give 2e-5 m
+    # the distance that the engine's rangefinder measures downwards; for x = 16 m and a slope of 5, float32 is exact to
+    # 2e-5 m
     np.testing.assert_allclose(obs[:, 3], obs[:, 4 + 21 * 21 // 2], atol=5e-5)
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_heights_of_a_state_are_the_same_on_both_engines(shared_env: SharedEnv, engine: str) -> None:
+def test_height_scan_of_a_state_is_equal_on_both_engines(shared_env: SharedEnv, engine: str) -> None:
     states = shared_env(OnTerrain, nworld=8).get_state()
     env = shared_env(OnTerrain, engine=engine, nworld=8)
     env.set_state(states)
     torch.testing.assert_close(env.obs[:, 4:], shared_env(OnTerrain, nworld=8).obs[:, 4:], rtol=0, atol=1e-6)
 
 
-def test_walking_far_raises_a_worlds_level_and_standing_lowers_it(shared_env: SharedEnv) -> None:
+def test_level_of_a_world_rises_after_walking_far_and_falls_after_standing(shared_env: SharedEnv) -> None:
     env = shared_env(OnTerrain, nworld=48)
 
     def episode(*speed: float) -> torch.Tensor:
@@ -220,5 +221,5 @@ def test_walking_far_raises_a_worlds_level_and_standing_lowers_it(shared_env: Sh
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_a_task_on_terrain_keeps_all_rules(engine: str) -> None:
+def test_task_on_terrain_follows_all_rules(engine: str) -> None:
     check_task(OnTerrain, engine=engine, steps=20)

@@ -29,7 +29,7 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return six_iterations(tmp_path_factory.mktemp("runs") / "six")
 
 
-def test_training_in_python_and_on_the_command_line_give_equal_numbers(six: Path, tmp_path: Path) -> None:
+def test_training_in_python_and_on_the_command_line_gives_equal_metrics(six: Path, tmp_path: Path) -> None:
     options = ["--samples", "512", "--hidden", "8", "--value-hidden", "8", "--mean-every", "2", "--mean-episodes", "2"]
     out = tmp_path / "command"
     arguments = ["train", "point_mass", "--nworld", "2", "--iterations", "6", "--keep-every", "2", "--out", str(out)]
@@ -41,14 +41,14 @@ def test_training_in_python_and_on_the_command_line_give_equal_numbers(six: Path
     assert configs[0] == configs[1] | {"threads": 1}
 
 
-def test_a_run_of_python_is_evaluated_and_resumed_by_the_command(six: Path, tmp_path: Path) -> None:
+def test_run_started_in_python_is_evaluated_and_resumed_on_the_command_line(six: Path, tmp_path: Path) -> None:
     run = Path(shutil.copytree(six, tmp_path / "run"))
     assert cli.main(["eval", str(run), "--episodes", "2", "--which", "best"]) == 0
     assert cli.main(["train", "--resume", str(run), "--iterations", "7", *QUIET]) == 0
     assert metrics(run)[:6] == metrics(six)
 
 
-def test_a_run_resumed_in_python_gives_identical_numbers(six: Path, tmp_path: Path) -> None:
+def test_run_resumed_in_python_gives_identical_metrics(six: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=2)
     run = lw.train(algorithm(lw.make("point_mass", nworld=2, seed=5)), folder, iterations=6, resume=True)
@@ -62,7 +62,7 @@ def test_a_run_resumed_in_python_gives_identical_numbers(six: Path, tmp_path: Pa
         lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
 
 
-def test_python_resumes_the_same_task_on_the_same_engine(six: Path, env: lw.Env, tmp_path: Path) -> None:
+def test_resume_with_another_task_or_engine_raises_an_error(six: Path, env: lw.Env, tmp_path: Path) -> None:
     other = Path(shutil.copytree(six, tmp_path / "other"))
     Run.open(other).amend(engine="warp")
     for folder, given, message in [
@@ -74,7 +74,7 @@ def test_python_resumes_the_same_task_on_the_same_engine(six: Path, env: lw.Env,
             lw.train(algorithm(given), folder, iterations=9, resume=True)
 
 
-def test_a_learner_that_has_iterated_begins_a_complete_run(six: Path, tmp_path: Path) -> None:
+def test_learner_after_some_iterations_starts_a_complete_run(six: Path, tmp_path: Path) -> None:
     npg, folder = algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run"
     for _ in range(3):
         next(npg)
@@ -94,7 +94,7 @@ def test_a_learner_that_has_iterated_begins_a_complete_run(six: Path, tmp_path: 
     assert metrics(folder) == metrics(six)[3:]
 
 
-def test_bad_arguments_leave_no_folder(env: lw.Env, tmp_path: Path) -> None:
+def test_invalid_train_arguments_make_no_folder(env: lw.Env, tmp_path: Path) -> None:
     npg = algorithm(env)
     for words, message in [
         ({"iterations": 0}, "iterations must be"),
@@ -121,7 +121,7 @@ def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
         lw.load(six, which="worst")
 
 
-def test_without_evaluations_the_best_policy_sampled_the_best_iteration(tmp_path: Path) -> None:
+def test_best_policy_without_evaluations_is_the_one_that_sampled_the_best_iteration(tmp_path: Path) -> None:
     """The policy before an iteration's update samples that iteration's episodes."""
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), tmp_path / "run", iterations=4, keep_every=1)
@@ -133,7 +133,7 @@ def test_without_evaluations_the_best_policy_sampled_the_best_iteration(tmp_path
         assert torch.equal(best, numbered)
 
 
-def test_a_callback_sees_every_iteration_and_ends_training(env: lw.Env, tmp_path: Path) -> None:
+def test_callback_receives_every_iteration_and_can_end_training(env: lw.Env, tmp_path: Path) -> None:
     seen = []
 
     def callback(iteration: lw.Iteration) -> bool:
@@ -145,7 +145,7 @@ def test_a_callback_sees_every_iteration_and_ends_training(env: lw.Env, tmp_path
     assert seen == [1, 2, 3] and run.read()["iteration"] == 3
 
 
-def test_an_error_in_the_callback_leaves_a_complete_run(six: Path, tmp_path: Path) -> None:
+def test_run_is_complete_after_an_error_in_the_callback(six: Path, tmp_path: Path) -> None:
     def callback(iteration: lw.Iteration) -> None:
         if iteration.iteration == 3:
             raise KeyError("mine")
@@ -160,10 +160,10 @@ def test_an_error_in_the_callback_leaves_a_complete_run(six: Path, tmp_path: Pat
 
 @pytest.mark.quick("KeyboardInterrupt")
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, FloatingPointError])
-def test_an_interrupted_iteration_leaves_the_last_save(
+def test_last_save_remains_after_an_interrupted_iteration(
     error: type[BaseException], six: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Worlds and networks may have changed since the save."""
+    """Worlds and networks may have changed after the save."""
     npg, folder = algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run"
     fit = ValueFit.__call__
 
@@ -198,7 +198,7 @@ class SlowToSave(lw.NPG):
 
 @pytest.fixture
 def sigint() -> Iterator[None]:
-    """Install Python's default SIGINT handler, because a shell may make its children ignore SIGINT."""
+    """Install Python's default SIGINT handler, because child processes of a shell may ignore SIGINT."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -210,7 +210,7 @@ def interrupt_in_fifth(iteration: lw.Iteration) -> None:
 
 
 @pytest.mark.usefixtures("sigint")
-def test_a_signal_keeps_all_finished_iterations_of_a_run_with_slow_saves(tmp_path: Path) -> None:
+def test_all_finished_iterations_are_saved_after_a_signal_even_if_saves_are_slow(tmp_path: Path) -> None:
     npg = SlowToSave(lw.make("point_mass", nworld=2), config=CONFIG)
     with pytest.raises(KeyboardInterrupt):
         lw.train(npg, tmp_path / "run", iterations=100, callback=interrupt_in_fifth)
@@ -219,7 +219,7 @@ def test_a_signal_keeps_all_finished_iterations_of_a_run_with_slow_saves(tmp_pat
 
 
 @pytest.mark.usefixtures("sigint")
-def test_a_second_signal_during_a_slow_save_ends_the_run_at_once(six: Path, tmp_path: Path) -> None:
+def test_second_signal_during_a_slow_save_ends_the_run_immediately(six: Path, tmp_path: Path) -> None:
     npg, folder = SlowToSave(lw.make("point_mass", nworld=2), config=CONFIG), tmp_path / "run"
     npg.signal_in_save = 2
     with pytest.raises(KeyboardInterrupt):
@@ -243,7 +243,7 @@ def test_training_ends_at_the_target_return(tmp_path: Path, capsys: pytest.Captu
     assert len(run.rows()) == 4
 
 
-def test_training_ends_after_its_minutes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_training_ends_after_the_given_minutes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "run"
     run = lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=1000, minutes=1e-6)
     assert len(run.rows()) == 1 and run.read()["iteration"] == 1
@@ -254,8 +254,8 @@ def test_training_ends_after_its_minutes(tmp_path: Path, capsys: pytest.CaptureF
     assert not (tmp_path / "other").exists()
 
 
-def test_a_run_continues_identically_from_the_last_complete_state(six: Path, tmp_path: Path) -> None:
-    """The state is as after kill -9 in iteration 5: iteration 3 was saved, and iteration 4 wrote the last row."""
+def test_run_resumes_identically_from_the_last_complete_state(six: Path, tmp_path: Path) -> None:
+    """The test simulates kill -9 in iteration 5: iteration 3 was saved, and iteration 4 wrote the last row."""
     folder = tmp_path / "run"
     states = {}
 
@@ -277,8 +277,10 @@ def test_a_run_continues_identically_from_the_last_complete_state(six: Path, tmp
         assert torch.equal(mean_action(lw.load(folder, which=which)), mean_action(lw.load(six, which=which)))
 
 
-def test_train_from_a_run_starts_with_its_policy(six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The new run has the old run's settings except one parameter; its first samples come from the old policy."""
+def test_training_from_another_run_starts_with_its_policy(
+    six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The new run has the old run's settings except for one parameter, and the old policy takes its first samples."""
     out = tmp_path / "out"
     arguments = ["train", "--from", str(six), "--which", "4", "--param", "success_distance=0.5", "--iterations", "1"]
     assert cli.main([*arguments, "--out", str(out), "--keep-every", "1", *QUIET]) == 0
@@ -304,7 +306,7 @@ def test_train_from_a_run_starts_with_its_policy(six: Path, tmp_path: Path, caps
     assert not (tmp_path / "no").exists()
 
 
-def test_flags_with_default_values_replace_the_settings_of_the_other_run(
+def test_flags_with_default_values_override_the_settings_of_the_source_run(
     six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old, out = Path(shutil.copytree(six, tmp_path / "old")), tmp_path / "out"
@@ -325,7 +327,7 @@ def test_flags_with_default_values_replace_the_settings_of_the_other_run(
     refused(capsys, "has gamma 0.9, not 0.995")
 
 
-def test_evaluations_and_training_with_one_seed_draw_different_states(env: lw.Env) -> None:
+def test_evaluation_and_training_with_equal_seeds_draw_different_initial_states(env: lw.Env) -> None:
     env.rand_reset(1)
     trained_on = env.obs.clone()
     seen: list[torch.Tensor] = []
@@ -338,8 +340,8 @@ def test_evaluations_and_training_with_one_seed_draw_different_states(env: lw.En
     assert not torch.isclose(seen[0], trained_on).all(1).any()
 
 
-def test_ppo_trains_by_the_same_loop_from_the_shell(six: Path, tmp_path: Path) -> None:
-    """PPO starts with the networks of an NPG run, and resumes to the same numbers."""
+def test_train_command_accepts_ppo(six: Path, tmp_path: Path) -> None:
+    """PPO starts with the networks of an NPG run, and a resumed run gives the same metrics."""
     options = ["--num-steps", "16", "--minibatches", "2", "--epochs", "2", "--nworld", "4", *QUIET]
     begin = ["train", "--from", str(six), "--algorithm", "ppo", *options, "--out"]
     assert cli.main([*begin, str(tmp_path / "whole"), "--iterations", "4"]) == 0
@@ -348,12 +350,12 @@ def test_ppo_trains_by_the_same_loop_from_the_shell(six: Path, tmp_path: Path) -
     assert metrics(tmp_path / "parts") == metrics(tmp_path / "whole")
     config = Run.open(tmp_path / "parts").config
     assert config["algorithm"] == "ppo" and config["ppo"]["hidden"] == [8] and "npg" not in config
-    assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # PPO does not take NPG's settings
+    assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # PPO does not use the settings of NPG
 
 
-def test_a_run_contains_the_transfer_verdict_of_its_policy(env: lw.Env, tmp_path: Path) -> None:
-    """By default the verdict is only made if the physics are not exact, because the other engine's kernels may take
-    minutes to compile."""
+def test_run_contains_the_transfer_verdict_of_its_policy(env: lw.Env, tmp_path: Path) -> None:
+    """By default the transfer test runs only if the physics are not exact, because compiling the other engine's kernels
+    may take minutes."""
     run = lw.train(algorithm(env), tmp_path / "exact", iterations=1)
     assert not run.transfer.exists()
     coarse = algorithm(lw.make("point_mass", nworld=2, frame_skip=2, horizon=20))

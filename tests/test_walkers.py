@@ -1,4 +1,4 @@
-"""Compare tables of walking robots with MuJoCo's kinematics and contacts, and prepare models for walking."""
+"""Test kinematic tables of walking robots against MuJoCo, and the preparation of models for walking."""
 
 from types import SimpleNamespace
 
@@ -40,8 +40,8 @@ XML = """
   <sensor><gyro site="ankle"/></sensor>
 </mujoco>
 """
-"""A robot with one leg of 3 joints and one of 1: two joints share a body, are off its origin and have a reference; one
-body is fixed."""
+"""A robot with a leg of 3 joints and a leg of 1 joint. Two joints share a body, away from its origin, and have a
+reference; one body is fixed."""
 
 
 def made(shape: str = "box", feet: tuple[str, ...] = ("ankle", "peg_end")) -> tuple[mujoco.MjModel, SimpleNamespace]:
@@ -85,7 +85,7 @@ def random_states(model: mujoco.MjModel, count: int) -> list[mujoco.MjData]:
 
 
 @pytest.mark.parametrize("shape", ["sphere", "capsule", "box"])
-def test_tables_give_the_positions_and_contacts_of_feet(shape: str) -> None:
+def test_kinematic_tables_give_the_positions_and_contacts_of_feet(shape: str) -> None:
     model, p = made(shape)
     assert walkers.leg_joints(model, p).tolist() == [[1, 2, 3], [4, -1, -1]]
     assert [model.geom(geom).name for geom in p.foot_geoms] == ["ball", "end"]
@@ -103,8 +103,8 @@ def test_tables_give_the_positions_and_contacts_of_feet(shape: str) -> None:
 
 
 @pytest.mark.parametrize("shape", ["cylinder", "ellipsoid"])
-def test_feet_of_other_shapes_touch_with_the_corners_of_their_boxes(shape: str) -> None:
-    """The corners reach at least as low as the shape."""
+def test_feet_of_other_shapes_touch_the_ground_at_the_corners_of_their_boxes(shape: str) -> None:
+    """The corners of the box are at least as low as the shape of the foot."""
     model, p = made(shape)
     soles = walkers.soles(model, p)
     for data in random_states(model, 50):
@@ -114,7 +114,7 @@ def test_feet_of_other_shapes_touch_with_the_corners_of_their_boxes(shape: str) 
         assert lowest <= 0 or not touching
 
 
-def test_models_without_a_base_or_legs_are_refused() -> None:
+def test_models_without_a_base_or_legs_raise_an_error() -> None:
     model, p = made()
     p.feet = [model.site("ankle").id]
     arm = mujoco.MjModel.from_xml_string(
@@ -136,7 +136,7 @@ def test_models_without_a_base_or_legs_are_refused() -> None:
         walkers.quarter_of_force(model, p)
 
 
-def test_a_prepared_model_has_force_sensors_and_the_friction_of_its_feet() -> None:
+def test_prepared_model_has_force_sensors_and_foot_friction() -> None:
     spec = mujoco.MjSpec.from_string(XML.format(shape="box"))
     walkers.prepare_walker(spec, ["ankle", "peg_end"], timestep=0.004, iterations=(3, 5))
     model = spec.compile()
@@ -152,7 +152,7 @@ def test_a_prepared_model_has_force_sensors_and_the_friction_of_its_feet() -> No
         walkers.prepare_walker(spec, ["toe"])
 
 
-def test_pairs_with_the_ground_become_contacts_of_the_feet() -> None:
+def test_contact_pairs_with_the_ground_are_replaced_by_contacts_of_the_feet() -> None:
     xml = XML.format(shape="box").replace('name="end" size=".02"', 'name="end" size=".02" contype="0" conaffinity="0"')
     pair = '<contact><pair geom1="end" geom2="floor" condim="3"/><pair geom1="end" geom2="ball"/></contact></mujoco>'
     spec = mujoco.MjSpec.from_string(xml.replace("</mujoco>", pair))
@@ -162,7 +162,7 @@ def test_pairs_with_the_ground_become_contacts_of_the_feet() -> None:
     assert walkers.contact_geoms(model, model.body("peg").id) == [model.geom("end").id]
 
 
-def test_motors_become_critically_damped_servos_with_the_same_limits() -> None:
+def test_motors_are_replaced_by_critically_damped_servos_with_the_same_limits() -> None:
     spec = mujoco.MjSpec.from_string(XML.format(shape="box"))
     walkers.use_servos(spec, ["hip_y", "knee"], reach=0.5)
     model = spec.compile()
@@ -178,7 +178,7 @@ def test_motors_become_critically_damped_servos_with_the_same_limits() -> None:
         walkers.use_servos(spec, ["peg"])
 
 
-def test_feet_are_added_at_an_element_of_their_body() -> None:
+def test_foot_sites_are_added_at_a_named_element_of_their_body() -> None:
     spec = mujoco.MjSpec.from_string(XML.format(shape="box"))
     walkers.add_feet(spec, {"a": ("shin", (0.0, 0.0, -0.1)), "b": ("peg", (0.0, 0.0, 0.1)), "c": ("end", (0.0,) * 3)})
     model = spec.compile()
@@ -188,7 +188,7 @@ def test_feet_are_added_at_an_element_of_their_body() -> None:
         walkers.add_feet(spec, {"d": ("toe", (0.0, 0.0, 0.0))})
 
 
-def test_round_feet_have_the_lowest_plane_and_the_friction_of_their_boxes() -> None:
+def test_round_feet_have_the_lowest_height_and_the_friction_of_their_boxes() -> None:
     spec = mujoco.MjSpec.from_string(XML.format(shape="box"))
     before = spec.copy().compile()
     walkers.prepare_walker(spec, ["ankle", "peg_end"])
@@ -202,7 +202,7 @@ def test_round_feet_have_the_lowest_plane_and_the_friction_of_their_boxes() -> N
     assert (model.geom_friction[geoms] == model.geom_friction[box]).all() and (model.geom_priority[geoms] == 1).all()
     place = [walkers.spheres_of(model, data, geom) for geom in geoms]
     inside = (np.concatenate(place)[:, :3] - data.geom_xpos[box]) @ data.geom_xmat[box].reshape(3, 3)
-    # the ends of the capsules touch the sides and the bottom of the box, whose half-sizes are 0.03, 0.04 and 0.02
+    # the ends of the capsules touch the sides and the bottom of the box with half-sizes 0.03, 0.04 and 0.02
     np.testing.assert_allclose(sorted(map(tuple, abs(inside).round(9))), 4 * [(0.02, 0.03, 0.01)], atol=1e-9)
     assert (inside[:, 2] < 0.0).all()
     with pytest.raises(ValueError, match=r"'ankle' is 0\.06 m wide: use a smaller radius"):

@@ -1,4 +1,4 @@
-"""The wheel holds everything that the package reads."""
+"""Test that the wheel contains all files that the package reads."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
-def test_the_wheel_has_every_module_model_and_pretrained_policy() -> None:
+def test_wheel_contains_every_module_model_and_pretrained_policy() -> None:
     wheel = pytest.importorskip("hatchling.builders.wheel")
     builder = wheel.WheelBuilder(str(ROOT))
     packed = {file.distribution_path for file in builder.recurse_included_files()}

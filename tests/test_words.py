@@ -1,4 +1,4 @@
-"""Refuse words and phrases that CONTRIBUTING.md excludes, and name their replacements.
+"""Find words and phrases that CONTRIBUTING.md excludes, and name their replacements.
 
 The search covers code, comments, messages and names (an underscore counts as a space), the documents, and the files
 that build and test the package. A phrase may span two lines.
@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 SETTLED: dict[str, str] = {
-    # one word for one thing
+    # words that the glossary replaces
     r"\brecordings?\b": "graph (captured launches), episode, buffer or video",
     r"\brecord(er|able)\b": "Graphs, capturable",
     r"\bfilm(s|ed|ing)?\b": "video",
@@ -28,7 +28,7 @@ SETTLED: dict[str, str] = {
     r"\btell (of|how|which|what|whether|about)\b": "say, report, hold, show",
     r"\b(is|are|was|were|be|been) told\b(?! apart)": "gets, is given, is reported",
     r"\b(tell|tells|told) (\w+ )?apart\b": "distinguish",
-    # code is not a person
+    # words that describe code as a person
     r"\bwhoever\b": "the caller, or a passive",
     r"\bfor who\b": "for a caller that",
     r"\b(caller|code|engine|function|kernel|loop|method|phase|planner|process|task|thread|world)s? who\b": "that",
@@ -59,14 +59,14 @@ SETTLED: dict[str, str] = {
 ALLOWED = (
     r"event\.record\(",  # torch's name
     r"catch_warnings\(record=True\)",  # Python's
-    r'"record": list\(self\.rows\)',  # MuJoCo's: Batch.rollout(record=...)
+    r'"record": list\(self\.rows\)',  # an argument of MuJoCo's Batch.rollout
     r'self\.control, record=\["qpos", "qvel"\]',
-    r"\bRecorder\b",  # of a video, viz/video.py
-    r'"record": "graphs"',  # the hint for a word of earlier releases, and its tests
+    r"\bRecorder\b",  # the class Recorder of viz/video.py
+    r'"record": "graphs"',  # a hint for users of earlier releases, and its tests
     r'\("record", "did you mean graphs\?"\)',
     r'\(\{"record": False\}, "no parameter \'record\': did you mean graphs"\)',
 )
-"""Code that must contain such a word."""
+"""Patterns of code that must contain an excluded word."""
 
 QUOTING = {
     "CHANGELOG.md": (r"`[^`]*`",),  # old names
@@ -99,7 +99,8 @@ def found_in(text: str, exempt: tuple[str, ...] = ()) -> list[str]:
         flat += re.sub(r"^\s*(#:?\s+)?", "", line).replace("_", " ") + " "
     found, lower = [], flat.lower()
     for pattern, replacement in SETTLED.items():
-        # a search without cases and from a letter, not from a boundary, is ten times as fast and excludes most texts
+        # this case-sensitive search, which does not start at a word boundary, is ten times as fast and excludes most
+        # texts
         if re.search(pattern.removeprefix(r"\b"), lower) is None:
             continue
         for match in re.finditer(pattern, flat, re.IGNORECASE):
@@ -131,5 +132,5 @@ def test_no_excluded_word_is_used() -> None:
         "the roll out of a plan",
     ],
 )
-def test_a_phrase_is_found_in_code_names_and_over_two_lines(text: str) -> None:
+def test_excluded_phrase_is_found_in_code_in_names_and_over_two_lines(text: str) -> None:
     assert len(found_in(text)) == 1

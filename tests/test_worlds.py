@@ -1,4 +1,4 @@
-"""Test the results of the phases of a step, of a reset and of restoring a state."""
+"""Test the phases of a step, of a reset, and of restoring a state."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from lyceum_warp import worlds
 from lyceum_warp.engines.c import mujoco_engine
 from lyceum_warp.graphs import capture
 from lyceum_warp.graphs.workers import Workers
-from lyceum_warp.kernels import steps
+from lyceum_warp.kernels.step_types import OUTCOMES
 from lyceum_warp.tasks.point_mass import PointMass
 
 ENGINES = ["mujoco", "warp"]
@@ -49,17 +49,17 @@ def outcomes_with_faults(
         env.step()
         groups = [*own.obs_groups.values(), *own.final_obs_groups.values()]
         metrics = [wp.to_torch(own.metrics), wp.to_torch(own.episode_metrics)]
-        outcome = [own.buffers[name] for name in steps.OUTCOMES]
+        outcome = [own.buffers[name] for name in OUTCOMES]
         kept += [array.clone() for array in (*groups, *metrics, *outcome, own.changed_view, env.get_state())]
     assert own.changed_view.any(), "no event changed a world"
     return kept, {kind: count for kind, count in env.fault_counts.items() if count}
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_rows_shared_by_lanes_equal_rows_of_one_lane(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_computed_by_several_lanes_equal_rows_of_one_lane(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a GPU the lanes of a warp share a world's rows, and each observation group has its own threads.
 
-    On the CPU these lanes and threads run one after another.
+    On the CPU the lanes of a warp and the threads of a world run one after another.
     """
 
     def launch_three(kernel: wp.Kernel, nworld: int, args: list[Any], device: wp.Device) -> None:
@@ -73,7 +73,7 @@ def test_rows_shared_by_lanes_equal_rows_of_one_lane(engine: str, monkeypatch: p
     assert all(torch.equal(a, b) for a, b in zip(one, three, strict=True))
 
 
-def test_parts_of_the_worlds_equal_all_worlds_together(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_do_not_depend_on_how_threads_divide_the_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each of three threads replays the launches around the C engine for a part of the four worlds."""
     together, counts = outcomes_with_faults("mujoco")
     monkeypatch.setattr(capture, "SECONDS_A_THREAD", 1e-9)
@@ -87,7 +87,8 @@ def test_parts_of_the_worlds_equal_all_worlds_together(monkeypatch: pytest.Monke
 
 
 def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.Env, lw.Env]:
-    """Make the tasks whose success needs three steps and one step; the points move fast, and goals differ."""
+    """Make two tasks whose success needs three steps and one step; the points move fast, and goals differ between
+    worlds."""
     goals = {"success_distance": np.linspace(0.3, 2.5, nworld)}
     held, plain = (lw.make(task, engine=engine, nworld=nworld, **goals, **options) for task in (Held, PointMass))
     for env in (held, plain):
@@ -98,8 +99,9 @@ def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.En
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_held_success_needs_its_steps_in_a_row_within_an_episode(engine: str) -> None:
-    """The end of an episode or a fault restarts the count; all other numbers equal the numbers of the plain task."""
+def test_success_steps_must_be_consecutive_within_an_episode(engine: str) -> None:
+    """The end of an episode or a fault restarts the count of success steps; all other results equal those of the plain
+    task."""
     held, plain = held_and_plain(engine, horizon=12)
     rows, rises, falls = torch.zeros(16), 0, 0
     generator = torch.Generator().manual_seed(0)
@@ -125,7 +127,7 @@ def test_a_held_success_needs_its_steps_in_a_row_within_an_episode(engine: str) 
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_state_keeps_its_success_steps_and_a_reset_clears_them(engine: str) -> None:
+def test_state_contains_the_count_of_success_steps_and_a_reset_clears_it(engine: str) -> None:
     goals = np.array([0.0, 99.0, 99.0])
     env = lw.make(Held, engine=engine, nworld=3, horizon=0, autoreset=False, success_distance=goals)
     for _ in range(2):
@@ -144,7 +146,7 @@ def test_a_state_keeps_its_success_steps_and_a_reset_clears_them(engine: str) ->
     assert env.success.tolist() == [False, True, True]
     env.set_state(full)
     assert env.success.tolist() == [False, True, True]
-    env.set_params(success_distance=0.0)  # a state counts as a success only if it meets the goal
+    env.set_params(success_distance=0.0)  # a state counts as a success only if it satisfies the goal
     env.set_state(full)
     assert not env.success.any()
 
@@ -168,7 +170,7 @@ def test_rollouts_and_plans_do_not_depend_on_success_steps() -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_parameters_that_become_per_world_reach_captured_graphs(engine: str) -> None:
+def test_captured_graphs_use_parameters_that_become_per_world(engine: str) -> None:
     env = lw.make("hopper", nworld=2, engine=engine)
     action = torch.ones(2, 3)
     for _ in range(3):
@@ -179,7 +181,7 @@ def test_parameters_that_become_per_world_reach_captured_graphs(engine: str) -> 
     torch.testing.assert_close(env.reward[0] - env.reward[1], torch.tensor(3.0))
 
 
-def test_random_streams_depend_on_a_worlds_index_over_all_processes() -> None:
+def test_random_streams_depend_on_the_index_of_a_world_over_all_processes() -> None:
     whole, part = lw.make("point_mass", nworld=4), lw.make("point_mass", nworld=2, first_world=2)
     for env in (whole, part):
         env.rand_reset(7)

@@ -1,4 +1,4 @@
-"""The source of the shortest task, for tests that change a line of it."""
+"""Define the source of the shortest task, for tests that change a line of it."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ class Tiny(lw.Task):
 
 
 def changed(*changes: tuple[str, str]) -> str:
-    """Replace the first occurrence of each passage in the source."""
+    """Return the source after replacing the first occurrence of each given text."""
     source = TINY
     for old, new in changes:
         assert old in source, f"{old!r} is not in the text"

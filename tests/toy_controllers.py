@@ -1,4 +1,4 @@
-"""Controllers for tests, and a planner on a simulated clock."""
+"""Define controllers for tests, and a planner on a simulated clock."""
 
 import math
 import time
@@ -20,7 +20,7 @@ def towards(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
 
 
 class StepPlanner:
-    """A planner whose actions encode two numbers: the step at which the plan was made, and the action's index.
+    """A planner whose actions encode two numbers: the step at which the plan was made, and the index of the action.
 
     Both numbers are divided by 100; ``hundredths`` converts the actions back.
     """
@@ -50,7 +50,7 @@ def hundredths(values: torch.Tensor) -> list[int]:
 
 
 class SamplingPlanner:
-    """A planner of zero actions that reports given numbers of failed samples in turn."""
+    """A planner of zero actions that reports the given numbers of failed samples, one number per plan."""
 
     def __init__(self, *failed: float) -> None:
         self.samples, self.failed, self.calls = 8, failed, 0
@@ -59,7 +59,7 @@ class SamplingPlanner:
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor) -> object:
         self.calls += 1
-        return object()  # the loops read ``actions`` and must ignore this
+        return object()  # the loops must read ``actions`` and ignore this attribute
 
     def reset(self, seed: int | None = None) -> None:
         self.calls = 0
@@ -123,8 +123,8 @@ def simulated_run(
         env: The plant.
         seconds: Planning time.
         steps: Number of steps.
-        horizon: Actions of a plan.
-        busy: Seconds that steps take, by their index.
+        horizon: Number of actions in a plan.
+        busy: Durations of steps in seconds, by step index.
     """
     env.rand_reset(0)
     clock = SimulatedClock()

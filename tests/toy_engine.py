@@ -1,4 +1,4 @@
-"""A third engine that implements only the contract in ``engines/base.py``: plain MuJoCo, one world at a time."""
+"""Define a third engine, which follows only the contract in ``engines/base.py`` and steps one world at a time."""
 
 import copy
 from collections.abc import Collection, Iterable
@@ -21,7 +21,7 @@ class ToyEngine(Engine):
 
     Each world has its own MjModel, and ``apply_model`` writes the world's fields into it.
 
-    Everything between two engine calls is captured in a graph, so ``reset``, ``commit``, ``find_faults`` and
+    All launches between two engine calls are captured in a graph, so ``reset``, ``commit``, ``find_faults`` and
     ``get_state`` consist of Warp launches on these rows.
     """
 

@@ -1,4 +1,4 @@
-"""Helpers for short training runs, from the command line and in Python."""
+"""Start short training runs from the command line and in Python."""
 
 import csv
 import signal
@@ -37,7 +37,8 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> None:
 
 
 def interrupted(argv: list[str]) -> int:
-    """Return the exit code of a command that gets a SIGINT; fail the test if the command does not handle it."""
+    """Return the exit code of a command that receives SIGINT; fail the test if the command does not handle the
+    signal."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         return cli.main(argv)

@@ -1,4 +1,4 @@
-"""A task whose dynamics differ between worlds: a ball on a rail, with a random length and masses."""
+"""Define a task whose dynamics differ between worlds: a ball on a rail, with a random length and masses."""
 
 import mujoco
 import warp as wp

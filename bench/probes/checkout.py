@@ -1,9 +1,9 @@
 """Compute numbers with a checkout's lyceum_warp, one unit of work after another, for bench/compare.py.
 
 compare.py runs this program once per checkout, with the checkout first on the path. The first answer lists the
-checkout's tasks and learners. Each following line on stdin is a unit (the keyword arguments of one of PARTS as JSON),
-and each line on stdout an answer. The arrays of a unit are written to the file that the program's argument names, in
-the order of their computation.
+checkout's tasks and learners. Each further line on stdin is a unit (the keyword arguments of a function in PARTS as
+JSON), and each line on stdout is an answer. The arrays of a unit are written to the file that the program's argument
+names, in the order of their computation.
 
 The program uses only public names of the package: the two checkouts may differ in everything else.
 """
@@ -31,11 +31,11 @@ torch.set_num_threads(1)  # the order of a sum depends on the number of threads
 torch.manual_seed(0)
 
 LEARNERS = ("NPG", "PPO")
-"""Public names of the learners that are compared if both checkouts have them."""
+"""Public names of the learners; a learner is compared if both checkouts have it."""
 
 
 class MissingModel(Exception):  # noqa: N818
-    """The model of a task belongs to an extra that is not installed."""
+    """The model of a task needs an extra that is not installed."""
 
 
 class Numbers:
@@ -44,17 +44,17 @@ class Numbers:
     def __init__(self) -> None:
         self.axes: dict[str, list[str]] = {}
         self.equal: list[tuple[str, str]] = []
-        """Pairs of prefixes whose arrays must be equal within the checkout."""
+        """Pairs of prefixes; within the checkout, the arrays of both prefixes must be equal."""
         self._arrays: dict[str, Any] = {}
 
     def add(self, name: str, value: Any, *axes: str, along: str | None = None) -> None:
         """Add an array, a number, a string, or every leaf of a mapping, a dataclass or a list.
 
         Args:
-            name: Name; names of leaves are appended.
+            name: Name of the value; the names of leaves are appended to it.
             value: The value. None is omitted.
             axes: Names of the leading axes.
-            along: Name of an additional leading axis, along which the values of several calls are stacked.
+            along: Name of an additional leading axis that stacks the values of several calls.
         """
         if dataclasses.is_dataclass(value):
             value = vars(value)
@@ -65,7 +65,7 @@ class Numbers:
             for i, part in enumerate(value):
                 self.add(f"{name}/{i}", part, *axes, along=along)
         elif value is not None:
-            # copied, because buffers change in place
+            # the array is copied, because buffers change in place
             array = value.detach().cpu().numpy().copy() if isinstance(value, torch.Tensor) else np.array(value)
             self.axes[name] = [*([along] if along else []), *axes]
             if along:
@@ -81,7 +81,7 @@ class Numbers:
 
 
 def make(task: str, engine: str, device: str, **options: Any) -> Any:
-    """Make an environment on an engine; on a GPU its results are reproducible.
+    """Make an environment on an engine; on a GPU the environment is deterministic.
 
     Raises:
         MissingModel: The task needs an extra that is not installed.
@@ -115,7 +115,7 @@ def split(env: Any, state: torch.Tensor) -> dict[str, torch.Tensor]:
 
 
 def observed(env: Any) -> dict[str, Any]:
-    """Return everything that an environment shows, except for its fields."""
+    """Return all outputs of an environment, except for its fields."""
     names = ("reward", "eval", "terminated", "truncated", "done", "done_reason", "success", "episode_step", "time")
     return {
         "state": split(env, env.get_state()),
@@ -129,7 +129,7 @@ def observed(env: Any) -> dict[str, Any]:
 
 
 def constants(model: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the numbers of a compiled model, by MuJoCo's names."""
+    """Yield the arrays of a compiled model, by MuJoCo's names."""
     for name in dir(model):
         if name.startswith("_") or name == "paths":
             continue
@@ -228,7 +228,7 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
 PLAN = (
     "actions", "nominal", "knot_actions", "standard_noise", "sampled", "returns", "weights", "adapted_noise",
 )  # fmt: skip
-"""Buffers of a planner; a missing one is reported."""
+"""Buffers of a planner; a missing buffer is reported."""
 
 TRAJECTORY = (
     "states", "obs", "actions", "rewards", "evals", "success", "plan_of", "plan_steps", "plan_failed", "plan_effective",
@@ -282,7 +282,7 @@ def commands(numbers: Numbers, *, task: str, engine: str, device: str, iteration
     flags = ["--engine", engine, "--device", where["device"], *(["--deterministic"] if where["deterministic"] else [])]
     flags += ["--samples", "1024", "--nworld", "4", "--seed", "7", "--mean-every", "2", "--mean-episodes", "2"]
     quiet = ["--no-video", "--no-plot"]
-    make(task, engine, device)  # raises MissingModel if the model is not installed
+    make(task, engine, device)  # this call raises MissingModel if the model is not installed
     with tempfile.TemporaryDirectory(dir=".") as folder, contextlib.chdir(folder):
         command("train", task, "--iterations", str(iterations), "--out", "whole", *flags, *quiet)
         command("train", task, "--iterations", str(iterations // 2), "--out", "resumed", *flags, *quiet)
@@ -311,10 +311,10 @@ def command(*words: str) -> None:
 
 
 PARTS = {"env": environment, "plans": plans, "learners": learning, "commands": commands}
-"""The parts of the comparison, by the names of --parts."""
+"""The parts of the comparison, by their names in --parts."""
 
 
-# messages to and from compare.py
+# the functions below exchange messages with compare.py
 
 
 def contents() -> dict[str, Any]:
@@ -342,7 +342,7 @@ def compute(unit: dict[str, Any], file: Path) -> dict[str, Any]:
     except Exception as error:
         answer["failure"] = failure(error)
     np.savez(file, **numbers.arrays())
-    gc.collect()  # environments contain reference cycles
+    gc.collect()  # free environments now, because they contain reference cycles
     return {**answer, "axes": numbers.axes, "equal": numbers.equal}
 
 

@@ -19,6 +19,7 @@ from lyceum_warp.binding.writes import written_fields
 from lyceum_warp.fields import is_data_field
 from lyceum_warp.kernels import random, steps
 from lyceum_warp.kernels import rows as kernel_rows
+from lyceum_warp.kernels.step_types import TaskCode
 from lyceum_warp.model_fields import NOT_NEGATIVE
 from lyceum_warp.task import FUNCTIONS, Row, TaskFunction
 
@@ -127,8 +128,8 @@ def kernels_of(
             written = [name for name, function in found.items() if function is not None]
             module = free_module_name(f"lyceum_warp.generated.{source.kernel_name}")
             given: dict[str, Any] = {"module": module, "functions": functions, "written": written}
-            names = [field.name for field in dataclasses.fields(steps.TaskCode) if field.name not in given]
-            _kernels[key] = steps.make_kernels(steps.TaskCode(**given, **{name: scope[name] for name in names}))
+            names = [field.name for field in dataclasses.fields(TaskCode) if field.name not in given]
+            _kernels[key] = steps.make_kernels(TaskCode(**given, **{name: scope[name] for name in names}))
         return _kernels[key]
 
 

@@ -9,7 +9,7 @@ import warp as wp
 
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.parts import Layout, sizes
-from lyceum_warp.kernels import steps
+from lyceum_warp.kernels import step_types
 from lyceum_warp.spaces import Space
 from lyceum_warp.support.arrays import launch_parts, launch_worlds
 from lyceum_warp.task import observer_name
@@ -94,7 +94,7 @@ class Probe:
             self._action = wp.zeros((1, sum((task.actions or {"": nu}).values())), dtype=float)
             self._totals, self._reason = wp.zeros(self._sums.size, dtype=wp.int64), wp.zeros(1, dtype=int)
             self._yes, self._no = wp.full(1, True, dtype=bool), wp.full(1, False, dtype=bool)
-            self._counters = steps.Counters()
+            self._counters = step_types.Counters()
             self._counters.step, self._counters.episode = wp.zeros(1, dtype=int), wp.zeros(1, dtype=int)
             self._counters.key = wp.zeros(1, dtype=wp.uint32)
             self._counters.rng = self._streams.array

@@ -4,11 +4,9 @@ import contextlib
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import rich.box
-import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.measure import Measurement
@@ -17,16 +15,12 @@ from rich.table import Table
 
 from lyceum_warp import training
 from lyceum_warp.algos.learner import Iteration, Learner
-from lyceum_warp.algos.policy import Policy
 from lyceum_warp.controllers.control_report import ControlReport
 from lyceum_warp.controllers.episode_collector import ControlProgress
 from lyceum_warp.controllers.trajectory import Trajectory
-from lyceum_warp.env import Env
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.viz.cameras import CameraChoice
 from lyceum_warp.viz.long_work import LongWork
-from lyceum_warp.viz.policy_videos import one_line, policy_states
-from lyceum_warp.viz.video import write_video
+from lyceum_warp.viz.policy_videos import one_line
 
 _TABLE_ROWS = 15
 
@@ -206,19 +200,6 @@ def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
         return str(make(*args, **words))
     except Exception as error:
         return f"none: {one_line(error)}"
-
-
-def policy_video(env: Env, policy: Policy, path: Path, seed: int, *, camera: CameraChoice = None) -> Path:
-    """Run an episode of a policy in a new world, write a video of it, and return the video's path."""
-    with LongWork("running an episode for the video", "steps", make_console()) as work:
-        one, states = policy_states(env, policy, seed, progress=work)
-    return states_video(one, states, path, camera=camera)
-
-
-def states_video(env: Env, states: torch.Tensor, path: Path, *, camera: CameraChoice = None) -> Path:
-    """Write a video of the given states, and return its path."""
-    with LongWork("drawing the video", "frames", make_console()) as work:
-        return write_video(env, states, path, camera=camera, progress=work)
 
 
 # plans

@@ -13,7 +13,7 @@ from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.algos.transfer import Transfer, transfer
 from lyceum_warp.binding.registry import file_name, find_task, task_name
 from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, Trust, given, parameters
-from lyceum_warp.cli.display import fitting_table, make_console, note, policy_video, tried
+from lyceum_warp.cli.display import fitting_table, make_console, note, tried
 from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.controllers.trajectory import source
 from lyceum_warp.engines.placement import options_for_few_worlds
@@ -27,6 +27,7 @@ from lyceum_warp.runs.task_copy import note_changes, run_env
 from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 from lyceum_warp.viz.long_work import LongWork
+from lyceum_warp.viz.policy_videos import policy_video
 from lyceum_warp.viz.video import check_video
 
 

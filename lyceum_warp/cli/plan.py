@@ -29,7 +29,7 @@ from lyceum_warp.cli.arguments import (
     optional_flags,
     parameters,
 )
-from lyceum_warp.cli.display import PlanDisplay, make_console, report_table, states_video, tried
+from lyceum_warp.cli.display import PlanDisplay, make_console, report_table, tried
 from lyceum_warp.controllers.checked_controller import CheckedController
 from lyceum_warp.controllers.control_report import ControlReport, control_report
 from lyceum_warp.controllers.loop import control
@@ -44,6 +44,7 @@ from lyceum_warp.support.validate import positive_number, whole_number
 from lyceum_warp.task import Task
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 from lyceum_warp.viz.control_plot import control_plot
+from lyceum_warp.viz.video import write_video
 
 
 @optional_flags(MPPIConfig, default="(default: the task's)")
@@ -366,7 +367,7 @@ def _report(run: Run, plant: Env, done: list[Trajectory], options: Plan) -> int:
     if options.plot:
         paths.append(("plot", tried(control_plot, done, run.folder / "plan.png")))
     if options.video:
-        paths.append(("video", tried(states_video, plant, done[0].states, run.folder / "video.mp4", camera=camera)))
+        paths.append(("video", tried(write_video, plant, done[0].states, run.folder / "video.mp4", camera=camera)))
     for name, path in paths:
         console.print(f"{name + ':':<12}{path}", soft_wrap=True, markup=False)
     return 0

@@ -26,7 +26,7 @@ from lyceum_warp.cli.arguments import (
     given,
     parameters,
 )
-from lyceum_warp.cli.display import Display, curve_table, make_console, note, policy_video, tried
+from lyceum_warp.cli.display import Display, curve_table, make_console, note, tried
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import read_checkpoint
 from lyceum_warp.runs.configuration import ALGORITHMS, Configuration, saved_networks
@@ -39,6 +39,7 @@ from lyceum_warp.viewer.follow import RunViewer
 from lyceum_warp.viz.cameras import parsed_camera
 from lyceum_warp.viz.learning_curve import learning_curve
 from lyceum_warp.viz.long_work import LongWork
+from lyceum_warp.viz.policy_videos import policy_video
 
 _FINAL_EPISODES = 32
 

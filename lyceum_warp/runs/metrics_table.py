@@ -1,6 +1,5 @@
 """Append to, read and truncate metrics.csv, the table of a run's iterations."""
 
-import contextlib
 import csv
 from collections.abc import Mapping
 from pathlib import Path
@@ -35,30 +34,18 @@ def append_row(path: Path, row: Mapping[str, Any]) -> None:
         csv.writer(file).writerow(map(row.get, columns))  # csv writes None as an empty cell
 
 
-def read_metrics(path: Path, *, lines: list[str] | None = None) -> list[dict[str, float | None]]:
-    """Read the rows. Empty cells become None.
-
-    Args:
-        path: The table.
-        lines: Lines to read instead of the table's lines.
+def read_metrics(path: Path) -> list[dict[str, float | None]]:
+    """Read the rows. An empty cell is None, and an incomplete last row, without a line end, is ignored.
 
     Raises:
         ValueError: A cell is not a number, or the rows differ in length.
     """
-    reader = csv.DictReader(_lines(path) if lines is None else lines, strict=True)
-    try:
-        return [{key: float(cell) if cell else None for key, cell in row.items()} for row in reader]
-    except (ValueError, TypeError, csv.Error) as error:
-        raise ValueError(f"{path} is not a table of metrics: line {reader.line_num}: {error}") from error
-
-
-def _lines(path: Path) -> list[str]:
-    """Read the lines of the table, including line ends."""
-    try:
-        with path.open(newline="") as file:
-            return file.readlines()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not a table of metrics: {error}") from error
+    with path.open(newline="") as file:
+        reader = csv.DictReader((line for line in file if line.endswith("\n")), strict=True)
+        try:
+            return [{key: float(cell) if cell else None for key, cell in row.items()} for row in reader]
+        except (ValueError, TypeError, csv.Error) as error:
+            raise ValueError(f"{path} is not a table of metrics: line {reader.line_num}: {error}") from error
 
 
 def cut_rows(path: Path, iteration: int) -> None:
@@ -69,21 +56,15 @@ def cut_rows(path: Path, iteration: int) -> None:
         iteration: Number of the last iteration to keep. The first row need not be iteration 1.
 
     Raises:
-        ValueError: A row to keep is damaged; the table then does not change.
+        ValueError: The table is damaged. The file does not change.
     """
     if not path.exists():
         return
-    lines = _lines(path)
-    header = next(csv.reader(lines[:1]), [])
-    column = header.index("iteration") if "iteration" in header else None
-    kept = []
-    for i, line in enumerate(lines):
-        number: float = i  # use the line's index if the cell is broken, because read_metrics reports broken lines
-        with contextlib.suppress(ValueError, IndexError, csv.Error):
-            number = float(next(csv.reader([line]))[column]) if i and column is not None else i
-        if line.endswith("\n") and (i == 0 or number <= iteration):
-            kept.append(line)
-    read_metrics(path, lines=kept)
+    rows = read_metrics(path)
+    with path.open(newline="") as file:
+        header, *lines = [line for line in file if line.strip()] or [""]
+    numbers = [row.get("iteration") or number for number, row in enumerate(rows, 1)]
+    kept = [line for line, number in zip(lines, numbers, strict=False) if number <= iteration]
     if kept != lines:
         with replaced(path) as temporary:
-            temporary.write_text("".join(kept), newline="")
+            temporary.write_text("".join([header, *kept]), newline="")

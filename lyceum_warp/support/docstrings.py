@@ -17,17 +17,14 @@ from typing import Any, TypeVar
 Class = TypeVar("Class", bound=type)
 
 
-@functools.lru_cache(maxsize=1)
-def _statements(source: str) -> list[ast.stmt]:
-    """Parse a module, whose classes are usually documented one after another."""
-    return ast.parse(source).body
+_parse = functools.lru_cache(maxsize=1)(ast.parse)  # the classes of a module are documented one after another
 
 
 def attribute_docs(cls: type) -> dict[str, str]:
     """The docstrings of a class's attributes by name, in source order; empty if there is no source."""
     try:
         lines, _ = inspect.findsource(inspect.getmodule(cls) or cls)
-        body: list[ast.stmt] = _statements("".join(lines))
+        body: list[ast.stmt] = _parse("".join(lines)).body
         for name in cls.__qualname__.split("."):
             body = next(each.body for each in body if isinstance(each, ast.ClassDef) and each.name == name)
     except (OSError, TypeError, SyntaxError, StopIteration):

@@ -30,11 +30,13 @@ def _interrupt(number: int, frame: Any) -> None:
 
 
 @contextlib.contextmanager
-def _handling(handler: Callable[[int, Any], None], *, replaces: Any = None) -> Iterator[dict[int, Any]]:
-    """Within the context, ``handler`` replaces other handlers.
+def signals(handler: Callable[[int, Any], None] = _interrupt, *, replaces: Any = None) -> Iterator[dict[int, Any]]:
+    """Within the context, the first Ctrl-C, SIGTERM or SIGHUP raises Interrupted.
+
+    Later signals do so only within ``obeyed``.
 
     Args:
-        handler: The handler.
+        handler: The handler of the signals; by default it raises Interrupted.
         replaces: The handler to replace; by default every handler except those that ignore the signal. Shells make
             background programs ignore SIGINT, and nohup makes programs ignore SIGHUP.
 
@@ -54,24 +56,12 @@ def _handling(handler: Callable[[int, Any], None], *, replaces: Any = None) -> I
             signal.signal(number, other)
 
 
-@contextlib.contextmanager
-def signals() -> Iterator[None]:
-    """Within the context, the first Ctrl-C, SIGTERM or SIGHUP raises Interrupted.
-
-    Later signals do so only within ``obeyed``.
-    """
-    with _handling(_interrupt):
-        yield
-
-
-@contextlib.contextmanager
-def obeyed() -> Iterator[None]:
+def obeyed() -> contextlib.AbstractContextManager[object]:
     """Within the context, a second Ctrl-C, SIGTERM or SIGHUP (after the first in ``signals``) raises Interrupted, too.
 
     This allows the user to cancel long work at the end of a program.
     """
-    with _handling(_interrupt, replaces=_ignore):
-        yield
+    return signals(replaces=_ignore)
 
 
 def _raise(number: int) -> None:
@@ -111,7 +101,7 @@ def postponed(*, insist: bool = False) -> Iterator[list[int]]:
         else:
             noted.append(number)
 
-    with _handling(note) as previous:
+    with signals(note) as previous:
         try:
             yield noted
         except Interrupted:

@@ -10,11 +10,11 @@ import torch
 
 from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
-from lyceum_warp.kernels import steps
+from lyceum_warp.kernels import step_types
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes
 
-OUTCOMES = (*steps.OUTCOMES, "obs", "final_obs")
+OUTCOMES = (*step_types.OUTCOMES, "obs", "final_obs")
 """The buffers that a step fills."""
 
 SHORT = 8

@@ -2,7 +2,7 @@
 
 import torch
 
-from lyceum_warp.kernels import steps
+from lyceum_warp.kernels.step_types import OUTCOMES
 from lyceum_warp.support.arrays import launch_worlds, torch_view
 from lyceum_warp.testing.context import SHORT, Context
 from lyceum_warp.world_arrays import memory_columns
@@ -140,7 +140,7 @@ def check_events(ctx: Context) -> None:
                 if not phase.name.startswith("event") and phase.name != "observe":
                     phase.run()
             a.step(action)
-            for name in steps.OUTCOMES:
+            for name in OUTCOMES:
                 ctx.equal(getattr(a, name), getattr(b, name), f"{name} of step {i} without the event")
             for name, final in a.final_obs_groups.items():
                 ctx.equal(final, b.final_obs_groups[name], f"the final group {name} of step {i} without the event")

@@ -1,5 +1,7 @@
 """Make videos of a policy, during and after training."""
 
+import contextlib
+import functools
 import logging
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +16,7 @@ from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.env import Env
 from lyceum_warp.viz.cameras import CameraChoice
+from lyceum_warp.viz.long_work import LongWork
 from lyceum_warp.viz.video import Progress, write_video
 
 log = logging.getLogger(__name__)
@@ -22,19 +25,30 @@ NamedProgress: TypeAlias = Callable[[str, str, int, int], object]
 """Progress callback: (description, unit, amount done, total amount)."""
 
 
-def policy_states(env: Env, policy: Policy, seed: int, *, progress: Progress | None = None) -> tuple[Env, torch.Tensor]:
-    """Run an episode of a policy in a new world; return the environment, and the states for ``write_video``.
+def policy_video(
+    env: Env, policy: Policy, path: Path, seed: int, *, camera: CameraChoice = None,
+    progress: NamedProgress | None = None,
+) -> Path:  # fmt: skip
+    """Run an episode of a policy in a new world, write a video of it, and return the video's path.
 
     Args:
         env: An environment of the policy's task.
         policy: The policy.
+        path: The file.
         seed: Seed of the initial state.
-        progress: Called regularly with the current number of steps and the horizon.
+        camera: The camera; see ``write_video``.
+        progress: Called regularly. By default a bar is shown on a terminal, and otherwise lines on stderr.
     """
     one = evaluation_worlds(env, 1, autoreset=False)
     policy = moved(policy, one) if isinstance(policy, torch.nn.Module) else policy
-    (episode,) = policy_episodes(one, acting(policy), 1, seed=seed, progress=progress)
-    return one, episode.states
+    with contextlib.ExitStack() as shown:
+        if progress is None:
+            running: Progress = shown.enter_context(LongWork("running an episode for the video", "steps"))
+        else:
+            running = functools.partial(progress, "running an episode", "steps")
+        (episode,) = policy_episodes(one, acting(policy), 1, seed=seed, progress=running)
+    drawing = None if progress is None else functools.partial(progress, "drawing the video", "frames")
+    return write_video(one, episode.states, path, camera=camera, progress=drawing)
 
 
 class Videos:
@@ -65,17 +79,12 @@ class Videos:
             return
         path = self.folder / f"{iteration.iteration:06d}.mp4"
         try:
-            env, states = policy_states(
-                self.learner.env, self.learner.policy, self.seed, progress=self._progress("running an episode", "steps")
+            policy_video(
+                self.learner.env, self.learner.policy, path, self.seed, camera=self.camera, progress=self.progress
             )
-            write_video(env, states, path, camera=self.camera, progress=self._progress("drawing the video", "frames"))
         except Exception as error:  # an error of any kind must not end the training
             self.note(f"no further videos ({one_line(error)})")
             self.every = 0
-
-    def _progress(self, text: str, unit: str) -> Progress:
-        named = self.progress
-        return lambda done, total: None if named is None else named(text, unit, done, total)
 
 
 def one_line(error: BaseException) -> str:

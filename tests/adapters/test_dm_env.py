@@ -1,4 +1,4 @@
-"""Use one world as a dm_env environment; dm_env's own checks accept it."""
+"""Use one world as a dm_env environment, and run dm_env's own checks on it."""
 
 import unittest
 
@@ -17,13 +17,13 @@ from lyceum_warp.adapters.dm_env import DmEnvironment  # noqa: E402
 
 
 class TestOfDmEnv(test_utils.EnvironmentTestMixin, unittest.TestCase):
-    """dm_env's checks, with actions that reach the end of several episodes."""
+    """Run dm_env's checks with actions that reach the end of several episodes."""
 
     def make_object_under_test(self) -> DmEnvironment:
         return DmEnvironment("hopper", horizon=6)
 
 
-def test_an_episode_has_dm_envs_step_types_discounts_and_numbers() -> None:
+def test_episode_has_the_step_types_discounts_and_values_that_dm_env_requires() -> None:
     env, twin = DmEnvironment("hopper", seed=3, horizon=4), lw.make("hopper", seed=3, horizon=4, autoreset=False)
     action = np.array([0.5, -0.5, 1.0], np.float32)
     twin.rand_reset()
@@ -38,14 +38,14 @@ def test_an_episode_has_dm_envs_step_types_discounts_and_numbers() -> None:
     assert first.last() and env.step(action).first()
 
 
-def test_a_termination_has_the_discount_0() -> None:
+def test_termination_has_discount_zero() -> None:
     env = DmEnvironment("hopper", healthy_angle_range=(-0.01, 0.01), seed=0)
     env.reset()
     step = next(step for step in (env.step(np.ones(3)) for _ in range(100)) if step.last())
     assert step.discount == 0.0
 
 
-def test_observations_are_the_tasks_parts_or_flat() -> None:
+def test_observations_are_a_dict_of_parts_or_a_flat_array() -> None:
     env = DmEnvironment("hopper")
     assert {name: spec.shape for name, spec in env.observation_spec().items()} == {"position": (5,), "velocity": (6,)}
     flat = DmEnvironment(Full, flat_observation=True)

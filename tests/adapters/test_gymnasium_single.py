@@ -37,10 +37,10 @@ def draws() -> bool:
 
 
 THEIRS = ("is -infinity. This is probably too low", "is infinity. This is probably too high")
-"""Warnings of the checker about unbounded observations; Gymnasium's own robots also cause them."""
+"""Warnings of Gymnasium's checker about unbounded observations, which its own robots also cause."""
 
 
-def test_gymnasiums_checker_accepts_the_adapter(hopper: gymnasium.Env, draws: bool) -> None:
+def test_gymnasium_env_checker_accepts_the_adapter(hopper: gymnasium.Env, draws: bool) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(hopper.unwrapped, skip_render_check=not draws)
@@ -49,7 +49,7 @@ def test_gymnasiums_checker_accepts_the_adapter(hopper: gymnasium.Env, draws: bo
     assert not [text for text in said if not any(known in text for known in THEIRS)]
 
 
-def test_a_step_returns_the_numbers_of_the_wrapped_environment() -> None:
+def test_step_returns_the_values_of_the_wrapped_environment() -> None:
     env, twin = GymnasiumEnv(Full), lw.make(Full, autoreset=False)
     obs, info = env.reset(seed=7)
     twin.rand_reset(7)
@@ -70,21 +70,21 @@ def test_a_step_returns_the_numbers_of_the_wrapped_environment() -> None:
         pytest.fail("no episode ended within the horizon")
 
 
-def test_a_fault_truncates_the_episode_with_its_last_good_observation(hopper: gymnasium.Env) -> None:
+def test_fault_truncates_the_episode_with_the_last_valid_observation(hopper: gymnasium.Env) -> None:
     before, _ = hopper.reset(seed=0)
     obs, reward, terminated, truncated, info = hopper.step(np.full(3, np.nan, dtype=np.float32))
     assert (reward, terminated, truncated) == (0.0, False, True) and info["done_reason"] == lw.Done.ACTION
     np.testing.assert_array_equal(obs, before)
 
 
-def test_gymnasiums_vector_environments_accept_the_adapter() -> None:
+def test_gymnasium_vector_environments_accept_the_adapter() -> None:
     envs = gymnasium.make_vec("lyceum_warp.gym:lyceum/PointMass-v0", num_envs=2, vectorization_mode="sync")
     obs, _ = envs.reset()
     assert (obs[0] != obs[1]).any()
     envs.step(envs.action_space.sample())
 
 
-def test_max_episode_steps_of_make_truncates_episodes(hopper: gymnasium.Env) -> None:
+def test_make_with_max_episode_steps_truncates_episodes(hopper: gymnasium.Env) -> None:
     env = gymnasium.make("lyceum_warp.gym:lyceum/Hopper-v0", max_episode_steps=2)
     env.reset(seed=0)
     ends = [env.step(np.zeros(3, dtype=np.float32))[3] for _ in range(2)]
@@ -102,13 +102,13 @@ def test_max_episode_steps_of_make_truncates_episodes(hopper: gymnasium.Env) -> 
         (np.zeros(3, dtype=int), r"float32 array of shape \(3,\), not a int64 array of shape \(3,\)"),
     ],
 )
-def test_an_action_that_does_not_fit_is_refused(action: Any, message: str, hopper: gymnasium.Env) -> None:
+def test_action_of_wrong_shape_raises_an_error(action: Any, message: str, hopper: gymnasium.Env) -> None:
     hopper.reset(seed=0)
     with pytest.raises(ValueError, match=message):
         hopper.unwrapped.step(action)
 
 
-def test_a_step_before_a_reset_is_refused() -> None:
+def test_step_before_a_reset_raises_an_error() -> None:
     env = GymnasiumEnv("hopper")
     with pytest.raises(ResetNeeded, match="there was no reset before this step: call reset"):
         env.step(np.zeros(3, dtype=np.float32))
@@ -116,6 +116,6 @@ def test_a_step_before_a_reset_is_refused() -> None:
         env.reset(options={"reset_mask": [True]})
 
 
-def test_an_environment_of_several_worlds_is_refused() -> None:
+def test_environment_with_several_worlds_raises_an_error() -> None:
     with pytest.raises(ValueError, match="the environment has 2 worlds, not num_envs=1"):
         GymnasiumEnv(lw.make("hopper", nworld=2, autoreset=False))

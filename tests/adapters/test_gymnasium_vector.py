@@ -1,4 +1,4 @@
-"""Use many worlds as a Gymnasium vector environment: numbers, modes, wrappers, errors."""
+"""Use many worlds as a Gymnasium vector environment, with its autoreset modes, wrappers and errors."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -83,7 +83,7 @@ def by_hand(env: lw.Env) -> list[dict[str, np.ndarray]]:
 
 
 @pytest.mark.parametrize("tensors", [False, True], ids=["numpy", "torch"])
-def test_a_step_returns_the_numbers_of_the_wrapped_environment(
+def test_step_returns_the_values_of_the_wrapped_environment(
     tensors: bool, vector: Callable[..., GymnasiumVectorEnv]
 ) -> None:
     envs = vector(torch=tensors)
@@ -123,7 +123,7 @@ def check_final(infos: dict[str, Any], step: dict[str, np.ndarray], tensors: boo
             np.testing.assert_array_equal(final["critic"], step["final_critic"][world])
 
 
-def test_results_of_a_step_do_not_change_with_the_next(hopper: GymnasiumVectorEnv) -> None:
+def test_results_of_a_step_do_not_change_in_the_next_step(hopper: GymnasiumVectorEnv) -> None:
     hopper.reset(seed=0)
     first = hopper.step(np.ones((N, 3), dtype=np.float32))
     before = [value.copy() for value in first[:4]]
@@ -132,7 +132,7 @@ def test_results_of_a_step_do_not_change_with_the_next(hopper: GymnasiumVectorEn
     assert not np.shares_memory(first[0], second[0])
 
 
-def test_without_copies_results_are_the_buffers(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_step_without_copies_returns_the_buffers(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector(torch=True, copy=False)
     obs, _ = envs.reset(seed=0)
     assert obs["policy"].data_ptr() == envs.env.obs.data_ptr()
@@ -140,7 +140,7 @@ def test_without_copies_results_are_the_buffers(vector: Callable[..., GymnasiumV
     assert np.shares_memory(obs["policy"], envs.env.obs.numpy())
 
 
-def test_with_disabled_resets_an_ended_world_waits_for_a_masked_reset(
+def test_ended_world_waits_for_a_masked_reset_if_autoreset_is_disabled(
     vector: Callable[..., GymnasiumVectorEnv],
 ) -> None:
     envs = vector(autoreset_mode=AutoresetMode.DISABLED)
@@ -161,7 +161,7 @@ def test_with_disabled_resets_an_ended_world_waits_for_a_masked_reset(
     assert (envs.env.episode_step.numpy()[ended] == 0).all()
 
 
-def test_a_mask_may_be_a_tensor(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_reset_accepts_a_mask_as_tensor(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector(torch=True)
     before, _ = envs.reset(seed=1)
     mask = torch.tensor([True, False, False, True])
@@ -172,7 +172,7 @@ def test_a_mask_may_be_a_tensor(vector: Callable[..., GymnasiumVectorEnv]) -> No
 
 @pytest.mark.parametrize("tensors", [False, True], ids=["numpy", "torch"])
 @pytest.mark.parametrize("mode", AutoresetMode)
-def test_a_fault_truncates_the_episode_with_its_last_good_observation(
+def test_fault_truncates_the_episode_with_the_last_valid_observation(
     mode: AutoresetMode, tensors: bool, vector: Callable[..., GymnasiumVectorEnv]
 ) -> None:
     envs = vector(autoreset_mode=mode, torch=tensors)
@@ -189,7 +189,7 @@ def test_a_fault_truncates_the_episode_with_its_last_good_observation(
     assert reward[1] == 0 and infos["done_reason"][1] == lw.Done.ACTION
 
 
-def test_in_mode_next_step_a_world_resets_in_the_step_after_its_end(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_next_step_mode_resets_a_world_in_the_step_after_its_end(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector(autoreset_mode=AutoresetMode.NEXT_STEP)
     envs.reset(seed=5)
     ended, ends = np.zeros(N, dtype=bool), 0
@@ -205,7 +205,7 @@ def test_in_mode_next_step_a_world_resets_in_the_step_after_its_end(vector: Call
 
 
 @pytest.mark.parametrize("tensors", [False, True], ids=["numpy", "torch"])
-def test_an_ignored_action_never_faults(tensors: bool, vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_ignored_invalid_action_causes_no_fault(tensors: bool, vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector(autoreset_mode=AutoresetMode.NEXT_STEP, torch=tensors)
     envs.reset(seed=5)
     faults, ended, ends = envs.env.fault_counts, np.zeros(N, dtype=bool), 0
@@ -217,7 +217,7 @@ def test_an_ignored_action_never_faults(tensors: bool, vector: Callable[..., Gym
     assert ends > 3 and envs.env.fault_counts == faults
 
 
-def test_equal_seeds_give_equal_worlds_and_no_seed_gives_different_worlds(
+def test_equal_seeds_give_equal_worlds_and_resets_without_seeds_differ(
     vector: Callable[..., GymnasiumVectorEnv],
 ) -> None:
     envs = vector()
@@ -228,7 +228,7 @@ def test_equal_seeds_give_equal_worlds_and_no_seed_gives_different_worlds(
     assert len(np.unique(first[:, 0])) == N
 
 
-def test_the_first_reset_without_a_seed_draws_a_seed(hopper: GymnasiumVectorEnv) -> None:
+def test_first_reset_without_a_seed_draws_one(hopper: GymnasiumVectorEnv) -> None:
     def first(**options: Any) -> np.ndarray:
         return GymnasiumVectorEnv("hopper", 2, **options).reset()[0]
 
@@ -236,7 +236,7 @@ def test_the_first_reset_without_a_seed_draws_a_seed(hopper: GymnasiumVectorEnv)
     np.testing.assert_array_equal(first(seed=3), first(seed=3))
 
 
-def test_spaces_have_the_bounds_of_the_environment(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_gymnasium_spaces_have_the_bounds_of_the_environment(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector()
     assert envs.single_action_space == gymnasium.spaces.Box(-1, 1, (3,), np.float32)
     assert {name: space.shape for name, space in envs.observation_space.items()} == {
@@ -255,7 +255,7 @@ OBSERVATION_WRAPPERS = {
     "DtypeObservation": lambda envs: wrappers.vector.DtypeObservation(envs, np.float64),
     "TransformObservation": lambda envs: wrappers.vector.TransformObservation(envs, lambda obs: np.clip(obs, -9, 9)),
 }
-"""Observation wrappers, which Gymnasium refuses in the mode SAME_STEP."""
+"""Observation wrappers, which Gymnasium does not allow in the mode SAME_STEP."""
 
 OTHER_WRAPPERS = {
     "ClipAction": wrappers.vector.ClipAction,
@@ -267,7 +267,7 @@ OTHER_WRAPPERS = {
 
 
 @pytest.mark.parametrize("name", [*OTHER_WRAPPERS, *OBSERVATION_WRAPPERS])
-def test_a_wrapper_of_gymnasium_works(
+def test_gymnasium_wrapper_accepts_the_environment(
     name: str, hopper: GymnasiumVectorEnv, hopper_in_next_step: GymnasiumVectorEnv
 ) -> None:
     if name in OTHER_WRAPPERS:
@@ -317,7 +317,7 @@ def test_pictures_show_the_current_state_of_each_world(vector: Callable[..., Gym
         (True, np.zeros((4, 3), dtype=np.float32), r"must be a float32 tensor .*, not a ndarray .*: torch=True"),
     ],
 )
-def test_actions_that_do_not_fit_are_refused(
+def test_actions_of_wrong_shape_or_type_raise_an_error(
     tensors: bool, action: Any, message: str, vector: Callable[..., GymnasiumVectorEnv]
 ) -> None:
     envs = vector(torch=tensors)
@@ -327,13 +327,13 @@ def test_actions_that_do_not_fit_are_refused(
     assert "\n" not in str(error.value)
 
 
-def test_a_step_before_a_reset_is_refused(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_step_before_a_reset_raises_an_error(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     with pytest.raises(ResetNeeded, match="there was no reset before this step: call reset"):
         vector().step(np.zeros((N, 3), dtype=np.float32))
 
 
 @pytest.mark.parametrize("seed", [None, 3])
-def test_a_partial_reset_before_the_first_full_reset_is_refused(
+def test_partial_reset_before_the_first_full_reset_raises_an_error(
     seed: int | None, vector: Callable[..., GymnasiumVectorEnv]
 ) -> None:
     with pytest.raises(ResetNeeded, match="no reset came before this reset_mask: call reset.. without it first"):
@@ -348,13 +348,15 @@ def test_a_partial_reset_before_the_first_full_reset_is_refused(
         ({"reset_mask": np.ones(4)}, r"the reset_mask must be a bool tensor of shape \(4,\), not a ndarray"),
     ],
 )
-def test_options_that_do_not_fit_are_refused(options: dict[str, Any], message: str, hopper: GymnasiumVectorEnv) -> None:
+def test_invalid_reset_options_raise_an_error(
+    options: dict[str, Any], message: str, hopper: GymnasiumVectorEnv
+) -> None:
     with pytest.raises(ValueError, match=message):
         hopper.reset(options=options)
 
 
 @pytest.mark.parametrize("seed", [-1, [1, 2, 3, 4], 0.5])
-def test_a_seed_that_is_not_a_whole_number_is_refused(seed: Any, hopper: GymnasiumVectorEnv) -> None:
+def test_seed_that_is_not_a_whole_number_raises_an_error(seed: Any, hopper: GymnasiumVectorEnv) -> None:
     with pytest.raises(ValueError, match="seed must be a whole number"):
         hopper.reset(seed=seed)
 
@@ -369,12 +371,12 @@ def test_a_seed_that_is_not_a_whole_number_is_refused(seed: Any, hopper: Gymnasi
         ({"ctrl_cost": 1.0}, "no parameter 'ctrl_cost': did you mean ctrl_cost_weight"),
     ],
 )
-def test_arguments_that_do_not_fit_are_refused(options: dict[str, Any], message: str) -> None:
+def test_invalid_vector_env_arguments_raise_an_error(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         GymnasiumVectorEnv("hopper", **options)
 
 
-def test_an_environment_that_does_not_fit_is_refused(made: Callable[..., lw.Env]) -> None:
+def test_unsuitable_environment_raises_an_error(made: Callable[..., lw.Env]) -> None:
     with pytest.raises(ValueError, match="has its options already: give horizon to lw.make"):
         GymnasiumVectorEnv(made(), horizon=3)
     with pytest.raises(ValueError, match="the environment has 4 worlds, not num_envs=3"):
@@ -385,7 +387,7 @@ def test_an_environment_that_does_not_fit_is_refused(made: Callable[..., lw.Env]
 
 
 @pytest.mark.parametrize("argument", ["wrappers", "vector_kwargs"])
-def test_arguments_for_another_vector_environment_are_refused(argument: str) -> None:
+def test_arguments_of_other_vector_environments_raise_an_error(argument: str) -> None:
     given: Any = {"wrappers": [gymnasium.wrappers.ClipAction], "vector_kwargs": {"copy": False}}[argument]
     with pytest.raises(gymnasium.error.Error, match=f"{argument}") as error:
         gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=2, **{argument: given})

@@ -16,13 +16,13 @@ def install(folder: Path, package: str, version: str) -> None:
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: {version}\n")
 
 
-def test_a_missing_library_is_named_with_the_command_that_installs_it() -> None:
+def test_error_of_a_missing_library_names_the_install_command() -> None:
     with pytest.raises(ImportError, match=r"needs the package not-there: pip install 'lyceum-warp\[x\]'"):
         check_library("not-there", low="1", below="2", install="lyceum-warp[x]")
 
 
 @pytest.mark.parametrize("version, fits", [("1.9", False), ("1.10", True), ("1.10rc1", True), ("2.0.0", False)])
-def test_a_version_must_lie_in_the_range(
+def test_library_version_outside_the_range_raises_an_error(
     version: str, fits: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     install(tmp_path, "learner", version)
@@ -42,7 +42,7 @@ def test_a_version_must_lie_in_the_range(
         ("stable-baselines3", "stable_baselines3", r"lyceum-warp\[stable-baselines3\]"),
     ],
 )
-def test_an_adapter_refuses_the_next_major_version(
+def test_adapter_rejects_the_next_major_version_of_its_library(
     package: str, module: str, install_hint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     install(tmp_path, package, "99.1")

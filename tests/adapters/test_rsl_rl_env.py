@@ -18,7 +18,7 @@ def env(shared_env: SharedEnv) -> lw.Env:
     return shared_env(Metered, nworld=4, horizon=10, far=1e3)
 
 
-def test_a_step_gives_all_groups_and_the_buffers(env: lw.Env) -> None:
+def test_step_returns_all_observation_groups_and_the_buffers(env: lw.Env) -> None:
     worlds = RslRlVecEnv(env)
     assert (worlds.num_envs, worlds.num_actions, worlds.max_episode_length) == (4, 1, 10)
     assert worlds.device == env.obs.device and worlds.cfg["task"] == "metered" and worlds.unwrapped is env
@@ -31,12 +31,12 @@ def test_a_step_gives_all_groups_and_the_buffers(env: lw.Env) -> None:
         assert torch.equal(extras["final_obs"][group], env.final_obs_groups[group])
 
 
-def test_a_task_is_made_with_its_options() -> None:
+def test_rsl_rl_env_passes_options_to_the_task() -> None:
     worlds = RslRlVecEnv(Metered, 3, horizon=7, far=2.0)
     assert (worlds.num_envs, worlds.max_episode_length, worlds.cfg["params"]) == (3, 7, {"far": 2.0})
 
 
-def test_observations_survive_the_next_step(env: lw.Env) -> None:
+def test_observations_do_not_change_in_the_next_step(env: lw.Env) -> None:
     """rsl_rl stores the observations of a step only after the next step."""
     worlds = RslRlVecEnv(env)
     first = worlds.get_observations()
@@ -63,12 +63,12 @@ def test_assigned_episode_lengths_move_the_time_limit(env: lw.Env) -> None:
     (torch.zeros(4), "must be whole numbers of shape"),
     (torch.tensor([0, 1, 10, 2]), "must be from 0 to 9, not from 0 to 10"),
 ])  # fmt: skip
-def test_episode_lengths_that_do_not_fit_are_refused(env: lw.Env, steps: torch.Tensor, message: str) -> None:
+def test_invalid_episode_lengths_raise_an_error(env: lw.Env, steps: torch.Tensor, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         RslRlVecEnv(env).episode_length_buf = steps
 
 
-def test_a_fault_is_a_time_out_and_a_termination_is_not(shared_env: SharedEnv) -> None:
+def test_fault_counts_as_time_out_and_termination_does_not(shared_env: SharedEnv) -> None:
     env = shared_env(Metered, nworld=4, horizon=10)
     worlds = RslRlVecEnv(env)
     worlds.episode_length_buf = torch.tensor([0, 0, 9, 9])
@@ -85,7 +85,7 @@ def test_a_fault_is_a_time_out_and_a_termination_is_not(shared_env: SharedEnv) -
     assert reward[1] == 0.0 and extras["final_obs"]["critic"].isfinite().all()
 
 
-def test_the_log_has_the_mean_metrics_of_recent_episodes(env: lw.Env) -> None:
+def test_log_has_the_mean_metrics_of_recent_episodes(env: lw.Env) -> None:
     worlds = RslRlVecEnv(env)
     worlds.episode_length_buf = torch.tensor([7, 7, 5, 0])
     action = torch.tensor([[0.1], [0.2], [0.3], [0.4]])
@@ -100,7 +100,7 @@ def test_the_log_has_the_mean_metrics_of_recent_episodes(env: lw.Env) -> None:
     assert efforts == pytest.approx([0.0, 0.0, two, two, three, three])
 
 
-def test_the_log_forgets_old_episodes(shared_env: SharedEnv) -> None:
+def test_log_excludes_old_episodes(shared_env: SharedEnv) -> None:
     env = shared_env(Metered, nworld=4, horizon=1, far=1e3)
     worlds = RslRlVecEnv(env)
     for step in range(1, 61):
@@ -116,7 +116,7 @@ def test_the_log_forgets_old_episodes(shared_env: SharedEnv) -> None:
         assert extras["log"]["metrics/effort"].item() == pytest.approx(action)
 
 
-def test_bad_environments_and_actions_are_refused(env: lw.Env, shared_env: SharedEnv) -> None:
+def test_unsuitable_environments_and_actions_raise_an_error(env: lw.Env, shared_env: SharedEnv) -> None:
     with pytest.raises(ValueError, match="the environment has autoreset=False: make it with autoreset=True"):
         RslRlVecEnv(shared_env(Metered, nworld=4, autoreset=False))
     with pytest.raises(ValueError, match="nworld= does not belong to an adapter: num_envs decides"):
@@ -130,7 +130,7 @@ def test_bad_environments_and_actions_are_refused(env: lw.Env, shared_env: Share
 
 
 @pytest.mark.long
-def test_rsl_rls_own_runner_learns(tmp_path: Path) -> None:
+def test_rsl_rl_runner_learns(tmp_path: Path) -> None:
     """The best possible return is about 250; an untrained policy has a negative mean return."""
     from rsl_rl.runners import OnPolicyRunner  # the import takes a second
 
@@ -151,7 +151,7 @@ def test_rsl_rls_own_runner_learns(tmp_path: Path) -> None:
     assert list(tmp_path.glob("model_*.pt"))
 
 
-def test_rsl_rls_writer_gets_the_metrics(env: lw.Env, tmp_path: Path) -> None:
+def test_rsl_rl_writer_receives_the_metrics(env: lw.Env, tmp_path: Path) -> None:
     from rsl_rl.runners import OnPolicyRunner
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -162,7 +162,7 @@ def test_rsl_rls_writer_gets_the_metrics(env: lw.Env, tmp_path: Path) -> None:
 
 
 @pytest.mark.gpu
-def test_gpu_a_step_does_not_wait_for_the_device() -> None:
+def test_gpu_step_does_not_wait_for_the_device() -> None:
     env = lw.make(Metered, nworld=64, device="cuda:0")
     worlds = RslRlVecEnv(env)
     action = torch.zeros(64, 1, device="cuda:0")

@@ -41,14 +41,14 @@ class Value(DeterministicMixin, Model):
 
 
 def wrapped(*, tensors: bool) -> Any:
-    """Wrap an environment for skrl; tensors use the wrapper that skrl provides for Isaac Lab."""
+    """Wrap an environment for skrl; environments with torch tensors use skrl's wrapper for Isaac Lab."""
     if not tensors:
         return wrap_env(GymnasiumVectorEnv("hopper", N), verbose=False)
     env = GymnasiumVectorEnv(Full, N, torch=True, dict_obs=True)
     return wrap_env(env, wrapper="isaaclab-single-agent", verbose=False)
 
 
-def test_tensors_pass_through_the_wrapper_unchanged() -> None:
+def test_skrl_wrapper_returns_tensors_unchanged() -> None:
     env, twin = wrapped(tensors=True), lw.make(Full, nworld=N)
     env.unwrapped.reset(seed=3)
     env.reset()

@@ -1,4 +1,4 @@
-"""Use many worlds as a Stable-Baselines3 vector environment: returned values, learners, wrappers, errors."""
+"""Use many worlds as a Stable-Baselines3 vector environment, with its learners, wrappers and errors."""
 
 import warnings
 
@@ -31,7 +31,7 @@ def hopper() -> StableBaselines3VecEnv:
     return StableBaselines3VecEnv("hopper", N)
 
 
-def test_a_step_returns_the_numbers_of_the_wrapped_environment(full: StableBaselines3VecEnv) -> None:
+def test_step_returns_the_values_of_the_wrapped_environment(full: StableBaselines3VecEnv) -> None:
     twin = lw.make(Full, nworld=N)
     full.seed(9)
     np.testing.assert_array_equal(full.reset(), (twin.rand_reset(9), twin.obs.numpy())[1])
@@ -60,7 +60,7 @@ def test_a_step_returns_the_numbers_of_the_wrapped_environment(full: StableBasel
     assert ends and timeouts
 
 
-def test_results_of_a_step_do_not_change_with_the_next(hopper: StableBaselines3VecEnv) -> None:
+def test_results_of_a_step_do_not_change_in_the_next_step(hopper: StableBaselines3VecEnv) -> None:
     hopper.reset()
     obs, reward, *_ = hopper.step(np.ones((N, 3), dtype=np.float32))
     kept = obs.copy(), reward.copy()
@@ -68,7 +68,7 @@ def test_results_of_a_step_do_not_change_with_the_next(hopper: StableBaselines3V
     assert np.array_equal(kept[0], obs) and np.array_equal(kept[1], reward)
 
 
-def test_ppo_updates_its_policy_and_keeps_statistics_of_episodes(hopper: StableBaselines3VecEnv) -> None:
+def test_ppo_updates_its_policy_and_records_episode_statistics(hopper: StableBaselines3VecEnv) -> None:
     model = PPO("MlpPolicy", hopper, n_steps=64, batch_size=64, n_epochs=2, seed=0, device="cpu")
     before = [parameter.clone() for parameter in model.policy.parameters()]
     model.learn(512)
@@ -78,7 +78,7 @@ def test_ppo_updates_its_policy_and_keeps_statistics_of_episodes(hopper: StableB
     assert len(returns) == len(lengths) == 6 and len(set(returns)) > 1 and min(lengths) > 1
 
 
-def test_an_off_policy_learner_stores_final_observations_and_does_not_store_time_limits_as_ends(
+def test_off_policy_learner_stores_final_observations_and_no_terminations_at_time_limits(
     full: StableBaselines3VecEnv,
 ) -> None:
     model = SAC("MlpPolicy", full, learning_starts=40, batch_size=16, buffer_size=2000, seed=0, device="cpu")
@@ -91,13 +91,13 @@ def test_an_off_policy_learner_stores_final_observations_and_does_not_store_time
         assert (buffer.next_observations[step, world] != buffer.observations[step + 1, world]).any()
 
 
-def test_stable_baselines3s_checker_accepts_a_single_world() -> None:
+def test_stable_baselines3_checker_accepts_a_single_world() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(GymnasiumEnv("hopper"), skip_render_check=True)
 
 
-def test_vector_wrappers_work(hopper: StableBaselines3VecEnv) -> None:
+def test_vector_wrappers_accept_the_environment(hopper: StableBaselines3VecEnv) -> None:
     with pytest.warns(UserWarning, match="already wrapped with a `Monitor`"):
         env = VecMonitor(VecNormalize(hopper))
     env.reset()
@@ -109,7 +109,7 @@ def test_vector_wrappers_work(hopper: StableBaselines3VecEnv) -> None:
     assert env.episode_count
 
 
-def test_a_seed_gives_the_same_worlds(hopper: StableBaselines3VecEnv) -> None:
+def test_equal_seeds_give_equal_worlds(hopper: StableBaselines3VecEnv) -> None:
     hopper.seed(2**31 + 1)
     first = hopper.reset()
     other = hopper.reset()
@@ -118,7 +118,7 @@ def test_a_seed_gives_the_same_worlds(hopper: StableBaselines3VecEnv) -> None:
     assert (first != other).any() and len(np.unique(first[:, 0])) == N
 
 
-def test_attributes_and_methods_reach_the_worlds() -> None:
+def test_get_attr_set_attr_and_env_method_reach_the_worlds() -> None:
     env = StableBaselines3VecEnv("hopper", N, ctrl_cost_weight=0.5)
     assert env.get_attr("render_mode") == [None] * N and env.has_attr("timestep") and not env.has_attr("colour")
     assert env.get_attr("ctrl_cost_weight", indices=[0, 2]) == [0.5, 0.5]
@@ -144,14 +144,16 @@ def test_attributes_and_methods_reach_the_worlds() -> None:
         ("reward", "the task 'hopper' has no parameter 'reward': "),
     ],
 )
-def test_an_attribute_without_effect_is_refused(name: str, message: str, hopper: StableBaselines3VecEnv) -> None:
+def test_setting_an_attribute_without_effect_raises_an_error(
+    name: str, message: str, hopper: StableBaselines3VecEnv
+) -> None:
     with pytest.raises(ValueError, match=message) as error:
         hopper.set_attr(name, 5)
     assert "\n" not in str(error.value) and name not in vars(hopper)
     hopper.set_attr("render_mode", hopper.render_mode)
 
 
-def test_observation_groups_are_a_dict_on_request(full: StableBaselines3VecEnv) -> None:
+def test_dict_obs_returns_observation_groups_as_a_dict(full: StableBaselines3VecEnv) -> None:
     assert full.observation_space.shape == (3,)
     env = StableBaselines3VecEnv(full.env, dict_obs=True)
     obs = env.reset()
@@ -160,7 +162,7 @@ def test_observation_groups_are_a_dict_on_request(full: StableBaselines3VecEnv) 
     model.learn(100)
 
 
-def test_a_picture_shows_all_worlds() -> None:
+def test_rendered_image_shows_all_worlds() -> None:
     env = StableBaselines3VecEnv("hopper", N, render_mode="rgb_array", render_size=(64, 48))
     try:
         assert env.render().shape == (2 * 48, 2 * 64, 3)
@@ -170,13 +172,13 @@ def test_a_picture_shows_all_worlds() -> None:
         env.close()
 
 
-def test_actions_that_do_not_fit_are_refused(hopper: StableBaselines3VecEnv) -> None:
+def test_actions_of_wrong_shape_or_type_raise_an_error(hopper: StableBaselines3VecEnv) -> None:
     hopper.reset()
     with pytest.raises(ValueError, match=r"float32 array of shape \(4, 3\), not a int64 array of shape \(4, 3\)"):
         hopper.step(np.zeros((N, 3), dtype=int))
 
 
-def test_a_step_before_a_reset_and_unknown_options_are_refused(full: StableBaselines3VecEnv) -> None:
+def test_step_before_a_reset_and_unknown_options_raise_errors(full: StableBaselines3VecEnv) -> None:
     env = StableBaselines3VecEnv(full.env)
     with pytest.raises(RuntimeError, match="there was no reset before this step: call reset"):
         env.step(np.zeros((N, 3), dtype=np.float32))

@@ -28,7 +28,7 @@ def wrapped(mode: str, *, tensors: bool, task: Any) -> Any:
 
 
 @pytest.mark.parametrize("mode, tensors, task", CASES)
-def test_a_rollout_returns_the_numbers_of_the_wrapped_environment(mode: str, tensors: bool, task: Any) -> None:
+def test_rollout_returns_the_values_of_the_wrapped_environment(mode: str, tensors: bool, task: Any) -> None:
     from torchrl.envs.utils import check_env_specs
 
     env, twin = wrapped(mode, tensors=tensors, task=task), lw.make(task, nworld=N)
@@ -52,7 +52,7 @@ def test_a_rollout_returns_the_numbers_of_the_wrapped_environment(mode: str, ten
     assert ends >= N
 
 
-def test_a_collector_and_advantages_work() -> None:
+def test_collector_and_advantages_accept_the_environment() -> None:
     from tensordict.nn import TensorDictModule
     from torchrl.collectors import Collector
     from torchrl.objectives.value import GAE

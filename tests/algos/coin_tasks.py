@@ -1,4 +1,5 @@
-"""Tasks for tests of the planner: the reward is the action times a coin, which is -1 or 1 with equal probability."""
+"""Define tasks for tests of the planner: the reward is the action times a coin, which is -1 or 1 with equal
+probability."""
 
 import warp as wp
 from rail_task import rail
@@ -66,12 +67,12 @@ class TossedAfter(lw.Task):
 
 
 class TossedAfterWithControl(TossedAfter):
-    """``TossedAfter`` with a ``control``, so that rollouts run step by step."""
+    """``TossedAfter`` with a ``control`` function, so that rollouts run step by step."""
 
     control = copied
 
 
 class TossedBefore(TossedAfter):
-    """The reward's coin was tossed in the previous step, and is stored in memory."""
+    """The reward's coin is tossed in the previous step, and stored in memory."""
 
     reward = paid_by_coin_before_action

@@ -27,7 +27,7 @@ def policy_of(activation: str, hidden: tuple[int, ...] = (8, 6), **options: obje
 
 @pytest.mark.parametrize("activation", ["tanh", "relu", "elu"])
 @pytest.mark.parametrize("hidden", [(), (8,), (8, 6), (3, 16, 4)])
-def test_hand_written_products_equal_autograds(activation: str, hidden: tuple[int, ...]) -> None:
+def test_hand_written_derivatives_equal_autograd(activation: str, hidden: tuple[int, ...]) -> None:
     policy = policy_of(activation, hidden)
     dense = DensePolicy.of(policy)
     assert dense is not None
@@ -44,7 +44,7 @@ def test_hand_written_products_equal_autograds(activation: str, hidden: tuple[in
             torch.testing.assert_close(plain(direction), written(direction), rtol=1e-4, atol=1e-5)
 
 
-def test_a_frozen_log_std_has_no_gradient() -> None:
+def test_frozen_log_std_has_no_gradient() -> None:
     policy = policy_of("tanh")
     policy.log_std.requires_grad_(False)
     dense = DensePolicy.of(policy)
@@ -55,7 +55,7 @@ def test_a_frozen_log_std_has_no_gradient() -> None:
     torch.testing.assert_close(plain(gradients[0]), written(gradients[0]), rtol=1e-4, atol=1e-5)
 
 
-def test_samples_and_predictions_equal_the_modules() -> None:
+def test_samples_and_predictions_equal_those_of_torch_modules() -> None:
     policy, generator = policy_of("tanh"), torch.Generator().manual_seed(0)
     dense = DensePolicy.of(policy)
     obs, noise = torch.randn(6, 5, generator=generator), torch.randn(6, 2, generator=generator)
@@ -65,12 +65,12 @@ def test_samples_and_predictions_equal_the_modules() -> None:
     value = perturbed(lw.ValueFunction(5, (7, 3), time_orders=2, normalize=True))
     value.observe(obs)
     steps, obs = torch.arange(12.0).view(4, 3), torch.randn(4, 3, 5, generator=generator)
-    # returns are about 200, rounded to float32
+    # the returns are about 200, and float32 rounds them
     torch.testing.assert_close(DenseValue.of(value)(obs, steps), value(obs, steps).detach(), rtol=1e-5, atol=1e-4)
 
 
 class Own(nn.Sequential):
-    """A user's subclass, which may compute anything."""
+    """A policy subclass of a user, which may compute anything."""
 
 
 def hooked(network: nn.Module) -> nn.Module:
@@ -101,7 +101,7 @@ def test_other_networks_use_autograd(kind: str) -> None:
         assert DensePolicy.of(lw.GaussianPolicy(5, 2, network=OTHERS[kind]())) is None
 
 
-def test_a_policy_subclass_or_frozen_layers_use_autograd() -> None:
+def test_policy_subclass_and_frozen_layers_use_autograd() -> None:
     class Policy(lw.GaussianPolicy):
         pass
 

@@ -1,5 +1,4 @@
-"""Train in several processes: worlds and updates equal the results of a single process, and any number of processes can
-resume."""
+"""Train in several processes, and compare worlds, updates and resumed runs with a single process."""
 
 import csv
 import os
@@ -18,8 +17,9 @@ from lyceum_warp.algos import distributed
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.runs.folder import Run
 
-# every feature that might differ with the number of processes: unfinished episodes, a normaliser, a subset of the
-# samples for the Fisher information, a smaller last mini-batch, an evaluation, restarts between iterations
+# these settings use every feature that might depend on the number of processes: unfinished episodes, a normaliser, a
+# subset of the samples for the Fisher information, a smaller last mini-batch, an evaluation, and restarts between
+# iterations
 OPTIONS = ["--samples", "600", "--nworld", "12", "--hidden", "8", "--value-hidden", "8", "--mean-every", "1",
            "--mean-episodes", "2", "--rollout", "segments", "--normalize", "--time-orders", "2",
            "--fisher-fraction", "0.34", "--min-restarts", "10"]  # fmt: skip
@@ -38,7 +38,7 @@ def torchrun(
 
 
 def ended(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str, str]]:
-    """Return exit codes, stdouts and stderrs."""
+    """Return the exit codes, stdouts and stderrs of processes."""
     try:
         outputs = [process.communicate(timeout=120) for process in processes]
     finally:
@@ -62,7 +62,7 @@ def table(run: Path) -> list[dict[str, float]]:
 
 
 def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
-    """Compare the tables' last rows and the checkpoints, up to rounding."""
+    """Compare the last metrics and the checkpoints of two runs, up to rounding."""
     row, expected = table(one)[-1], table(other)[-1]
     for name in expected:
         bound = tolerance * (10.0 if name.startswith("mean_") else 1.0)  # episodes amplify rounding
@@ -80,7 +80,7 @@ def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
 
 @pytest.mark.long
 def test_two_machines_make_the_same_update_as_one_process(tmp_path: Path) -> None:
-    """Two torchrun commands stand in for two machines; a single process then continues their run."""
+    """Two torchrun commands represent two machines; a single process then continues their run."""
     two, one = tmp_path / "two", tmp_path / "one"
     arguments = ["train", "hopper", *OPTIONS, *QUIET]
     endpoint = f"--rdzv-endpoint=127.0.0.1:{free_port()}"
@@ -107,16 +107,12 @@ PPO = ["--algorithm", "ppo", "--nworld", "12", "--num-steps", "20", "--minibatch
 """Settings with unfinished episodes, a normaliser, an adaptive learning rate, leftover samples and an evaluation."""
 
 
+@pytest.mark.quick("npg")
 @pytest.mark.parametrize(
     ("settings", "tolerance"),
-    [
-        pytest.param(OPTIONS, 2e-4, id="npg"),
-        # Adam turns rounding errors of small gradients into steps
-        pytest.param(PPO, 2e-3, id="ppo", marks=pytest.mark.long),
-        pytest.param(
-            [*PPO, "--whiten-minibatches", "--std-type", "log"], 2e-3, id="whitened ppo", marks=pytest.mark.long
-        ),
-    ],
+    # Adam turns rounding errors of small gradients into steps
+    [(OPTIONS, 2e-4), (PPO, 2e-3), ([*PPO, "--whiten-minibatches", "--std-type", "log"], 2e-3)],
+    ids=["npg", "ppo", "whitened ppo"],
 )
 def test_two_processes_make_the_same_update_as_one(settings: list[str], tolerance: float, tmp_path: Path) -> None:
     two, one = tmp_path / "two", tmp_path / "one"
@@ -133,7 +129,7 @@ def test_two_processes_make_the_same_update_as_one(settings: list[str], toleranc
 SAC = ["--algorithm", "sac", "--nworld", "12", "--num-steps", "20", "--updates", "4", "--actor-every", "2", "--n-step",
        "2", "--batch", "64", "--warmup", "60", "--replay", "120", "--hidden", "8", "--value-hidden", "8",
        "--mean-every", "1", "--mean-episodes", "2"]  # fmt: skip
-"""A replay buffer that is full after 10 steps, a normaliser, a warm-up, an evaluation."""
+"""Settings of SAC with a replay buffer that is full after 10 steps, a normaliser, a warm-up and an evaluation."""
 
 
 @pytest.mark.long
@@ -147,7 +143,7 @@ def test_two_processes_make_the_same_updates_of_sac_as_one(tmp_path: Path) -> No
     assert code == 0 and "6 worlds each in 2 processes" in out, error
     assert Run.open(two).config == Run.open(one).config
     assert_equal_runs(two, one, tolerance=2e-3)
-    for run in (one, two):  # a single process continues the run of two, with the replay buffer of both
+    for run in (one, two):  # a single process continues the run of two processes, with the replay buffers of both
         assert cli.main(["train", "--resume", str(run), "--iterations", "2", *QUIET]) == 0
     assert_equal_runs(two, one, tolerance=1e-2)
 
@@ -232,8 +228,8 @@ def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_an_error_in_one_process_ends_all_and_two_processes_continue_the_run_of_one(tmp_path: Path) -> None:
-    """Only rank 0 can see the error: the folder is taken."""
+def test_error_in_one_process_ends_all_and_two_processes_resume_the_run_of_one(tmp_path: Path) -> None:
+    """The run's folder exists already, and only rank 0 can see this error."""
     launch = ["--standalone", "--nproc-per-node=2"]
     run, other = tmp_path / "run", tmp_path / "other"
     arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations"]
@@ -251,13 +247,13 @@ def test_an_error_in_one_process_ends_all_and_two_processes_continue_the_run_of_
     assert_equal_runs(run, other, tolerance=2e-3)
 
 
-def test_worlds_that_cannot_be_shared_evenly_are_refused() -> None:
+def test_worlds_that_cannot_be_divided_evenly_raise_an_error() -> None:
     assert Team(0, 3).share(9) == 3
     with pytest.raises(ValueError, match="3 processes cannot share 8 worlds evenly: use a multiple of 3"):
         Team(0, 3).share(8)
 
 
-def test_fewer_gpus_than_processes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fewer_gpus_than_processes_raise_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     for name, value in {"WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1"}.items():
         monkeypatch.setenv(name, value)

@@ -10,8 +10,8 @@ import lyceum_warp as lw
 from lyceum_warp.algos.evaluation import evaluation_seed
 
 
-def test_evaluate_counts_equally_many_episodes_of_every_world() -> None:
-    """A world with short episodes contributes no additional episodes; the results equal the results of a plain loop."""
+def test_evaluate_counts_the_same_number_of_episodes_in_every_world() -> None:
+    """Worlds with short episodes contribute no additional episodes, and the results equal those of a plain loop."""
     env = lw.make("hopper", nworld=4, horizon=60)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
     counts: list[tuple[int, int]] = []
@@ -57,7 +57,7 @@ def test_evaluate_needs_automatic_resets_and_a_horizon() -> None:
         lw.evaluate(lw.make("point_mass", horizon=0), policy, 1)
 
 
-def test_parameters_of_each_world_reach_the_worlds_of_the_mean_policy() -> None:
+def test_worlds_of_the_mean_policy_get_the_parameters_of_each_world() -> None:
     env = lw.make("point_mass", nworld=4, horizon=12, success_distance=[0.0, 9.0, 0.0, 9.0])
     config = lw.NPGConfig(samples=320, hidden=(8, 8), value_hidden=(16,), mean_every=1, mean_episodes=6)
     npg = lw.NPG(env, config=config)
@@ -67,7 +67,7 @@ def test_parameters_of_each_world_reach_the_worlds_of_the_mean_policy() -> None:
     assert it.mean_success == it.success == 1.0
 
 
-def test_each_episode_has_its_own_dynamics() -> None:
+def test_each_episode_draws_its_own_dynamics() -> None:
     """Values drawn at resets differ between all episodes; values drawn at the start differ between worlds."""
     env = lw.make(Varied, nworld=3)
     policy = lw.GaussianPolicy(1, 1)
@@ -79,7 +79,7 @@ def test_each_episode_has_its_own_dynamics() -> None:
     assert torch.equal(lw.evaluate(env, policy, 6, seed=3).metrics["mass"], got.metrics["mass"])
 
 
-def test_the_mean_policy_of_a_task_that_never_ends_is_evaluated_over_1000_steps() -> None:
+def test_mean_policy_is_evaluated_over_1000_steps_if_the_task_has_no_horizon() -> None:
     env = lw.make("half_cheetah", nworld=2, horizon=0)
     config = lw.NPGConfig(samples=20, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2)
     iteration = next(lw.NPG(env, config=config))

@@ -1,4 +1,4 @@
-"""Test the learner interface: runs, export and resumption need only the base class."""
+"""Test a minimal subclass of the learner's base class: run folders, export and resumption."""
 
 import dataclasses
 from pathlib import Path
@@ -34,7 +34,7 @@ class DriftConfig:
 
 
 class Drift(lw.Learner):
-    """Add noise to a constant action, and report only what is required."""
+    """A learner that adds noise to a constant action, and reports only the required numbers."""
 
     algorithm = "drift"
 
@@ -71,7 +71,7 @@ def test_a_minimal_learner_resumes_bit_for_bit(env: lw.Env) -> None:
         other.load_state_dict(saved | {"env": torch.zeros(3, 1)})
 
 
-def test_a_policy_that_is_not_gaussian_is_saved_and_exported(env: lw.Env, tmp_path: Path) -> None:
+def test_policy_that_is_not_gaussian_is_saved_and_exported(env: lw.Env, tmp_path: Path) -> None:
     drift, shown = Drift(env), []
     run = lw.train(drift, tmp_path / "run", iterations=2, callback=shown.append, display=Display(make_console()))
     assert len(shown) == 2 and len(list(curve_table(run.rows(), make_console()).columns)) == 2
@@ -89,15 +89,13 @@ def test_a_policy_that_is_not_gaussian_is_saved_and_exported(env: lw.Env, tmp_pa
 @pytest.mark.parametrize("config, best_by", [
     (lw.NPGConfig(), "mean_return"), (lw.PPOConfig(mean_every=0), "return_mean"), (DriftConfig(), "mean_return"),
 ])  # fmt: skip
-def test_the_best_policy_has_the_largest_return_that_the_learner_reports(
-    config: Any, best_by: str, env: lw.Env
-) -> None:
+def test_best_policy_has_the_largest_reported_return(config: Any, best_by: str, env: lw.Env) -> None:
     drift = Drift(env)
     drift.config = config
     assert drift.best_by == best_by
 
 
-def test_environments_that_do_not_fit_are_refused(shared_env: SharedEnv) -> None:
+def test_unsuitable_environments_raise_errors(shared_env: SharedEnv) -> None:
     with pytest.raises(ValueError, match="Drift needs an environment that resets automatically: make the"):
         Drift(shared_env("point_mass", nworld=2, autoreset=False))
     with pytest.raises(ValueError, match="process 1 of 2 with 2 worlds needs an environment with first_world=2, not 0"):

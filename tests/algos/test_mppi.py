@@ -45,7 +45,7 @@ class Weighed(Varied):
 
 
 def place(obs: torch.Tensor) -> torch.Tensor:
-    """Return a value of point_mass that is low far from the target and at high speed."""
+    """Return a value function of point_mass that is low far from the target and at high speed."""
     return -2 * (obs[:, 0] - obs[:, 4]).abs() - 0.1 * obs[:, 2] * obs[:, 3]
 
 
@@ -70,7 +70,7 @@ def heavy_arm() -> mujoco.MjSpec:
     return spec
 
 
-# undo the reward weights that the task's planning sets
+# these reward weights override the task's suggestions for planning
 HOPPER = dict(task="hopper", horizon=12, samples=24, temperature=0.5, noise=0.8, healthy_reward=1.0,
               forward_reward_weight=1.0, integrator="euler")  # fmt: skip
 POINT = dict(task="point_mass", horizon=9, samples=40, temperature=0.3)
@@ -98,14 +98,14 @@ CASES: dict[str, dict[str, Any]] = {
     "one_knot": POINT | dict(update="predictive_sampling", noise=0.4, knots=1, include_plan=True),
 }
 ON_WARP = ("reach", "stop", "value", "covariance", "model", "cem_smoothed", "linear", "cubic_cem")
-"""Cases that run each kernel once on the Warp engine."""
+"""Cases that together run each kernel once on the Warp engine."""
 LIKE_OTHERS = ("negative", "mppi_without_plan", "without_plan", "cem_of_one", "zero", "knot_for_each_step", "one_knot")
-"""Cases that are left to make test-all."""
+"""Cases that only ``make test-all`` runs."""
 
 
 @pytest.mark.quick(*(f"{case}-mujoco" for case in CASES if case not in LIKE_OTHERS), "cubic_cem-warp")
 @pytest.mark.parametrize("case, engine", [*((case, "mujoco") for case in CASES), *((case, "warp") for case in ON_WARP)])
-def test_plans_equal_the_plain_versions(case: str, engine: str) -> None:
+def test_plans_equal_the_plain_implementation(case: str, engine: str) -> None:
     check_against(Plain, engine, **CASES[case])
 
 
@@ -118,7 +118,7 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
         settings["model"] = settings["model"]()
     plan = MPPI(task, engine=engine, seed=5, iterations=iterations, **settings)
     plain = kind(task, engine=engine, count=len(plan.knot_actions), **settings)
-    # random numbers depend on the seed and the number of previous draws, so a twin can draw the noise of each iteration
+    # random numbers depend on the seed and the number of previous draws, so a second planner can draw the same noise
     knots = {name: settings[name] for name in ("knots", "spline") if name in settings}
     twin = MPPI(task, seed=5, samples=plan.samples, horizon=plan.horizon, iterations=1, **knots)
     plant = lw.make(task, engine=engine, seed=3, autoreset=False)
@@ -167,7 +167,7 @@ def test_samples_that_terminated_get_no_terminal_value() -> None:
 
 
 def numbers(plan: MPPI, state: torch.Tensor, calls: int = 4) -> list[torch.Tensor]:
-    """Return all numbers of several consecutive plans."""
+    """Return the actions and statistics of several consecutive plans."""
     result = []
     for _ in range(calls):
         result.append(plan(state))
@@ -180,7 +180,7 @@ def same(a: list[torch.Tensor], b: list[torch.Tensor]) -> bool:
 
 
 @pytest.mark.parametrize("update", ["mppi", *UPDATES])
-def test_equal_seeds_give_equal_plans_and_a_reset_restarts_the_noise(update: str) -> None:
+def test_equal_seeds_give_equal_plans_before_and_after_a_reset(update: str) -> None:
     words = UPDATES.get(update, {})
     plan, twin, other = (MPPI("reach", seed=seed, horizon=8, samples=10, **words) for seed in (4, 4, 5))
     _, state = reached(0)
@@ -204,7 +204,7 @@ def test_equal_seeds_give_equal_plans_and_a_reset_restarts_the_noise(update: str
 @pytest.mark.quick("mean-mujoco", "worst-mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("risk", ["mean", "worst"])
-def test_plans_in_several_models_equal_the_plain_versions(risk: Any, engine: str) -> None:
+def test_plans_in_several_models_equal_the_plain_implementation(risk: Any, engine: str) -> None:
     settings = dict(horizon=6, samples=8, noise=1.0, smoothing=(1, 0, 0), temperature=0.5, update="mppi", risk=risk)
     plan = MPPI(Weighed, engine=engine, models=3, seed=2, **settings)
     fields = {name: rows.numpy() for name, rows in plan.model_fields.items()}
@@ -222,7 +222,7 @@ def test_plans_in_several_models_equal_the_plain_versions(risk: Any, engine: str
         plain.knots = plan.actions.double().numpy()
 
 
-def test_drawn_models_depend_on_the_seed_and_differ_from_the_plants() -> None:
+def test_drawn_models_depend_on_the_seed_and_differ_from_the_plant_model() -> None:
     plan, twin, other = (MPPI(Varied, horizon=2, samples=3, models=4, seed=seed) for seed in (1, 1, 2))
     masses = plan.model_fields["body_mass"].clone()
     assert torch.equal(masses, twin.model_fields["body_mass"])
@@ -242,7 +242,7 @@ def test_planning_in_drawn_models_ignores_the_model_fields_of_the_state() -> Non
     assert torch.equal(light(state), heavy(changed)) and torch.equal(light.model_returns, heavy.model_returns)
 
 
-def test_a_sample_that_fails_in_one_model_fails() -> None:
+def test_sample_counts_as_failed_if_it_fails_in_one_model() -> None:
     plan = MPPI(Varied, horizon=3, samples=4, models=2)
     plan.model_fields["body_mass"][1, 1] = torch.nan
     plan(plan.state_of())
@@ -255,7 +255,7 @@ def test_a_sample_that_fails_in_one_model_fails() -> None:
 def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
     settings: dict[str, Any] = dict(horizon=4, samples=40, smoothing=(1, 0, 0), temperature=1.0, engine=engine)
     if how == "physics":
-        # strong motors: only small actions keep MuJoCo's accelerations and Warp's velocities below 1e10
+        # with motors this strong, only small actions keep MuJoCo's accelerations and Warp's velocities below 1e10
         settings |= dict(noise=1.0, limit=1e9, model=rail({"mujoco": 1e10, "warp": 2.5e12}[engine]))
     elif how == "value":
         settings |= dict(noise=1.0, limit=1e9, value=lambda obs: torch.where(obs[:, 0] > 0, torch.nan, 1.0))
@@ -282,7 +282,7 @@ def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("update", ["mppi", "cem", "predictive_sampling"])
-def test_a_plan_whose_samples_all_fail_is_only_shifted(update: str, engine: str) -> None:
+def test_plan_is_only_shifted_if_all_samples_fail(update: str, engine: str) -> None:
     plan = MPPI(Picky, engine=engine, horizon=5, samples=8, noise=0.1, limit=10.0, seed=3, update=update)
     plan(plan.state_of())
     for _ in range(3):
@@ -324,7 +324,7 @@ def test_actions_stay_within_the_control_ranges() -> None:
         assert (plan.actions >= low).all() and (plan.actions <= high).all()
         at_bounds = (plan.sampled == low) | (plan.sampled == high)
         assert at_bounds.float().mean() > 0.5
-    free = MPPI(Picky, noise=10.0, horizon=4, limit=1e9)  # Picky's controls are unlimited
+    free = MPPI(Picky, noise=10.0, horizon=4, limit=1e9)  # the task Picky has no control limits
     free(free.state_of())
     assert free.sampled.abs().max() > 10
 
@@ -347,8 +347,9 @@ def test_plans_shift_by_the_elapsed_steps(fill: Any) -> None:
 
 @pytest.mark.parametrize("spline", ["zero", "linear", "cubic"])
 @pytest.mark.parametrize("knots", [1, 3, 5, 8, 12])
-def test_a_shifted_plan_with_knots_keeps_its_actions(knots: int, spline: Any) -> None:
-    """The actions of the remaining steps stay the same, even if the shift is smaller than the distance of two knots."""
+def test_shifted_plan_with_knots_keeps_its_actions(knots: int, spline: Any) -> None:
+    """The actions of the remaining steps do not change, even if the shift is smaller than the distance between two
+    knots."""
     plan = MPPI("point_mass", horizon=12, samples=4, knots=knots, spline=spline, fill="repeat", noise=0.3, seed=1)
     plan(plan.state_of())
     for shift in (0, 1, 1, 1, 2, 7, 1):
@@ -375,7 +376,7 @@ def place_in_warp(obs: Row[float]) -> float:
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
-def test_equal_values_in_torch_and_in_warp_give_equal_plans(engine: str) -> None:
+def test_equal_value_functions_in_torch_and_warp_give_equal_plans(engine: str) -> None:
     settings = POINT | dict(engine=engine, noise=0.5, discount=0.9, iterations=2)
     in_torch, column, in_warp, without = (
         MPPI(value=value, **settings) for value in (place, lambda obs: place(obs)[:, None], place_in_warp, None)
@@ -393,7 +394,7 @@ def test_equal_values_in_torch_and_in_warp_give_equal_plans(engine: str) -> None
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_value_function_gets_the_step_at_the_end_of_the_plan(engine: str) -> None:
+def test_value_function_receives_the_step_at_the_end_of_the_plan(engine: str) -> None:
     value = lw.ValueFunction(6, (16,), scale=50.0, time_orders=2, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         torch.nn.init.xavier_uniform_(value.network[-1].weight)  # a new value function predicts 0
@@ -415,7 +416,7 @@ def test_a_value_function_gets_the_step_at_the_end_of_the_plan(engine: str) -> N
             assert not torch.allclose(plan.returns, wrong.returns, atol=1e-3)
 
 
-def test_a_value_function_must_fit_the_observations_of_its_group() -> None:
+def test_value_function_of_another_observation_size_raises_an_error() -> None:
     group, other = (lw.ValueFunction(n, (8,), generator=torch.Generator().manual_seed(0)) for n in (2, 3))
     plan = MPPI(Picky, horizon=3, samples=4, value=group)
     plan(plan.state_of())
@@ -436,7 +437,7 @@ def test_a_value_function_must_fit_the_observations_of_its_group() -> None:
         (3.0, "value must be a function of observations, or None, not float 3.0"),
     ],
 )  # fmt: skip
-def test_a_value_that_does_not_fit_is_refused_when_the_planner_is_made(value: Any, message: str) -> None:
+def test_invalid_value_function_raises_an_error_when_the_planner_is_made(value: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         MPPI("point_mass", horizon=3, samples=7, value=value)
 
@@ -457,7 +458,7 @@ def test_plans_with_and_without_graphs_are_equal(words: dict[str, Any], engine: 
 
 
 def drive(task: str, steps: int, seed: int, **settings: Any) -> tuple[lw.Env, np.ndarray, np.ndarray]:
-    """Control a plant; return it, its rewards, and its evaluations up to its end or success."""
+    """Control a plant until its episode ends or succeeds; return the plant, its rewards and its evaluations."""
     plan = MPPI(task, seed=seed, **settings)
     plant = lw.make(task, autoreset=False, seed=seed)
     rewards, evals = [], []
@@ -500,10 +501,11 @@ def test_hopper_hops_without_falling() -> None:
 
 
 def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
-    """Return the mean return over runs of 100 steps, and the standard deviation of this mean if coins are unknown.
+    """Return the mean return over runs of 100 steps, and the mean's standard deviation if actions do not depend on
+    coins.
 
-    Plant and planner have equal seeds. A return is the sum of action times coin. If no action depends on its coin, its
-    variance is the sum of the squared actions.
+    Plant and planner have equal seeds. A return is the sum of action times coin. If no action depends on its coin, the
+    variance of the return is the sum of the squared actions.
     """
     plan = MPPI(task, engine="mujoco", horizon=4, noise=2.0, smoothing=(1, 0, 0))
     plant = lw.make(task, autoreset=False)
@@ -522,20 +524,20 @@ def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
 
 @pytest.mark.quick("TossedAfter")
 @pytest.mark.parametrize("task", [TossedAfter, TossedAfterWithControl])
-def test_a_planner_cannot_exploit_a_coin_tossed_after_the_action(task: type[lw.Task]) -> None:
+def test_planner_cannot_exploit_noise_drawn_after_the_action(task: type[lw.Task]) -> None:
     mean, deviation = earned(task)
     assert 0.5 < deviation < 2.3, "the planner should act"
     assert abs(mean) < 3 * deviation
 
 
-def test_a_planner_exploits_a_coin_tossed_before_the_action() -> None:
+def test_planner_exploits_noise_drawn_before_the_action() -> None:
     mean, _ = earned(TossedBefore, runs=5)
     assert mean > 80
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [TossedAfter, TossedAfterWithControl])
-def test_every_sample_of_every_iteration_has_its_own_draws(task: type[lw.Task], engine: str) -> None:
+def test_each_sample_of_each_iteration_draws_its_own_noise(task: type[lw.Task], engine: str) -> None:
     coins: list[torch.Tensor] = []
 
     def value(obs: torch.Tensor) -> torch.Tensor:
@@ -566,7 +568,7 @@ def test_settings_and_buffers_cannot_be_assigned() -> None:
             setattr(plan, name, torch.zeros(3))
 
 
-def test_a_seed_or_a_shift_that_is_not_a_whole_number_is_refused() -> None:
+def test_seed_or_shift_that_is_not_a_whole_number_raises_an_error() -> None:
     plan = MPPI("point_mass", horizon=3, samples=2)
     for wrong in (-1, 0.5, "a"):
         with pytest.raises(ValueError, match="seed must be a whole number from 0"):

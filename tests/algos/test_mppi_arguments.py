@@ -32,7 +32,7 @@ def observe_noisy(s: Rail, p: NoisyParams, obs: Row[float]):
 
 
 class Noisy(lw.Task):
-    """A task with a parameter named like a setting."""
+    """A task with a parameter that has the name of a planner setting."""
 
     model, obs = staticmethod(rail), {"x": 1}
     World, Params, observe = Rail, NoisyParams, observe_noisy
@@ -46,7 +46,7 @@ def arguments(task: Any, config: MPPIConfig | None = None, value: Any = None, pa
     return planner_arguments(find_task(task), config, words, params, value)
 
 
-def test_planning_gives_settings_options_and_parameters_and_arguments_override_them() -> None:
+def test_arguments_override_the_suggestions_in_task_planning() -> None:
     plan = MPPI("hopper", horizon=2, samples=2)
     assert plan.config == MPPIConfig(horizon=2, samples=2, noise=0.1).completed()
     assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
@@ -81,7 +81,7 @@ def test_invalid_planning_raises_an_error_that_names_task_and_part(planning: Any
     assert "\n" not in str(raised.value)
 
 
-def test_a_part_of_planning_must_be_a_dict() -> None:
+def test_task_planning_entry_that_is_not_a_dict_raises_an_error() -> None:
     with pytest.raises(ValueError, match=r"settings of lw.Planning must be a dict, not \['horizon'\]"):
         Planning(settings=["horizon"])  # type: ignore[arg-type]
 
@@ -100,7 +100,7 @@ REACH = task_config(find_task("reach"))
         ("reach", MPPIConfig(horizon=3, samples=8), {"samples": 7}, MPPIConfig(horizon=3, samples=7)),
     ],
 )
-def test_keyword_settings_override_config_which_overrides_planning(
+def test_keyword_settings_override_config_and_config_overrides_planning(
     task: str, config: MPPIConfig | None, words: dict[str, Any], expected: MPPIConfig
 ) -> None:
     assert arguments(task, config, **words)[0] == expected.completed()
@@ -116,7 +116,7 @@ def test_arguments_are_sorted_into_settings_options_and_parameters() -> None:
     assert arguments(task, physics=physics)[1].physics == physics
 
 
-def test_an_ambiguous_name_must_be_given_in_config_or_params() -> None:
+def test_ambiguous_argument_name_raises_an_error_that_names_config_and_params() -> None:
     message = (
         r"'noise' is a setting of MPPI and a parameter of the task 'noisy': pass the setting as "
         r"config=lw.MPPIConfig\(noise=...\), or the parameter as params=\{'noise': ...\}"
@@ -153,14 +153,14 @@ def test_an_ambiguous_name_must_be_given_in_config_or_params() -> None:
         ({"models": 4}, "models=4 needs a task that draws model fields, but 'reach' draws none: write model"),
     ],
 )  # fmt: skip
-def test_wrong_arguments_are_refused_in_one_line(words: dict[str, Any], message: str) -> None:
+def test_invalid_planner_arguments_raise_a_one_line_error(words: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message) as raised:
         MPPI("reach", **words)
     assert "\n" not in str(raised.value)
 
 
-def test_with_a_value_function_planning_parameters_do_not_apply() -> None:
-    """A value function was fitted to the task's own rewards."""
+def test_planning_parameters_are_ignored_with_a_value_function() -> None:
+    """The value function was fitted to the task's own rewards."""
     plan = MPPI("hopper", horizon=2, samples=2, value=lambda obs: obs[:, 0])
     assert plan.env.task.params["healthy_reward"] == 1.0 and plan.env.task.params["forward_reward_weight"] == 1.0
     assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER and plan.settings["noise"] == 0.1
@@ -177,7 +177,7 @@ def test_with_a_value_function_planning_parameters_do_not_apply() -> None:
         ({"config": MPPIConfig(discount=0.7)}, 0.9, 0.7),
     ],
 )
-def test_the_discount_defaults_to_the_value_functions(
+def test_discount_defaults_to_the_discount_of_the_value_function(
     words: dict[str, Any], fitted: float | None, expected: float
 ) -> None:
     value = lw.ValueFunction(6)
@@ -185,14 +185,14 @@ def test_the_discount_defaults_to_the_value_functions(
     assert arguments(planned(settings={"discount": 0.8}), value=value, **words)[0].discount == expected
 
 
-def test_a_different_update_drops_the_settings_of_the_tasks_update() -> None:
+def test_different_update_ignores_settings_for_the_update_of_the_task() -> None:
     task = planned(settings={"update": "cem", "elites": 5, "min_noise": 0.1, "samples": 20})
     assert (arguments(task)[0].elites, arguments(task)[0].min_noise) == (5, 0.1)
     other = arguments(task, update="predictive_sampling")[0]
     assert (other.elites, other.min_noise, other.samples, other.include_plan) == (None, None, 20, True)
 
 
-def test_omitted_settings_get_the_updates_defaults() -> None:
+def test_omitted_settings_get_the_defaults_of_the_update() -> None:
     def chosen(**words: Any) -> tuple[Any, ...]:
         config = arguments("reach", noise=[0.5] * 7, **words)[0]
         return config.include_plan, config.elites, config.min_noise
@@ -204,7 +204,7 @@ def test_omitted_settings_get_the_updates_defaults() -> None:
 
 
 @pytest.mark.parametrize("planner, update", [(lw.CEM, "cem"), (lw.PredictiveSampling, "predictive_sampling")])
-def test_cem_and_predictive_sampling_are_mppi_with_another_update(planner: type[MPPI], update: Any) -> None:
+def test_cem_and_predictive_sampling_equal_mppi_with_another_update(planner: type[MPPI], update: Any) -> None:
     config = MPPIConfig(horizon=3, samples=6)
     one, other = planner("reach", config, seed=1), MPPI("reach", config, update=update, seed=1)
     assert one.config == other.config and one.config.update == update
@@ -232,7 +232,7 @@ def test_cem_and_predictive_sampling_are_mppi_with_another_update(planner: type[
         ("adroit_pen", dict(samples=160, solver={"noslip_iterations": 0}), ("warp", "cuda:0")),
     ],
 )  # fmt: skip
-def test_auto_on_a_gpu_places_samples_by_their_number(
+def test_engine_auto_on_a_gpu_depends_on_the_number_of_samples(
     task: str, words: dict[str, Any], expected: tuple[str, str | None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cuda = types.SimpleNamespace(is_cuda=True), types.SimpleNamespace(is_cuda=False)

@@ -41,14 +41,14 @@ from lyceum_warp.spaces import Space
         ("nominal_model", [1, "yes", None], "nominal_model must be True or False"),
     ],
 )  # fmt: skip
-def test_a_setting_out_of_range_is_refused_by_name(name: str, wrong: list[Any], message: str) -> None:
+def test_error_of_a_setting_out_of_range_names_the_setting(name: str, wrong: list[Any], message: str) -> None:
     for value in wrong:
         with pytest.raises(ValueError, match=message):
             MPPIConfig(**{name: value})
             pytest.fail(f"{name}={value!r} was accepted")
 
 
-def test_drawn_models_exclude_the_nominal_one() -> None:
+def test_drawn_models_exclude_the_nominal_model() -> None:
     with pytest.raises(ValueError, match="models=4 draws model fields, but nominal_model=True does not: omit one"):
         MPPIConfig(models=4, nominal_model=True)
 
@@ -57,7 +57,7 @@ def test_drawn_models_exclude_the_nominal_one() -> None:
     *((betas, False) for betas in ((0.25, 0.8, 0.3), (1, 1, 0), (1, 0, 1), (1, 0, -1), (1, -1.5, 0), (1, 1.9, -1))),
     *((betas, True) for betas in ((1, 0, 0), (0.5, 0.3, 0.2), (5, 1.9, -0.95), (1, -0.9, 0), (1, 0, 0.99))),
 ])  # fmt: skip
-def test_smoothing_must_have_its_poles_inside_the_unit_circle(smoothing: Any, stable: bool) -> None:
+def test_smoothing_with_poles_outside_the_unit_circle_raises_an_error(smoothing: Any, stable: bool) -> None:
     assert (max(abs(np.roots([1, -smoothing[1], -smoothing[2]]))) < 1 - 1e-12) == stable
     if stable:
         assert MPPIConfig(smoothing=smoothing).smoothing == smoothing
@@ -66,7 +66,7 @@ def test_smoothing_must_have_its_poles_inside_the_unit_circle(smoothing: Any, st
         MPPIConfig(smoothing=smoothing)
 
 
-def test_arrays_and_tensors_become_tuples_of_floats() -> None:
+def test_arrays_and_tensors_are_converted_to_tuples_of_floats() -> None:
     config = MPPIConfig(
         horizon=np.int64(3), noise=torch.eye(2), smoothing=[1, 0, 0], fill=np.array([1, 2])  # type: ignore[arg-type]
     )  # fmt: skip
@@ -81,7 +81,7 @@ def test_arrays_and_tensors_become_tuples_of_floats() -> None:
     ("noise", np.eye(3), r"noise must be a standard deviation, 2 standard deviations, or a positive definite"),
     ("fill", [1], r"fill must be 'zero', 'repeat', a number or 2 numbers, not \(1.0,"),
 ])  # fmt: skip
-def test_settings_for_a_different_number_of_actions_are_refused(name: str, value: Any, message: str) -> None:
+def test_settings_for_a_different_action_size_raise_an_error(name: str, value: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         MPPI("point_mass", horizon=3, samples=4, **{name: value})
 

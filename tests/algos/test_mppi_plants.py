@@ -1,4 +1,4 @@
-"""Plan for several plants at once; the plans equal the plans of separate planners."""
+"""Plan for several plants at once, and compare with a planner for each plant."""
 
 from typing import Any
 
@@ -67,7 +67,7 @@ def test_plans_for_several_plants_equal_single_planners(case: str, engine: str) 
 
 
 @pytest.mark.parametrize("kind", ["torch", "warp", "fitted"])
-def test_a_value_function_gets_the_samples_of_every_plant(kind: str) -> None:
+def test_value_function_receives_the_samples_of_every_plant(kind: str) -> None:
     generator = torch.Generator().manual_seed(0)
     fitted = lw.ValueFunction(6, time_orders=2)
     for weights in fitted.parameters():
@@ -104,7 +104,7 @@ def test_a_masked_reset_restarts_only_some_plants() -> None:
 
 
 @pytest.mark.parametrize("update", ["mppi", "cem", "predictive_sampling"])
-def test_a_plant_whose_samples_all_fail_keeps_its_plan(update: str) -> None:
+def test_plan_of_a_plant_does_not_change_if_all_its_samples_fail(update: str) -> None:
     def second_fails(obs: torch.Tensor) -> torch.Tensor:
         plant = torch.arange(len(obs)) // 5
         return torch.where(plant == 1, torch.nan, obs[:, 0])
@@ -123,7 +123,7 @@ def test_a_plant_whose_samples_all_fail_keeps_its_plan(update: str) -> None:
         torch.testing.assert_close(actions[i], alone(states[i], shift=0))
 
 
-def test_a_plan_for_each_world_controls_an_environment() -> None:
+def test_plans_for_each_world_control_an_environment() -> None:
     env = lw.make("point_mass", nworld=4, seed=2, horizon=30)
     state = env.get_state()
     state[1, env.state_space.parts["step"]] = 10  # the episode of world 1 ends after 20 steps
@@ -143,7 +143,7 @@ def test_a_plan_for_each_world_controls_an_environment() -> None:
     assert (now < 0.3 * far)[[0, 2, 3]].all()
 
 
-def test_bad_input_raises_a_one_line_error() -> None:
+def test_invalid_states_and_masks_raise_a_one_line_error() -> None:
     with pytest.raises(ValueError, match="plants must be a whole number .*, not 0"):
         lw.MPPI("point_mass", plants=0)
     plan = lw.MPPI("point_mass", horizon=3, samples=4, plants=2)
@@ -170,6 +170,6 @@ def test_bad_input_raises_a_one_line_error() -> None:
         lw.control(lw.make("point_mass", autoreset=False), plan, steps=2)
 
 
-def test_plants_that_do_not_fit_into_memory_are_refused() -> None:
+def test_too_many_plants_for_the_memory_raise_an_error() -> None:
     with pytest.raises(ValueError, match=r"use nworld=.*, where nworld is plants \* samples \* models, 10000 "):
         lw.MPPI("point_mass", horizon=4, samples=10**5, plants=10**4)

@@ -8,7 +8,7 @@ from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient
 
 
 def test_fisher_product_equals_the_covariance_of_the_score() -> None:
-    """F = E[score score^T]; quadrature over each action gives the exact expectation."""
+    """Fisher information is E[score score^T]; quadrature over each action gives the exact expectation."""
     torch.manual_seed(1)
     policy = lw.GaussianPolicy(5, 2, (6, 4))
     for parameter in policy.parameters():
@@ -30,7 +30,7 @@ def test_fisher_product_equals_the_covariance_of_the_score() -> None:
     torch.testing.assert_close(product(vector), fisher @ vector + 0.1 * vector, atol=2e-4, rtol=2e-4)
 
 
-def test_conjugate_gradient_solves_and_further_iterations_change_nothing() -> None:
+def test_conjugate_gradient_solves_the_system_and_more_iterations_change_nothing() -> None:
     generator = torch.Generator().manual_seed(3)
     root = torch.randn(12, 12, generator=generator, dtype=torch.float64)
     matrix, target = root @ root.T + torch.eye(12), torch.randn(12, generator=generator, dtype=torch.float64)

@@ -8,7 +8,7 @@ from lyceum_warp.algos.networks import Activation, Normalizer, mlp
 
 
 @pytest.mark.parametrize("name", get_args(Activation))
-def test_every_activation_follows_only_hidden_layers(name: Activation) -> None:
+def test_activations_follow_only_hidden_layers(name: Activation) -> None:
     network, obs = mlp([3, 5, 4, 2], activation=name), torch.randn(7, 3)
     function = getattr(torch.nn.functional, name) if name != "tanh" else torch.tanh
     expected = obs
@@ -17,7 +17,7 @@ def test_every_activation_follows_only_hidden_layers(name: Activation) -> None:
     torch.testing.assert_close(network(obs), expected)
 
 
-def test_an_unknown_activation_is_refused_by_name() -> None:
+def test_unknown_activation_raises_an_error_that_names_it() -> None:
     for module in (lambda: mlp([2, 2, 1], activation="sin"), lambda: lw.GaussianPolicy(2, 1, activation="sin"),
                    lambda: lw.ValueFunction(2, activation="sin")):  # type: ignore[arg-type] # fmt: skip
         with pytest.raises(ValueError, match="^activation must be 'tanh', .* not 'sin'$"):
@@ -30,10 +30,11 @@ def test_npg_learns_with_different_activations_of_policy_and_value() -> None:
     npg = lw.NPG(env, config=config)
     assert (npg.policy.shape["activation"], npg.value.shape["activation"]) == ("elu", "relu")
     iteration = next(npg)
-    assert iteration.kl == pytest.approx(0.5 * config.delta, rel=0.3)  # the Fisher products are correct
+    # a correct step length shows that the Fisher products are correct
+    assert iteration.kl == pytest.approx(0.5 * config.delta, rel=0.3)
 
 
-def test_normalizer_has_the_mean_and_variance_of_all_batches_together() -> None:
+def test_normalizer_has_the_mean_and_variance_over_all_batches() -> None:
     obs = torch.randn(1000, 4) * torch.tensor([1.0, 10.0, 0.1, 3.0]) + torch.tensor([0.0, 5.0, -2.0, 100.0])
     normalizer = Normalizer(4)
     torch.testing.assert_close(normalizer(obs[:5, :1].expand(5, 4)), obs[:5, :1].expand(5, 4).clamp(-10, 10))

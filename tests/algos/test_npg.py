@@ -1,4 +1,4 @@
-"""Test NPG as a whole: correct step lengths, exact resumption, and a task that it learns."""
+"""Test that NPG takes steps of the given length, resumes exactly, and learns a task."""
 
 import copy
 import dataclasses
@@ -24,7 +24,7 @@ def env() -> lw.Env:
     return lw.make("point_mass", nworld=16, horizon=12, nthread=1)
 
 
-def test_a_step_has_the_kl_divergence_that_delta_sets(env: lw.Env) -> None:
+def test_step_has_the_kl_divergence_that_delta_sets(env: lw.Env) -> None:
     env.rand_reset(0)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=3200, delta=1e-3, normalize=False), seed=0)
     before = torch.cat([p.detach().flatten() for p in npg.policy.parameters()])
@@ -36,7 +36,7 @@ def test_a_step_has_the_kl_divergence_that_delta_sets(env: lw.Env) -> None:
 
 
 @pytest.mark.parametrize("rollout", ["episodes", "segments"])
-def test_a_run_is_reproducible_and_resumes_bit_for_bit(env: lw.Env, rollout: str) -> None:
+def test_run_is_reproducible_and_resumes_bit_for_bit(env: lw.Env, rollout: str) -> None:
     config = dataclasses.replace(SMALL, rollout=rollout, time_orders=2, normalize=True)
     if rollout == "segments":  # iterations are shorter than an episode, and worlds restart between them
         config = dataclasses.replace(config, samples=16 * 5, min_restarts=1.5)
@@ -86,7 +86,7 @@ def test_learning_does_not_depend_on_the_scale_of_rewards(env: lw.Env) -> None:
     assert plain[-1].explained_variance > 0.5
 
 
-def test_one_extreme_reward_is_bounded_and_counted(env: lw.Env) -> None:
+def test_extreme_reward_is_bounded_and_counted(env: lw.Env) -> None:
     def outlier(reward: torch.Tensor, iteration: int) -> None:
         if iteration == 3:
             reward[5, 2] = -1e10
@@ -115,7 +115,7 @@ def test_a_step_that_exceeds_the_kl_limit_is_shortened(env: lw.Env) -> None:
     assert max(next(free).kl for _ in range(4)) > 0.2
 
 
-def test_changed_observation_statistics_count_towards_the_kl_limit() -> None:
+def test_kl_limit_includes_the_change_of_observation_statistics() -> None:
     """Observations jump in iteration 4, but the KL divergence between sampling policies stays below its limit."""
     env = lw.make("hopper", nworld=16, seed=1, nthread=1)
     config = lw.NPGConfig(samples=1600, hidden=(16,), value_hidden=(16,), mean_every=0, log_std=-2.0)
@@ -142,8 +142,8 @@ def test_changed_observation_statistics_count_towards_the_kl_limit() -> None:
 
 
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
-def test_a_value_function_follows_a_change_of_the_returns_scale(factor: float) -> None:
-    """All new returns lie outside the old range, as after a change of the task."""
+def test_value_function_follows_a_change_in_the_scale_of_returns(factor: float) -> None:
+    """After the change, all returns lie outside the old range."""
     value = lw.ValueFunction(3)
     returns = 50.0 + 10.0 * torch.randn(1000, generator=torch.Generator().manual_seed(0))
     value.rescale(returns, first=True)
@@ -154,7 +154,7 @@ def test_a_value_function_follows_a_change_of_the_returns_scale(factor: float) -
     assert value.shift.item() == pytest.approx(factor * 50.0, rel=0.1)
 
 
-def test_the_value_function_gets_the_group_critic_if_the_task_has_it() -> None:
+def test_value_function_uses_the_observation_group_critic_if_it_exists() -> None:
     env = lw.make(Full, nworld=4)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=40))
     it = next(npg)
@@ -166,13 +166,13 @@ def test_the_value_function_gets_the_group_critic_if_the_task_has_it() -> None:
         lw.NPG(env, config=dataclasses.replace(SMALL, value_group="privileged"))
 
 
-def test_a_state_of_another_number_of_worlds_is_refused(env: lw.Env) -> None:
+def test_loading_a_state_with_another_number_of_worlds_raises_an_error(env: lw.Env) -> None:
     npg = lw.NPG(env, config=SMALL)
     with pytest.raises(ValueError, match="the state has 16 worlds, but the environment has 3"):
         lw.NPG(lw.make("point_mass", nworld=3), config=SMALL).load_state_dict(npg.state_dict())
 
 
-def test_segments_continue_the_previous_episodes(env: lw.Env) -> None:
+def test_rollout_segments_continue_the_previous_episodes(env: lw.Env) -> None:
     env.rand_reset(0)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=16 * 5, mean_every=0))
     assert npg.segments  # NPG selects segments, because 5 steps are shorter than an episode of 12
@@ -190,7 +190,8 @@ def test_segments_continue_the_previous_episodes(env: lw.Env) -> None:
 
 @pytest.mark.parametrize(("min_restarts", "begun"), [(None, 1), (2.0, 3), (0.0, 0)])
 def test_worlds_restart_if_too_few_begin_an_episode(min_restarts: float | None, begun: int) -> None:
-    """With evenly spread time limits, 40 * 5 / 128 = 1.6 worlds would begin an episode in an iteration of 5 steps."""
+    """If time limits were evenly spread, 40 * 5 / 128 = 1.6 worlds would begin an episode in an iteration of 5
+    steps."""
     env = lw.make("point_mass", nworld=40, horizon=128)
     config = lw.NPGConfig(samples=40 * 5, hidden=(8,), value_hidden=(8,), mean_every=0, min_restarts=min_restarts)
     npg = lw.NPG(env, config=config)
@@ -216,7 +217,7 @@ def test_point_mass_learns_to_reach_the_target() -> None:
     assert np.mean(rewards[-3:]) > 0.7, rewards
 
 
-def test_wrong_arguments_are_refused(env: lw.Env) -> None:
+def test_invalid_npg_arguments_raise_an_error(env: lw.Env) -> None:
     with pytest.raises(ValueError, match=r"env of NPG .* of type Env, as lw.make\(...\) .*, not str 'hopper'"):
         lw.NPG("hopper")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"config of NPG .* of type NPGConfig .* not dict"):
@@ -298,7 +299,7 @@ def parameters(npg: lw.NPG) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in (*npg.policy.parameters(), *npg.value.parameters())])
 
 
-def test_rewards_whose_sums_exceed_float32_are_bounded(task_file: TaskFile) -> None:
+def test_rewards_are_bounded_if_their_sums_exceed_float32(task_file: TaskFile) -> None:
     for size in (1e20, 3e38):
         npg = wild(task_file, {"reward_size": size})
         iterations = [next(npg) for _ in range(5)]
@@ -306,7 +307,7 @@ def test_rewards_whose_sums_exceed_float32_are_bounded(task_file: TaskFile) -> N
         assert all(math.isfinite(it.value_error) and it.kl > 1e-6 for it in iterations)
 
 
-def test_updates_that_are_not_finite_are_skipped_and_counted(task_file: TaskFile) -> None:
+def test_non_finite_updates_are_skipped_and_counted(task_file: TaskFile) -> None:
     npg = wild(task_file, {"chance": 0.002, "size": 1e30})
     skipped = []
     for _ in range(12):
@@ -320,7 +321,7 @@ def test_updates_that_are_not_finite_are_skipped_and_counted(task_file: TaskFile
     assert parameters(npg).isfinite().all()
 
 
-def test_many_consecutive_updates_that_are_not_finite_end_a_run(task_file: TaskFile, tmp_path: Path) -> None:
+def test_many_consecutive_non_finite_updates_end_a_run(task_file: TaskFile, tmp_path: Path) -> None:
     npg = wild(task_file, {"chance": 0.9, "size": 1e30})
     before = mean_actions(npg.policy)
     with pytest.raises(FloatingPointError) as raised:
@@ -336,7 +337,7 @@ def test_many_consecutive_updates_that_are_not_finite_end_a_run(task_file: TaskF
     assert math.isfinite(next(wild(task_file, {"chance": 0.9, "size": 1e30}, normalize=True)).kl)
 
 
-def test_a_value_function_that_became_not_finite_is_restored(task_file: TaskFile) -> None:
+def test_value_function_is_restored_after_a_non_finite_update(task_file: TaskFile) -> None:
     npg = wild(task_file, {})
     next(npg)
     good = parameters(npg)[-1].item()
@@ -359,8 +360,8 @@ def on_gpu(**changes: object) -> lw.NPG:
 
 
 @pytest.mark.gpu
-def test_gpu_an_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every other synchronizing call raises."""
+def test_gpu_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The test makes all synchronizing calls except for one raise an error."""
     npg = on_gpu(normalize=True, min_restarts=2.0)
     copies = []
 
@@ -381,8 +382,9 @@ def test_gpu_an_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.gpu
-def test_gpu_a_resumed_run_continues() -> None:
-    """A captured fit holds the addresses of the optimizer's moments, so loading a state captures it again."""
+def test_gpu_learner_continues_after_loading_a_state() -> None:
+    """A captured value fit contains the addresses of the optimizer's moments, so loading a state must capture it
+    again."""
     npg = on_gpu()
     saved = npg.state_dict()
     first = next(npg)
@@ -393,8 +395,8 @@ def test_gpu_a_resumed_run_continues() -> None:
     assert again.gradient_norm == pytest.approx(first.gradient_norm, rel=1e-2)
 
 
-@pytest.mark.parametrize("kl_limit", [1.0, 1.5])  # a limit of 1.0 shortens many steps
-def test_optimized_iterations_equal_those_with_autograd(kl_limit: float, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("kl_limit", [1.0, 1.5])  # a KL limit of 1.0 shortens many steps
+def test_optimized_iterations_equal_iterations_with_autograd(kl_limit: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The plain version uses autograd, all rounds of the line search, and a value fit after the policy's step."""
     threads, learned = torch.get_num_threads(), []
     torch.set_num_threads(2)

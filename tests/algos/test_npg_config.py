@@ -26,23 +26,23 @@ from lyceum_warp.algos.npg_config import enough_samples
         ("activation", "swish", "be 'tanh', 'relu', .* or 'softplus', not 'swish'"),
     ],
 )
-def test_wrong_values_are_refused_by_name(name: str, value: object, wanted: str) -> None:
+def test_error_of_an_invalid_value_names_the_setting(name: str, value: object, wanted: str) -> None:
     with pytest.raises(ValueError, match=rf"^{name} must .*{wanted}"):
         lw.NPGConfig(**{name: value})  # type: ignore[arg-type]
 
 
-def test_every_field_is_checked() -> None:
+def test_every_config_field_is_checked() -> None:
     for field in dataclasses.fields(lw.NPGConfig):
         with pytest.raises(ValueError, match=f"^{field.name} must "):
             lw.NPGConfig(**{field.name: object()})
 
 
-def test_numbers_of_other_types_and_lists_are_converted() -> None:
+def test_lists_and_numbers_of_other_types_are_converted() -> None:
     config = lw.NPGConfig(samples=1e4, gamma=1, hidden=[8.0, 8])  # type: ignore[arg-type]
     assert config == lw.NPGConfig(samples=10_000, gamma=1.0, hidden=(8, 8))
     assert (type(config.samples), type(config.gamma)) == (int, float)
 
 
-def test_default_samples_are_the_papers_or_16_steps_of_every_world() -> None:
+def test_default_samples_are_those_of_the_paper_or_16_steps_of_each_world() -> None:
     assert [enough_samples(lw.NPGConfig(), n) for n in (10, 64, 1000)] == [10_000, 10_000, 16_000]
     assert enough_samples(lw.NPGConfig(samples=5), 1000) == 5

@@ -41,7 +41,7 @@ def rollout() -> lw.Rollout:
 
 
 def part_of(rollout: lw.Rollout, worlds: slice) -> Any:
-    """Return the samples of some worlds as one process would hold them."""
+    """Return the samples of some worlds, as if one process had collected only them."""
     return SimpleNamespace(
         **{name: getattr(rollout, name)[:, worlds] for name in NAMES},
         episode_metrics={name: sums[:, worlds] for name, sums in rollout.episode_metrics.items()},
@@ -50,7 +50,7 @@ def part_of(rollout: lw.Rollout, worlds: slice) -> Any:
 
 
 def test_episode_statistics_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
-    """The statistics of one rollout equal the pooled statistics of two parts of its worlds."""
+    """The statistics of a rollout equal the pooled statistics of two parts of its worlds."""
     ended = rollout.done & ~rollout.episode_return.isnan()
     assert 6 < ended.sum() < rollout.done.sum()
     returns = rollout.episode_return[ended].double()
@@ -67,7 +67,7 @@ def test_episode_statistics_cover_only_complete_episodes(rollout: lw.Rollout) ->
     assert episode_statistics(parts) == pytest.approx(expected, rel=1e-5)
 
 
-def test_value_statistics_of_two_processes_equal_statistics_of_all_samples() -> None:
+def test_value_statistics_of_two_processes_equal_those_of_all_samples() -> None:
     returns, predicted = 3.0 + torch.randn(2, 50, dtype=torch.float64), 2.0 + torch.randn(2, 50, dtype=torch.float64)
     sums = [ValueSums(*(x.item() for x in prediction_sums(r, p))) for r, p in zip(returns, predicted, strict=True)]
     error = returns - predicted
@@ -80,7 +80,8 @@ def test_value_statistics_of_two_processes_equal_statistics_of_all_samples() -> 
 
 
 def test_metric_means_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
-    """The means of one rollout equal the pooled means of two parts of its worlds; they are NaN if no episode ended."""
+    """The mean metrics of a rollout equal the pooled means of two parts of its worlds, and are NaN if no episode
+    ended."""
     ended = rollout.done & ~rollout.episode_return.isnan()
     expected = {name: sums[ended].mean().item() for name, sums in rollout.episode_metrics.items()}
     assert list(expected) == ["forward", "effort"] and expected["effort"] > 0.1
@@ -102,7 +103,7 @@ def test_metric_means_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
     assert all(math.isnan(mean) for mean in summary(none, 10, list(expected))["metrics"].values())
 
 
-def test_a_row_of_metrics_has_a_column_for_each_metric() -> None:
+def test_metrics_row_has_a_column_for_each_metric() -> None:
     env = lw.make(Metered, nworld=4)
     config = lw.NPGConfig(samples=400, hidden=(8,), value_hidden=(8,), mean_every=0)
     it = next(lw.NPG(env, config=config))
@@ -115,13 +116,13 @@ def test_a_row_of_metrics_has_a_column_for_each_metric() -> None:
     assert row["metrics/effort"] == it.metrics["effort"] and row["return_mean"] == it.return_mean
 
 
-def test_the_mean_reward_covers_all_samples_also_if_no_episode_ended() -> None:
+def test_mean_reward_covers_all_samples_even_if_no_episode_ended() -> None:
     env = lw.make("point_mass", nworld=4, horizon=1000)
     npg = lw.NPG(env, config=lw.NPGConfig(samples=40, rollout="segments", hidden=(4,), value_hidden=(4,)))
     assert next(npg).reward_mean == pytest.approx(npg.rollout.reward.mean().item())
 
 
-def test_a_task_without_success_reports_no_success_rate() -> None:
+def test_task_without_success_reports_no_success_rate() -> None:
     env = lw.make("hopper", nworld=2, horizon=10)
     config = lw.NPGConfig(samples=40, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2)
     iteration = next(lw.NPG(env, config=config))

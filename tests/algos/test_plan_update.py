@@ -14,7 +14,7 @@ ENGINES = ["mujoco", "warp"]
 
 
 class EliteMean(lw.PlanUpdate):
-    """Take the mean of the best samples, and keep the noise."""
+    """A plan update that takes the mean of the best samples, and does not change the noise."""
 
     def __init__(self, elites: int) -> None:
         self.elites = elites
@@ -25,7 +25,7 @@ class EliteMean(lw.PlanUpdate):
 
 
 class TorchCEM(EliteMean):
-    """CEM by its formulas, in torch."""
+    """CEM written in torch from its formulas."""
 
     adapts_noise = True
 
@@ -44,7 +44,7 @@ class TorchCEM(EliteMean):
 
 
 class HalfWay(EliteMean):
-    """Move from the previous plan halfway to the mean of the best samples."""
+    """A plan update that moves the plan halfway to the mean of the best samples."""
 
     def fit(self, samples: lw.PlanSamples) -> None:
         samples.plan.lerp_(samples.nominal, 0.5)
@@ -58,7 +58,7 @@ def weigh_first(returns: wp.array2d[float], weights: wp.array2d[float], summary:
 
 
 class First(lw.PlanUpdate):
-    """Choose the first sample, in a Warp kernel."""
+    """A plan update that chooses the first sample in a Warp kernel."""
 
     capturable = True
 
@@ -80,7 +80,7 @@ def compare(one: lw.Planner, other: lw.Planner, calls: int = 4) -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("more", [{}, {"knots": 3}, {"plants": 2, "iterations": 2}, {"graphs": False}])
-def test_cem_that_a_user_writes_in_torch_gives_the_plans_of_cem(more: dict[str, Any], engine: str) -> None:
+def test_user_written_cem_in_torch_gives_the_same_plans(more: dict[str, Any], engine: str) -> None:
     smoothing = lw.MPPIConfig(knots=more.get("knots")).noise_smoothing
     own = lw.Planner(engine=engine, update=TorchCEM(3, 0.05, smoothing), **POINT, **more)
     compare(own, cem := lw.CEM(engine=engine, elites=3, min_noise=0.05, **POINT, **more))
@@ -93,15 +93,15 @@ def test_cem_that_a_user_writes_in_torch_gives_the_plans_of_cem(more: dict[str, 
 
 
 @pytest.mark.parametrize("knots", [None, 3])
-def test_a_fit_may_change_the_plan(knots: int | None) -> None:
+def test_fit_may_change_the_plan(knots: int | None) -> None:
     half, whole = (lw.Planner(update=kind(3), knots=knots, **POINT) for kind in (HalfWay, EliteMean))
     state = half.state_of(qpos=[0.1, 0.2, -0.5, 0.3])
-    torch.testing.assert_close(half(state), 0.5 * whole(state))  # the first plan was zero
+    torch.testing.assert_close(half(state), 0.5 * whole(state))  # the first plan starts from zero actions
     torch.testing.assert_close(half.actions, 0.5 * whole.actions)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_an_update_of_warp_launches_belongs_to_the_graph(engine: str) -> None:
+def test_update_with_warp_launches_is_captured_in_the_graph(engine: str) -> None:
     plan = lw.Planner(engine=engine, update=First(), include_plan=False, **POINT)
     for _ in range(3):  # direct, captured, replayed
         plan(plan.state_of())
@@ -109,7 +109,7 @@ def test_an_update_of_warp_launches_belongs_to_the_graph(engine: str) -> None:
     assert plan.summary["best_return"] == plan.returns[0]
 
 
-def test_a_plan_stays_if_all_samples_of_a_users_update_fail() -> None:
+def test_plan_does_not_change_if_all_samples_of_a_user_written_update_fail() -> None:
     plan = lw.Planner(update=EliteMean(3), value=lambda obs: torch.full((len(obs),), torch.nan), **POINT)
     plan.actions.fill_(0.25)
     plan(plan.state_of(), shift=0)
@@ -122,7 +122,7 @@ def test_planners_with_one_update_object_do_not_share_buffers() -> None:
     assert vars(update).keys() == {"elites", "min_noise", "smoothing"}
 
 
-def test_settings_show_a_users_update_with_its_attributes() -> None:
+def test_settings_show_a_user_written_update_with_its_attributes() -> None:
     plan = lw.Planner(update=EliteMean(3), **POINT)
     assert plan.settings["update"] == "EliteMean(elites=3)"
     assert plan.config.update is not None and type(plan).__name__ == "Planner"
@@ -135,7 +135,7 @@ class Returning(EliteMean):
         return torch.softmax(samples.returns, 1)
 
 
-def test_weights_that_are_returned_are_refused() -> None:
+def test_update_that_returns_weights_raises_an_error() -> None:
     plan = lw.Planner(update=Returning(3), **POINT)
     with pytest.raises(ValueError, match=r"weigh of Returning must write into samples.weights and return None, not a "):
         plan(plan.state_of())
@@ -149,6 +149,6 @@ def test_weights_that_are_returned_are_refused() -> None:
         ({"update": TorchCEM(3, 0.1, (1, 0, 0)), "noise": [[1, 0], [0, 1]]}, "must be standard deviations, not"),
     ],
 )  # fmt: skip
-def test_a_users_update_that_does_not_fit_is_refused(words: dict[str, Any], message: str) -> None:
+def test_invalid_user_written_update_raises_an_error(words: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         lw.Planner(**(POINT | words))

@@ -23,7 +23,7 @@ def reset_state(task: str) -> tuple[torch.Tensor, dict[str, slice]]:
     return plant.get_state()[0], dict(plant.state_space.parts)
 
 
-def test_state_of_sets_the_given_parts_and_keeps_the_rest(reach: lw.MPPI) -> None:
+def test_state_of_sets_only_the_given_parts(reach: lw.MPPI) -> None:
     qpos = np.linspace(-0.5, -0.1, 7)
     state = reach.state_of(qpos=qpos, qvel=[0.1] * 7, time=0.3, mocap_pos=torch.tensor([[0.1, 0.2, 0.3]]), step=15)
     expected, parts = reset_state("reach")
@@ -35,7 +35,7 @@ def test_state_of_sets_the_given_parts_and_keeps_the_rest(reach: lw.MPPI) -> Non
     reach(state)
 
 
-def test_state_of_a_time_sets_the_step_unless_it_is_given(reach: lw.MPPI) -> None:
+def test_state_of_a_given_time_sets_the_step_unless_a_step_is_given(reach: lw.MPPI) -> None:
     step = reach.env.state_space.parts["step"]
     assert reach.state_of(time=0.2)[step] == 10
     assert reach.state_of(time=0.2, step=3)[step] == 3
@@ -50,12 +50,12 @@ def test_state_of_a_time_sets_the_step_unless_it_is_given(reach: lw.MPPI) -> Non
         ({"time": "now"}, "the part 'time' of a state must be numbers, not 'now'"),
     ],
 )
-def test_state_of_refuses_parts_that_do_not_fit(parts: dict[str, object], message: str, reach: lw.MPPI) -> None:
+def test_state_of_invalid_parts_raises_an_error(parts: dict[str, object], message: str, reach: lw.MPPI) -> None:
     with pytest.raises(ValueError, match=message):
         reach.state_of(**parts)
 
 
-def test_a_state_of_another_shape_or_type_is_refused(point: lw.MPPI) -> None:
+def test_planning_from_a_state_of_wrong_shape_or_type_raises_an_error(point: lw.MPPI) -> None:
     state, before = point.state_of(), point.actions.clone()
     size = len(state)
     for wrong, found in (
@@ -71,7 +71,7 @@ def test_a_state_of_another_shape_or_type_is_refused(point: lw.MPPI) -> None:
 
 
 @pytest.mark.parametrize(("part", "number"), [("qvel", np.nan), ("qpos", np.inf), ("time", -np.inf)])
-def test_a_state_that_is_not_finite_is_refused_by_its_part(part: str, number: float, point: lw.MPPI) -> None:
+def test_error_of_a_non_finite_state_names_the_part(part: str, number: float, point: lw.MPPI) -> None:
     broken, before = point.state_of(), point.actions.clone()
     broken[point.env.state_space.parts[part]] = number
     with pytest.raises(ValueError, match=f"the state to plan from has {number} in its '{part}': states must be finite"):
@@ -79,7 +79,7 @@ def test_a_state_that_is_not_finite_is_refused_by_its_part(part: str, number: fl
     assert torch.equal(point.actions, before)
 
 
-def test_a_batch_of_one_state_plans_like_the_state() -> None:
+def test_batch_of_one_state_gives_the_same_plan_as_the_state() -> None:
     row, single = (lw.MPPI("point_mass", horizon=3, samples=4) for _ in range(2))
     state = row.state_of()
     assert torch.equal(row(state[None]), single(state))

@@ -13,7 +13,7 @@ def policy() -> lw.GaussianPolicy:
     return policy
 
 
-def test_log_prob_equals_torchs(policy: lw.GaussianPolicy) -> None:
+def test_log_prob_equals_that_of_torch(policy: lw.GaussianPolicy) -> None:
     obs, action = torch.randn(20, 5), torch.randn(20, 2)
     expected = torch.distributions.Normal(policy(obs), policy.log_std.exp()).log_prob(action).sum(-1)
     torch.testing.assert_close(policy.log_prob(obs, action), expected)
@@ -29,7 +29,7 @@ def test_samples_have_the_mean_and_the_standard_deviation_of_the_policy(policy: 
 
 
 @pytest.mark.parametrize("hidden", [8, (8, 0), "wide"])
-def test_wrong_hidden_layers_are_refused(hidden: object) -> None:
+def test_invalid_hidden_layers_raise_an_error(hidden: object) -> None:
     # type: ignore[arg-type]
     for module in (lambda: lw.GaussianPolicy(3, 1, hidden), lambda: lw.ValueFunction(3, hidden)):
         with pytest.raises(ValueError, match=r"hidden must be the widths of the hidden layers, as in \(64, 64\), not "):

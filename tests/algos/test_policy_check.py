@@ -1,4 +1,4 @@
-"""Test user-defined policy networks: NPG refuses unsuitable networks, and trains others like its default network."""
+"""Test that NPG rejects unsuitable policy networks of users, and trains others like its default network."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +16,7 @@ from lyceum_warp.runs.folder import Run
 
 
 class Net(nn.Module):
-    """A network whose output ``change`` modifies."""
+    """A network that applies the function ``change`` to its output."""
 
     def __init__(self, change: Callable[[torch.Tensor], object] = lambda mean: mean) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ class Unused(Net):
 
 
 class Counting(Net):
-    """A network whose output depends on the number of its calls."""
+    """A network whose output depends on the number of previous calls."""
 
     def forward(self, obs: torch.Tensor) -> object:
         self.calls = getattr(self, "calls", 0.0) + 1.0
@@ -78,7 +78,7 @@ def frozen(module: nn.Module) -> nn.Module:
         (nn.Sequential(nn.Linear(6, 2), nn.Softmax(0)), "depends on other rows of the batch"),
     ],
 )
-def test_npg_refuses_a_network_in_one_line(shared_env: SharedEnv, network: nn.Module, message: str) -> None:
+def test_unsuitable_network_raises_a_one_line_error(shared_env: SharedEnv, network: nn.Module, message: str) -> None:
     env = shared_env("point_mass", nworld=2)
     torch.manual_seed(0)
     with pytest.raises(ValueError, match=message) as caught:
@@ -96,19 +96,19 @@ def test_npg_refuses_a_network_in_one_line(shared_env: SharedEnv, network: nn.Mo
         ),
     ],
 )
-def test_npg_refuses_a_policy_in_one_line(shared_env: SharedEnv, policy: object, message: str) -> None:
+def test_unsuitable_policy_raises_a_one_line_error(shared_env: SharedEnv, policy: object, message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         lw.NPG(shared_env("point_mass"), policy)
     assert "\n" not in str(caught.value)
 
 
-def test_a_network_that_is_not_a_module_is_refused() -> None:
+def test_network_that_is_not_a_torch_module_raises_an_error() -> None:
     with pytest.raises(ValueError, match=r"network must be a module of torch \(torch.nn.Module\), not list"):
         lw.GaussianPolicy(6, 2, network=[64, 64])  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("layer", [nn.LayerNorm(8), nn.GELU(), nn.PReLU(), nn.Softsign()])
-def test_the_check_accepts_usual_layers_and_changes_nothing(shared_env: SharedEnv, layer: nn.Module) -> None:
+def test_policy_check_accepts_usual_layers_and_changes_nothing(shared_env: SharedEnv, layer: nn.Module) -> None:
     env = shared_env("point_mass")
     policy = lw.GaussianPolicy(6, 2, network=nn.Sequential(nn.Linear(6, 8), layer, nn.Linear(8, 2)))
     before, random = env.get_state(), torch.get_rng_state()
@@ -117,7 +117,7 @@ def test_the_check_accepts_usual_layers_and_changes_nothing(shared_env: SharedEn
     assert all(parameter.grad is None for parameter in policy.parameters())
 
 
-def test_npg_trains_a_users_network_like_its_own() -> None:
+def test_npg_trains_a_user_network_like_its_default_network() -> None:
     config = lw.NPGConfig(samples=200, hidden=(8,))
     own = mlp([6, 8, 2], last_scale=1e-2, generator=torch.Generator().manual_seed(3))
     policies = (
@@ -131,7 +131,7 @@ def test_npg_trains_a_users_network_like_its_own() -> None:
     assert iterations[0] == iterations[1]
 
 
-def test_a_policy_with_a_users_network_is_saved_and_loaded(tmp_path: Path) -> None:
+def test_policy_with_a_user_network_is_saved_and_loaded(tmp_path: Path) -> None:
     torch.manual_seed(0)
     policy, obs = lw.GaussianPolicy(6, 2, network=Net(), normalize=True), torch.randn(5, 6)
     policy.normalizer.update(torch.randn(10, 6) + 3.0)
@@ -150,7 +150,7 @@ def test_a_policy_with_a_users_network_is_saved_and_loaded(tmp_path: Path) -> No
         lw.load(run, policy=lw.GaussianPolicy(6, 2, network=nn.Linear(6, 2), normalize=True))
 
 
-def test_a_policy_of_a_users_class_is_not_loaded_as_another_class(tmp_path: Path) -> None:
+def test_policy_of_a_user_class_is_not_loaded_as_another_class(tmp_path: Path) -> None:
     class Bounded(lw.GaussianPolicy):
         def forward(self, obs: torch.Tensor) -> torch.Tensor:
             return torch.tanh(super().forward(obs))

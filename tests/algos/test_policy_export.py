@@ -40,28 +40,28 @@ def trained(**options: object) -> lw.GaussianPolicy:
 
 
 def compare(policy: lw.GaussianPolicy, path: Path, run: Run) -> None:
-    """Compare actions for batches of another size than the example, with single and clipped observations."""
+    """Compare actions for batches of other sizes than in the export, for single observations, and for clipped
+    observations."""
     for n in (1, 7):
         obs = (40.0 * np.random.default_rng(n).standard_normal((n, 5))).astype(np.float32)
         with torch.no_grad():
             expected = policy(torch.from_numpy(obs)).numpy()
         action = run(path, obs)
         assert action.shape == (n, 2) and action.dtype == np.float32
-        np.testing.assert_allclose(action, expected, rtol=1e-5, atol=1e-5)  # rounding errors of three layers
+        # tolerance for the rounding errors of three layers
+        np.testing.assert_allclose(action, expected, rtol=1e-5, atol=1e-5)
 
 
 @RUNS
-def test_an_exported_policy_gives_the_same_actions(name: str, run: Run, tmp_path: Path) -> None:
+def test_exported_policy_gives_the_same_actions(name: str, run: Run, tmp_path: Path) -> None:
     policy = trained(normalize=True)
     path = lw.export_policy(policy, tmp_path / "new" / name)
     assert path == tmp_path / "new" / name and [file.name for file in path.parent.iterdir()] == [name]
     compare(policy, path, run)
 
 
-@pytest.mark.parametrize(
-    "activation",
-    [pytest.param(name, marks=pytest.mark.long if k else ()) for k, name in enumerate(get_args(Activation))],
-)
+@pytest.mark.quick("tanh")
+@pytest.mark.parametrize("activation", get_args(Activation))
 def test_every_activation_is_exported_without_warnings(
     activation: Activation, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -82,7 +82,7 @@ class Own(nn.Module):
 
 @RUNS
 @pytest.mark.quick("policy.pt2-run_torch")
-def test_a_users_network_is_exported(name: str, run: Run, tmp_path: Path) -> None:
+def test_user_network_is_exported(name: str, run: Run, tmp_path: Path) -> None:
     policy = trained(network=Own(), normalize=True)
     before, modes = [p.clone() for p in policy.parameters()], [m.training for m in policy.modules()]
     path = lw.export_policy(policy, tmp_path / name)
@@ -100,7 +100,7 @@ class Branch(nn.Module):
         return self.linear(obs) if obs.sum() > 0 else -self.linear(obs)
 
 
-def test_a_network_that_cannot_be_exported_raises_one_line_and_writes_no_file(tmp_path: Path) -> None:
+def test_failed_export_raises_a_one_line_error_and_writes_no_file(tmp_path: Path) -> None:
     path = tmp_path / "policy.onnx"
     path.write_bytes(b"older")
     with pytest.raises(ValueError, match=r"^the policy's network cannot be exported to \.onnx \(.*\)$") as caught:
@@ -109,7 +109,9 @@ def test_a_network_that_cannot_be_exported_raises_one_line_and_writes_no_file(tm
     assert path.read_bytes() == b"older" and len(list(tmp_path.iterdir())) == 1
 
 
-def test_wrong_arguments_and_a_missing_package_raise_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_export_arguments_and_a_missing_package_raise_one_line_errors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     policy = lw.GaussianPolicy(5, 2)
     with pytest.raises(ValueError, match=r"policy\.jit must end with \.onnx or \.pt2$"):
         lw.export_policy(policy, tmp_path / "policy.jit")

@@ -1,4 +1,4 @@
-"""Test PPO as a whole: it learns, bootstraps truncated episodes, follows its schedules, and resumes exactly."""
+"""Test that PPO learns, bootstraps truncated episodes, follows its schedules, and resumes exactly."""
 
 import copy
 import dataclasses
@@ -37,7 +37,7 @@ def weights(ppo: lw.PPO) -> dict[str, torch.Tensor]:
     return {**ppo.policy.state_dict(), **{f"value.{name}": part for name, part in ppo.value.state_dict().items()}}
 
 
-def test_it_learns_for_a_fixed_seed() -> None:
+def test_ppo_learns_for_a_fixed_seed() -> None:
     """The mean policy's return is at most about 250; the first policies' returns are negative."""
     config = lw.PPOConfig(hidden=(32, 32), value_hidden=(32, 32), mean_every=40)
     ppo = lw.PPO(lw.make("point_mass", nworld=32), config=config)
@@ -51,7 +51,7 @@ def test_it_learns_for_a_fixed_seed() -> None:
     {}, {"std_type": "log", "whiten_minibatches": True, "schedule": "fixed", "final_entropy_coef": 0.1,
          "entropy_decay": (1, 3), "minibatches": 5, "stagger": False, "normalize": False},
 ])  # fmt: skip
-def test_a_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], env: lw.Env) -> None:
+def test_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], env: lw.Env) -> None:
     def fresh(seed: int, **others: Any) -> lw.PPO:
         env.rand_reset(7)
         return made(env, seed=seed, **changes | others)
@@ -64,7 +64,7 @@ def test_a_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], 
     torch.manual_seed(2)  # torch's global generators stay unchanged
     again = fresh(1)
     np.testing.assert_equal([numbers(next(again)) for _ in range(4)], first + rest)
-    resumed = fresh(2, learning_rate=1e-4)  # the state holds the learning rate
+    resumed = fresh(2, learning_rate=1e-4)  # the saved state contains the learning rate
     next(resumed)
     resumed.load_state_dict(saved)
     np.testing.assert_equal([numbers(next(resumed)) for _ in range(2)], rest)
@@ -72,7 +72,7 @@ def test_a_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], 
         assert torch.equal(part, weights(resumed)[name]), name
 
 
-def test_statistics_equal_the_samples_statistics(shared_env: SharedEnv) -> None:
+def test_reported_statistics_equal_the_statistics_of_the_samples(shared_env: SharedEnv) -> None:
     """Every episode has 10 steps; an episode with a random start does not count."""
     ppo = made(shared_env(Metered, nworld=4, horizon=10, far=1e3))
     found: list[float] = []
@@ -92,8 +92,9 @@ def test_statistics_equal_the_samples_statistics(shared_env: SharedEnv) -> None:
     assert it.kl == pytest.approx(torch.distributions.kl_divergence(old, new).sum(-1).mean().item(), rel=1e-4)
 
 
-def test_a_truncated_episode_bootstraps_from_its_final_observation(env: lw.Env) -> None:
-    """In the first step, world 0 continues, 1 reaches its time limit, 2 has a fault, and 3 terminates."""
+def test_truncated_episode_bootstraps_from_its_final_observation(env: lw.Env) -> None:
+    """In the first step, world 0 continues, world 1 reaches its time limit, world 2 has a fault, and world 3
+    terminates."""
     ppo = made(env, num_steps=3, normalize=False, minibatches=1)
     state = env.get_state()
     for part, column in {"qpos": [0, 0, 0, 5], "qvel": [1, 2, 3, 4], "step": [0, 9, 0, 0]}.items():
@@ -113,7 +114,7 @@ def test_a_truncated_episode_bootstraps_from_its_final_observation(env: lw.Env) 
     assert rollout.done[0].tolist() == [False, True, True, True]
     assert rollout.terminated[0].tolist() == [False, False, False, True]
     final = rollout.final_obs_groups["critic"]
-    assert final[0, 2, 1] == 3.0  # the last finite observation
+    assert final[0, 2, 1] == 3.0  # after a fault, the final observation is the last finite one
     with torch.no_grad():
         value, after = (ppo.value(obs, rollout.step) for obs in (rollout.obs_groups["critic"], final))
     gamma, lam = SMALL.gamma, SMALL.lam
@@ -149,7 +150,7 @@ def test_the_learning_rate_follows_the_kl_divergence(changes: dict[str, Any], ra
     assert next(made(env, **changes)).learning_rate == pytest.approx(rate)
 
 
-def test_the_weight_of_the_entropy_falls_linearly(env: lw.Env) -> None:
+def test_entropy_weight_decreases_linearly(env: lw.Env) -> None:
     config = lw.PPOConfig(entropy_coef=0.02, final_entropy_coef=0.01, entropy_decay=(10, 20))
     assert [config.entropy_weight(it) for it in (1, 10, 15, 20, 99)] == pytest.approx([0.02, 0.02, 0.015, 0.01, 0.01])
     assert lw.PPOConfig(entropy_coef=0.02).entropy_weight(500) == 0.02
@@ -161,7 +162,7 @@ def test_the_weight_of_the_entropy_falls_linearly(env: lw.Env) -> None:
     assert stds[1][0] == pytest.approx(stds[0][0]) and stds[1][2] > stds[0][2] + 0.02
 
 
-def test_training_continues_from_given_networks_and_a_users_network(env: lw.Env) -> None:
+def test_training_continues_from_given_networks_and_from_a_user_network(env: lw.Env) -> None:
     npg = lw.NPG(env, config=lw.NPGConfig(samples=80, hidden=(8,), value_hidden=(8,), time_orders=2, mean_every=0))
     next(npg)
     policy, value = copy.deepcopy(npg.policy).requires_grad_(False), copy.deepcopy(npg.value).requires_grad_(False)
@@ -191,7 +192,7 @@ def test_training_continues_from_given_networks_and_a_users_network(env: lw.Env)
     assert not torch.equal(own.network.weight, before)
 
 
-def test_a_run_has_all_files_and_resumes(tmp_path: Path) -> None:
+def test_ppo_run_writes_all_files_and_resumes(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     for iterations, resume in ((2, False), (4, True)):
         env = lw.make(Metered, nworld=4, horizon=10)
@@ -213,12 +214,12 @@ def test_a_run_has_all_files_and_resumes(tmp_path: Path) -> None:
     ({"entropy_decay": (5, 5)}, r"entropy_decay must have a last iteration after the first iteration, not \(5, 5\)"),
     ({"value_group": 3}, "value_group must be the name of a group of observations, not 3"),
 ])  # fmt: skip
-def test_hyperparameters_that_are_not_valid_are_refused(words: dict[str, Any], message: str) -> None:
+def test_invalid_hyperparameters_raise_an_error(words: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         lw.PPOConfig(**words)
 
 
-def test_arguments_that_do_not_fit_are_refused(env: lw.Env) -> None:
+def test_invalid_ppo_arguments_raise_an_error(env: lw.Env) -> None:
     with pytest.raises(
         ValueError, match="200 mini-batches need at least as many samples, not 48: use more worlds, or make"
     ):
@@ -229,6 +230,6 @@ def test_arguments_that_do_not_fit_are_refused(env: lw.Env) -> None:
         made(env, seed=-1)
 
 
-def test_an_update_that_is_not_finite_ends_learning(env: lw.Env) -> None:
+def test_non_finite_update_ends_learning(env: lw.Env) -> None:
     with pytest.raises(FloatingPointError, match="the update of iteration 1 is not finite: make learning_rate, or the"):
         next(made(env, learning_rate=1e30, schedule="fixed"))

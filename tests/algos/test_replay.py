@@ -1,4 +1,4 @@
-"""Test the replay buffer: contents, n-step returns across episode ends, sampling and saved states."""
+"""Test the contents, n-step returns, sampling and saved states of the replay buffer."""
 
 from typing import Any
 
@@ -72,10 +72,11 @@ def test_non_finite_values_are_not_stored(env: lw.Env) -> None:
     parts = (*batch.obs.values(), *batch.next_obs.values(), batch.action, batch.reward, batch.discount)
     assert all(part.isfinite().all() for part in parts)
     assert batch.discount[5 * 3 + 1] == pytest.approx(0.9)
-    assert torch.equal(batch.next_obs["critic"][16], batch.obs["critic"][16])  # the last valid observation
+    # after a fault, the next observation is the last valid one
+    assert torch.equal(batch.next_obs["critic"][16], batch.obs["critic"][16])
 
 
-def test_samples_are_uniform_and_counted(env: lw.Env) -> None:
+def test_replay_samples_are_uniform_and_reproducible(env: lw.Env) -> None:
     replay, _ = filled(env, 20)
     draws = [replay.sample(20_000, generator=torch.Generator().manual_seed(3)) for _ in range(2)]
     assert torch.equal(draws[0].reward, draws[1].reward)
@@ -83,7 +84,7 @@ def test_samples_are_uniform_and_counted(env: lw.Env) -> None:
     assert len(counts) == 45 and counts.min() > 300 and counts.max() < 600  # 444 each
 
 
-def test_a_restored_buffer_samples_and_continues_identically(env: lw.Env) -> None:
+def test_restored_replay_buffer_continues_identically(env: lw.Env) -> None:
     replay, _ = filled(env, 20)
     other = lw.Replay(env, 45)
     other.load_state_dict(replay.state_dict())

@@ -1,4 +1,4 @@
-"""Test SAC as a whole: an update equals plain torch, a run learns and resumes exactly."""
+"""Test that SAC's updates equal plain torch, and that runs learn and resume exactly."""
 
 import copy
 import dataclasses
@@ -36,8 +36,9 @@ def numbers(it: SACIteration) -> dict[str, Any]:
     return {name: value for name, value in it.row().items() if "time" not in name and name != "samples_per_second"}
 
 
-def test_it_learns_for_a_fixed_seed(shared_env: SharedEnv) -> None:
-    """With random actions the pole falls after about 5 steps; after these updates, with other seeds, after 45 to 75."""
+def test_sac_learns_for_a_fixed_seed(shared_env: SharedEnv) -> None:
+    """With random actions the pole falls after about 5 steps, and after these updates, for other seeds, after 45 to 75
+    steps."""
     config = lw.SACConfig(
         hidden=(32, 32), value_hidden=(32, 32), num_steps=50, warmup=300, updates=4, batch=128, n_step=3,
         learning_rate=1e-3, temperature=0.1, tau=0.02, gamma=0.97, mean_every=4, mean_episodes=4,
@@ -51,7 +52,7 @@ def test_it_learns_for_a_fixed_seed(shared_env: SharedEnv) -> None:
 
 
 class Plain(torch.nn.Module):
-    """One critic of a twin in float64, written out."""
+    """One of the twin critics, written in plain torch with float64."""
 
     def __init__(self, twin: lw.TwinCritic, k: int) -> None:
         super().__init__()
@@ -70,11 +71,11 @@ class Plain(torch.nn.Module):
 
 
 @pytest.mark.parametrize("changes", [{"updates": 1}, {"updates": 1, "n_step": 3, "critic_bound": "mean"}])
-def test_an_update_equals_plain_torch_in_float64(changes: dict[str, Any], env: lw.Env) -> None:
+def test_sac_update_equals_plain_torch_in_float64(changes: dict[str, Any], env: lw.Env) -> None:
     sac = made(env, target_entropy=-0.7, temperature=0.3, **changes)
     for _ in range(2):
         next(sac)
-    with torch.no_grad():  # without a change, the target would equal the critics
+    with torch.no_grad():  # change the critics, because they equal their targets at first
         for p in sac.target.parameters():
             p += 0.05
     sac.draw()
@@ -104,7 +105,7 @@ def test_an_update_equals_plain_torch_in_float64(changes: dict[str, Any], env: l
     unit = 2.0 * (batch.action.double() + 1.0) / 2.0 - 1.0  # actions of this task are between -1 and 1
     loss = sum((critic(batch.obs["critic"].double(), unit) - target).square().mean() for critic in critics)
     step = torch.optim.Adam([p for critic in critics for p in critic.parameters()], lr=config.learning_rate)
-    # Adam's moments so far
+    # moments of Adam before the update
     for k, critic in enumerate(critics):
         for own, p in zip(critic.parameters(), sac.value.network.parameters(), strict=True):
             saved = sac.critic_step.optimizer.state[p]
@@ -133,7 +134,7 @@ def test_an_update_equals_plain_torch_in_float64(changes: dict[str, Any], env: l
         torch.testing.assert_close(new, old + 0.005 * (p - old))
 
 
-def test_the_density_of_actions_integrates_to_one() -> None:
+def test_action_density_integrates_to_one() -> None:
     policy = lw.SquashedPolicy(1, 1, (4,), low=[-2.0], high=[3.0], generator=torch.Generator().manual_seed(0))
     obs = torch.ones(20_001, 1)
     mean, log_std = policy(obs[:1])
@@ -147,7 +148,7 @@ def test_the_density_of_actions_integrates_to_one() -> None:
 
 
 @pytest.mark.parametrize("changes", [{}, {"n_step": 3, "actor_every": 2, "normalize": False, "layer_norm": False}])
-def test_a_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], env: lw.Env) -> None:
+def test_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], env: lw.Env) -> None:
     def fresh(seed: int) -> lw.SAC:
         env.rand_reset(7)
         return made(env, seed=seed, **changes)
@@ -170,8 +171,8 @@ def test_a_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], 
     assert math.isnan(first[0]["critic_loss"]) and math.isfinite(first[1]["critic_loss"])
 
 
-def test_a_run_continues_with_the_replay_buffer_of_its_folder(tmp_path: Path) -> None:
-    """The buffer holds 20 steps of 4 worlds; an iteration has 12."""
+def test_resumed_run_uses_the_replay_buffer_in_its_folder(tmp_path: Path) -> None:
+    """The buffer holds 20 steps of 4 worlds, and an iteration has 12 steps."""
     runs = []
     for name, parts in (("whole", (6,)), ("parts", (1, 2, 3, 5, 6))):
         for i, iterations in enumerate(parts):
@@ -196,7 +197,7 @@ def test_a_run_continues_with_the_replay_buffer_of_its_folder(tmp_path: Path) ->
         lw.train(made(sac.env), tmp_path / "parts", iterations=7, resume=True)
 
 
-def test_given_networks_are_trained_further(env: lw.Env) -> None:
+def test_training_continues_from_given_networks(env: lw.Env) -> None:
     sac = made(env)
     for _ in range(2):
         next(sac)
@@ -224,7 +225,7 @@ def test_given_networks_are_trained_further(env: lw.Env) -> None:
         lw.SAC(env, value=lw.TwinCritic(1, 1, group="critic"))
 
 
-def test_actions_without_bounds_get_the_limit(shared_env: SharedEnv) -> None:
+def test_unbounded_actions_get_the_default_limit(shared_env: SharedEnv) -> None:
     env = shared_env("go1_velocity", nworld=2)
     sac = lw.SAC(env, config=dataclasses.replace(SMALL, action_limit=1.5, num_steps=3))
     next(sac)
@@ -259,7 +260,7 @@ def test_a_non_finite_reward_is_a_fault_and_learning_continues(env: lw.Env) -> N
     assert sac.replay.truncated[4:16, 1].sum() >= 4 and sac.replay.reward.isfinite().all()
 
 
-def test_an_update_that_is_not_finite_ends_learning(env: lw.Env) -> None:
+def test_non_finite_update_ends_learning(env: lw.Env) -> None:
     sac = made(env, learning_rate=1e30)
     next(sac)
     with pytest.raises(FloatingPointError, match="the updates of iteration 2 are not finite: make learning_rate, or"):
@@ -279,7 +280,7 @@ def test_defaults_depend_on_the_number_of_worlds() -> None:
     ({"hidden": (0,)}, "hidden"),
     ({"tau": 1.5}, "tau must be a finite number from 0 to 1, not 1.5"),
 ])  # fmt: skip
-def test_hyperparameters_that_are_not_valid_are_refused(words: dict[str, Any], message: str) -> None:
+def test_invalid_hyperparameters_raise_an_error(words: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         lw.SACConfig(**words)
     with pytest.raises(ValueError, match="updates=6 must be a multiple of actor_every, which is 4"):

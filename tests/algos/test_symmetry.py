@@ -1,4 +1,4 @@
-"""Test policies that are exactly symmetric, or learn symmetry."""
+"""Test exactly symmetric policies, and losses and samples that make policies more symmetric."""
 
 import dataclasses
 from collections.abc import Callable
@@ -34,8 +34,8 @@ def asymmetry(policy: Callable[[torch.Tensor], torch.Tensor], env: lw.Env) -> fl
         return (policy(mirror.obs(obs)) - mirror.action(policy(obs))).abs().mean().item()
 
 
-def test_an_exact_policy_is_equivariant_bit_for_bit_also_after_loading(env: lw.Env, tmp_path: Path) -> None:
-    """The normaliser's statistics need not be symmetric."""
+def test_symmetric_policy_is_equivariant_bit_for_bit_before_and_after_loading(env: lw.Env, tmp_path: Path) -> None:
+    """The policy is symmetric although the normaliser's statistics are not."""
     ppo = learner(env, "exact")
     run = lw.train(ppo, tmp_path / "run", iterations=2)
     policy = lw.load(run)
@@ -47,7 +47,7 @@ def test_an_exact_policy_is_equivariant_bit_for_bit_also_after_loading(env: lw.E
     obs = torch.randn(9, 6)
     (action,) = runtime.InferenceSession(str(file)).run(["action"], {"obs": obs.numpy()})
     np.testing.assert_allclose(action, policy(obs), rtol=1e-5, atol=1e-6)
-    # NPG and a run that continues from it keep the symmetry
+    # the policy stays symmetric under NPG and in a run that continues
     npg = lw.NPG(env, lw.load(run), config=lw.NPGConfig(samples=512, value_hidden=(8,), mean_every=0))
     next(npg)
     assert asymmetry(npg.policy, env) == 0.0
@@ -69,7 +69,7 @@ def test_standard_deviations_of_a_walking_robot_are_symmetric(shared_env: Shared
 
 
 @pytest.mark.long
-def test_losses_and_mirrored_samples_make_a_policy_more_symmetric(env: lw.Env) -> None:
+def test_symmetry_losses_and_mirrored_samples_make_a_policy_more_symmetric(env: lw.Env) -> None:
     found = {}
     for name in ("none", "loss", "augment"):
         ppo = learner(env, name, schedule="fixed", learning_rate=3e-3)
@@ -95,8 +95,8 @@ def test_a_symmetric_run_resumes_bit_for_bit(symmetry: str, tmp_path: Path) -> N
         lw.train(lw.PPO(lw.make("point_mass", nworld=8), config=CONFIG), halves.folder, iterations=9, resume=True)
 
 
-def test_mirrored_samples_have_the_gradient_of_the_mirrored_task(env: lw.Env) -> None:
-    """For a policy and a value function that are symmetric, mirrored samples add the mirror image of the gradient."""
+def test_mirrored_samples_add_the_gradient_of_the_mirrored_task(env: lw.Env) -> None:
+    """If policy and value function are symmetric, mirrored samples add the mirror image of the gradient."""
     ppo = learner(env, "augment", hidden=(), value_hidden=(), normalize=False)
     with torch.no_grad():
         for network in (ppo.policy.network, ppo.value.network):
@@ -112,13 +112,13 @@ def test_mirrored_samples_have_the_gradient_of_the_mirrored_task(env: lw.Env) ->
     torch.testing.assert_close(weight, weight * rows[:, None] * columns, rtol=0.0, atol=1e-6)
 
 
-def test_a_task_without_a_mirror_image_is_refused(shared_env: SharedEnv) -> None:
+def test_task_without_a_mirror_function_raises_an_error(shared_env: SharedEnv) -> None:
     with pytest.raises(ValueError, match="the task 'hopper' declares no mirror image: set mirror = lw.Mirror"):
         lw.PPO(shared_env("hopper"), config=dataclasses.replace(CONFIG, symmetry="exact"))
 
 
 @pytest.mark.parametrize("symmetry", ["exact", "loss", "augment"])
-def test_sac_learns_symmetric_policies_and_keeps_them(symmetry: str, env: lw.Env, tmp_path: Path) -> None:
+def test_symmetric_policies_stay_symmetric_under_sac(symmetry: str, env: lw.Env, tmp_path: Path) -> None:
     config = lw.SACConfig(
         hidden=(16,), value_hidden=(16,), batch=64, warmup=64, num_steps=40, updates=4, mean_every=0, symmetry=symmetry
     )
@@ -128,12 +128,12 @@ def test_sac_learns_symmetric_policies_and_keeps_them(symmetry: str, env: lw.Env
     policy = lw.load(lw.train(sac, tmp_path / "run", iterations=2))
     assert asymmetry(policy.act, env) == asymmetry(sac.policy.act, env)
     if symmetry == "exact":
-        assert max(before, asymmetry(policy.act, env)) < 1e-6  # adding the bounds to unit actions rounds
+        assert max(before, asymmetry(policy.act, env)) < 1e-6  # scaling actions to their bounds rounds the results
         assert lw.SAC(env, lw.load(tmp_path / "run"), config=lw.SACConfig(batch=64)).config.symmetry == "exact"
     else:
         assert asymmetry(policy.act, env) < before
 
 
-def test_bounds_that_are_not_symmetric_are_refused() -> None:
+def test_asymmetric_action_bounds_raise_an_error() -> None:
     with pytest.raises(ValueError, match="have different bounds than their mirror images"):
         lw.SquashedPolicy(1, 1, (4,), low=[-1.0], high=[2.0], mirror={"obs": ([0], [-1.0]), "action": ([0], [-1.0])})

@@ -26,7 +26,7 @@ def test_both_engines_play_the_same_episodes(shared_env: SharedEnv) -> None:
     assert returns.first == pytest.approx(own.returns.mean().item())
     assert lengths.first == pytest.approx(own.lengths.mean().item())
     assert falls.first == pytest.approx(own.terminated.mean().item())
-    # initial states differ by far more than the engines, so only paired episodes show the agreement
+    # initial states differ much more than the engines do, so only paired episodes show the agreement
     assert returns.verdict == lengths.verdict == "same" and own.lengths.std() > 1.0
     assert returns.high - returns.low < 0.2 * own.returns.std().item()
     assert shown[-1][0] <= shown[-1][1] == 400 and torch.equal(env.get_state(), before)
@@ -34,7 +34,7 @@ def test_both_engines_play_the_same_episodes(shared_env: SharedEnv) -> None:
     assert found.to_dict()["comparisons"][0]["differences"][0]["verdict"] == "same"
 
 
-def test_each_physics_of_the_task_is_compared_with_the_exact_one() -> None:
+def test_each_physics_of_the_task_is_compared_with_the_exact_physics() -> None:
     env = lw.make(Coarse, horizon=200)
     found = lw.transfer(env, still, 8, warp=False)
     ((exact, coarse),) = [(pair.first, pair.second) for pair in found.comparisons]

@@ -18,7 +18,7 @@ def test_a_value_function_has_the_discount_of_its_fitted_returns(tmp_path: Path)
     run.save(policy_content(0, npg.policy, value), {})
     assert lw.load_value(run).discount == 0.9
     content = torch.load(run.policy)
-    del content["value"]["shape"]["discount"]  # earlier releases did not save it
+    del content["value"]["shape"]["discount"]  # earlier releases did not save the discount
     torch.save(content, run.policy)
     assert lw.load_value(run).discount is None
 

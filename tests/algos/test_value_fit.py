@@ -12,10 +12,10 @@ from lyceum_warp.algos.value_fit import ValueFit
 
 
 @pytest.mark.parametrize("activation", ["tanh", "relu", "elu"])
-def test_hand_written_steps_equal_autograds(activation: Any) -> None:
-    """The second call continues with the moments of the first."""
+def test_hand_written_value_steps_equal_autograd(activation: Any) -> None:
+    """The second fit continues with the optimizer moments of the first fit."""
     generator = torch.Generator().manual_seed(2)
-    data = [torch.randn(50, 6, generator=generator) for _ in range(2)]  # the last mini-batch is smaller
+    data = [torch.randn(50, 6, generator=generator) for _ in range(2)]  # the last mini-batch is smaller than the others
     fits = []
     for written_out in (False, True):
         init = torch.Generator().manual_seed(0)
@@ -39,7 +39,7 @@ def test_hand_written_steps_equal_autograds(activation: Any) -> None:
             torch.testing.assert_close(moments[name], others[name], rtol=1e-4, atol=1e-6)
 
 
-def test_a_users_network_is_fitted_by_autograd() -> None:
+def test_user_value_network_is_fitted_by_autograd() -> None:
     value = lw.ValueFunction(5, (8,), activation="gelu", scale=1.0)
     assert DenseValue.of(value) is None
     fit = ValueFit(value, 50, 5, rate=1e-2, epochs=20, batch=16, team=Team())
@@ -49,9 +49,9 @@ def test_a_users_network_is_fitted_by_autograd() -> None:
 
 
 @pytest.mark.gpu
-def test_gpu_a_captured_fit_learns_the_same_as_plain_launches() -> None:
-    """The first call captures a graph between two mini-batches; the second only replays it, on different samples."""
-    samples, batch = 1000, 96  # the last mini-batch is smaller
+def test_gpu_captured_value_fit_equals_plain_launches() -> None:
+    """The first fit captures a graph between two mini-batches; the second fit only replays it, on different samples."""
+    samples, batch = 1000, 96  # the last mini-batch is smaller than the others
     generator = torch.Generator("cuda").manual_seed(2)
     data = [torch.randn(samples, 6, generator=generator, device="cuda") for _ in range(2)]
     fits = []

@@ -1,4 +1,4 @@
-"""Compare two checkouts: identical ones have no difference, and every changed line is found."""
+"""Compare two checkouts: identical checkouts have no difference, and every change is reported."""
 
 import json
 import os
@@ -32,7 +32,8 @@ QUICK: dict[str, Any] = {"engines": ("mujoco",), "parts": ("env",), "steps": 3}
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Compare with a copy in which one task exits, one raises an error, and point_mass has a changed reward."""
+    """Compare the working tree with a copy in which one task exits, one raises an error, and point_mass has a changed
+    reward."""
     changes = {
         "tasks/point_mass.py": ("return 1.0 - distance(s1)", "return 2.0 - distance(s1)"),
         "tasks/cartpole_swingup.py": ("import warp as wp\n", "import os\nos._exit(3)\n"),
@@ -49,7 +50,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.long
-def test_a_changed_reward_is_reported_with_its_numbers_and_nothing_else(report: dict[str, Any]) -> None:
+def test_only_the_changed_reward_is_reported_with_its_numbers(report: dict[str, Any]) -> None:
     (unit,) = (unit for unit in report["units"] if unit["name"] == "env/point_mass/mujoco")
     found = {each["name"].removeprefix("env/point_mass/mujoco/"): each for each in unit["differences"]}
     places = ("steps", "of_states", "after_getters", "restored_step", "masked_rand_reset", "fault", "rollout")
@@ -91,7 +92,7 @@ def test_a_package_that_cannot_be_imported_is_reported(tmp_path: Path, capsys: p
     assert "    package: new failed: RuntimeError: no package" in capsys.readouterr().out.splitlines()
 
 
-def test_a_name_that_is_neither_folder_nor_revision_is_refused() -> None:
+def test_name_that_is_neither_folder_nor_revision_raises_an_error() -> None:
     with pytest.raises(ValueError, match="'no_such_revision' is neither a folder with lyceum_warp/ nor a revision"):
         compare.run(compare.Options("no_such_revision", str(ROOT)))
 
@@ -109,7 +110,7 @@ OTHER_NAN = np.array([0x7FC00001], np.uint32).view(np.float32)[0]
         ([[1.0]], [[np.nextafter(np.float32(1), np.float32(2))]], {"step": 0, "index": 0}, 2.0**-23, 1),
     ],
 )
-def test_numbers_differ_in_any_bit(
+def test_numbers_that_differ_in_one_bit_are_reported(
     old: list, new: list, first: dict[str, int], largest: float | None, count: int
 ) -> None:
     found = compare.difference("a", np.array(old, np.float32), np.array(new, np.float32), ["step"])
@@ -124,14 +125,14 @@ def test_shape_type_and_text_are_compared() -> None:
     assert compare.difference("a", np.array("ab"), np.array("ab")) is None
 
 
-def test_names_in_only_one_checkout_are_added_or_removed() -> None:
+def test_names_in_only_one_checkout_are_reported_as_added_or_removed() -> None:
     zero = np.zeros(1)
     found = compare.differences("u", {"both": zero, "gone": zero}, {"new": zero, "both": zero}, {})
     assert [(each.name, each.kind) for each in found] == [("u/gone", "removed"), ("u/new", "added")]
 
 
 @pytest.mark.long
-def test_every_part_of_a_revision_equals_itself(tmp_path: Path) -> None:
+def test_revision_equals_itself_in_every_part(tmp_path: Path) -> None:
     if not (ROOT / ".git").exists():
         pytest.skip("needs the repository")
     options = ["--tasks", "point_mass", "--iterations", "4", "--steps", "4"]
@@ -144,7 +145,7 @@ def test_every_part_of_a_revision_equals_itself(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_both_processes_and_removes_the_folders(number: signal.Signals, tmp_path: Path) -> None:
+def test_signal_ends_both_processes_and_removes_their_folders(number: signal.Signals, tmp_path: Path) -> None:
     program = subprocess.Popen(
         [sys.executable, PROGRAM, str(ROOT), "--tasks", "point_mass"], stdout=subprocess.PIPE, text=True,
         env=environment(tmp_path),
@@ -161,5 +162,5 @@ def test_a_signal_ends_both_processes_and_removes_the_folders(number: signal.Sig
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Return an environment in which a program keeps its temporary files in a folder."""
+    """Return environment variables that put a program's temporary files into a folder."""
     return os.environ | {"TMPDIR": str(folder)}

@@ -67,7 +67,9 @@ def lines(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_results_carry_their_case_and_provenance(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_stored_results_contain_their_case_machine_and_versions(
+    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert toy.main("--out", tmp_path / "new" / "toy.jsonl") == 0
     rows = lines(tmp_path / "new" / "toy.jsonl")
     assert rows[0]["case"] == {"task": "hop", "repeat": 0, "contestant": "ours"} and rows[0]["result"] == {"rate": 3.0}
@@ -78,7 +80,7 @@ def test_results_carry_their_case_and_provenance(toy: Any, tmp_path: Path, capsy
     assert "| ours | 1.50 (1.50 to 1.50) |\n| theirs | 1.00 (1.00 to 1.00) |" in out
 
 
-def test_stopped_run_continues_without_measuring_again(
+def test_stopped_experiment_continues_without_repeating_cases(
     toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "toy.jsonl"
@@ -111,7 +113,7 @@ def test_results_of_other_machines_and_versions_are_not_reused(
         row = lines(path)[-1]
 
 
-def test_a_failing_case_does_not_stop_the_others(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_failing_case_does_not_stop_other_cases(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "toy.jsonl"
     assert toy.main("--out", path, "--contestants", "ours", "--seeds", 14) == 1
     assert len(lines(path)) == 3 and "failed: task=walk repeat=0 contestant=ours" in capsys.readouterr().err
@@ -124,7 +126,7 @@ def test_overview_lists_the_experiments(capsys: pytest.CaptureFixture[str]) -> N
     assert all(re.search(rf"^{name} +\S", out, re.MULTILINE) for name in experiment.NAMES)
 
 
-def test_dry_run_prints_cases_and_measures_nothing(
+def test_dry_run_prints_cases_without_measuring_them(
     toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert toy.main("--out", tmp_path / "toy.jsonl", "--tasks", "walk", "--dry-run") == 0
@@ -132,7 +134,9 @@ def test_dry_run_prints_cases_and_measures_nothing(
     assert not toy.measured and not (tmp_path / "toy.jsonl").exists()
 
 
-def test_a_file_without_results_is_refused(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_file_with_invalid_lines_raises_an_error(
+    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "toy.jsonl").write_text("{}\n")
     assert toy.main("--out", tmp_path / "toy.jsonl") == 2
     assert capsys.readouterr().err.endswith("toy.jsonl: line 1 is not a result of an experiment\n")
@@ -144,13 +148,13 @@ def test_a_file_without_results_is_refused(toy: Any, tmp_path: Path, capsys: pyt
         ("throughput", "--tasks hoper", "there is no task 'hoper': did you mean hopper?"),
         ("throughput", "--parts one", "there is no part 'one': there are sampling, suite, single, cores, worlds, kept"),
         ("throughput", "--device cuda:99", "there is no GPU for --device cuda:99"),
-        ("mppi", "--jobs 2", "plans and a GPU are timed alone: give --jobs 1, or --parts episodes"),
+        ("mppi", "--jobs 2", "plans and GPU cases are timed alone: give --jobs 1, or --parts episodes"),
         ("mppi", "--block 0", "episodes, block and repeats must be at least 1"),
         ("npg", "--jobs 1000", "1000 jobs with 2 threads need 2000 cores"),
         ("fidelity", "--nworld 0", "--nworld"),
     ],
 )
-def test_bad_input_of_an_experiment_gets_one_line(
+def test_invalid_experiment_options_print_one_line(
     name: str, words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = ["--short", "--out", str(tmp_path / "out.jsonl"), *words.split()]
@@ -159,7 +163,9 @@ def test_bad_input_of_an_experiment_gets_one_line(
     assert error.startswith(f"{name}: ") and message in error and error.count("\n") == 1
 
 
-def test_figures_and_tables_need_only_results(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_figures_and_tables_are_made_from_stored_results(
+    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     toy.main("--out", tmp_path / "toy.jsonl")
     toy.measured.clear()
     assert plot.main(plot.Options(("toy",), tmp_path)) == 0
@@ -175,7 +181,7 @@ def test_figures_and_tables_need_only_results(toy: Any, tmp_path: Path, capsys: 
         plot.main(plot.Options((), tmp_path / "empty"))
 
 
-def test_a_peer_runs_in_a_separate_virtual_environment(
+def test_other_library_runs_in_a_separate_virtual_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(venvs, "FOLDER", tmp_path)

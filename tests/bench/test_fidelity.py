@@ -18,7 +18,7 @@ def run(out: Path, *words: str) -> int:
     return int(experiment.main(fidelity.EXPERIMENT, ["--out", str(out), *words]))
 
 
-def test_short_mode_compares_trajectories(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_short_fidelity_run_compares_trajectories(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "fidelity.jsonl"
     assert run(out, *SMALL) == 0
     result = json.loads(out.read_text())["result"]
@@ -27,7 +27,7 @@ def test_short_mode_compares_trajectories(tmp_path: Path, capsys: pytest.Capture
         low, high = found["obs"]["median"], found["obs"]["p99"]
         assert all(0.0 <= a <= b < 1e-5 for a, b in zip(low, high, strict=True))
         assert found["half_apart"] is None and found["faults"] == 0
-    assert result["pairs"]["engines"]["obs"]["p99"][-1] > 0.0  # moving worlds differ by float32 rounding
+    assert result["pairs"]["engines"]["obs"]["p99"][-1] > 0.0  # worlds that move differ by float32 rounding
     assert f"| {TASK} | 3 |" in capsys.readouterr().out
 
 
@@ -43,7 +43,7 @@ def test_different_dynamics_diverge(monkeypatch: pytest.MonkeyPatch) -> None:
     assert pairs["engines"]["half_apart"] <= 4 and pairs["moved"]["half_apart"] is None
 
 
-def test_worlds_that_have_diverged_once_stay_counted() -> None:
+def test_worlds_count_as_diverged_after_their_first_divergence() -> None:
     error = torch.zeros(6, 4)
     # three worlds diverge after 3, 5 and 4 steps, and one never diverges
     error[2:, 0], error[4:, 1], error[3, 2] = 1.0, 1.0, 1.0

@@ -20,7 +20,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made.folder
 
 
-def test_a_policy_is_judged_once(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_gate_judges_each_policy_once(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--short", "--policy", str(run), "--out", str(tmp_path / "gate.jsonl")]
     assert experiment.main(gate.EXPERIMENT, words) == 0
     out = capsys.readouterr().out
@@ -29,7 +29,7 @@ def test_a_policy_is_judged_once(run: Path, tmp_path: Path, capsys: pytest.Captu
     assert "1 of 1 cases are stored" in capsys.readouterr().out
 
 
-def test_a_standing_robot_has_the_error_of_its_command(run: Path) -> None:
+def test_velocity_error_of_a_standing_robot_equals_its_command(run: Path) -> None:
     env = gate.worlds(run, 2, gate.Options(), **gate.calm(gate.worlds(run, 1, gate.Options())))
     stand = SimpleNamespace(act=lambda obs: torch.zeros(2, 12))
     played = gate.play(env, stand, [(0.8, 0.6, 0.0), (0.0, 0.0, 0.5)], 50, gate.home(env))
@@ -38,7 +38,7 @@ def test_a_standing_robot_has_the_error_of_its_command(run: Path) -> None:
     assert not played.fell.any()
 
 
-def test_every_limit_is_necessary() -> None:
+def test_gate_fails_if_any_limit_is_exceeded() -> None:
     good = {"falls": 1, "perf": 0.9, "action_change": 0.21, "roll_pitch_rate": 0.2, "yaw_rate": 0.1,
             "joint_velocity": 1.0}  # fmt: skip
     assert gate.passes("nanoG1", good)

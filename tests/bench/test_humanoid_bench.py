@@ -5,7 +5,9 @@ import humanoid
 import pytest
 
 
-def test_the_short_mode_runs_both_loops_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_short_humanoid_run_uses_both_control_loops_and_resumes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ["--short", "--threads", "1", "--out", str(tmp_path / "humanoid.jsonl")]
     assert experiment.main(humanoid.EXPERIMENT, words) == 0
     out = capsys.readouterr().out
@@ -17,7 +19,7 @@ def test_the_short_mode_runs_both_loops_and_resumes(tmp_path: Path, capsys: pyte
         assert "physics fast" in row.case["settings"]
 
 
-def test_each_task_has_its_own_success() -> None:
+def test_each_humanoid_task_has_its_own_success_criterion() -> None:
     def row(task: str, **result: object) -> experiment.Row:
         usual = {"fell": False, "speed": 0.7, "up_at_the_end": True, "seconds": 20.0, "plans": 100, "misses": 1,
                  "plan_ms": 8.0, "plan_max_ms": 16.0, "oldest_action_steps": 2}  # fmt: skip

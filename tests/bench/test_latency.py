@@ -9,7 +9,7 @@ def main(out: Path, *words: str) -> int:
     return experiment.main(latency.EXPERIMENT, ["--short", "--threads", "1", "--out", str(out), *words])
 
 
-def test_the_short_mode_runs_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_short_latency_run_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "latency.jsonl"
     assert main(out, "--samples", "8", "16") == 0
     text = capsys.readouterr().out
@@ -22,7 +22,7 @@ def test_the_short_mode_runs_and_resumes(tmp_path: Path, capsys: pytest.CaptureF
         assert found["age_steps"] <= found["age_steps_max"] and found["episodes"] == 1
 
 
-def test_a_task_with_suggested_physics_is_also_planned_with_its_exact_physics() -> None:
+def test_task_with_suggested_physics_is_also_planned_with_exact_physics() -> None:
     cases = latency.cases(latency.Options(tasks=("humanoid", "cartpole"), threads=2))
     assert {(case.task, case.physics) for case in cases} == {
         ("humanoid", "fast"), ("humanoid", "exact"), ("cartpole", "own"),
@@ -33,7 +33,7 @@ def test_a_task_with_suggested_physics_is_also_planned_with_its_exact_physics() 
     assert {(case.task, case.samples) for case in named} == {("humanoid", 4096)}
 
 
-def test_own_plans_with_the_samples_and_the_horizon_of_the_task() -> None:
+def test_option_own_plans_with_the_samples_and_horizon_of_the_task() -> None:
     (case,) = latency.cases(latency.Options(tasks=("reach",), own=True))
     assert (case.samples, case.horizon) == (30, 16)
     with pytest.raises(ValueError, match="omit --samples and --horizons"):

@@ -7,7 +7,7 @@ import pytest
 
 
 @pytest.mark.parametrize("algorithm", ["npg", "ppo"])
-def test_a_run_ends_at_its_target(
+def test_learning_run_ends_at_its_target(
     algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
@@ -21,7 +21,7 @@ def test_a_run_ends_at_its_target(
     assert f"| hopper | {algorithm.upper()} | default | 8 | 0 | 0 |" in capsys.readouterr().out
 
 
-def test_a_robot_that_stands_has_tracking_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_standing_robot_has_tracking_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     import lyceum_warp as lw
 
     monkeypatch.setattr(learning, "WALKED", (8, 50))
@@ -32,7 +32,7 @@ def test_a_robot_that_stands_has_tracking_errors(monkeypatch: pytest.MonkeyPatch
     assert 0.1 < found["velocity_error"] < 2.0 and found["falls_per_world_second"] >= 0.0
 
 
-def test_figure_needs_only_results(tmp_path: Path) -> None:
+def test_learning_figure_is_drawn_from_stored_results(tmp_path: Path) -> None:
     rows = experiment.read(experiment.RESULTS / "learning.jsonl")
     walkers = [row for row in rows if row.case["task"] == "go1_velocity"]
     learning.figure(walkers).savefig(tmp_path / "learning.png")

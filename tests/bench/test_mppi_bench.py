@@ -14,7 +14,7 @@ def main(out: Path, *words: str) -> int:
 
 
 @pytest.mark.parametrize("task", ["reach", "half_cheetah", "adroit_pen"])
-def test_python_environments_give_our_rewards(task: str) -> None:
+def test_python_environments_give_the_rewards_of_this_package(task: str) -> None:
     if task == "adroit_pen":
         pytest.importorskip("gymnasium_robotics")
     env = lw.make(task, autoreset=False, nthread=1, seed=3)
@@ -28,7 +28,7 @@ def test_python_environments_give_our_rewards(task: str) -> None:
 
 
 @pytest.mark.long
-def test_the_short_mode_runs_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_short_mppi_run_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "mppi.jsonl"
     assert main(out, "--contestants", "mppi", "python") == 0
     text = capsys.readouterr().out
@@ -38,10 +38,10 @@ def test_the_short_mode_runs_and_resumes(tmp_path: Path, capsys: pytest.CaptureF
     rows = experiment.read(out)
     assert all(row.result["plan_ms"] > 0.0 for row in rows)
     returns = [row.result["return"] for row in rows if row.case["part"] == "episodes"]
-    assert max(returns) - min(returns) < 0.2 * abs(min(returns))  # both have the same planner and plant
+    assert max(returns) - min(returns) < 0.2 * abs(min(returns))  # both contestants have the same planner and plant
 
 
-def test_an_episode_that_two_blocks_share_counts_once() -> None:
+def test_episode_in_two_blocks_counts_once() -> None:
     def block(contestant: str, first: int, seconds: list[float]) -> Any:
         each = [[first + i, i != 1, -100.0, value] for i, value in enumerate(seconds)]
         where = {"part": "episodes", "task": "reach", "contestant": contestant, "repeat": 1, "threads": 2}

@@ -13,7 +13,7 @@ from lyceum_warp.algos.rollout_buffer import Rollout
 
 
 def case(contestant: str, **changes: Any) -> Any:
-    """Return the short mode's case with fewer samples."""
+    """Return a case of the short mode with fewer samples."""
     found = npg.cases(npg.Options(short=True, contestants=(contestant,), threads=1))[0]
     return dataclasses.replace(found, samples=500, nworld=found.nworld and 4, **changes)
 
@@ -25,7 +25,7 @@ def row(contestant: str, seed: int, curve: list[Any], **result: Any) -> Any:
     return npg.Row(dataclasses.asdict(made), found | result, {}, 1.0)
 
 
-def test_gymnasium_fills_the_buffer_with_the_numbers_of_our_environments() -> None:
+def test_gymnasium_fills_the_rollout_buffer_with_the_same_values() -> None:
     nworld, steps = 4, 60
     env = lw.make("hopper", nworld=nworld, seed=0, nthread=1)
     ours = Rollout(env, steps)
@@ -50,14 +50,14 @@ def test_gymnasium_fills_the_buffer_with_the_numbers_of_our_environments() -> No
         for name in ("obs", "action", "final_obs", "reward", "step", "terminated", "done", "episode_length"):
             mine, theirs = (getattr(rollout, name)[:until, world] for rollout in (ours, fed))
             assert torch.allclose(mine.float(), theirs.float(), atol=1e-4), name
-        # the first, shortened episodes count in neither buffer
+        # the first episodes, which are shortened, count in neither buffer
         assert torch.equal(ours.episode_return[:until, world].isnan(), fed.episode_return[:until, world].isnan())
     later = fed.done.cumsum(0).roll(1, 0) > 0
     assert not fed.episode_return[1:][later[1:]].isnan().any()
 
 
 @pytest.mark.parametrize("mode", ["sync", "async"])
-def test_gymnasiums_first_episodes_are_as_short_as_ours(mode: str) -> None:
+def test_first_episodes_of_gymnasium_are_equally_short(mode: str) -> None:
     env = lw.make("swimmer", nworld=2, nthread=1)
     state = env.get_state()
     state[:, env.state_space.parts["step"]] = torch.tensor([[995.0], [998.0]], dtype=torch.float64)
@@ -71,7 +71,7 @@ def test_gymnasiums_first_episodes_are_as_short_as_ours(mode: str) -> None:
 
 @pytest.mark.quick("npg")
 @pytest.mark.parametrize("contestant", ["npg", "npg_gymnasium"])
-def test_a_run_yields_a_curve(contestant: str) -> None:
+def test_npg_run_returns_a_learning_curve(contestant: str) -> None:
     result = npg.measure(case(contestant), npg.Options(short=True))
     curve = result["curve"]
     assert [point[0] for point in curve] == [0, 500]
@@ -81,14 +81,14 @@ def test_a_run_yields_a_curve(contestant: str) -> None:
     assert (result.get("mode") in ("sync", "async")) == (contestant == "npg_gymnasium")
 
 
-def test_a_peers_learner_ends_when_its_time_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_learner_of_another_library_ends_after_its_time_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("stable_baselines3")
     monkeypatch.setitem(npg.LIMITS, "ppo_sb3", 1e-2)
     result = npg.measure(dataclasses.replace(case("ppo_sb3"), samples=1_000_000), npg.Options(short=True))
     assert result["samples"] < 256 and [point[0] for point in result["curve"]] == [0, result["samples"]]
 
 
-def test_tables_and_figure_need_only_results(tmp_path: Path) -> None:
+def test_npg_tables_and_figure_are_made_from_stored_results(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     rows = []
     for name, slower in (("npg", 1.0), ("npg_gymnasium", 3.0), ("ppo_sb3", 20.0)):
@@ -101,5 +101,5 @@ def test_tables_and_figure_need_only_results(tmp_path: Path) -> None:
     assert found["NPG, Gymnasium's environments (sync)"][7] == "3.00 (3.00 to 3.00)"
     assert len(agreement.rows) == 10 and "differ at 0 of 10 points" in agreement.title
     npg.figure(rows).savefig(tmp_path / "npg.png")
-    # runs that were stopped early are plotted, too
+    # runs that were stopped early are also plotted
     npg.figure([rows[0], row("npg", 1, [[0, 0.0, 5.0], [50_000, 2.0, 9.0]])])

@@ -15,7 +15,7 @@ FAULTS = ("--short", "--parts", "faults", "--threads", "1", "--nworld", "16")
 
 @pytest.fixture
 def work(request: pytest.FixtureRequest, pytestconfig: pytest.Config, tmp_path: Path) -> Path:
-    """Return the test's folder, without states; its path is the same in every run."""
+    """Return an empty folder for states, whose path is the same in every run of the tests."""
     cache = getattr(pytestconfig, "cache", None)
     folder: Path = cache.mkdir(request.node.name) if cache else tmp_path / "work"
     for file in folder.glob("*.pt"):
@@ -41,7 +41,7 @@ def test_every_injected_fault_is_found_and_counted(
     assert re.search(r"\| point_mass, cpu \| 16 \| 1.92e\+04 \|", capsys.readouterr().out)
 
 
-def test_chunks_equal_an_uninterrupted_run_bit_for_bit(work: Path, tmp_path: Path) -> None:
+def test_soak_chunks_equal_an_uninterrupted_run_bit_for_bit(work: Path, tmp_path: Path) -> None:
     for name, steps in (("two", "4800"), ("one", "9600")):
         run(tmp_path / f"{name}.jsonl", *FAULTS, "--steps", steps, "--work", str(work))
     ends = [torch.load(work / f"point_mass-auto-cpu-16-{steps}-0-same-bits-{chunk}.pt", weights_only=True)
@@ -50,12 +50,13 @@ def test_chunks_equal_an_uninterrupted_run_bit_for_bit(work: Path, tmp_path: Pat
     assert all(torch.equal(end, ends[1][name]) for name, end in ends[0].items())
 
 
-def test_another_machine_continues_in_the_folder_of_states(
+def test_soak_run_continues_on_another_machine_with_the_state_folder(
     work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = (*FAULTS, "--steps", "1600", "--work", str(work))
     first = run(tmp_path / "here.jsonl", *words)
-    assert run(tmp_path / "there.jsonl", *words)[0]["found"] == first[1]["found"]  # the last row may be lost
+    # an interruption may lose the last row
+    assert run(tmp_path / "there.jsonl", *words)[0]["found"] == first[1]["found"]
     for file in work.glob("*.pt"):
         file.unlink()
     (tmp_path / "here.jsonl").write_text((tmp_path / "here.jsonl").read_text().splitlines(keepends=True)[0])
@@ -63,7 +64,7 @@ def test_another_machine_continues_in_the_folder_of_states(
     assert "skipped: there is no " in capsys.readouterr().out
 
 
-def test_a_fault_that_spreads_or_is_missed_is_reported(
+def test_missed_faults_and_faults_that_spread_are_reported(
     work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(soak, "VARIANT", soak.VARIANT.replace("== 4.0", "== 7.0").replace("== 5.0", "== 6.0"))
@@ -80,7 +81,7 @@ def test_a_fault_that_spreads_or_is_missed_is_reported(
 
 
 @pytest.mark.long
-def test_a_killed_training_ends_like_an_uninterrupted_one(work: Path, tmp_path: Path) -> None:
+def test_killed_training_run_ends_like_an_uninterrupted_run(work: Path, tmp_path: Path) -> None:
     memory, kills = sorted(run(tmp_path / "soak.jsonl", "--short", "--parts", "kills", "memory", "--work", str(work)),
                            key=len)  # fmt: skip
     assert kills["kills"] == 1 and kills["exit_code"] == 0 and kills["iterations"] == 60
@@ -88,11 +89,11 @@ def test_a_killed_training_ends_like_an_uninterrupted_one(work: Path, tmp_path: 
     assert len(memory["memory"]) == soak.SAMPLES and memory["bytes_per_env"] < 1e6
 
 
-def test_growth_is_measured_without_the_first_sample() -> None:
+def test_memory_growth_excludes_the_first_sample() -> None:
     assert soak.slope([[100, 9**9], [200, 3000], [300, 5000], [400, 7000]], 1) == pytest.approx(20.0)
 
 
-def test_random_actions_are_counted_without_injected_faults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_part_random_counts_faults_without_injecting_any(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("--short", "--parts", "random", "--threads", "1", "--nworld", "16", "--steps", "1600")
     (result,) = run(tmp_path / "soak.jsonl", *words)
     assert result["steps"] == 1600 and result["first"] is None and not any(result["faults"].values())

@@ -18,7 +18,7 @@ def lines(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_throughput_is_measured_once_and_tabulated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_throughput_is_measured_once_and_written_as_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "throughput.jsonl"
     words = (
         "--tasks cartpole --contestants native c gymnasium gym-sync --threads 1 --parts sampling single kept".split()
@@ -41,7 +41,9 @@ def test_throughput_is_measured_once_and_tabulated(tmp_path: Path, capsys: pytes
     assert len([*tmp_path.glob("throughput-*.png")]) == 1
 
 
-def test_rates_are_measured_by_cores_and_worlds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_throughput_is_measured_for_several_numbers_of_cores_and_worlds(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "throughput.jsonl"
     words = "--tasks cartpole --contestants native c --threads 1 --parts cores worlds".split()
     assert run("throughput", out, *words) == 0
@@ -54,16 +56,18 @@ def test_rates_are_measured_by_cores_and_worlds(tmp_path: Path, capsys: pytest.C
     assert f"| {ours:,.0f}; {ours / native:.2f} |" in printed
 
 
-def test_the_suite_is_measured_beside_dm_control_with_equal_numbers_of_worlds() -> None:
+def test_suite_and_dm_control_are_measured_with_equal_numbers_of_worlds() -> None:
     options = throughput.Options(parts=("suite",), tasks=("dm/cheetah_run", "dm/quadruped_walk"), threads=2, repeats=1)
     found = [(case.task, case.worlds, case.contestant) for case in throughput.cases(options)]
     assert found.count(("dm/cheetah_run", 16, "envpool")) == 1 and len(found) == 3 * (3 + 2)
-    assert ("dm/quadruped_walk", 16, "envpool") not in found  # EnvPool's has more observations
+    assert ("dm/quadruped_walk", 16, "envpool") not in found  # EnvPool's version has more observations
     assert {case.threads for case in throughput.cases(options)} == {2}
 
 
 @pytest.mark.parametrize("task", ["cartpole", "herb_reach"])
-def test_python_tasks_give_our_observations_and_rewards(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_tasks_give_the_observations_and_rewards_of_this_package(
+    task: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """From equal states and actions, Gymnasium's environment returns the same observations and rewards."""
     monkeypatch.syspath_prepend(str(BENCH / "peers" / "environments"))
     import gymnasium

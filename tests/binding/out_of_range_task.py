@@ -1,4 +1,4 @@
-"""A task in which one function writes before or behind its array; a parameter chooses the function."""
+"""Define a task in which one function writes before or behind its array; a parameter chooses the function."""
 
 import warp as wp
 

@@ -40,7 +40,7 @@ def bound(file: Path, **options: Any) -> BoundTask:
         ("action_range = (0.0, float('inf'))", r"must be two finite numbers, lowest first"),
     ],
 )
-def test_an_invalid_attribute_of_the_class_is_refused(line: str, message: str, tmp_path: Path) -> None:
+def test_invalid_task_attribute_raises_an_error(line: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         bound(tiny_task.write(tmp_path, f"{tiny_task.TINY}    {line}\n"))
 
@@ -53,7 +53,7 @@ DECLARED_OTHERWISE = {
 
 
 @pytest.mark.parametrize(("fields", "message"), DECLARED_OTHERWISE.values(), ids=DECLARED_OTHERWISE)
-def test_a_field_of_a_wrong_type_is_refused_by_naming_the_type(fields: str, message: str, tmp_path: Path) -> None:
+def test_error_of_a_field_with_a_wrong_type_names_the_type(fields: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         lw.make(tiny_task.write(tmp_path, tiny_task.changed(("qpos: Row[float]", fields))))
 
@@ -65,7 +65,7 @@ OBSERVATIONS = {
 
 
 @pytest.mark.parametrize("case", OBSERVATIONS)
-def test_an_observation_that_does_not_fit_obs_is_refused(case: str, task_file: TaskFile) -> None:
+def test_observation_size_that_differs_from_obs_raises_an_error(case: str, task_file: TaskFile) -> None:
     observe, message = OBSERVATIONS[case]
     file = task_file(
         f"observes_{case.replace(' ', '_').replace('-', '_')}.py", tiny_task.changed(("obs[0] = s.qpos[0]", observe))
@@ -116,22 +116,20 @@ NOT_COMPILED = {
 
 
 @pytest.mark.parametrize(("function", "message"), NOT_COMPILED.values(), ids=NOT_COMPILED)
-def test_a_function_that_warp_cannot_compile_is_explained_in_one_line(
-    function: str, message: str, tmp_path: Path
-) -> None:
+def test_function_that_warp_cannot_compile_raises_a_one_line_error(function: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         lw.make(tiny_task.write(tmp_path, tiny_task.with_function(function)))
     assert "\n" not in str(caught.value)
 
 
-def test_actions_are_scaled_only_to_controls_with_ranges(tmp_path: Path) -> None:
+def test_actions_are_scaled_only_for_controls_with_ranges(tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, f"{tiny_task.TINY}    action_range = (-1.0, 1.0)\n")
     spec = mujoco.MjSpec.from_file(str(DATA / "unlimited.xml"))
     with pytest.raises(ValueError, match=r"the controls \[0\] have no range in the model: set the actuators"):
         lw.make(file, model=spec)
 
 
-def test_a_model_without_actuators_is_refused(tmp_path: Path) -> None:
+def test_model_without_actuators_raises_an_error(tmp_path: Path) -> None:
     spec = lw.gymnasium_model("hopper.xml").spec()
     for actuator in list(spec.actuators):
         spec.delete(actuator)
@@ -139,7 +137,7 @@ def test_a_model_without_actuators_is_refused(tmp_path: Path) -> None:
         bound(tiny_task.write(tmp_path, tiny_task.TINY), model=spec)
 
 
-def test_a_step_lasts_frame_skip_substeps(tmp_path: Path) -> None:
+def test_step_takes_frame_skip_substeps(tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, f"{tiny_task.TINY}    frame_skip = 3\n")
     for physics, skip in ((None, 3), (PhysicsOptions(frame_skip=5), 5)):
         task = bound(file, physics=physics)
@@ -147,7 +145,7 @@ def test_a_step_lasts_frame_skip_substeps(tmp_path: Path) -> None:
         assert task.params["dt"] == task.timestep == skip * task.model.opt.timestep
 
 
-def test_more_success_steps_than_an_episode_has_are_refused(tmp_path: Path) -> None:
+def test_success_steps_longer_than_an_episode_raise_an_error(tmp_path: Path) -> None:
     source = tiny_task.with_function("def success(s: World, p: Params) -> bool:\n    return True")
     for horizon, steps in ((0, 6), (6, 6), (6, 1)):
         bound(tiny_task.write(tmp_path, f"{source}    horizon, success_steps = {horizon}, {steps}\n"))
@@ -155,13 +153,13 @@ def test_more_success_steps_than_an_episode_has_are_refused(tmp_path: Path) -> N
         bound(tiny_task.write(tmp_path, f"{source}    horizon, success_steps = 6, 7\n"))
 
 
-def test_an_observation_has_one_size_in_all_worlds() -> None:
+def test_observation_size_that_differs_between_worlds_raises_an_error() -> None:
     flags = [True, False]
     with pytest.raises(ValueError, match=r"obs of the task 'hopper' differs between worlds in \['position'\]"):
         lw.make("hopper", nworld=2, exclude_current_positions_from_observation=flags)
 
 
-def test_parameters_that_would_change_the_observation_are_refused_and_not_kept() -> None:
+def test_parameters_that_change_the_observation_size_raise_an_error_and_are_not_set() -> None:
     env = lw.make("hopper", nworld=2)
     for value in (False, [True, False]):
         with pytest.raises(ValueError, match="would change the observation's parts: make a new environment"):

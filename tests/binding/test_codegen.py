@@ -16,18 +16,18 @@ def kernels(file: Path | str) -> Any:
     return BoundTask(find_task(file)).kernels
 
 
-def test_the_same_functions_share_their_kernels(tmp_path: Path) -> None:
+def test_equal_functions_share_kernels(tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, f"{tiny_task.TINY}\nclass Slower(Tiny):\n    frame_skip = 2\n")
     assert kernels(f"{file}:Tiny") is kernels(f"{file}:Slower") is kernels(f"{file}:Tiny")
 
 
-def test_a_different_function_makes_different_kernels(tmp_path: Path) -> None:
+def test_different_functions_have_different_kernels(tmp_path: Path) -> None:
     other = f"{tiny_task.with_function(EVALUATE.replace('evaluate', 'height'))}\nclass Other(Tiny):\n"
     file = tiny_task.write(tmp_path, f"{other}    evaluate = height\n")
     assert kernels(f"{file}:Tiny") is not kernels(f"{file}:Other")
 
 
-def test_a_kernel_module_has_the_same_name_for_a_copy_of_the_task_file_until_it_changes(tmp_path: Path) -> None:
+def test_kernel_module_name_is_equal_for_a_copied_task_file_and_changes_with_the_file(tmp_path: Path) -> None:
     """Warp caches compiled kernels by the module's name."""
     (tmp_path / "copy").mkdir()
     file, copy = (tiny_task.write(folder, tiny_task.TINY) for folder in (tmp_path, tmp_path / "copy"))

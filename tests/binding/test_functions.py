@@ -13,9 +13,9 @@ from lyceum_warp.task import FUNCTIONS, Task
 MEANT = {
     name: f"def {function.signature}:\n    {function.default or 'obs[0] = 1.0'}"
     for name, function in FUNCTIONS.items()
-    if name not in ("tally", "share")  # these functions need each other and additional structs
+    if name not in ("tally", "share")  # these functions must be defined together, and need additional structs
 }
-"""Every function of the table, as written in a task's file."""
+"""Every function of ``task.FUNCTIONS``, as a task's file defines it."""
 
 
 def source_of(folder: Path, text: str) -> TaskSource:
@@ -24,7 +24,7 @@ def source_of(folder: Path, text: str) -> TaskSource:
 
 
 @pytest.mark.parametrize("name", MEANT)
-def test_a_function_written_as_in_the_table_is_found(name: str, tmp_path: Path) -> None:
+def test_function_with_the_signature_in_the_table_is_found(name: str, tmp_path: Path) -> None:
     source = source_of(tmp_path, tiny_task.with_function(MEANT[name]))
     assert [key for key, function in source.functions.items() if function] == sorted(
         {"observe", name}, key=list(FUNCTIONS).index
@@ -32,7 +32,7 @@ def test_a_function_written_as_in_the_table_is_found(name: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", MEANT)
-def test_a_function_with_other_arguments_is_refused_with_the_line_to_write(name: str, tmp_path: Path) -> None:
+def test_error_of_a_function_with_other_arguments_shows_the_correct_line(name: str, tmp_path: Path) -> None:
     text = tiny_task.TINY if name == "observe" else tiny_task.with_function(MEANT[name])
     with pytest.raises(ValueError) as caught:
         source_of(tmp_path, text.replace(f"def {name}(", f"def {name}(more: float, "))
@@ -53,7 +53,7 @@ WRONG_SIGNATURES = {
 
 
 @pytest.mark.parametrize(("function", "message"), WRONG_SIGNATURES.values(), ids=WRONG_SIGNATURES)
-def test_a_function_with_another_result_or_missing_argument_is_refused(
+def test_function_with_wrong_result_or_missing_argument_raises_an_error(
     function: str, message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=message):
@@ -69,13 +69,13 @@ INCOMPLETE = {
 
 
 @pytest.mark.parametrize(("old", "new", "message"), INCOMPLETE.values(), ids=INCOMPLETE)
-def test_an_incomplete_file_says_what_is_missing(old: str, new: str, message: str, tmp_path: Path) -> None:
+def test_error_of_an_incomplete_file_names_the_missing_part(old: str, new: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         source_of(tmp_path, tiny_task.changed((old, new)))
 
 
 @pytest.mark.parametrize("name", ["World", "Params"])
-def test_an_ordinary_class_in_place_of_a_struct_is_refused(name: str, tmp_path: Path) -> None:
+def test_ordinary_class_instead_of_a_warp_struct_raises_an_error(name: str, tmp_path: Path) -> None:
     text = tiny_task.TINY.replace("    model =", f"    class {name}:\n        qpos: Row[float]\n\n    model =")
     with pytest.raises(ValueError, match=f"{name} of the task 'tiny' must be a Warp struct: decorate it with @wp.st"):
         source_of(tmp_path, text)
@@ -88,7 +88,7 @@ def test_an_ordinary_class_in_place_of_a_struct_is_refused(name: str, tmp_path: 
         ("horzon = 10", "'horzon' in its class: did you mean horizon"),
     ],
 )
-def test_a_misspelt_attribute_of_the_class_is_refused(line: str, message: str, tmp_path: Path) -> None:
+def test_misspelt_task_attribute_raises_an_error(line: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         source_of(tmp_path, f"{tiny_task.TINY}    {line}\n")
 
@@ -106,7 +106,7 @@ def test_a_subclass_inherits_functions_and_structs(tmp_path: Path) -> None:
     assert (first.world, first.params) == (second.world, second.params)
 
 
-def test_every_function_of_the_table_is_in_the_help_of_task() -> None:
+def test_help_of_task_describes_every_function_in_the_table() -> None:
     assert all(function.signature in str(Task.__doc__) for function in FUNCTIONS.values())
     assert lw.Task is Task
 
@@ -123,7 +123,7 @@ USERS = {
 
 
 @pytest.mark.parametrize("user", USERS)
-def test_an_unlisted_observe_function_must_be_called_in_its_module(user: str, tmp_path: Path) -> None:
+def test_unlisted_observe_function_raises_an_error_if_nothing_calls_it(user: str, tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, tiny_task.changed(("class Tiny", f"{CRITIC}class Tiny")) + USERS[user])
     task = find_task(f"{file}:Tiny")
     source = TaskSource(task, task_name(task))

@@ -49,13 +49,13 @@ def shared(folder: Path, skip: int) -> Path:
     return tiny_task.write(folder, SHARED)
 
 
-def test_a_task_imports_modules_beside_it(tmp_path: Path) -> None:
+def test_task_can_import_modules_from_its_folder(tmp_path: Path) -> None:
     path = list(sys.path)
     assert find_task(shared(tmp_path, 3)).frame_skip == 3
     assert sys.path == path and not list(tmp_path.rglob("__pycache__"))
 
 
-def test_modules_of_one_name_in_two_folders_are_distinct(tmp_path: Path) -> None:
+def test_modules_with_equal_names_in_two_folders_are_distinct(tmp_path: Path) -> None:
     files = []
     for name, skip in (("a", 4), ("b", 5)):
         (tmp_path / name).mkdir()
@@ -71,7 +71,7 @@ def test_a_changed_module_is_reloaded(tmp_path: Path) -> None:
     assert (find_task(file).frame_skip, first.frame_skip) == (17, 6)
 
 
-def test_a_failing_module_does_not_replace_loaded_modules(tmp_path: Path) -> None:
+def test_module_that_raises_does_not_replace_loaded_modules(tmp_path: Path) -> None:
     file = shared(tmp_path, 8)
     first, module = find_task(file), sys.modules["aaa_size"]
     (tmp_path / "aaa_size.py").write_text("from aaa_inner.number import SKIP\n1 / 0\n")

@@ -26,12 +26,12 @@ def ball(option: str = "") -> mujoco.MjSpec:
 # sources
 
 
-def test_a_compiled_model_is_refused() -> None:
+def test_compiled_model_raises_an_error() -> None:
     with pytest.raises(ValueError, match="must be a file or an MjSpec, not a compiled MjModel: give its MjSpec"):
         load_spec(ball().compile())
 
 
-def test_a_relative_path_belongs_to_the_tasks_file_not_to_the_current_folder(
+def test_relative_model_path_starts_at_the_folder_of_the_task_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "models").mkdir()
@@ -43,9 +43,7 @@ def test_a_relative_path_belongs_to_the_tasks_file_not_to_the_current_folder(
     assert task_spec(find_task(file)).modelname == "hopper"
 
 
-def test_the_current_folder_is_searched_only_for_the_option_model(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_current_folder_is_searched_only_for_the_option_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = lw.gymnasium_model("hopper.xml").spec()
     spec.geom("torso_geom").density = 5000
     (tmp_path / "hopper.xml").write_text(spec.to_xml())
@@ -62,27 +60,27 @@ def test_the_current_folder_is_searched_only_for_the_option_model(
         ("robott.xml", r"no model file .*robott.xml \(did you mean robot.xml\?\), and of Gymnasium's models: "),
     ],
 )
-def test_a_model_file_that_is_missing_is_named(model: str, message: str, tmp_path: Path) -> None:
+def test_error_of_a_missing_model_file_names_the_file(model: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "robot.xml").write_text("<mujoco/>")
     file = tiny_task.write(tmp_path, tiny_task.changed(("hopper.xml", model)))
     with pytest.raises(FileNotFoundError, match=message):
         lw.make(file)
 
 
-def test_a_file_that_mujoco_cannot_read_is_named(tmp_path: Path) -> None:
+def test_error_of_an_unreadable_model_file_names_the_file(tmp_path: Path) -> None:
     (tmp_path / "robot.xml").write_text("<mujoco><robot/></mujoco>")
     with pytest.raises(ValueError, match=r"MuJoCo can't read the model .*robot.xml: "):
         load_spec(tmp_path / "robot.xml")
 
 
-def test_a_missing_gymnasium_robotics_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_without_gymnasium_robotics_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if "robotics" in name else find(name, *a))
     with pytest.raises(FileNotFoundError, match=r"gymnasium-robotics, .*: pip install 'lyceum-warp\[hand\]'"):
         lw.make("adroit_pen", engine="mujoco")
 
 
-def test_a_model_that_gymnasium_robotics_lacks_is_refused_with_similar_names() -> None:
+def test_error_of_an_unknown_gymnasium_robotics_model_suggests_similar_names() -> None:
     with pytest.raises(FileNotFoundError, match=r"no model file 'adroit_hand/adroit_pan.xml'.* adroit_hand/adroit_pen"):
         lw.gymnasium_robotics_model("adroit_hand/adroit_pan.xml").spec()
 
@@ -90,12 +88,12 @@ def test_a_model_that_gymnasium_robotics_lacks_is_refused_with_similar_names() -
 # changes before compiling
 
 
-def test_the_pgs_solver_becomes_newton() -> None:
+def test_pgs_solver_is_replaced_by_newton() -> None:
     assert compile_model(ball('solver="PGS"'), (), PHYSICS).opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
     assert compile_model(ball('solver="CG"'), (), PHYSICS).opt.solver == mujoco.mjtSolver.mjSOL_CG
 
 
-def test_sleep_is_turned_off_with_a_line_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+def test_sleep_is_disabled_with_a_line_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("INFO"):
         model = compile_model(ball('timestep="0.002"><flag sleep="enable"/></option><option'), (), PHYSICS)
     assert not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
@@ -108,8 +106,8 @@ PAIRS = """<mujoco model="pairs"><worldbody>
   <contact><pair geom1="floor" geom2="ball" friction="2"/><pair geom1="ball" geom2="floor"/></contact></mujoco>"""
 
 
-def test_a_pair_that_is_listed_twice_makes_one_contact(caplog: pytest.LogCaptureFixture) -> None:
-    """MuJoCo would create two contacts and MuJoCo Warp one."""
+def test_contact_pair_that_is_listed_twice_creates_one_contact(caplog: pytest.LogCaptureFixture) -> None:
+    """Otherwise MuJoCo would create two contacts, and MuJoCo Warp only one."""
     assert mujoco.MjModel.from_xml_string(PAIRS).npair == 2
     with caplog.at_level("INFO"):
         model = compile_model(mujoco.MjSpec.from_string(PAIRS), (), PHYSICS)
@@ -117,12 +115,12 @@ def test_a_pair_that_is_listed_twice_makes_one_contact(caplog: pytest.LogCapture
     assert "pairs lists a pair of ball and floor twice" in caplog.text
 
 
-def test_the_energy_is_turned_on_if_it_is_read() -> None:
+def test_energy_is_computed_only_if_the_task_reads_it() -> None:
     assert compile_model(ball(), ["energy"], PHYSICS).opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY
     assert not compile_model(ball(), ["qpos"], PHYSICS).opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY
 
 
-def test_physics_options_replace_the_models_own() -> None:
+def test_physics_options_override_the_options_of_the_model() -> None:
     solver = {"iterations": 7, "ls_iterations": 9}
     physics = PhysicsOptions(
         timestep=0.015, cone="elliptic", integrator="implicitfast", solver=solver, jacobian="sparse", impratio=10
@@ -134,19 +132,19 @@ def test_physics_options_replace_the_models_own() -> None:
     assert (option.jacobian, option.impratio) == (mujoco.mjtJacobian.mjJAC_SPARSE, 10.0)
 
 
-def test_a_field_that_needs_a_sensor_gets_one() -> None:
+def test_sensors_are_added_for_fields_that_need_them() -> None:
     model = compile_model(ball(), ["qpos", "cfrc_ext", "subtree_linvel"], PHYSICS)
     kinds = [mujoco.mjtSensor.mjSENS_FRAMELINACC, mujoco.mjtSensor.mjSENS_SUBTREELINVEL]
     assert sorted(model.sensor_type) == sorted(map(int, kinds))
     assert not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR
 
 
-def test_sensors_are_turned_off_if_no_field_needs_them() -> None:
+def test_sensors_are_disabled_if_no_field_needs_them() -> None:
     model = compile_model(ball(), ["qpos"], PHYSICS)
     assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR
 
 
-def test_a_model_that_mujoco_refuses_is_named() -> None:
+def test_error_of_an_invalid_model_names_the_model() -> None:
     spec = ball()
     spec.worldbody.add_body().add_joint()
     with pytest.raises(ValueError, match="MuJoCo refuses the model 'ball': "):
@@ -156,8 +154,9 @@ def test_a_model_that_mujoco_refuses_is_named() -> None:
 # replicas
 
 
-def test_a_replica_has_the_model_of_its_original(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Later edits of the MjSpec, or a ``model`` that returns a different model at each call, have no effect."""
+def test_replica_has_the_model_of_its_original_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A replica ignores later edits of the MjSpec, and a ``model`` function that returns a different model at each
+    call."""
     spec = lw.gymnasium_model("hopper.xml").spec()
     env = lw.make("hopper", model=spec)
     spec.geom("torso_geom").density = 5000
@@ -186,7 +185,7 @@ CORNERS = "".join(f"v {x} {y} {z}\n" for x in (-0.1, 0.1) for y in (-0.1, 0.1) f
 
 
 @pytest.mark.parametrize("as_spec", [False, True])
-def test_a_model_of_a_relative_path_and_its_meshes_are_found_from_another_folder(
+def test_model_with_a_relative_path_and_its_meshes_are_found_from_another_folder(
     as_spec: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "elsewhere").mkdir()
@@ -199,14 +198,14 @@ def test_a_model_of_a_relative_path_and_its_meshes_are_found_from_another_folder
     assert env.replicate().model.nmesh == 1
 
 
-def test_xml_text_is_refused_with_a_suggestion() -> None:
+def test_error_of_xml_text_as_model_suggests_an_mjspec() -> None:
     with pytest.raises(
         ValueError, match=r"^the model '<mujoco><asset><mesh \.\.\.' is XML.*mujoco.MjSpec.from_string\(\.\.\.\)"
     ):
         load_spec(f"\n  {CUBE}")
 
 
-def test_no_body_is_simple_if_inertial_frames_move() -> None:
+def test_no_body_is_simple_if_its_inertial_frame_is_randomized() -> None:
     assert compile_model(ball(), (), PHYSICS).body_simple[1] == 1
     assert compile_model(ball(), (), PHYSICS, varied=["body_mass"]).body_simple[1] == 1
     assert compile_model(ball(), (), PHYSICS, varied=["body_ipos"]).body_simple[1] == 0

@@ -61,7 +61,7 @@ def test_defaults_come_from_the_struct_and_dt_from_the_timestep(model: mujoco.Mj
     assert list(values["offset"]) == [0.0, 0.0, 0.5]
 
 
-def test_named_elements_become_their_indices_in_the_model(model: mujoco.MjModel) -> None:
+def test_named_elements_become_model_indices(model: mujoco.MjModel) -> None:
     values = parameters(model).values
     assert (values["tip"], values["elbow"]) == (0, 1)
     for elbow in ("shoulder", lw.dof("shoulder"), 0):
@@ -88,19 +88,19 @@ def test_named_elements_become_their_indices_in_the_model(model: mujoco.MjModel)
         ({"gain": lw.body("lower")}, "gain of 'arm' can't be an element of 'xpos': it is a number"),
     ],
 )
-def test_a_value_that_does_not_fit_is_refused(given: dict[str, Any], message: str, model: mujoco.MjModel) -> None:
+def test_invalid_parameter_value_raises_an_error(given: dict[str, Any], message: str, model: mujoco.MjModel) -> None:
     with pytest.raises(ValueError, match=message):
         parameters(model, **given)
 
 
-def test_a_parameter_without_a_default_must_be_given(model: mujoco.MjModel) -> None:
+def test_missing_value_of_a_parameter_without_default_raises_an_error(model: mujoco.MjModel) -> None:
     with pytest.raises(ValueError, match="the task 'arm' needs values for mass"):
         parameters(model, Demanding)
     assert parameters(model, Demanding, mass=2).values["mass"] == 2.0
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_a_parameter_with_the_name_of_an_option_is_refused(name: str, model: mujoco.MjModel) -> None:
+def test_parameter_with_the_name_of_an_option_raises_an_error(name: str, model: mujoco.MjModel) -> None:
     struct = wp.struct(type("Params", (), {"__annotations__": {"dt": float, name: int}, name: 3}))
     message = f"the parameter '{name}' of the task 'arm' has the name of an option of make.*: rename it in Params"
     with pytest.raises(ValueError, match=message):
@@ -108,11 +108,11 @@ def test_a_parameter_with_the_name_of_an_option_is_refused(name: str, model: muj
 
 
 @pytest.mark.parametrize("values", [[1.0, 2.0], (1, 2), np.array([1.0, 2.0]), torch.tensor([1.0, 2.0])])
-def test_one_value_per_world_may_be_any_sequence(values: Any, model: mujoco.MjModel) -> None:
+def test_values_per_world_may_be_any_sequence(values: Any, model: mujoco.MjModel) -> None:
     np.testing.assert_array_equal(parameters(model, gain=values).values["gain"], [1.0, 2.0])
 
 
-def test_the_array_has_one_entry_until_a_value_differs_between_worlds(model: mujoco.MjModel) -> None:
+def test_parameter_array_has_one_entry_until_a_value_differs_between_worlds(model: mujoco.MjModel) -> None:
     device = wp.get_device("cpu")
     shared = parameters(model, offset=(1, 2, 3), lively=True).array(device)
     assert shared.shape == (1,)
@@ -134,7 +134,7 @@ class Tables:
     order: wp.array[int] = (2, 0, 1)
 
 
-def test_a_table_may_come_as_array_tensor_list_or_file(model: mujoco.MjModel, tmp_path: Path) -> None:
+def test_table_is_read_from_array_tensor_list_or_file(model: mujoco.MjModel, tmp_path: Path) -> None:
     rows = [[1.0, 2.0], [3.0, 4.0], [5.0, 6.5]]
     np.save(tmp_path / "rows.npy", rows)
     for given in (rows, np.array(rows), torch.tensor(rows, requires_grad=True), wp.array(rows, dtype=float),
@@ -145,7 +145,7 @@ def test_a_table_may_come_as_array_tensor_list_or_file(model: mujoco.MjModel, tm
     assert (values["points"].shape, values["order"].tolist()) == ((3, 3), [2, 0, 1])
 
 
-def test_a_table_is_a_copy_that_cannot_be_written(model: mujoco.MjModel) -> None:
+def test_table_is_a_read_only_copy(model: mujoco.MjModel) -> None:
     given = np.zeros((2, 2), dtype=np.float32)
     values = parameters(model, Tables, motion=given).values
     given[0, 0] = 5.0
@@ -170,12 +170,12 @@ def test_a_table_is_a_copy_that_cannot_be_written(model: mujoco.MjModel) -> None
         ({"order": [2**40]}, r"order of 'arm' has 1.*at \[0\]: it must be a whole number of 32 bits"),
     ],
 )
-def test_a_table_that_does_not_fit_is_refused(given: dict[str, Any], message: str, model: mujoco.MjModel) -> None:
+def test_invalid_table_raises_an_error(given: dict[str, Any], message: str, model: mujoco.MjModel) -> None:
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         parameters(model, Tables, **given)
 
 
-def test_a_file_without_a_table_is_refused(model: mujoco.MjModel, tmp_path: Path) -> None:
+def test_file_without_a_table_raises_an_error(model: mujoco.MjModel, tmp_path: Path) -> None:
     (tmp_path / "text.npy").write_text("1 2 3")
     np.savez(tmp_path / "several.npz", a=1)
     for name, message in (("text.npy", "cannot be read"), ("several.npz", "a .npy file written by numpy.save")):
@@ -183,7 +183,7 @@ def test_a_file_without_a_table_is_refused(model: mujoco.MjModel, tmp_path: Path
             parameters(model, Tables, motion=tmp_path / name)
 
 
-def test_a_table_of_another_type_is_refused(model: mujoco.MjModel) -> None:
+def test_table_of_another_type_raises_an_error(model: mujoco.MjModel) -> None:
     struct = wp.struct(type("Params", (), {"__annotations__": {"t": wp.array(dtype=wp.float64)}, "t": [1.0]}))
     with pytest.raises(ValueError, match="the parameter 't' of the task 'arm' has the type .*float64.*: a table is"):
         parameters(model, struct)
@@ -196,7 +196,7 @@ class Named:
     chains: wp.array2d[int] = [lw.bodies("upper", "lower"), [lw.body("lower"), 0]]
 
 
-def test_a_table_of_named_elements_has_their_indices(model: mujoco.MjModel) -> None:
+def test_table_of_named_elements_contains_their_indices(model: mujoco.MjModel) -> None:
     found = parameters(model, Named).values
     assert (found["joints"].tolist(), found["chains"].tolist()) == ([1, 0], [[1, 2], [2, 0]])
     assert parameters(model, Named, joints=["shoulder"]).values["joints"].tolist() == [0]
@@ -214,14 +214,14 @@ def test_a_table_of_named_elements_has_their_indices(model: mujoco.MjModel) -> N
         (lw.sites("tip"), "joints of 'arm' can't have an element of 'site_xpos': it has elements of 'qvel'"),
     ],
 )
-def test_a_table_with_elements_of_another_kind_is_refused(
+def test_table_with_elements_of_another_kind_raises_an_error(
     joints: list[Any], message: str, model: mujoco.MjModel
 ) -> None:
     with pytest.raises(ValueError, match=message):
         parameters(model, Named, joints=joints)
 
 
-def test_each_kind_of_element_has_a_table(model: mujoco.MjModel) -> None:
+def test_table_accepts_each_kind_of_element(model: mujoco.MjModel) -> None:
     kinds = {
         "sites": "site_xpos", "bodies": "xpos", "geoms": "geom_xpos", "joints": "xanchor", "qposes": "qpos",
         "dofs": "qvel", "actuators": "actuator_force", "sensors": "sensordata",
@@ -234,9 +234,8 @@ def test_each_kind_of_element_has_a_table(model: mujoco.MjModel) -> None:
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_functions_read_tables_which_change_in_place(engine: str) -> None:
-    """After graphs are captured, tables are replaced by tables of the same shape, of a different shape, or with one
-    value per world."""
+def test_functions_read_new_tables_after_graphs_are_captured(engine: str) -> None:
+    """The new tables have the same shape, a different shape, or one value per world."""
     env = lw.make(Follow, engine=engine, nworld=2)
 
     def first_steps() -> torch.Tensor:
@@ -258,8 +257,8 @@ def test_functions_read_tables_which_change_in_place(engine: str) -> None:
     torch.testing.assert_close(env.reward[1], 2.0 * env.reward[0])
 
 
-def test_other_environments_get_the_tables() -> None:
-    """A larger replica, scratch worlds, followers, a planner, and the evaluation of a policy get the tables."""
+def test_replicas_planners_and_evaluations_get_the_tables() -> None:
+    """The tables reach a larger replica, scratch worlds, followers, a planner, and the evaluation of a policy."""
     motion = np.array([[0.25, 0.0]])
     env = lw.make(Follow, motion=motion, gain=[1.0, 2.0], nworld=2)
     motion[:] = 9.0  # changing the array has no effect, because the environment has a copy
@@ -281,7 +280,7 @@ def test_other_environments_get_the_tables() -> None:
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("found", ["number", "nan"])
 def test_check_task_finds_an_out_of_range_read_of_a_table(task_file: Any, found: str, engine: str) -> None:
-    """The read is reported even if it returns NaN, which ends the episode with a fault."""
+    """The out-of-range read is reported even if it returns NaN, which ends the episode with a fault."""
     source = (Path(__file__).parent.parent / "table_task.py").read_text()
     wrong = source.replace("p.motion.shape[0] - 1)", "p.motion.shape[0])")
     value = {"number": "0.0", "nan": "wp.nan"}[found]
@@ -326,7 +325,7 @@ class Uncomputable:
     body: int = lw.from_model(lambda model, p: model.body_mas[0])
 
 
-def test_a_parameter_that_cannot_be_computed_is_named(model: mujoco.MjModel) -> None:
+def test_error_of_a_parameter_that_cannot_be_computed_names_it(model: mujoco.MjModel) -> None:
     with pytest.raises(ValueError, match="parameter body of 'arm' can't be computed from .*: Attri.* 'body_mas'"):
         parameters(model, Uncomputable)
     assert parameters(model, Uncomputable, body=1).values["body"] == 1

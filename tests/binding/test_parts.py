@@ -1,4 +1,4 @@
-"""Test named parts of memory and of observations: order, sizes, types, and mistakes."""
+"""Test the order, sizes, types and errors of named parts of memory and observations."""
 
 from pathlib import Path
 from typing import Any
@@ -79,7 +79,7 @@ class Marked(lw.Task):
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_parts_have_their_order_sizes_and_values_in_states_and_observations(engine: str) -> None:
+def test_states_and_observations_contain_all_parts_in_order(engine: str) -> None:
     env = lw.make(Marked, nworld=2, engine=engine)
     env.reset()
     sizes = {name: part.stop - part.start for name, part in env.state_space.parts.items()}
@@ -102,7 +102,7 @@ def test_parts_have_their_order_sizes_and_values_in_states_and_observations(engi
     assert env.obs[:, 5].tolist() == [6.0, 7.0]
 
 
-def test_a_table_sets_the_sizes_of_parts_permanently() -> None:
+def test_table_determines_the_sizes_of_parts_permanently() -> None:
     env = lw.make(Marked, places=[1.0, 2.0])
     assert env.obs.shape == (1, 5)
     env.set_params(places=[3.0, 4.0])
@@ -165,7 +165,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize(("changes", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_in_a_part_raises_one_line_that_names_it(
+def test_invalid_part_raises_a_one_line_error_that_names_it(
     changes: list[tuple[str, str]], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=f"^{message}") as caught:
@@ -173,8 +173,8 @@ def test_a_mistake_in_a_part_raises_one_line_that_names_it(
     assert "\n" not in str(caught.value)
 
 
-def test_a_helper_named_like_an_observe_function_defines_no_group(tmp_path: Path) -> None:
-    """The function's name resembles a group's function, but ``observe`` calls it as a helper."""
+def test_helper_function_called_by_observe_defines_no_observation_group(tmp_path: Path) -> None:
+    """The helper has the name of an observation group's function, but ``observe`` calls it."""
     helper = struct_of(PART, "observe_all(s, p, obs)").replace(
         "@wp.func\n",
         "@wp.func\ndef observe_all(s: World, p: Params, obs: Policy):\n    obs.x[0] = s.qpos[0]\n\n@wp.func\n",

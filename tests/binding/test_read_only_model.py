@@ -1,4 +1,4 @@
-"""Test that an environment's model refuses edits, but otherwise behaves like any MjModel."""
+"""Test that an environment's model is read-only, but otherwise behaves like any MjModel."""
 
 import copy
 import pickle
@@ -31,13 +31,13 @@ EDITS: dict[str, Callable[[mujoco.MjModel], object]] = {
 
 @pytest.mark.parametrize("pickled", [False, True])
 @pytest.mark.parametrize("edit", EDITS.values(), ids=EDITS)
-def test_an_edit_is_refused(edit: Callable[[mujoco.MjModel], object], pickled: bool) -> None:
+def test_edit_of_the_model_raises_an_error(edit: Callable[[mujoco.MjModel], object], pickled: bool) -> None:
     model = read_only(mujoco.MjModel.from_xml_string(XML))
     if pickled:
         model = pickle.loads(pickle.dumps(model))
         assert type(model) is ReadOnlyModel
     own = r"^env\.model is read-only, .* in startup or randomize, or .* as model=$"
-    message = rf"{own}|^(assignment destination|output array) is read-only$"  # the second message is NumPy's
+    message = rf"{own}|^(assignment destination|output array) is read-only$"  # NumPy raises the second message
     with pytest.raises((AttributeError, ValueError), match=message):
         edit(model)
     assert (model.body_mass == mujoco.MjModel.from_xml_string(XML).body_mass).all()

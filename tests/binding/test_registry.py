@@ -40,7 +40,7 @@ def test_every_task_of_the_package_is_found_by_its_name() -> None:
         assert task_name(find_task(name)) == name
 
 
-def test_a_name_in_a_namespace_belongs_to_its_own_class_and_is_one_part_of_a_path() -> None:
+def test_task_name_with_a_namespace_finds_its_own_class_and_gives_a_valid_file_name() -> None:
     assert find_task("dm/humanoid_walk") is not find_task("humanoid_walk")
     assert file_name("dm/humanoid_walk") == "dm-humanoid_walk" and file_name("hopper") == "hopper"
     with pytest.raises(ValueError, match="no task 'dm/walker_wlk': did you mean dm/walker_walk"):
@@ -48,18 +48,18 @@ def test_a_name_in_a_namespace_belongs_to_its_own_class_and_is_one_part_of_a_pat
 
 
 @pytest.mark.parametrize("name", ["hopper.xml", "foo.bar", "./t", ""])
-def test_an_unknown_name_is_refused(name: str) -> None:
+def test_unknown_task_name_raises_an_error(name: str) -> None:
     with pytest.raises(ValueError, match="there is no task"):
         find_task(name)
 
 
-def test_a_misspelt_name_is_refused_with_similar_ones() -> None:
+def test_error_of_a_misspelt_task_name_suggests_similar_names() -> None:
     with pytest.raises(ValueError, match=r"no task 'hoper': did you mean hopper.* .*path/to/file.py"):
         find_task("hoper")
 
 
 @pytest.mark.parametrize("task", [3, None, lw.Env])
-def test_an_object_that_is_not_a_task_is_refused(task: object) -> None:
+def test_object_that_is_not_a_task_raises_an_error(task: object) -> None:
     with pytest.raises(ValueError, match=r"a task is a name, a file or a subclass of lw\.Task, not "):
         find_task(task)  # type: ignore[arg-type]
 
@@ -73,7 +73,7 @@ def test_a_registered_class_is_found_by_name(load: Load) -> None:
     assert find_task("registered_here") is module.RegisteredHere
 
 
-def test_a_name_used_by_another_file_or_the_package_is_refused(load: Load) -> None:
+def test_task_name_of_another_file_or_of_the_package_raises_an_error(load: Load) -> None:
     load("first_taker", "import lyceum_warp as lw\n@lw.register\nclass TakenHere(lw.Task):\n    pass\n")
     with pytest.raises(ValueError, match=r"'taken_here' is taken by first_taker.TakenHere: rename yours"):
         load("second_taker", "import lyceum_warp as lw\n@lw.register\nclass TakenHere(lw.Task):\n    pass\n")
@@ -85,17 +85,17 @@ def test_a_name_used_by_another_file_or_the_package_is_refused(load: Load) -> No
 # files
 
 
-def test_a_file_is_found_by_string_and_by_path(tmp_path: Path) -> None:
+def test_task_file_is_found_by_string_and_by_path(tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, tiny_task.TINY)
     assert find_task(file) is find_task(str(file)) is find_task(f"{file}:Tiny")
 
 
-def test_a_missing_file_is_named() -> None:
+def test_error_of_a_missing_task_file_names_the_file() -> None:
     with pytest.raises(FileNotFoundError, match=r"there is no task file 'nowhere/task\.py'"):
         find_task("nowhere/task.py")
 
 
-def test_one_of_several_tasks_of_a_file_must_be_named(tmp_path: Path) -> None:
+def test_file_with_several_tasks_raises_an_error_without_a_task_name(tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, f"{tiny_task.TINY}\nclass Other(Tiny):\n    pass\n")
     with pytest.raises(ValueError, match=r"has 2 tasks \(Tiny, Other\): name one of them, as .*tiny.py:Name"):
         find_task(file)
@@ -109,7 +109,7 @@ def test_a_file_without_a_task_is_refused(tmp_path: Path) -> None:
         find_task(tiny_task.write(tmp_path, "import lyceum_warp\n"))
 
 
-def test_two_files_may_register_tasks_of_one_name(tmp_path: Path) -> None:
+def test_two_files_may_register_tasks_with_equal_names(tmp_path: Path) -> None:
     files = []
     for folder, skip in (("a", 1), ("b", 2)):
         (tmp_path / folder).mkdir()

@@ -18,7 +18,8 @@ ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
 
 
 def stepped(env: lw.Env, steps: int = 12) -> list[dict[str, np.ndarray]]:
-    """Collect the states before and after each step, the action, the reward, the metrics and the end."""
+    """Collect the states before and after each step, the actions, rewards and metrics, and whether the episode
+    ended."""
     found = []
     generator = torch.Generator().manual_seed(0)
     for _ in range(steps):
@@ -33,7 +34,7 @@ def stepped(env: lw.Env, steps: int = 12) -> list[dict[str, np.ndarray]]:
 
 
 @ENGINES
-def test_rewards_metrics_and_ends_equal_their_formulas(engine: str) -> None:
+def test_rewards_metrics_and_terminations_equal_their_formulas(engine: str) -> None:
     env = lw.make(Terms, nworld=6, engine=engine, autoreset=False, seed=1)
     ended = np.zeros(6, dtype=bool)
     for s in stepped(env, 40):
@@ -55,7 +56,7 @@ def test_rewards_metrics_and_ends_equal_their_formulas(engine: str) -> None:
 
 
 @ENGINES
-def test_weights_are_set_like_parameters_also_per_world(engine: str) -> None:
+def test_weights_are_set_like_parameters_and_may_differ_between_worlds(engine: str) -> None:
     env, other = (lw.make(Terms, nworld=2, engine=engine, seed=1, **words) for words in ({}, {"near": 2.0, "fast": 0}))
     action = torch.ones((2, env.action_space.size))
     start = env.get_state()
@@ -76,7 +77,7 @@ def test_weights_are_set_like_parameters_also_per_world(engine: str) -> None:
 
 
 @ENGINES
-def test_a_rollout_has_the_rewards_of_steps(engine: str) -> None:
+def test_rollout_returns_the_rewards_of_separate_steps(engine: str) -> None:
     env = lw.make(Terms, nworld=3, engine=engine, autoreset=False, horizon=0, near=[1.0, 2.0, 3.0])
     loop = OpenLoop(lw.make(Terms, nworld=3, engine=engine, autoreset=False, near=[1.0, 2.0, 3.0]), 4)
     loop.state.copy_(env.get_state()[0])
@@ -90,13 +91,13 @@ def test_a_rollout_has_the_rewards_of_steps(engine: str) -> None:
         assert torch.equal(loop.terminated[t], env.terminated)
 
 
-def test_a_variant_with_other_weights_shares_the_kernels() -> None:
+def test_variant_with_other_weights_shares_the_kernels() -> None:
     plain, other = lw.make(Terms), lw.make(Ordered)
     assert plain.task.kernels is other.task.kernels
     assert (plain.task.params["near"], other.task.params["near"]) == (1.0, 3.0)
 
 
-def test_reward_text_calls_each_function_once() -> None:
+def test_printed_reward_formula_calls_each_function_once() -> None:
     text = lw.make(Terms).task.reward_text
     reward = text[text.index("def reward") : text.index("def score")]
     assert "    total = weights[0] * near_\n    total += weights[1] * fast_\n" in reward
@@ -111,7 +112,7 @@ TASK = "class Tiny(lw.Task):"
 
 
 def term(function: str, *lines: str, before: str = "") -> list[tuple[str, str]]:
-    """Make changes that add a function and lines of the class."""
+    """Make changes that add a function and lines to the task's source."""
     body = "\n".join(f"    {line}" for line in lines or ('rewards = {"upright": 1.0}',))
     return [(TASK, f"{before}@wp.func\n{function}\n\n{TASK}\n{body}")]
 
@@ -190,7 +191,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
 
 
 @pytest.mark.parametrize(("changes", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_in_a_term_raises_one_line_that_names_it(
+def test_invalid_term_raises_a_one_line_error_that_names_it(
     changes: list[tuple[str, str]], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=f"^{message}") as caught:
@@ -199,12 +200,12 @@ def test_a_mistake_in_a_term_raises_one_line_that_names_it(
 
 
 @ENGINES
-def test_a_task_with_terms_keeps_every_rule(engine: str) -> None:
+def test_task_with_terms_follows_all_rules(engine: str) -> None:
     quick = [check for check in CHECKS if check is not check_memory]
     assert not check_task(Terms, engine=engine, steps=40, checks=quick).unused
 
 
-def test_unused_fields_and_terms_are_named(tmp_path: Path) -> None:
+def test_check_task_reports_unused_fields_and_terms(tmp_path: Path) -> None:
     source = tiny_task.changed(
         *term(
             "def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):\n"
@@ -220,7 +221,7 @@ def test_unused_fields_and_terms_are_named(tmp_path: Path) -> None:
     assert str(report).endswith("unused: World.count is never read: remove it")
 
 
-def test_an_index_out_of_range_in_a_term_is_found(tmp_path: Path) -> None:
+def test_check_task_finds_an_index_out_of_range_in_a_term(tmp_path: Path) -> None:
     source = tiny_task.changed(*term("def upright(qpos: Row[float]) -> float:\n    return qpos[60] * 0.0"))
     with pytest.raises(AssertionError, match=r"upright reads qpos\[60\] out of range \(tiny\.py, line \d+\)"):
         check_task(tiny_task.write(tmp_path, source), engine="mujoco", steps=3, checks=[check_bounds])

@@ -1,4 +1,4 @@
-"""Test variants, which extend their parent's structs and run its functions over them."""
+"""Test variants of tasks, which extend the parent's structs and use its functions."""
 
 import subprocess
 import sys
@@ -19,7 +19,7 @@ ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
 
 
 @ENGINES
-def test_a_variant_has_its_parents_terms_and_its_own(engine: str) -> None:
+def test_variant_has_the_terms_of_its_parent_and_its_own(engine: str) -> None:
     parent, env = (lw.make(task, nworld=3, engine=engine, seed=2, horizon=0) for task in (Terms, Variant))
     assert env.task.params["target"] == 0.1 and env.task.params["border"] == parent.task.params["border"]
     assert list(env.state_space.parts)[-3:] == ["pushes", "work", "metrics"]
@@ -45,7 +45,7 @@ def test_variants_of_the_same_structs_share_kernels_and_do_not_change_their_pare
 
 
 @ENGINES
-def test_a_variant_keeps_every_rule(engine: str) -> None:
+def test_variant_follows_all_rules(engine: str) -> None:
     quick = [check for check in CHECKS if check is not check_memory]
     assert not check_task(Variant, engine=engine, steps=30, checks=quick).unused
 
@@ -110,7 +110,7 @@ def child(folder: Path, *changes: tuple[str, str]) -> Path:
     return tiny_task.write(folder, source, "child.py")
 
 
-def test_a_variant_in_a_file_replaces_a_helper_of_its_parents_functions(tmp_path: Path) -> None:
+def test_variant_in_a_file_replaces_a_helper_function_of_its_parent(tmp_path: Path) -> None:
     env = lw.make(child(tmp_path))
     parent = lw.make(tmp_path / "variant_parent.py")
     state = env.get_state()
@@ -121,7 +121,7 @@ def test_a_variant_in_a_file_replaces_a_helper_of_its_parents_functions(tmp_path
     assert (env.obs.item(), parent.obs.item()) == (1.25, 0.25)
 
 
-def test_a_variant_in_another_folder_has_its_parents_model_file(
+def test_variant_in_another_folder_finds_the_model_file_of_its_parent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ball = "<body><freejoint/><geom size='.1'/></body>"
@@ -151,13 +151,13 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize(("changes", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_in_a_variant_raises_one_line(changes: list[tuple[str, str]], message: str, tmp_path: Path) -> None:
+def test_invalid_variant_raises_a_one_line_error(changes: list[tuple[str, str]], message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         lw.make(child(tmp_path, *changes))
     assert "\n" not in str(caught.value)
 
 
-def test_an_error_in_a_copy_names_the_line_of_its_original(tmp_path: Path) -> None:
+def test_error_in_a_copied_function_names_the_line_of_the_original(tmp_path: Path) -> None:
     file = child(tmp_path)
     parent = tmp_path / "variant_parent.py"
     parent.write_text(PARENT.replace("scaled(s.qpos[p.place], s)", "scaled(s.qpos[p.place], s)\n\n").replace(
@@ -169,7 +169,7 @@ def test_an_error_in_a_copy_names_the_line_of_its_original(tmp_path: Path) -> No
 
 
 @pytest.mark.long
-def test_the_module_of_a_variant_has_the_same_hash_in_every_process() -> None:
+def test_kernel_module_of_a_variant_has_the_same_hash_in_every_process() -> None:
     program = (
         f"import sys; sys.path[:0] = {[str(Path(terms_task.__file__).parent)]}\n"
         "import lyceum_warp as lw\nfrom terms_variant import Variant\n"

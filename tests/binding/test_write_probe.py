@@ -24,7 +24,8 @@ ROWS = {
     "randomize": (11, 6, "qpos", "the model has 6"),
     "randomize of a stream": (12, 1, "rng", "a stream has 1"),
 }
-"""For each function: its number in the task, the size and the name of its row, and the declaration of that size."""
+"""By function: its number in the task, the size and the name of the row that it writes, and the declaration of that
+size."""
 
 PROGRAM = """
 import sys
@@ -41,7 +42,7 @@ for line in sys.stdin:
 """
 
 
-def test_writes_out_of_range_are_refused_and_leave_the_heap_intact() -> None:
+def test_writes_out_of_range_raise_an_error_before_they_damage_the_heap() -> None:
     cases, messages = [], []
     for name, (number, size, row, declared) in ROWS.items():
         function, into, of = name.split()[0], row and f" into {row}", row and f" of {row}"

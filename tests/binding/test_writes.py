@@ -1,4 +1,4 @@
-"""Analyse which arguments a Warp function writes."""
+"""Find the arguments that a Warp function writes."""
 
 import sys
 from typing import Any
@@ -110,7 +110,7 @@ def writes_forms(s: Forms, p: Params):
             own.element = s.of_a_local_struct
 
 
-def test_every_form_of_a_write_is_found() -> None:
+def test_all_kinds_of_writes_are_found() -> None:
     assert written_fields(writes_forms) == {*Forms.vars} - {"not_at_all"}
     assert {write.use for write in find_writes(writes_forms)} == {None}
 
@@ -167,7 +167,7 @@ def uses_rows(s: Uses, p: Params):
     row = s.before
     for i in range(int(p.gain)):
         if i > 0:
-            row[0] = 1.0  # from the second iteration on, the name means a different row
+            row[0] = 1.0  # from the second iteration on, the name refers to a different row
         row = s.after
     first, second = Uses(), Uses()
     first.before = s.in_a_struct
@@ -205,7 +205,7 @@ def reads_only(s: World, p: Params, obs: Row[float]):
     obs[2] = own[0] + vec7()[0] + wp.max(float(int(s.qpos[0])), 1.0)
 
 
-def test_reading_and_changing_a_copy_writes_only_results() -> None:
+def test_changing_a_copy_of_an_argument_counts_as_no_write() -> None:
     assert {write.target for write in find_writes(reads_only)} == {"obs"}
 
 
@@ -304,7 +304,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("name", "function", "message"), REFUSED.values(), ids=REFUSED)
-def test_a_write_that_the_task_form_forbids_raises_one_line(name: str, function: Any, message: str) -> None:
+def test_forbidden_write_in_a_task_raises_a_one_line_error(name: str, function: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         check_writes("mine", {name: function}, RIGHTS)
     assert "\n" not in str(caught.value)

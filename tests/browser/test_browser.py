@@ -1,4 +1,4 @@
-"""Test the viewer in a real browser: what a page shows, and how it responds to input."""
+"""Test in a real browser that the viewer's page draws the scene and responds to input."""
 
 import contextlib
 import http.server
@@ -37,7 +37,7 @@ pytestmark = pytest.mark.browser
 SECONDS = 120.0
 """Time limit for a page, in seconds; without a GPU a browser draws only a few frames per second."""
 INPUT_SECONDS = 6.0
-"""Seconds to wait for the effect of a key or a click, which a busy browser may lose."""
+"""Seconds to wait for the effect of a key or click before it is repeated; a busy browser may lose it."""
 VIEW = {"width": 1000, "height": 640}
 FLAGS = (
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
@@ -93,7 +93,7 @@ class Block(lw.Task):
 
 
 class WatchedWindow(Window):
-    """Stores the last frame and the user's commands, and sends a test's commands."""
+    """A viewer session that stores the last frame and the user's commands, and sends commands of the test."""
 
     def __init__(self, *given: Any) -> None:
         self.last: Frame | None = None
@@ -153,7 +153,7 @@ class Tab:
         return self
 
     def loaded_again(self) -> None:
-        """Wait until the page, which is open, has drawn the panel."""
+        """Wait until the open page has drawn the panel."""
         self.logs("First remote draw frame applied")
         self.frames(3)
 
@@ -172,10 +172,10 @@ class Tab:
                 self.page.wait_for_timeout(20)
             if done:
                 return
-        raise AssertionError("the page did not do it")
+        raise AssertionError("the page did not reach the expected state")
 
     def press(self, keys: str, until: Callable[[], Any]) -> None:
-        """Press keys, such as "Control+ArrowRight", long enough for the page to register each of them."""
+        """Press keys such as "Control+ArrowRight", each long enough for the page to notice it."""
 
         def act(attempt: int) -> None:
             names = keys.split("+")
@@ -196,7 +196,7 @@ class Tab:
             self.frames(1)
 
     def click_near(self, x: float, y: float, until: Callable[[], Any]) -> None:
-        """Click at a point of the panel, or slightly above or below it."""
+        """Click at a point of the panel, or slightly above or below this point."""
         self.repeat(lambda attempt: self.click(x, y + (0, 0, 20, -20, 0, 40, -40)[attempt % 7]), until)
 
     def release(self) -> None:
@@ -206,7 +206,7 @@ class Tab:
         self.frames(2)
 
     def place(self) -> float:
-        """Return the horizontal centre of the red block, from 0 to 1."""
+        """Return the horizontal position of the red block's centre, from 0 to 1."""
         self.frames(3)
         return red_place(self.page)
 
@@ -243,7 +243,7 @@ def browser(launch: Callable[[], Browser]) -> Iterator[Browser]:
 
 
 def new_context(browser: Browser) -> BrowserContext:
-    """Open a context without cookies, with pictures small enough for a machine without a GPU."""
+    """Open a browser context without cookies, with a window small enough for a machine without a GPU."""
     return browser.new_context(viewport=VIEW, device_scale_factor=0.25)  # type: ignore[arg-type]
 
 
@@ -275,7 +275,7 @@ def shared_tab(viewer: Viewer, browser: Browser) -> Iterator[Tab]:
 
 @pytest.fixture
 def tab(shared_tab: Tab) -> Tab:
-    """Return the page, paused in the mode "passive" at the first step of an episode."""
+    """Return a page that is paused in the mode "passive" at the first step of an episode."""
     viewer = shared_tab.viewer
     shared_tab.release()
     viewer.window.extra += [SetPaused(True), SetMode("passive"), Reset(random=False)]
@@ -300,7 +300,7 @@ def test_keys_and_buttons_pause_step_and_choose_a_controller(tab: Tab) -> None:
 
 
 @pytest.mark.long  # a double click needs frames within 0.3 s, so without a GPU it needs many attempts
-def test_a_body_is_pushed_by_dragging(tab: Tab) -> None:
+def test_dragging_a_body_pushes_it(tab: Tab) -> None:
     viewer = tab.viewer
     middle = tab.place()
     tab.press("Space", lambda: not viewer.status.paused)
@@ -323,7 +323,7 @@ def test_a_body_is_pushed_by_dragging(tab: Tab) -> None:
 
 
 @pytest.mark.long
-def test_an_episode_is_scrubbed_and_played(tab: Tab) -> None:
+def test_slider_and_play_button_show_a_recorded_episode(tab: Tab) -> None:
     viewer = tab.viewer
     viewer.window.extra += [SetMode("playback"), Seek(0), SetBackwards(False)]
     tab.wait(lambda: viewer.status.mode == "playback")
@@ -338,7 +338,7 @@ def test_an_episode_is_scrubbed_and_played(tab: Tab) -> None:
 
 
 @pytest.mark.long
-def test_the_page_has_a_title_and_links_to_new_files(tab: Tab, tmp_path: Path) -> None:
+def test_page_has_a_title_and_links_to_new_files(tab: Tab, tmp_path: Path) -> None:
     assert tab.page.title() == "block"
     assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{43}/", tab.page.url)  # without the token
     assert tab.page.evaluate("document.cookie") == ""
@@ -373,7 +373,7 @@ def test_a_recorded_page_plays_without_a_server(browser: Browser, tmp_path: Path
 
 
 @pytest.mark.long
-def test_another_browser_controls_after_one_is_closed_or_killed(
+def test_another_browser_gets_control_after_the_first_is_closed_or_killed(
     viewer: Viewer, launch: Callable[[], Browser], context: BrowserContext, shared_tab: Tab
 ) -> None:
     shared_tab.page.goto("about:blank")
@@ -395,7 +395,9 @@ def test_another_browser_controls_after_one_is_closed_or_killed(
 
 
 @pytest.mark.long
-def test_the_tab_in_front_controls_and_another_takes_over(viewer: Viewer, context: BrowserContext) -> None:
+def test_foreground_tab_controls_the_viewer_and_another_tab_can_take_over(
+    viewer: Viewer, context: BrowserContext
+) -> None:
     def controls(tab: Tab) -> None:
         paused = viewer.status.paused
         tab.press("Space", lambda: viewer.status.paused != paused)
@@ -411,7 +413,7 @@ def test_the_tab_in_front_controls_and_another_takes_over(viewer: Viewer, contex
 
 
 @pytest.mark.long
-def test_a_walking_robot_is_driven_by_keys(context: BrowserContext) -> None:
+def test_keys_set_the_command_of_a_walking_robot(context: BrowserContext) -> None:
     viewer = Viewer(Session(lw.make("go1_velocity"), seed=0))
     tab = Tab(context.new_page(), viewer).loaded()
     tab.press("Enter", lambda: viewer.status.driven)
@@ -460,7 +462,7 @@ def test_pages_of_other_sites_cannot_reach_the_viewer(viewer: Viewer, context: B
 
 @pytest.mark.long
 def test_ctrl_c_ends_the_command_and_closes_its_port(context: BrowserContext, tmp_path: Path) -> None:
-    # a shell makes its background jobs ignore Ctrl-C
+    # background jobs of a shell ignore Ctrl-C
     obey = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
     program = f"{obey}; import lyceum_warp.cli; sys.exit(lyceum_warp.cli.main())"
     command = [sys.executable, "-c", program, "view", "point_mass"]

@@ -12,7 +12,7 @@ def test_bench_lists_the_experiments(capfd: pytest.CaptureFixture[str]) -> None:
     assert "--short" in out and "lyceum-warp bench plot" in out
 
 
-def test_bench_passes_options_and_exit_code_of_a_program(capfd: pytest.CaptureFixture[str]) -> None:
+def test_bench_forwards_options_and_returns_the_exit_code_of_the_program(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "plot", "no_experiment"]) == 2
     assert capfd.readouterr().err.startswith("plot: there is no experiment 'no_experiment': ")
 
@@ -22,7 +22,7 @@ def test_bench_refuses_unknown_programs(capfd: pytest.CaptureFixture[str]) -> No
     assert "there is no program 'throughputs' in bench/: did you mean throughput?" in capfd.readouterr().err
 
 
-def test_bench_says_that_it_needs_a_checkout(
+def test_bench_without_a_checkout_prints_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("lyceum_warp.cli.bench.FOLDER", tmp_path / "bench")

@@ -28,7 +28,7 @@ def first(npg: lw.NPG) -> lw.Iteration:
 
 @contextlib.contextmanager
 def shown_on(console: Console, npg: lw.NPG, total: int = 10) -> Iterator[display.Display]:
-    """Return the display of a run that has printed its first line."""
+    """Return the display of a run after it has printed its first line."""
     shown = display.Display(console)
     with shown.training(Run(Path("run"), {}), npg, total):
         console.file.truncate(0)
@@ -36,7 +36,7 @@ def shown_on(console: Console, npg: lw.NPG, total: int = 10) -> Iterator[display
         yield shown
 
 
-def test_the_first_line_names_the_task_the_worlds_the_algorithm_and_the_folder(npg: lw.NPG) -> None:
+def test_first_line_names_task_worlds_algorithm_and_folder(npg: lw.NPG) -> None:
     console = Console(file=io.StringIO(), width=120, highlight=False)
     with display.Display(console).training(Run(Path("run"), {}), npg, 10):
         pass
@@ -57,7 +57,7 @@ def test_the_first_line_shows_the_reward_if_no_episode_has_ended(npg: lw.NPG, fi
     assert line(npg, first, reward_mean=-0.8125) == "iteration    1/10  reward -0.812 a step 29.4k samples/s\n"
 
 
-def test_a_line_shows_only_known_numbers(npg: lw.NPG, first: lw.Iteration) -> None:
+def test_iteration_line_omits_unknown_numbers(npg: lw.NPG, first: lw.Iteration) -> None:
     common = {"return_mean": 3072.4, "mean_return": 3117.2}
     assert line(npg, first, **common) == "iteration    1/10  return 3072 (mean policy 3117) 29.4k samples/s\n"
     assert "(mean policy 3117) success 25% 29.4k" in line(npg, first, **common, success=0.25)
@@ -67,7 +67,7 @@ def test_a_line_shows_only_known_numbers(npg: lw.NPG, first: lw.Iteration) -> No
 
 
 @pytest.mark.parametrize("changes", [{}, {"success": 0.25}, {"success": 1.0, "faults": 12_345, "outliers": 12_345}])
-def test_the_bar_fits_into_80_columns(npg: lw.NPG, first: lw.Iteration, changes: dict[str, object]) -> None:
+def test_progress_bar_fits_into_80_columns(npg: lw.NPG, first: lw.Iteration, changes: dict[str, object]) -> None:
     console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system=None)
     last = dataclasses.replace(first, iteration=100, return_mean=-123.4567, mean_return=-123.4567, **changes)
     with shown_on(console, npg, 100) as shown:
@@ -84,7 +84,7 @@ def table(rows: list[dict[str, float | None]], width: int = 80) -> str:
     return console.file.getvalue()
 
 
-def test_the_table_of_a_run_has_at_most_15_rows_with_evaluations_first() -> None:
+def test_final_table_has_at_most_15_rows_and_prefers_rows_with_evaluations() -> None:
     rows: list[dict[str, float | None]] = [{"iteration": float(i), "mean_return": None} for i in range(1, 101)]
     shown = [int(line) for line in table(rows).split()[2:]]
     assert len(shown) == 15 and (shown[0], shown[-1]) == (1, 100)
@@ -94,8 +94,8 @@ def test_the_table_of_a_run_has_at_most_15_rows_with_evaluations_first() -> None
     assert [line[0] for line in lines if line and line[0].isdigit()] == list(map(str, [1, *range(10, 101, 10)]))
 
 
-def test_the_table_omits_empty_columns(first: lw.Iteration) -> None:
-    row = first.row()  # HalfCheetah has no success, and no episode has ended
+def test_final_table_omits_empty_columns(first: lw.Iteration) -> None:
+    row = first.row()  # HalfCheetah defines no success, and no episode has ended
     shown = table([row])
     assert "reward" in shown and f"{first.reward_mean:.3g}" in shown
     assert not any(word in shown for word in ("success", "return", "policy"))
@@ -104,10 +104,10 @@ def test_the_table_omits_empty_columns(first: lw.Iteration) -> None:
     assert max(map(len, shown.splitlines())) <= 80
 
 
-def test_the_table_counts_faults_and_outliers_of_all_iterations(first: lw.Iteration) -> None:
+def test_final_table_counts_faults_and_outliers_of_all_iterations(first: lw.Iteration) -> None:
     row = first.row() | {"faults": 1.0, "outliers": 3.0}
     assert "2 faults and 6 outliers in all 2 iterations" in " ".join(table([row, row]).split())
-    assert "fault" not in table([first.row(), {"iteration": 2.0}])  # a row as an earlier release wrote it
+    assert "fault" not in table([first.row(), {"iteration": 2.0}])  # a row of an earlier release
 
 
 @pytest.mark.parametrize("width, absent", [(60, {"samples", "std"}), (80, set()), (40, {"samples", "std", "KL"})])
@@ -123,7 +123,7 @@ def test_a_narrow_terminal_shows_fewer_columns(width: int, absent: set[str], fir
 
 
 @pytest.mark.parametrize("width", [60, 80])
-def test_tables_wrap_their_first_column_and_omit_others(width: int) -> None:
+def test_narrow_tables_wrap_their_first_column_and_omit_others(width: int) -> None:
     names = ["evaluation at the end", "track_linear_velocity_of_the_base", "return"]
     columns = {"": names, **{name: ["-1.23457e-05"] * 3 for name in ("mean", "std", "min", "max")}}
     console = Console(file=io.StringIO(), width=width)

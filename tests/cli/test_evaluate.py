@@ -11,9 +11,9 @@ from training_runs import interrupted, refused, train
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.cli import display
 from lyceum_warp.controllers.saved_episodes import episode_env, load_episodes
 from lyceum_warp.runs.folder import load
+from lyceum_warp.viz import policy_videos
 from lyceum_warp.viz.cameras import find_camera
 
 
@@ -24,7 +24,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_a_run_from_a_gpu_is_evaluated_anywhere(
+def test_run_from_a_gpu_is_evaluated_on_a_cpu(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"
@@ -38,7 +38,7 @@ def test_a_run_from_a_gpu_is_evaluated_anywhere(
     assert "no device 'cuda:7'" in capsys.readouterr().err
 
 
-def test_eval_prints_statistics_of_the_seeds_episodes(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_eval_prints_statistics_of_the_episodes_of_its_seed(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     outputs = []
     for seed in ("7", "7", "8"):
         assert cli.main(["eval", str(trained), "--episodes", "3", "--seed", seed, "--nworld", "2"]) == 0
@@ -53,7 +53,7 @@ def test_eval_prints_statistics_of_the_seeds_episodes(trained: Path, capsys: pyt
     assert "success:" in lines
 
 
-def test_an_interrupted_evaluation_says_so(
+def test_interrupted_evaluation_prints_that_it_was_interrupted(
     trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(lw.Env, "step", lambda env: signal.raise_signal(signal.SIGINT))
@@ -61,7 +61,9 @@ def test_an_interrupted_evaluation_says_so(
     assert "interrupted by SIGINT before the episodes were complete" in capsys.readouterr().err
 
 
-def test_other_physics_do_not_count_as_a_changed_model(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_eval_with_other_physics_prints_no_warning_about_a_changed_model(
+    trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["eval", str(trained), "--episodes", "2", "--integrator", "implicitfast"]) == 0
     assert "has changed" not in "".join(capsys.readouterr())
 
@@ -75,15 +77,13 @@ def test_eval_refuses_zero_episodes_and_folders_without_a_run(
     refused(capsys, "there is no run in")
 
 
-def test_a_folder_name_may_look_like_rich_markup(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_folder_name_may_contain_rich_markup(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = Path(shutil.copytree(trained, tmp_path / "[" / "bold]x"))
     assert cli.main(["eval", str(run), "--episodes", "1"]) == 0
     assert f"1 episodes of the mean policy in {run}" in capsys.readouterr().out
 
 
-def test_the_evaluated_episodes_are_saved(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_eval_saves_the_evaluated_episodes(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, options = tmp_path / "episodes", ["--episodes", "3", "--nworld", "2", "--seed", "7"]
     assert cli.main(["eval", str(trained), *options, "--episodes-to", str(out)]) == 0
     shown = capsys.readouterr().out
@@ -102,7 +102,7 @@ def test_the_evaluated_episodes_are_saved(trained: Path, tmp_path: Path, capsys:
     refused(capsys, f"{out} exists and is not an empty folder: use another folder")
 
 
-def test_a_video_is_made_with_the_camera_that_is_named(
+def test_video_is_made_with_the_named_camera(
     trained: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("imageio_ffmpeg")
@@ -112,7 +112,7 @@ def test_a_video_is_made_with_the_camera_that_is_named(
         cameras.append(find_camera(env.model, options["camera"]))
         return path
 
-    monkeypatch.setattr(display, "write_video", write_video)
+    monkeypatch.setattr(policy_videos, "write_video", write_video)
     for words in (["0"], ["free"], ["azimuth=30", "track=agent"]):
         flags = [flag for word in words for flag in ("--camera", word)]
         assert cli.main(["eval", str(trained), "--episodes", "1", "--horizon", "9", "--video", *flags]) == 0

@@ -40,7 +40,7 @@ def test_export_writes_to_the_given_path(run: Path, tmp_path: Path) -> None:
         (["--which", "best"], ["best"]),
     ],
 )
-def test_export_refuses_bad_input_in_one_line(
+def test_invalid_input_of_export_prints_one_line(
     run: Path, options: list[str], words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["export", str(run), *options]) == 2

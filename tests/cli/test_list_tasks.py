@@ -17,7 +17,7 @@ INSTALL = "pip install 'lyceum-warp[hand]'"
 
 
 def rows(out: str) -> dict[str, list[str]]:
-    """Return the words of each task's row, by task name. Descriptions and notes are indented lines."""
+    """Return the words in each task's row as a dict from task names. Descriptions and notes are indented lines."""
     table, _, legend = out.partition("\n\n")
     assert legend.startswith("obs, act: ")
     heading, *lines = table.splitlines()
@@ -53,7 +53,7 @@ def test_tasks_are_listed_with_their_sizes_and_models(capsys: pytest.CaptureFixt
     assert "    hop forward on one leg (Gymnasium's Hopper-v5) (physics: fast)" in out.splitlines()
 
 
-def test_on_a_narrow_terminal_models_are_listed_below_the_numbers(
+def test_narrow_terminal_lists_models_below_the_numbers(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(list_tasks, "make_console", lambda: Console(width=60, highlight=False))
@@ -63,7 +63,7 @@ def test_on_a_narrow_terminal_models_are_listed_below_the_numbers(
     assert "model: gymnasium-robotics [hand]" in " ".join(table.split())
 
 
-def test_listed_sizes_equal_an_environments(capsys: pytest.CaptureFixture[str]) -> None:
+def test_listed_sizes_equal_the_sizes_of_an_environment(capsys: pytest.CaptureFixture[str]) -> None:
     cli.main(["tasks", "gymnasium"])
     found = rows(capsys.readouterr().out)
     for name in ("hopper", "humanoid", "pusher"):
@@ -76,7 +76,7 @@ def test_listed_sizes_equal_an_environments(capsys: pytest.CaptureFixture[str]) 
     ("word", "found", "other"),
     [("walker", "walker2d", "reach"), ("HOP", "hopper", "reach"), ("[hand]", "adroit_pen", "hopper")],
 )
-def test_a_word_selects_by_name_description_and_model(
+def test_search_word_selects_tasks_by_name_description_or_model(
     word: str, found: str, other: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["tasks", word]) == 0
@@ -84,7 +84,7 @@ def test_a_word_selects_by_name_description_and_model(
     assert found in listed and other not in listed
 
 
-def test_a_word_without_matching_tasks_raises_a_one_line_error(capsys: pytest.CaptureFixture[str]) -> None:
+def test_search_word_without_matching_tasks_prints_a_one_line_error(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["tasks", "submarine"]) == 2
     refused(capsys, "'submarine'", "lyceum-warp tasks")
 
@@ -112,7 +112,7 @@ def test_a_task_with_a_missing_extra_is_listed_without_its_sizes(
         (7, "obs of the task 'hopper' is 7: add the parts of its observation"),
     ],
 )
-def test_a_broken_task_is_listed_with_its_mistake(
+def test_broken_task_is_listed_with_its_error(
     broken: object, shown: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(find_task("hopper"), "obs", broken)

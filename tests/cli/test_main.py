@@ -31,7 +31,7 @@ def help_of(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     with pytest.raises(SystemExit) as ended:
         cli.main(words)
     assert ended.value.code == 0
-    return capsys.readouterr().out.replace("│", " ")  # boxes have no sides on some terminals
+    return capsys.readouterr().out.replace("│", " ")  # some terminals draw boxes without sides
 
 
 def test_help_describes_the_usual_options_and_help_all_describes_all(
@@ -60,7 +60,7 @@ def test_help_describes_the_usual_options_and_help_all_describes_all(
     ("view hopper --zzz=1", "view has no option --zzz: lyceum-warp view --help-all lists the options"),
     ("train hopper walker2d", "train does not take the argument 'walker2d': see lyceum-warp train --help"),
 ])  # fmt: skip
-def test_a_misspelt_command_or_option_is_one_line_with_a_suggestion(
+def test_misspelt_command_or_option_prints_one_line_with_a_suggestion(
     words: str, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(words.split()) == 2
@@ -68,7 +68,7 @@ def test_a_misspelt_command_or_option_is_one_line_with_a_suggestion(
 
 
 @pytest.mark.parametrize("option", ["--help", "--version"])
-def test_help_and_version_load_neither_torch_nor_warp_nor_mujoco(option: str) -> None:
+def test_help_and_version_do_not_import_torch_warp_or_mujoco(option: str) -> None:
     program = f"""
 import contextlib, sys
 from lyceum_warp.cli import main
@@ -83,13 +83,13 @@ print(*sys.modules, file=sys.stderr)
     assert not {"torch", "warp", "mujoco"} & loaded
 
 
-def test_a_wrong_value_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_flag_value_prints_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         cli.main(["train", "hopper", "--samples", "many"])
     assert ended.value.code == 2
     assert "--samples" in capsys.readouterr().err
 
 
-def test_version_prints_the_packages_version(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_prints_the_package_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out == f"lyceum-warp {lw.__version__}\n"

@@ -1,4 +1,4 @@
-"""Test lyceum-warp new: it writes a task file for any model, and refuses unsuitable models and names."""
+"""Test lyceum-warp new, which writes a task file for any model, and rejects unsuitable models and names."""
 
 import importlib.util
 import re
@@ -42,7 +42,7 @@ SENSED = text(
 )
 """A model whose sensors measure every joint and the motion of the floating body."""
 
-# without the slow checks that do not depend on the model
+# all checks except slow ones that do not depend on the model
 QUICK_CHECKS = tuple(check for check in CHECKS if check not in (episodes.check_memory, indices.check_bounds))
 
 
@@ -65,7 +65,7 @@ def new(name: str, xml: str) -> Path:
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_a_new_task_keeps_the_rules_on_both_engines(engine: str, folder: Path) -> None:
+def test_new_task_follows_the_rules_on_both_engines(engine: str, folder: Path) -> None:
     file = new("everything", RICH)
     check_task(str(file), engine=engine, nworld=2, horizon=6, frame_skip=1, checks=MODEL_CHECKS)
 
@@ -86,7 +86,7 @@ def test_a_new_task_observes_the_state_and_the_sensors_that_measure_it(folder: P
     assert env.reward.tolist() == [0.0, 0.0]
 
 
-def test_a_model_whose_sensors_measure_every_joint_is_observed_only_through_them(folder: Path) -> None:
+def test_new_task_observes_only_sensors_if_they_measure_every_joint(folder: Path) -> None:
     task = find_task(new("sensed", SENSED))
     assert task.obs == {"sensors": 7}
     unsensed = SENSED.replace('<gyro site="imu"/>', '<gyro site="end"/>')  # no sensor measures the floating body
@@ -95,7 +95,7 @@ def test_a_model_whose_sensors_measure_every_joint_is_observed_only_through_them
 
 @pytest.mark.parametrize("model", [*MOVING.values(), *SENSING.values(), *PLUGINS.values()],
                          ids=[*MOVING, *SENSING, *PLUGINS])  # fmt: skip
-def test_any_model_gets_a_task_that_fits_it(model: str, folder: Path) -> None:
+def test_new_task_for_any_model_has_matching_sizes(model: str, folder: Path) -> None:
     task = BoundTask(find_task(new("walk", model)))
     sizes = {"position": task.model.nq, "velocity": task.model.nv, "activation": task.model.na}
     found = dict(task.obs_layouts["policy"])
@@ -107,13 +107,14 @@ def test_any_model_gets_a_task_that_fits_it(model: str, folder: Path) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("model", [*MOVING.values(), *SENSING.values()], ids=[*MOVING, *SENSING])
-def test_a_new_task_for_any_model_keeps_the_rules(model: str, engine: str, folder: Path) -> None:
+def test_new_task_for_any_model_follows_the_rules(model: str, engine: str, folder: Path) -> None:
     file = new("walk", model)
     check_task(str(file), engine=engine, nworld=2, steps=10, horizon=6, frame_skip=2, checks=QUICK_CHECKS)
 
 
 def package_models() -> list[Path]:
-    """Models that gymnasium, dm_control and MuJoCo Warp ship, except those without actuators or without their files."""
+    """Return the models in gymnasium, dm_control and MuJoCo Warp, except for models without actuators or with missing
+    files."""
     folders = {"gymnasium": "envs/mujoco/assets", "dm_control": "suite", "mujoco_warp": "test_data"}
     found: list[Path] = []
     for package, within in folders.items():
@@ -125,7 +126,7 @@ def package_models() -> list[Path]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("model", package_models(), ids=lambda path: f"{path.parent.name}-{path.stem}")
-def test_a_new_task_for_a_packages_model_keeps_the_rules(model: Path, folder: Path) -> None:
+def test_new_task_for_a_model_of_another_package_follows_the_rules(model: Path, folder: Path) -> None:
     assert cli.main(["new", "walk", "--model", str(model)]) == 0
     check_task("walk.py", engine="mujoco", nworld=2, steps=10, horizon=6, frame_skip=2, checks=QUICK_CHECKS)
 
@@ -159,7 +160,7 @@ def test_new_files_are_formatted(folder: Path) -> None:
         assert done.returncode == 0, done.stdout
 
 
-def test_the_models_path_is_written_relative_to_the_task_file(folder: Path) -> None:
+def test_model_path_is_written_relative_to_the_task_file(folder: Path) -> None:
     for made in ("models", "tasks"):
         Path(made).mkdir()
     model = Path("models", "robot.xml")
@@ -172,7 +173,7 @@ def test_the_models_path_is_written_relative_to_the_task_file(folder: Path) -> N
         assert BoundTask(find_task(file)).model.nu == 1
 
 
-def test_a_model_of_a_package_or_of_menagerie_is_named_by_its_source(
+def test_model_of_a_package_or_of_menagerie_is_loaded_from_its_source(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     robot = Path("checkout", "leg", "scene.xml")
@@ -256,7 +257,7 @@ def test_an_invalid_model_raises_a_one_line_error(
     assert not Path("walk.py").exists()
 
 
-def test_names_that_need_quoting_are_written_as_they_are(folder: Path) -> None:
+def test_model_names_with_special_characters_are_quoted(folder: Path) -> None:
     xml = text(ARM.replace('name="tip"', 'name="a &quot;tip&quot;"'), actuated('<motor joint="hinge"/>'))
     Path('my "{robot}".xml').write_text(xml.replace('<site name="here" pos="0 0 2"/>', ""))
     assert cli.main(["new", "walk", "--model", 'my "{robot}".xml']) == 0

@@ -45,13 +45,14 @@ SLED = """
   </actuator>
 </mujoco>
 """
-"""Two legs with boxes as feet, in bodies without joints, and a tail. The order of the actuators differs from the order
-of the joints."""
+"""A robot with two legs and a tail; its feet are boxes in bodies without joints. The order of the actuators differs
+from the order of the joints."""
 
 
 @pytest.fixture
 def folder(pytestconfig: pytest.Config, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty current folder, the same in every run of the tests, so that Warp finds compiled kernels in its cache."""
+    """Change to an empty folder that has the same path in every run of the tests, so that Warp finds compiled
+    kernels."""
     assert pytestconfig.cache is not None
     folder: Path = pytestconfig.cache.mkdir("new_velocity")
     for file in folder.iterdir():
@@ -67,7 +68,7 @@ def new(*words: str) -> int:
 
 
 @pytest.mark.long
-def test_the_file_of_a_robot_is_short_and_its_task_keeps_the_rules(folder: Path) -> None:
+def test_new_velocity_file_is_short_and_its_task_follows_the_rules(folder: Path) -> None:
     assert new("ant_walk", "--model", "gymnasium:ant.xml") == 0
     text = Path("ant_walk.py").read_text()
     assert len(text.splitlines()) < 60 and max(map(len, text.splitlines())) <= 120
@@ -79,7 +80,7 @@ def test_the_file_of_a_robot_is_short_and_its_task_keeps_the_rules(folder: Path)
     assert len(env.task.params["feet"]) == 4
 
 
-def test_motors_become_servos_that_hold_the_pose(folder: Path) -> None:
+def test_motors_are_replaced_by_servos_that_hold_the_pose(folder: Path) -> None:
     assert new("ant_walk", "--model", "gymnasium:ant.xml") == 0
     env = lw.make("ant_walk.py", nworld=2, push_seconds=(1e6, 1e6))
     for _ in range(100):
@@ -90,7 +91,7 @@ def test_motors_become_servos_that_hold_the_pose(folder: Path) -> None:
     assert env.obs_groups["critic"][:, -16:-12].all(), "all feet touch the ground"
 
 
-def test_a_robot_learns_for_an_iteration(folder: Path, tmp_path: Path) -> None:
+def test_ppo_trains_a_new_velocity_task_for_an_iteration(folder: Path, tmp_path: Path) -> None:
     assert new("ant_walk", "--model", "gymnasium:ant.xml") == 0
     words = ["--algorithm", "ppo", "--nworld", "4", "--iterations", "1", "--num-steps", "4", "--mean-every", "0",
              "--horizon", "20", "--no-transfer"]  # fmt: skip
@@ -98,7 +99,7 @@ def test_a_robot_learns_for_an_iteration(folder: Path, tmp_path: Path) -> None:
 
 
 def test_feet_and_joints_are_found_on_the_legs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """New sites are at the centres of the soles; an existing site is kept; other joints keep their pose."""
+    """New sites are at the centres of the soles, an existing site is reused, and other joints keep their pose."""
     assert new("sled_walk", "--model", "sled.xml") == 0
     assert capsys.readouterr().out.startswith("sled_walk.py: feet foot_1, toe; joints left_hip, right_hip; check")
     env = lw.make("sled_walk.py", nworld=1, **{"push_seconds": (1e6, 1e6), "sliding_friction": (1.0, 1.0)})
@@ -111,7 +112,7 @@ def test_feet_and_joints_are_found_on_the_legs(folder: Path, capsys: pytest.Capt
     assert issubclass(find_task("sled_walk.py"), lw.Task) and find_task("sled_walk.py").rewards["single_stance"] > 0
 
 
-def test_options_name_feet_and_joints(folder: Path) -> None:
+def test_options_feet_and_joints_select_feet_and_joints(folder: Path) -> None:
     assert new("sled_stand", "--model", "sled.xml", "--feet", "left_shin", "toe", "--joints", "left_hip") == 0
     params = lw.make("sled_stand.py").task
     assert [params.model.site(i).name for i in params.params["feet"]] == ["left_shin_foot", "toe"]
@@ -132,7 +133,7 @@ def test_options_name_feet_and_joints(folder: Path) -> None:
          "(tendon actuators do not count)"),
     ],
 )  # fmt: skip
-def test_a_robot_without_legs_is_refused(
+def test_robot_without_legs_prints_an_error(
     folder: Path, change: tuple[str, str], options: list[str], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("sled.xml").write_text(SLED.replace(*change) if change else SLED)
@@ -140,13 +141,14 @@ def test_a_robot_without_legs_is_refused(
     assert words in " ".join(capsys.readouterr().err.split()) and not Path("sled_walk.py").exists()
 
 
-def test_feet_without_the_template_are_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_option_feet_without_the_template_prints_an_error(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["new", "sled_walk", "--model", "sled.xml", "--feet", "toe"]) == 2
     assert "--feet and --joints belong to --template velocity" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("task", ["spot_velocity", pytest.param("g1_velocity", marks=pytest.mark.long)])
-def test_robots_of_menagerie_become_tasks(task: str, folder: Path) -> None:
+@pytest.mark.quick("spot_velocity")
+@pytest.mark.parametrize("task", ["spot_velocity", "g1_velocity"])
+def test_new_velocity_accepts_robots_of_menagerie(task: str, folder: Path) -> None:
     model = {"g1_velocity": "unitree_g1/scene_mjx.xml", "spot_velocity": "boston_dynamics_spot/scene.xml"}[task]
     assert new("walk", "--model", f"menagerie:{model}") == 0
     found, own = lw.make("walk.py").task, lw.make(task).task

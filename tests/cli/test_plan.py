@@ -28,20 +28,20 @@ def plan(out: Path, *options: str, task: str = "point_mass") -> int:
     return cli.main(["plan", task, "--out", str(out), *SMALL, *options])
 
 
-def test_no_episode_begins_after_the_time_limit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_starts_no_episode_after_the_time_limit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     assert plan(out, *QUIET, "--steps", "3", "--episodes", "3", "--minutes", "1e-9") == 0
     assert "1e-09 minutes are over after 1 of 3 episodes" in capsys.readouterr().out
     assert [file.name for file in out.glob("*.npz")] == ["episode-000.npz"]
 
 
-def test_a_folder_name_may_look_like_rich_markup(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_folder_name_may_contain_rich_markup(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "[" / "bold]x"
     assert plan(out, "--steps", "2", "--no-video", "--no-plot") == 0
     assert f"files in {out}" in capsys.readouterr().out
 
 
-def test_a_run_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     assert plan(out, "--episodes", "2", "--seed", "3", "--no-video") == 0
     shown = capsys.readouterr().out
@@ -54,7 +54,8 @@ def test_a_run_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.Captu
     assert config["planner"]["horizon"] == 10 and config["planner"]["noise"] == 0.3 and config["seed"] == 3
     report = json.loads((out / "report.json").read_text())
     assert report["episodes"] == 2 and report["steps"] == 80
-    with np.load(out / "episode-001.npz", allow_pickle=False) as file:  # a user without this package can read it, too
+    # a user without this package can also read the file
+    with np.load(out / "episode-001.npz", allow_pickle=False) as file:
         assert file["actions"].shape == (40, 2) and file["rewards"].shape == (40,)
     # the same controller, called from Python, gives the same episode
     env = lw.make("point_mass", autoreset=False, horizon=40)
@@ -63,9 +64,7 @@ def test_a_run_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.Captu
     assert torch.equal(again.states, Trajectory.load(out / "episode-001.npz").states)
 
 
-def test_a_planner_uses_the_suggested_physics_unless_others_are_given(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_planner_uses_the_suggested_physics_by_default(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, flags, timestep in (("fast", [], 0.015), ("exact", ["--physics", "exact"], None)):
         small = ["--steps", "2", "--horizon", "2", *QUIET, *flags]
         assert plan(tmp_path / name, *small, task="humanoid") == 0
@@ -87,7 +86,7 @@ def test_a_planner_uses_the_suggested_physics_unless_others_are_given(
 
 
 @pytest.mark.long
-def test_a_video_is_made_of_the_first_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_makes_a_video_of_the_first_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(tmp_path / "run", "--no-plot", "--steps", "12", "--camera", "azimuth=20", "--camera", "track=1") == 0
     lines = capsys.readouterr().out.splitlines()
     video = next(line for line in lines if line.startswith("video:")).split(maxsplit=1)[1]
@@ -96,20 +95,20 @@ def test_a_video_is_made_of_the_first_episode(tmp_path: Path, capsys: pytest.Cap
     assert Path(video).read_bytes()[4:8] == b"ftyp"
 
 
-def test_real_time_keeps_the_rate_of_the_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plant_keeps_its_rate_with_real_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(tmp_path / "run", *QUIET, "--real-time") == 0
     assert "async" in capsys.readouterr().out
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["mode"] == "async" and report["deadline_ms"] == pytest.approx(20.0)
-    assert 0.5 < report["real_time_factor"] < 1.01  # 40 steps of 20 ms; a busy machine may be late
+    assert 0.5 < report["real_time_factor"] < 1.01  # the 40 steps take 20 ms each, and a busy machine may be slower
 
 
 def measured_by(microseconds: float) -> Any:
-    """Replace a measurement by planning times that are proportional to the samples and the horizon of a planner."""
+    """Return a function that replaces the measurement; its planning times are proportional to samples and horizon."""
     return lambda plant, planner: 1e-6 * microseconds * planner.samples * planner.horizon
 
 
-def test_real_time_chooses_only_settings_that_are_not_given(
+def test_real_time_leaves_given_settings_unchanged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plan_command, "planning_time", measured_by(30.0))
@@ -165,7 +164,7 @@ def test_real_time_shortens_the_horizon_and_replans_less_often(
     assert (planner["knots"], planner["timestep"]) == (settings["knots"] // 2, 0.015)
 
 
-def test_a_value_function_of_a_run_changes_plans(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_value_function_of_a_run_changes_the_plans(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "npg"
     assert cli.main(["train", "point_mass", "--out", str(run), *TINY, *QUIET, "--iterations", "1"]) == 0
     assert plan(tmp_path / "with", *QUIET, "--value", str(run), "--discount", "0.97") == 0
@@ -182,7 +181,7 @@ def test_a_value_function_of_a_run_changes_plans(tmp_path: Path, capsys: pytest.
     refused(capsys, f"--value {run} is a run of the task 'point_mass', not of 'reach'")
 
 
-def test_a_planner_param_changes_only_the_planner(tmp_path: Path) -> None:
+def test_planner_param_changes_only_the_planner_worlds(tmp_path: Path) -> None:
     options = ["--param", "success_distance=0.2", "--planner-param", "success_distance=0.1"]
     assert plan(tmp_path / "run", *QUIET, *options) == 0
     config = json.loads((tmp_path / "run" / "config.json").read_text())
@@ -194,7 +193,7 @@ def test_a_planner_param_changes_only_the_planner(tmp_path: Path) -> None:
     ([], "euler", mujoco.mjtIntegrator.mjINT_EULER),  # the task's planning sets this parameter
     (["--integrator", "implicitfast"], "implicitfast", mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
 ])  # fmt: skip
-def test_physics_options_change_only_the_planner(
+def test_physics_options_change_only_the_planner_worlds(
     options: list[str], name: str, integrator: int, tmp_path: Path, made_envs: list[lw.Env]
 ) -> None:
     out = tmp_path / "run"
@@ -210,7 +209,7 @@ def test_physics_options_change_only_the_planner(
     assert (settings["integrator"], settings["deterministic"]) == (name, True)
 
 
-def test_every_update_is_saved_and_printed_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_name_of_each_plan_update_is_saved_and_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flags = ["--knots", "4", "--spline", "linear", "--include-plan", "--replan-every", "3", "--steps", "9"]
     shown = {
         ("cem", "--elites", "3", "--min-noise", "0.02"): "CEM, 8 samples",
@@ -258,7 +257,7 @@ def test_every_update_is_saved_and_printed_by_name(tmp_path: Path, capsys: pytes
     (["--camera", "track=elbow"], ["the camera cannot track the body 'elbow'"]),
     (["--no-video", "--camera", "0"], ["--camera has no effect with --no-video"]),
 ])  # fmt: skip
-def test_an_option_out_of_range_prints_one_line_and_leaves_no_folder(
+def test_option_out_of_range_prints_one_line_and_makes_no_folder(
     options: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert plan(tmp_path / "run", *options) == 2
@@ -266,7 +265,7 @@ def test_an_option_out_of_range_prints_one_line_and_leaves_no_folder(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_folder_that_is_not_empty_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_output_folder_that_is_not_empty_prints_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "thesis.tex").write_text("")
     assert plan(tmp_path / "run") == 2
@@ -276,7 +275,7 @@ def test_a_folder_that_is_not_empty_is_refused(tmp_path: Path, capsys: pytest.Ca
     assert "--resume" not in (error := capsys.readouterr().err) and "contains a run: use another folder" in error
 
 
-def test_an_interrupt_keeps_complete_episodes(
+def test_complete_episodes_are_saved_after_an_interrupt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     steps = []
@@ -297,7 +296,7 @@ def test_an_interrupt_keeps_complete_episodes(
 
 
 @pytest.mark.parametrize("mode", [[], ["--real-time"]])
-def test_an_interrupt_keeps_the_interrupted_episode(
+def test_interrupted_episode_is_saved(
     mode: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def third(display: PlanDisplay, now: lw.ControlProgress) -> None:
@@ -318,12 +317,12 @@ def test_an_interrupt_keeps_the_interrupted_episode(
 @pytest.mark.parametrize(
     ("words", "fill"), [(["-0.5"], -0.5), (["-0.5", "0.25"], [-0.5, 0.25]), (["repeat"], "repeat")]
 )
-def test_fill_is_a_word_or_one_number_or_an_action(words: list[str], fill: object, tmp_path: Path) -> None:
+def test_fill_accepts_a_word_a_number_or_an_action(words: list[str], fill: object, tmp_path: Path) -> None:
     assert plan(tmp_path / "run", *QUIET, "--steps", "1", "--fill", *words) == 0
     assert json.loads((tmp_path / "run" / "config.json").read_text())["planner"]["fill"] == fill
 
 
-def test_settings_default_to_the_tasks(tmp_path: Path) -> None:
+def test_planner_settings_default_to_those_of_the_task(tmp_path: Path) -> None:
     argv = ["plan", "reach", "--out", str(tmp_path / "run"), *QUIET, "--steps", "1", "--samples", "7"]
     assert (
         cli.main([*argv, "--noise", "0.3", "0.4", "0.5", "0.6", "0.7", "0.8", "0.9", "--smoothing", "1", "0", "0"]) == 0
@@ -333,7 +332,7 @@ def test_settings_default_to_the_tasks(tmp_path: Path) -> None:
     assert settings["noise"] == [0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9] and settings["smoothing"] == [1, 0, 0]
 
 
-def test_every_setting_has_a_flag() -> None:
+def test_every_planner_setting_has_a_flag() -> None:
     flags = [field.name for field in dataclasses.fields(Settings)]
     assert flags == [field.name for field in dataclasses.fields(lw.MPPIConfig)]
     assert Settings().on_top_of(lw.MPPIConfig(horizon=3)) == lw.MPPIConfig(horizon=3)
@@ -341,7 +340,7 @@ def test_every_setting_has_a_flag() -> None:
     assert given.on_top_of(lw.MPPIConfig(samples=3)) == lw.MPPIConfig(samples=3, noise=0.25, fill=0.5, horizon=4)
 
 
-def test_a_parameter_with_the_name_of_a_setting_is_given_by_param(task_file: TaskFile, tmp_path: Path) -> None:
+def test_param_sets_a_task_parameter_with_the_name_of_a_setting(task_file: TaskFile, tmp_path: Path) -> None:
     origin = Path(inspect.getfile(find_task("point_mass")))
     source = origin.read_text().replace('"point_mass.xml"', repr(str(origin.with_name("point_mass.xml"))))
     source = source.replace("@lw.register\n", "").replace("success_distance", "temperature")
@@ -353,14 +352,14 @@ def test_a_parameter_with_the_name_of_a_setting_is_given_by_param(task_file: Tas
     assert Trajectory.load(tmp_path / "run" / "episode-000.npz").params["temperature"] == 0.5
 
 
-def test_nthread_sets_the_planners_threads(tmp_path: Path, made_envs: list[lw.Env]) -> None:
+def test_nthread_sets_the_number_of_planner_threads(tmp_path: Path, made_envs: list[lw.Env]) -> None:
     assert plan(tmp_path / "run", *QUIET, "--steps", "1", "--nthread", "2", "--engine", "mujoco") == 0
     assert [env.options.nthread for env in made_envs] == [1, 2]
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert (config["engine"], config["device"], config["nthread"]) == ("mujoco", "cpu", 2)
 
 
-def test_the_live_display_shows_the_real_time_factor_or_the_age(capsys: pytest.CaptureFixture[str]) -> None:
+def test_live_display_shows_the_real_time_factor_or_the_age_of_actions(capsys: pytest.CaptureFixture[str]) -> None:
     now = lw.ControlProgress(10, 0.5, 1.0, 2.0, True, 0.01, 0.03, plans=6)
     for real_time, words in ((False, "20 Hz 0.40x real time"), (True, "10 plans/s action 30 ms old")):
         with PlanDisplay(Console(force_terminal=True, width=120), 0, 1, 20, 0.02, real_time=real_time) as display:

@@ -19,13 +19,12 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.binding.registry import find_task
-from lyceum_warp.cli import display
 from lyceum_warp.cli.algorithms import Hyperparameters
 from lyceum_warp.cli.arguments import given
 from lyceum_warp.cli.train import EnvFlags, Train
 from lyceum_warp.runs.configuration import ALGORITHMS, Configuration
 from lyceum_warp.runs.folder import Run, load
-from lyceum_warp.viz import drawing
+from lyceum_warp.viz import policy_videos
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +34,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_metrics_of_a_task_are_columns_also_after_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_task_metrics_are_columns_before_and_after_resuming(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     metered, out = str(Path(__file__).parent.parent / "metered_task.py"), tmp_path / "run"
     assert train(out, "--iterations", "1", task=metered) == 0
     assert cli.main(["train", "--resume", str(out), "--iterations", "2", *QUIET]) == 0
@@ -48,7 +47,7 @@ def test_metrics_of_a_task_are_columns_also_after_resume(tmp_path: Path, capsys:
     assert " forward " in printed and " effort " in printed
 
 
-def test_a_task_file_is_trained_and_evaluated(
+def test_train_and_eval_accept_a_task_file(
     task_file: TaskFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     origin = Path(inspect.getfile(find_task("point_mass")))
@@ -71,30 +70,29 @@ def test_a_task_file_is_trained_and_evaluated(
     rows = metrics(out)
     assert [row["iteration"] for row in rows] == ["1", "2"]
     assert [bool(row["mean_return"]) for row in rows] == [False, True]
-    monkeypatch.chdir("/")  # the task is found from another working directory, too
+    monkeypatch.chdir("/")  # the task is also found from another working directory
     assert cli.main(["eval", str(tmp_path / out), "--episodes", "2", "--video"]) == 0
     video = tmp_path / out / "eval.mp4"
     assert f"video: {video if video.exists() else 'none: '}" in capsys.readouterr().out
 
 
-def test_a_video_that_fails_prints_one_line_and_the_run_succeeds(
+def test_failed_video_prints_one_line_and_training_succeeds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(*args: object, **words: object) -> None:
         raise OSError(28, "No space left on\ndevice")
 
-    monkeypatch.setattr(display, "write_video", fail)
-    monkeypatch.setattr(drawing, "libraries", lambda: ["nonsense"])
+    monkeypatch.setattr(policy_videos, "write_video", fail)
     out = tmp_path / "run"
     options = [*TINY, "--horizon", "6", "--no-plot", "--iterations", "1", "--video-every", "1"]
     assert cli.main(["train", "point_mass", "--out", str(out), *options]) == 0
     shown = capsys.readouterr()
     assert "video:      none: [Errno 28] No space left on device" in shown.out.splitlines()
-    assert "lyceum-warp: no further videos (this machine cannot draw off-screen (nonsense: " in shown.err
+    assert "lyceum-warp: no further videos ([Errno 28] No space left on device)" in shown.err
     assert load(out) is not None
 
 
-def test_an_unknown_camera_is_refused_before_the_folder_is_made(
+def test_unknown_camera_prints_an_error_before_the_folder_is_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for flags, message in (
@@ -107,7 +105,9 @@ def test_an_unknown_camera_is_refused_before_the_folder_is_made(
     assert not (tmp_path / "run").exists()
 
 
-def test_resume_refuses_other_settings(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_resume_with_other_settings_prints_an_error(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     resume = ["train", "--resume", str(trained), *QUIET]
     before = {path: path.read_bytes() for path in trained.iterdir()}
     for options, words in [
@@ -128,7 +128,7 @@ def test_resume_refuses_other_settings(trained: Path, tmp_path: Path, capsys: py
     refused(capsys, "there is no run in")
 
 
-def test_a_resumed_run_keeps_its_tensorboard_and_video_settings(tmp_path: Path) -> None:
+def test_resumed_run_uses_its_saved_tensorboard_and_video_settings(tmp_path: Path) -> None:
     out = tmp_path / "run"
     pytest.importorskip("tensorboard")
     assert train(out, "--iterations", "1", "--tensorboard", "--video-every", "50") == 0
@@ -141,7 +141,7 @@ def test_a_resumed_run_keeps_its_tensorboard_and_video_settings(tmp_path: Path) 
     assert len(list(out.glob("events.out.tfevents.*"))) == 2
     config = Run.open(out).config
     assert (config.pop("tensorboard"), config.pop("video_every")) == (False, 0)
-    (out / "config.json").write_text(json.dumps(config))  # an earlier release wrote such a file
+    (out / "config.json").write_text(json.dumps(config))  # an earlier release wrote a file like this
     assert cli.main([*resume, "4"]) == 0
 
 
@@ -150,13 +150,14 @@ def physics(env: lw.Env) -> tuple[int, int, int, bool]:
     return opt.integrator, opt.iterations, opt.ls_iterations, env.options.physics.deterministic
 
 
-def test_a_run_keeps_its_physics(
+def test_resumed_run_uses_its_saved_physics(
     tmp_path: Path, made_envs: list[lw.Env], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(display, "write_video", lambda env, states, path, **options: path)
+    monkeypatch.setattr(policy_videos, "write_video", lambda env, states, path, **options: path)
     out = tmp_path / "run"
     options = ["--integrator", "euler", "--solver", "iterations=7", "--solver", "ls_iterations=9", "--deterministic"]
-    assert train(out, "--iterations", "1", "--no-transfer", *options, task="hopper") == 0  # its own integrator is RK4
+    # the task's default integrator is RK4
+    assert train(out, "--iterations", "1", "--no-transfer", *options, task="hopper") == 0
     solver = {"iterations": 7, "ls_iterations": 9}
     given = {"integrator": "euler", "solver": solver, "deterministic": True}
     assert Run.open(out).config["physics"] == given
@@ -165,7 +166,8 @@ def test_a_run_keeps_its_physics(
     assert cli.main([*resume, "3", "--solver", "iterations=7", "--integrator", "euler"]) == 0
     assert cli.main(["eval", str(out), "--episodes", "2", "--video"]) == 0
     assert {physics(env) for env in made_envs} == {(mujoco.mjtIntegrator.mjINT_EULER, 7, 9, True)}
-    assert {env.nworld for env in made_envs} == {1, 2, 32}  # video, training and eval, final evaluation
+    # 1 world for videos, 2 for training and eval, 32 for the final evaluation
+    assert {env.nworld for env in made_envs} == {1, 2, 32}
     capsys.readouterr()
     for other, words in [
         (["--integrator", "rk4"], "has integrator euler, not rk4"),
@@ -176,7 +178,7 @@ def test_a_run_keeps_its_physics(
         refused(capsys, words, "a run keeps its settings")
 
 
-def test_physics_by_name_are_saved_as_options_and_eval_replaces_them(
+def test_named_physics_are_saved_as_options_and_eval_can_replace_them(
     tmp_path: Path, made_envs: list[lw.Env], task_file: TaskFile, capsys: pytest.CaptureFixture[str]
 ) -> None:
     line = "    physics = {'fast': lw.PhysicsOptions(integrator='euler', timestep=0.004, frame_skip=2)}\n"
@@ -203,7 +205,7 @@ def changed_config(trained: Path, folder: Path, change: Any) -> list[str]:
     return ["train", "--resume", str(folder), "--iterations", "5", *QUIET]
 
 
-def test_a_run_keeps_the_options_of_its_environment(
+def test_resumed_run_uses_its_saved_environment_options(
     tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
@@ -231,7 +233,7 @@ def test_every_hyperparameter_has_a_flag(algorithm: str) -> None:
     assert changed.on_top_of(config(hidden=(3,)), algorithm) == config(hidden=(3,), gamma=0.5, normalize=False)
 
 
-def test_a_flag_of_the_other_algorithm_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_flag_of_another_algorithm_prints_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     for words, message in (
         (
             ["--learning-rate", "3"],
@@ -245,7 +247,7 @@ def test_a_flag_of_the_other_algorithm_is_refused(capsys: pytest.CaptureFixture[
         refused(capsys, message)
 
 
-def test_hyperparameters_are_shown_by_help_with_their_algorithms(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_lists_hyperparameters_with_their_algorithms(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main(["train", "--help-all"])
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
@@ -260,21 +262,23 @@ def test_hyperparameters_are_shown_by_help_with_their_algorithms(capsys: pytest.
     (lambda config: config.update(nworld="many"), "not 'many'"),
     (lambda config: config.pop("params"), "'params'"),
 ])  # fmt: skip
-def test_a_configuration_that_does_not_fit_prints_one_line(
+def test_invalid_configuration_prints_one_line(
     change: Any, words: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(changed_config(trained, tmp_path / "run", change)) == 2
     refused(capsys, "config.json is ", words)
 
 
-def test_a_configuration_of_an_earlier_release_has_the_defaults_of_newer_hyperparameters(
+def test_configuration_of_an_earlier_release_gets_defaults_for_newer_hyperparameters(
     trained: Path, tmp_path: Path
 ) -> None:
     resume = changed_config(trained, tmp_path / "run", lambda config: config["npg"].pop("time_orders"))
     assert cli.main(resume) == 0
 
 
-def test_resume_refuses_broken_checkpoints(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_resume_with_only_damaged_checkpoints_prints_an_error(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     resume = changed_config(trained, tmp_path / "run", lambda config: None)
     checkpoint = tmp_path / "run" / "checkpoint.pt"
     for path in (checkpoint, checkpoint.with_name("previous.pt")):
@@ -290,7 +294,7 @@ def test_resume_refuses_broken_checkpoints(trained: Path, tmp_path: Path, capsys
 
 @pytest.mark.quick("a flipped bit")
 @pytest.mark.parametrize("damage", ["cut off", "a flipped bit"])
-def test_resume_falls_back_from_a_broken_checkpoint_to_the_previous_one(
+def test_resume_loads_the_previous_checkpoint_if_the_last_one_is_damaged(
     damage: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
@@ -305,7 +309,7 @@ def test_resume_falls_back_from_a_broken_checkpoint_to_the_previous_one(
     assert metrics(out) == metrics(trained)
 
 
-def test_a_broken_best_policy_is_replaced_with_a_message(
+def test_damaged_best_policy_is_replaced_with_a_message(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     resume = changed_config(trained, tmp_path / "run", lambda config: None)
@@ -346,7 +350,7 @@ def test_train_refuses_to_overwrite_a_run(trained: Path, capsys: pytest.CaptureF
         ("point_mass", ["--solver", "iterations"], ["'iterations'", "NAME=VALUE"]),
     ],
 )
-def test_a_bad_option_prints_one_line_and_leaves_no_folder(
+def test_invalid_option_prints_one_line_and_makes_no_folder(
     task: str, options: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert train(tmp_path / "run", *options, task=task) == 2
@@ -354,19 +358,21 @@ def test_a_bad_option_prints_one_line_and_leaves_no_folder(
     assert not (tmp_path / "run").exists()
 
 
-def test_train_without_a_task_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_train_without_a_task_prints_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["train"]) == 2
     refused(capsys, "train needs a task", "hopper")
 
 
-def test_a_return_below_require_return_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_train_exits_with_1_if_the_return_is_below_require_return(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert train(tmp_path / "easy", "--iterations", "1", "--require-return", "-1e6") == 0
     assert train(tmp_path / "hard", "--iterations", "1", "--require-return", "1e6") == 1
     assert "--require-return demands more than 1e+06" in capsys.readouterr().err
     assert (tmp_path / "hard" / "checkpoint.pt").exists()
 
 
-def test_the_default_number_of_worlds_depends_on_the_device_and_the_algorithm() -> None:
+def test_default_number_of_worlds_depends_on_device_and_algorithm() -> None:
     found = []
     for device, size, nworld in (("cpu", 2, None), ("cuda:0", 1, None), ("cuda", 2, None), ("cuda", 2, 96)):
         options = Train(task="hopper", env=EnvFlags(device=device), nworld=nworld)
@@ -430,7 +436,7 @@ def assert_continues(out: Path, output: str, trained: Path) -> None:
 
 @pytest.mark.quick("step", "save")
 @pytest.mark.parametrize("moment", ["step", "move", "state_dict", "save"])
-def test_an_interrupted_run_ends_after_the_iteration_and_continues(
+def test_interrupted_run_ends_after_the_iteration_and_can_be_resumed(
     moment: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The signal arrives in this process while the run samples, learns or writes."""
@@ -453,7 +459,7 @@ def test_an_interrupted_run_ends_after_the_iteration_and_continues(
     assert_continues(out, capsys.readouterr().out, trained)
 
 
-def test_a_second_interrupt_ends_a_run_at_once_and_it_continues_from_its_last_save(
+def test_second_interrupt_ends_a_run_immediately_and_it_resumes_from_its_last_save(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, steps = tmp_path / "run", []
@@ -476,7 +482,7 @@ def test_a_second_interrupt_ends_a_run_at_once_and_it_continues_from_its_last_sa
     assert metrics(out) == metrics(trained)
 
 
-def test_a_killed_run_continues(trained: Path, tmp_path: Path) -> None:
+def test_killed_run_can_be_resumed(trained: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "100000"]
     program = f"import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"

@@ -1,4 +1,4 @@
-"""Test lyceum-warp tune: its table, the flags that it prints, and errors."""
+"""Test the table, the printed flags and the errors of lyceum-warp tune."""
 
 import dataclasses
 from pathlib import Path
@@ -33,7 +33,9 @@ def test_tune_prints_a_table_and_flags_that_other_commands_accept(
         (["hopper", "--run", "none"], "there is no run in none"),
     ],
 )
-def test_wrong_arguments_print_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_tune_arguments_print_one_line(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["tune", *words]) == 2
     err = capsys.readouterr().err
     assert message in err and err.count("\n") == 1

@@ -14,7 +14,7 @@ from lyceum_warp.viewer.protocol import Frame, Scene
 
 
 class Opened:
-    """Collects the scenes and frames of the windows that the command opens."""
+    """A fake window that collects the scenes and frames of the command."""
 
     def __init__(self) -> None:
         self.scenes: list[Scene] = []
@@ -54,7 +54,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [lw.control(env, towards, seed=seed).save(folder / f"episode-{seed:03d}.npz") for seed in (0, 1)]
 
 
-def test_a_task_is_shown(opened: Opened) -> None:
+def test_view_shows_a_task(opened: Opened) -> None:
     options = ["--nworld", "3", "--port", "8123", "--param", "success_distance=0.2"]
     assert cli.main(["view", "point_mass", *options]) == 0
     (scene,) = opened.scenes
@@ -63,7 +63,7 @@ def test_a_task_is_shown(opened: Opened) -> None:
 
 
 @pytest.mark.long
-def test_a_task_is_shown_under_a_planner(opened: Opened) -> None:
+def test_view_shows_a_task_controlled_by_a_planner(opened: Opened) -> None:
     opened.number = 12
     assert cli.main(["view", "point_mass", "--mppi", "--samples", "4", "--horizon", "5", "--paused"]) == 0
     (scene,) = opened.scenes
@@ -71,7 +71,7 @@ def test_a_task_is_shown_under_a_planner(opened: Opened) -> None:
     assert opened.frames[-1].status.paused
 
 
-def test_a_runs_policy_is_shown(opened: Opened, run: Path) -> None:
+def test_view_shows_the_policy_of_a_run(opened: Opened, run: Path) -> None:
     assert cli.main(["view", str(run), "--seed", "3"]) == 0
     (scene,) = opened.scenes
     assert scene.controllers == ("policy",) and scene.nworld == 16
@@ -80,7 +80,7 @@ def test_a_runs_policy_is_shown(opened: Opened, run: Path) -> None:
     assert cli.main(["view", str(run), "--follow", "--nworld", "1"]) == 0
 
 
-def test_episodes_are_played_back(opened: Opened, files: list[Path]) -> None:
+def test_view_plays_saved_episodes(opened: Opened, files: list[Path]) -> None:
     for words in ([str(file) for file in files], [str(files[0].parent)]):
         assert cli.main(["view", *words]) == 0
         scene = opened.scenes[-1]
@@ -101,7 +101,7 @@ def test_episodes_are_played_back(opened: Opened, files: list[Path]) -> None:
         (["point_mass", "--param", "nworld=3"], ["nworld is an option"]),
     ],
 )
-def test_a_mistake_prints_one_line(
+def test_invalid_view_arguments_print_one_line(
     opened: Opened, capsys: pytest.CaptureFixture[str], words: list[str], messages: list[str]
 ) -> None:
     assert cli.main(["view", *words]) == 2

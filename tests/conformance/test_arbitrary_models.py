@@ -1,4 +1,4 @@
-"""Test that tasks of arbitrary models obey the rules on every engine that supports the model; others raise one line."""
+"""Test that tasks with arbitrary models follow the rules on every engine that supports the model."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from lyceum_warp.testing import CHECKS, check_task
 from lyceum_warp.testing import episode_rules as episodes
 
 OPTIONS: dict[str, dict[str, Any]] = {
-    "mujoco": {  # omits a slow check that does not depend on the model
+    "mujoco": {  # all checks except a slow one that does not depend on the model
         "nworld": 3, "steps": 20, "frame_skip": 2, "checks": [c for c in CHECKS if c is not episodes.check_memory],
     },
     "warp": {"nworld": 2, "steps": 20, "horizon": 6, "frame_skip": 1, "checks": MODEL_CHECKS},
@@ -107,28 +107,28 @@ def sensing(model: str) -> type[lw.Task]:
 )
 @pytest.mark.parametrize("engine", OPTIONS)
 @pytest.mark.parametrize("model", MOVING.values(), ids=MOVING)
-def test_a_model_keeps_the_rules(model: str, engine: str) -> None:
+def test_task_with_an_arbitrary_model_follows_the_rules(model: str, engine: str) -> None:
     check_task(moving(model), engine=engine, **OPTIONS[engine])
 
 
 @pytest.mark.quick("delayed sensors-warp", "welds and sensors-mujoco")
 @pytest.mark.parametrize("engine", OPTIONS)
 @pytest.mark.parametrize("model", SENSING.values(), ids=SENSING)
-def test_a_model_with_sensors_keeps_the_rules(model: str, engine: str) -> None:
+def test_task_with_sensors_follows_the_rules(model: str, engine: str) -> None:
     check_task(sensing(model), engine=engine, **OPTIONS[engine])
 
 
-# plugins, and other features that MuJoCo Warp lacks
+# these models use plugins and other features that MuJoCo Warp lacks
 
 
 @pytest.mark.quick("'mjTRN_SO3'] not supported", "Actuator plugins not supported")
 @pytest.mark.parametrize("model", PLUGINS.values(), ids=PLUGINS)
-def test_a_model_that_only_the_mujoco_engine_supports_keeps_the_rules(model: str) -> None:
+def test_task_that_only_the_mujoco_engine_supports_follows_the_rules(model: str) -> None:
     check_task(moving(model), engine="mujoco", nworld=2, steps=20, frame_skip=2, checks=MODEL_CHECKS)
 
 
 @pytest.mark.parametrize(("reason", "model"), PLUGINS.items())
-def test_a_model_that_the_warp_engine_does_not_support_is_refused_in_a_line(reason: str, model: str) -> None:
+def test_model_that_the_warp_engine_does_not_support_raises_a_one_line_error(reason: str, model: str) -> None:
     task = moving(model)
     with pytest.raises(ValueError, match=f"MuJoCo Warp refuses the model: .*{reason}.*; .* use engine='mujoco'$"):
         lw.make(task, engine="warp")
@@ -146,7 +146,7 @@ RICH = text(
 FIELDS = ("eq_active", "history", "plastic", "energy", "flexvert_xpos", "flexedge_length", "flexedge_velocity")
 
 
-def test_fields_of_only_some_models_are_equal_on_both_engines_and_in_mujoco() -> None:
+def test_fields_that_only_some_models_have_are_equal_on_both_engines_and_in_mujoco() -> None:
     seen = []
     for engine in ("mujoco", "warp"):
         env = lw.make(moving(RICH), engine=engine, nworld=2, fields=FIELDS, seed=1)
@@ -167,8 +167,8 @@ def test_fields_of_only_some_models_are_equal_on_both_engines_and_in_mujoco() ->
         torch.testing.assert_close(*(fields[name] for fields in seen), rtol=1e-3, atol=1e-3, msg=name)
 
 
-def test_an_equality_constraint_activated_at_a_reset_acts_equally_on_both_engines() -> None:
-    """The engine accepts boolean values, too."""
+def test_equality_constraint_activated_at_a_reset_acts_equally_on_both_engines() -> None:
+    """The engine also accepts boolean values."""
     ends = []
     for engine in ("mujoco", "warp"):
         env = lw.make(moving(RICH), engine=engine, nworld=2, fields=["eq_active"])
@@ -247,5 +247,5 @@ class Pushed(lw.Task):
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", OPTIONS)
-def test_a_model_without_actuators_keeps_the_rules(engine: str) -> None:
+def test_task_without_actuators_follows_the_rules(engine: str) -> None:
     check_task(Pushed, engine=engine, **OPTIONS[engine])

@@ -55,7 +55,7 @@ def view(batch: Batch, w: int) -> World:
 VIEWS = {World: view}
 
 
-# correct functions, in every form that Warp supports
+# correct functions with every construct that Warp supports
 
 ORDER = wp.constant(wp.vec3i(2, 1, 0))
 
@@ -99,7 +99,7 @@ def doubled(v: wp.vec3) -> wp.vec3:
 @wp.func
 def right(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):
     total = 0.0
-    for i in range(3):  # Warp unrolls the loop, because it changes a constant
+    for i in range(3):  # Warp unrolls this loop, because the loop changes a constant
         total += s.qpos[i] * p.gains[i]
     obs[0] = total
     obs[1] = s.qpos[-1] + s.site_xpos[1][2] + s.site_xpos[-1].x + s.xmat[0][1, 2] + s.xmat[0][-1][0]
@@ -157,7 +157,7 @@ FINDINGS = [
 
 
 KEPT: list[wp.array] = []
-"""Arrays that other arrays point to, stored here so that they are not freed."""
+"""Arrays that other arrays point to; this list keeps them alive."""
 
 
 DEVICE = wp.get_device("cpu")
@@ -190,7 +190,7 @@ def run_right(batch: Batch, params: wp.array[Params], obs: wp.array2d[float], rn
     right(view(batch, w), params[0], obs[w], rng[w])
 
 
-def test_a_checked_copy_computes_the_same_numbers_and_finds_nothing(params: wp.array) -> None:
+def test_checked_copy_of_a_correct_function_gives_equal_results_without_findings(params: wp.array) -> None:
     checked = checked_functions("test.right", {"right": right}, VIEWS, DEVICE)
     report = checked.report(DEVICE)
     results = []
@@ -204,7 +204,7 @@ def test_a_checked_copy_computes_the_same_numbers_and_finds_nothing(params: wp.a
     assert checked_functions("test.right", {"right": right}, VIEWS, DEVICE) is checked
 
 
-def test_indices_out_of_range_and_endless_loops_are_named(params: wp.array) -> None:
+def test_checked_copy_reports_indices_out_of_range_and_endless_loops(params: wp.array) -> None:
     checked = checked_functions("test.wrong", {"wrong": wrong}, VIEWS, DEVICE)
     report = checked.report(DEVICE)
     wp.launch(checked.kernels["wrong"], 2, [report, batch(), params, wp.zeros((2, 1), dtype=float)], device=DEVICE)
@@ -239,6 +239,6 @@ def function_as_a_value(s: World, p: Params) -> float:
         (function_as_a_value, r"function_as_a_value uses last as a value \(.*, line \d+\): call it instead"),
     ],
 )
-def test_a_function_that_cannot_be_checked_is_named(function: Any, message: str) -> None:
+def test_function_that_cannot_be_checked_is_reported_by_name(function: Any, message: str) -> None:
     with pytest.raises(Unchecked, match=message):
         checked_functions("test.unchecked", {"function": function}, VIEWS, DEVICE)

@@ -19,12 +19,12 @@ EVERY_RULE = {
 }
 """Tasks for which all rules are checked, by engine; together they use most features of models."""
 OF_THE_TASK = tuple(check for check in CHECKS if check not in (check_memory, check_not_finite))
-"""Rules for other tasks on the C engine, without two slow rules, which depend little on the task."""
+"""Rules for other tasks on the C engine; two slow rules are omitted, because they depend little on the task."""
 OF_THE_STATE = (
     buffers.check_addresses, buffers.check_getters, state.check_restoring, state.check_purity, state.check_determinism,
     state.check_reset,
 )  # fmt: skip
-"""Rules for other tasks on the Warp engine, which is slow on a CPU; the C engine and other tests cover the rest."""
+"""Rules for other tasks on the Warp engine; there are few because this engine is slow on a CPU."""
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
 
 
@@ -35,9 +35,9 @@ def settled_again() -> None:
 
 
 def options(task: str, engine: str) -> dict[str, int]:
-    """Return the number of steps of the long rules; hopper gets enough to find a leak of one number per step.
+    """Return the number of steps of the long rules; hopper takes enough steps to find a leak of one number per step.
 
-    On a CPU a step of the Warp engine takes milliseconds, so other tasks take few steps there.
+    On a CPU a step of the Warp engine takes milliseconds, so other tasks take few steps on it.
     """
     every = task in EVERY_RULE[engine]
     if engine == "mujoco":
@@ -47,13 +47,13 @@ def options(task: str, engine: str) -> dict[str, int]:
     return {"steps": 100 if every else 40, "frame_skip": min(2, find_task(task).frame_skip)}
 
 
-# contacts; a robot with events and drawn dynamics; no contacts; a planner's task; the same on the Warp engine
+# these cases cover contacts, events, randomized dynamics, tasks without contacts, and tasks for planners
 @pytest.mark.quick(
     "mujoco-half_cheetah", "mujoco-go1_velocity", "mujoco-cartpole_swingup", "mujoco-reach",
     "warp-go1_velocity", "warp-half_cheetah", "warp-point_mass",
 )  # fmt: skip
 @pytest.mark.parametrize(("engine", "task"), [(engine, task) for engine in EVERY_RULE for task in PACKAGE])
-def test_a_task_keeps_the_rules(task: str, engine: str) -> None:
+def test_task_follows_all_rules(task: str, engine: str) -> None:
     checks = CHECKS if task in EVERY_RULE[engine] else OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
     report = check_task(task, engine=engine, checks=checks, **options(task, engine))
     assert list(report.seconds) == [check.__name__.removeprefix("check_") for check in checks]
@@ -63,16 +63,16 @@ def test_a_task_keeps_the_rules(task: str, engine: str) -> None:
 @pytest.mark.parametrize(
     ("task", "engine"), [(task, engine) for engine in EVERY_RULE for task in PACKAGE if task not in EVERY_RULE[engine]]
 )
-def test_a_task_keeps_the_other_rules(task: str, engine: str) -> None:
+def test_task_follows_the_quick_rules(task: str, engine: str) -> None:
     done = OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
     checks = [check for check in CHECKS if check not in done]
     if engine == "warp" and "rough" in task:
-        # the rule compares with the C engine, which makes more contacts with a height field
+        # this rule compares with the C engine, which creates more contacts with a height field
         checks.remove(check_dynamics)
     check_task(task, engine=engine, checks=checks, **options(task, engine))
 
 
 @pytest.mark.quick("point_mass")
 @pytest.mark.parametrize("task", ["hopper", "point_mass"])
-def test_a_task_keeps_the_rules_on_a_third_engine(task: str) -> None:
+def test_task_follows_the_rules_on_a_third_engine(task: str) -> None:
     assert f"{task} on the toy engine" in str(check_task(task, engine=ToyEngine, steps=200))

@@ -1,4 +1,4 @@
-"""Test that the index rule finds mistakes in a task's file that would silently give wrong numbers."""
+"""Test that the index rule finds errors in a task's file that would silently give wrong results."""
 
 import re
 
@@ -74,18 +74,18 @@ class Tiny""",
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_indices_out_of_range_are_found_and_named(task_file: TaskFile, engine: str) -> None:
+def test_index_rule_reports_indices_out_of_range(task_file: TaskFile, engine: str) -> None:
     with pytest.raises(AssertionError, match="tiny on the .* engine breaks the rule 'bounds': ") as caught:
         check_task(task_file("wrong.py", WRONG), engine=engine, steps=10, checks=[check_bounds])
     message = str(caught.value)
-    assert message.count("\n") == 1  # the first line is the problem; the state follows
+    assert message.count("\n") == 1  # the first line names the problem, and the state follows
     for pattern in MISTAKES:
         assert re.search(pattern, message), f"{pattern} is not in {message}"
     assert message.count("out of range") == len(MISTAKES)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_an_element_of_a_field_without_elements_is_named(task_file: TaskFile, engine: str) -> None:
+def test_index_rule_reports_an_element_of_an_empty_field(task_file: TaskFile, engine: str) -> None:
     text = tiny_task.changed(
         (FIELDS, f"{FIELDS}\n    ten_length: Row[float]"), ("obs[0] = s.qpos[0]", "obs[0] = s.ten_length[1]")
     )

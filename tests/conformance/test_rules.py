@@ -23,7 +23,7 @@ Function = Callable[..., Any]
 
 
 def then(extra: Callable[[Any], object]) -> Callable[[Function], Function]:
-    """Return a decorator for a method that calls a function after each call."""
+    """Return a decorator that calls a function after each call of the decorated method."""
 
     def wrap(method: Function) -> Function:
         def longer(self: Any, *args: Any, **kwargs: Any) -> Any:
@@ -74,7 +74,8 @@ def spoil_rewards(env: lw.Env) -> None:
 
 
 def count_steps_as_none(method: Function) -> Function:
-    """Set the step counter to zero while states are judged, so that their noise equals the noise of the reset."""
+    """Set the step counter to zero while observations are computed, so that their noise equals the noise of the
+    reset."""
 
     def judge(self: Worlds, *args: Any, **kwargs: Any) -> None:
         kept = self.counters.step.numpy().copy()
@@ -161,7 +162,7 @@ BREAKS: list[Break] = [
     ("bad_warmstart", MujocoEngine, "__init__", then(keep_warm_start)),
     ("not_finite", lw.Env, "step", then(spoil_rewards)),
 ]
-"""Rules with patched functions that violate them, for hopper."""
+"""Patches that violate each rule, for hopper."""
 
 FULL_BREAKS: list[Break] = [
     ("groups", lw.Env, "step", then(another_critic)),
@@ -179,12 +180,12 @@ FULL_BREAKS: list[Break] = [
     ("keyframe", MujocoEngine, "__init__", then(from_the_default)),
     ("rejection", Worlds, "_redraw", nothing),
 ]
-"""Rules with patched functions for the task with every feature."""
+"""Patches that violate each rule, for the task with every feature."""
 
 SETTLED_BREAKS: list[Break] = [
     ("settle", MujocoEngine, "settle", at_once),
 ]
-"""Rules with patched functions for the variant of this task that settles."""
+"""Patches that violate each rule, for a variant of the task that settles after a reset."""
 
 ALL_BREAKS = [
     *(("hopper", *broken) for broken in BREAKS),
@@ -196,7 +197,7 @@ ALL_BREAKS = [
 @pytest.mark.parametrize(
     ("task", "rule", "owner", "name", "wrap"), ALL_BREAKS, ids=[f"{b[1]}-{b[3]}-{i}" for i, b in enumerate(ALL_BREAKS)]
 )
-def test_a_broken_rule_is_reported(
+def test_violated_rule_is_reported(
     task: str | type[lw.Task], rule: str, owner: Any, name: str, wrap: Callable[[Function], Function],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
@@ -208,30 +209,30 @@ def test_a_broken_rule_is_reported(
 
 @pytest.mark.quick("Full")
 @pytest.mark.parametrize("task", [Full, Settled])
-def test_a_task_with_every_feature_keeps_the_rules(task: type[lw.Task]) -> None:
+def test_task_with_every_feature_follows_the_rules(task: type[lw.Task]) -> None:
     check_task(task, engine="mujoco", steps=60)
 
 
 @pytest.mark.quick("Weighed-warp", "Practiced-warp", "Gifted-mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("task", [Weighed, Practiced, Gifted])
-def test_a_task_that_observes_lasting_values_keeps_the_rules(task: type[lw.Task], engine: str) -> None:
+def test_task_that_observes_lasting_memory_follows_the_rules(task: type[lw.Task], engine: str) -> None:
     checks = [check for check in CHECKS if engine == "mujoco" or check.__name__ == "check_reset"]
     check_task(task, engine=engine, nworld=3, steps=60, frame_skip=1, checks=checks)
 
 
-def test_a_task_with_every_feature_keeps_the_rules_of_the_form_on_the_warp_engine() -> None:
+def test_task_with_every_feature_follows_the_task_form_rules_on_the_warp_engine() -> None:
     rules = ("groups", "events", "inputs", "dynamics", "rejection")
     checks = [check for check in CHECKS if check.__name__.removeprefix("check_") in rules]
     check_task(Full, engine="warp", nworld=2, frame_skip=1, checks=checks)
 
 
-def test_every_rule_has_a_patch_that_breaks_it() -> None:
+def test_every_rule_has_a_patch_that_violates_it() -> None:
     rules = {f"check_{rule}" for _, rule, *_ in ALL_BREAKS}
     assert rules == {check.__name__ for check in CHECKS}
 
 
-def test_all_broken_rules_are_reported_together(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_violated_rules_are_reported_together(monkeypatch: pytest.MonkeyPatch) -> None:
     checks = [check for check in CHECKS if check.__name__ in ("check_reset", "check_time", "check_masked_reset")]
     monkeypatch.setattr(lw.Env, "reset", then(lambda env: env.action.fill_(0.1))(lw.Env.reset))
     with pytest.raises(AssertionError) as caught:
@@ -239,7 +240,7 @@ def test_all_broken_rules_are_reported_together(monkeypatch: pytest.MonkeyPatch)
     assert [line.split("'")[1] for line in str(caught.value).splitlines()[::2]] == ["reset", "masked_reset"]
 
 
-def test_a_single_world_and_no_steps_are_refused() -> None:
+def test_check_task_with_one_world_or_zero_steps_raises_an_error() -> None:
     with pytest.raises(ValueError, match="compare worlds with one another: nworld must be at least 2, not 1"):
         check_task("hopper", nworld=1)
     with pytest.raises(ValueError, match="steps must be a whole number from 1 to .*, not -5"):

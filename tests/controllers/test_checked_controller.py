@@ -1,4 +1,4 @@
-"""Check controllers and their actions, convert time steps, and describe controllers in trajectories."""
+"""Test checks of controllers and actions, the conversion of time steps, and descriptions of controllers."""
 
 import math
 from collections.abc import Callable
@@ -24,12 +24,12 @@ def env() -> lw.Env:
     return lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
 
 
-def test_an_object_that_is_not_callable_is_refused(env: lw.Env) -> None:
+def test_controller_that_is_not_callable_raises_an_error(env: lw.Env) -> None:
     with pytest.raises(ValueError, match=r"must be callable with \(state, obs\), not str 'towards': pass a function"):
         control(env, "towards")  # type: ignore[arg-type]
 
 
-def test_a_policy_of_one_argument_is_refused(env: lw.Env) -> None:
+def test_policy_with_one_argument_raises_an_error(env: lw.Env) -> None:
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
     with pytest.raises(ValueError, match=r"GaussianPolicy takes one argument: pass lambda state, obs: policy\(obs\)"):
         control(env, policy, steps=2)
@@ -44,7 +44,7 @@ def test_a_planner_cannot_control_its_own_environment(run: Run) -> None:
 
 
 @pytest.mark.parametrize("timestep", [0.0, math.nan, "fast"])
-def test_a_time_step_that_is_not_positive_is_refused(env: lw.Env, timestep: object) -> None:
+def test_time_step_that_is_not_positive_raises_an_error(env: lw.Env, timestep: object) -> None:
     planner = StepPlanner(env)
     planner.timestep = timestep  # type: ignore[assignment]
     with pytest.raises(ValueError, match="the timestep of a controller must be a positive number of seconds"):
@@ -52,7 +52,7 @@ def test_a_time_step_that_is_not_positive_is_refused(env: lw.Env, timestep: obje
 
 
 @BOTH
-def test_a_bad_action_or_plan_is_refused(run: Run, env: lw.Env) -> None:
+def test_invalid_action_or_plan_raises_an_error(run: Run, env: lw.Env) -> None:
     bad = type("Bad", (), {"actions": torch.zeros(8, 3), "__call__": lambda *_: torch.zeros(2)})
     for controller, message in (
         (lambda *_: torch.zeros(1, 2), r"return an action of shape \(2,\), not a float32 tensor of shape \(1, 2\)"),
@@ -64,7 +64,7 @@ def test_a_bad_action_or_plan_is_refused(run: Run, env: lw.Env) -> None:
             run(env, controller)
 
 
-def test_action_holds_or_interpolates_a_coarser_plan_and_skips_steps_of_a_finer_plan(env: lw.Env) -> None:
+def test_actions_of_coarser_plans_are_held_or_interpolated_and_finer_plans_skip_steps(env: lw.Env) -> None:
     plan = torch.tensor([[0.0, 1.0], [1.0, 3.0], [2.0, 9.0]])
 
     def applied(timestep: float, steps: int, **words: str) -> list[float]:
@@ -80,7 +80,7 @@ def test_action_holds_or_interpolates_a_coarser_plan_and_skips_steps_of_a_finer_
     assert applied(env.timestep / 2, 3) == [0, 2, 2]
 
 
-def test_a_time_step_that_is_not_a_multiple_of_the_plants_is_refused(env: lw.Env) -> None:
+def test_time_step_that_is_not_a_multiple_of_the_plant_time_step_raises_an_error(env: lw.Env) -> None:
     planner = StepPlanner(env)
     planner.timestep = 1.5 * env.timestep
     with pytest.raises(
@@ -90,7 +90,7 @@ def test_a_time_step_that_is_not_a_multiple_of_the_plants_is_refused(env: lw.Env
 
 
 @pytest.mark.parametrize("between, change", [("hold", [0, 1, 0, 1, 0]), ("linear", [1, 1, 1, 1, 1])])
-def test_a_planner_with_twice_the_interval_applies_each_action_twice_or_interpolates(
+def test_actions_of_a_planner_with_doubled_time_step_are_applied_twice_or_interpolated(
     between: str, change: list[int]
 ) -> None:
     plant = lw.make("point_mass", autoreset=False, horizon=40)
@@ -103,7 +103,7 @@ def test_a_planner_with_twice_the_interval_applies_each_action_twice_or_interpol
     torch.testing.assert_close(timed.actions[0], actions[0], rtol=0, atol=0)
 
 
-def test_a_function_is_described_by_its_name(env: lw.Env, tmp_path: Path) -> None:
+def test_trajectory_describes_a_function_by_its_name(env: lw.Env, tmp_path: Path) -> None:
     def zeros(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         return torch.zeros(2)
 
@@ -112,14 +112,14 @@ def test_a_function_is_described_by_its_name(env: lw.Env, tmp_path: Path) -> Non
     assert Trajectory.load(episode.save(tmp_path / "a.npz")).seed is None
 
 
-def test_settings_are_described_by_json_values(env: lw.Env, tmp_path: Path) -> None:
+def test_trajectory_describes_settings_by_json_values(env: lw.Env, tmp_path: Path) -> None:
     episode = control(env, SamplingPlanner(0), steps=1)
     assert episode.controller["name"] == "SamplingPlanner" and episode.controller["smoothing"] == [1.0, 0.0]
     assert isinstance(episode.controller["odd"], str)
     assert Trajectory.load(episode.save(tmp_path / "a.npz")).controller == episode.controller
 
 
-def test_a_task_with_an_action_of_several_numbers_is_controlled(shared_env: SharedEnv) -> None:
+def test_controller_accepts_a_task_with_a_multidimensional_action(shared_env: SharedEnv) -> None:
     env = shared_env("go1_velocity", engine="mujoco", autoreset=False)
     trajectory = control(env, lambda state, obs: torch.zeros(12), steps=2, seed=0)
     assert trajectory.actions.shape == (2, 12)

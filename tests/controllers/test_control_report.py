@@ -27,7 +27,7 @@ def episode(env: lw.Env) -> Trajectory:
 
 
 def with_plan_times(episode: Trajectory, times: np.ndarray) -> Trajectory:
-    """Replace the planning times of an episode; the first plan takes one second."""
+    """Replace the planning times of an episode; the first time becomes one second."""
     plans = len(times) + 1
     return dataclasses.replace(
         episode, plan_times=torch.tensor([1.0, *times], dtype=torch.float64), plan_of=torch.zeros_like(episode.plan_of),
@@ -40,7 +40,7 @@ def times() -> np.ndarray:
     return np.random.default_rng(0).gamma(2, 0.005, 1000)
 
 
-def test_planning_times_are_summarised_without_the_first_plan(episode: Trajectory, times: np.ndarray) -> None:
+def test_planning_time_summary_excludes_the_first_plan(episode: Trajectory, times: np.ndarray) -> None:
     report = control_report(with_plan_times(episode, times))
     for name, q in (("p50", 0.5), ("p90", 0.9), ("p99", 0.99), ("p99_9", 0.999), ("max", 1.0)):
         assert getattr(report, f"plan_{name}_ms") == pytest.approx(1000 * np.quantile(times, q))
@@ -48,20 +48,20 @@ def test_planning_times_are_summarised_without_the_first_plan(episode: Trajector
     assert report.first_plan_ms == 1000
 
 
-def test_the_rate_sets_the_deadline(episode: Trajectory, times: np.ndarray) -> None:
+def test_rate_determines_the_deadline(episode: Trajectory, times: np.ndarray) -> None:
     timed = with_plan_times(episode, times)
     assert control_report(timed).misses == (times > episode.timestep).sum()
     assert control_report(timed, rate=100).misses == (times > 0.01).sum()
 
 
-def test_a_quantile_of_too_few_plans_is_missing(episode: Trajectory, times: np.ndarray) -> None:
+def test_report_omits_a_quantile_with_too_few_plans(episode: Trajectory, times: np.ndarray) -> None:
     for plans, missing in ((999, "p99_9"), (99, "p99"), (9, "p90"), (1, "p50"), (0, "max")):
         report = control_report(with_plan_times(episode, times[:plans]))
         assert getattr(report, f"plan_{missing}_ms") is None
     assert report.miss_share is None and ("planning time max", "-") in report.rows()
 
 
-def test_success_has_wilsons_confidence_interval(episode: Trajectory) -> None:
+def test_success_has_the_wilson_confidence_interval(episode: Trajectory) -> None:
     for successes, low, high in ((8, 0.4902, 0.9433), (0, 0, 0.2775), (10, 0.7225, 1)):
         ten = [
             dataclasses.replace(episode, success=torch.ones(40, dtype=torch.bool) & (i < successes)) for i in range(10)
@@ -70,7 +70,7 @@ def test_success_has_wilsons_confidence_interval(episode: Trajectory) -> None:
         assert (report.success_low, report.success_high) == pytest.approx((low, high), abs=1e-4)
 
 
-def test_several_episodes_make_one_report(episode: Trajectory) -> None:
+def test_several_episodes_give_one_report(episode: Trajectory) -> None:
     met = torch.ones_like(episode.success)
     three = [
         dataclasses.replace(episode, success=met & (i < 3), rewards=met * float(i), wall_seconds=float(i))
@@ -87,17 +87,17 @@ def test_several_episodes_make_one_report(episode: Trajectory) -> None:
 
 
 @pytest.mark.parametrize("rate", [0.0, math.inf, "fast"])
-def test_a_rate_that_is_not_positive_is_refused(episode: Trajectory, rate: object) -> None:
+def test_rate_that_is_not_positive_raises_an_error(episode: Trajectory, rate: object) -> None:
     with pytest.raises(ValueError, match=f"rate must be a positive number of plans per second, not {rate!r}"):
         control_report(episode, rate=rate)  # type: ignore[arg-type]
 
 
-def test_an_empty_list_is_refused() -> None:
+def test_report_of_no_episodes_raises_an_error() -> None:
     with pytest.raises(ValueError, match="at least one trajectory"):
         control_report([])
 
 
-def test_episodes_with_different_settings_are_refused(env: lw.Env) -> None:
+def test_report_of_episodes_with_different_settings_raises_an_error(env: lw.Env) -> None:
     one = control(env, SamplingPlanner(0), steps=2)
     with pytest.raises(ValueError, match="differ in their mode"):
         control_report([one, dataclasses.replace(one, mode="async")])
@@ -108,7 +108,7 @@ def test_episodes_with_different_settings_are_refused(env: lw.Env) -> None:
         control_report([one, dataclasses.replace(one, params={**one.params, "success_distance": 1.0})])
 
 
-def test_episodes_with_equal_nan_parameters_make_one_report(env: lw.Env) -> None:
+def test_episodes_with_equal_nan_parameters_give_one_report(env: lw.Env) -> None:
     one = control(env, SamplingPlanner(0), steps=2)
     odd = dataclasses.replace(one, params={**one.params, "odd": math.nan})
     assert control_report([odd, dataclasses.replace(odd, params={**one.params, "odd": float("nan")})]).episodes == 2
@@ -127,7 +127,7 @@ def test_failed_samples_are_reported(env: lw.Env, tmp_path: Path) -> None:
     assert torch.equal(loaded.plan_failed, episode.plan_failed) and loaded.plan_failed.dtype == torch.float64
 
 
-def test_a_controller_without_samples_has_no_statistics_of_them(env: lw.Env) -> None:
+def test_report_of_a_controller_without_samples_has_no_sample_statistics(env: lw.Env) -> None:
     episode = control(env, lambda state, obs: torch.zeros(2), steps=3)
     assert episode.plan_failed.isnan().all() and episode.plan_effective.isnan().all()
     report = control_report(episode)
@@ -136,7 +136,7 @@ def test_a_controller_without_samples_has_no_statistics_of_them(env: lw.Env) -> 
 
 
 @pytest.mark.parametrize("run", [control, control_async])
-def test_plans_of_mppi_without_a_good_sample_are_counted(run: Callable[..., Trajectory], env: lw.Env) -> None:
+def test_report_counts_mppi_plans_without_a_successful_sample(run: Callable[..., Trajectory], env: lw.Env) -> None:
     options = dict(horizon=4, samples=3, nthread=1)
     blind = lw.MPPI("point_mass", **options, value=lambda obs: torch.full((3,), math.nan))
     report = control_report(run(env, blind, steps=4, seed=0))
@@ -161,7 +161,7 @@ def test_json_has_null_for_infinite_numbers(episode: Trajectory, tmp_path: Path)
     assert [file.name for file in path.parent.iterdir()] == ["report.json"]
 
 
-def test_rows_have_units_and_dashes_for_missing_values(episode: Trajectory, env: lw.Env) -> None:
+def test_report_rows_have_units_and_dashes_for_missing_values(episode: Trajectory, env: lw.Env) -> None:
     rows = dict(control_report(episode).rows())
     assert rows["episodes"] == "1 of point_mass (40 steps, sync)"
     assert rows["planning time p99.9"] == "-" and rows["planning time p50"].endswith(" ms")
@@ -171,7 +171,7 @@ def test_rows_have_units_and_dashes_for_missing_values(episode: Trajectory, env:
     assert rows["age of the action, max"] == "5 steps (5000 ms)"
 
 
-def test_rows_show_ages_in_steps_and_milliseconds(env: lw.Env) -> None:
+def test_report_rows_show_ages_in_steps_and_milliseconds(env: lw.Env) -> None:
     episode = control(env, SamplingPlanner(0), steps=3)
     old = dataclasses.replace(episode, plan_steps=episode.plan_steps - 1, ages=episode.ages * 0 + 0.0202)
     rows = dict(control_report(old).rows())

@@ -1,4 +1,4 @@
-"""Test the common part of both control loops: limits, progress, and the trajectory of an interrupted episode."""
+"""Test the code that both control loops share: limits, progress, and trajectories of interrupted episodes."""
 
 import time
 from collections.abc import Callable
@@ -25,7 +25,7 @@ def env() -> lw.Env:
 
 
 @BOTH
-def test_unsuitable_environments_are_refused(run: Run, shared_env: SharedEnv) -> None:
+def test_control_of_unsuitable_environments_raises_an_error(run: Run, shared_env: SharedEnv) -> None:
     for options, message in (
         ({}, "one world without automatic resets, not nworld=1, autoreset=True"),
         ({"nworld": 2, "autoreset": False}, "one world without automatic resets, not nworld=2, autoreset=False"),
@@ -36,7 +36,7 @@ def test_unsuitable_environments_are_refused(run: Run, shared_env: SharedEnv) ->
 
 
 @BOTH
-def test_control_refuses_bad_arguments(run: Run, env: lw.Env) -> None:
+def test_control_with_invalid_arguments_raises_an_error(run: Run, env: lw.Env) -> None:
     control(env, towards)
     for arguments, message in (
         ({"steps": 0}, "steps must be a whole number from 1 to .*, not 0"),
@@ -67,7 +67,7 @@ def test_progress_includes_the_step_and_counts_the_plans(
 
 @BOTH
 @pytest.mark.parametrize("kind", [KeyboardInterrupt, RuntimeError])
-def test_on_abort_gets_the_complete_steps(run: Run, kind: type[BaseException], env: lw.Env) -> None:
+def test_on_abort_receives_the_complete_steps(run: Run, kind: type[BaseException], env: lw.Env) -> None:
     def stop(progress: ControlProgress) -> None:
         if progress.step == 5:
             raise kind
@@ -89,10 +89,10 @@ def test_on_abort_is_not_called_before_the_first_step(run: Run, env: lw.Env) -> 
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        run(env, fails, on_abort=lambda part: pytest.fail("there was no step"))
+        run(env, fails, on_abort=lambda part: pytest.fail("on_abort was called before the first step"))
 
 
-def test_an_interrupted_step_is_omitted(env: lw.Env, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trajectory_omits_an_interrupted_step(env: lw.Env, monkeypatch: pytest.MonkeyPatch) -> None:
     step, calls, parts = env.step, [], []
 
     def stop() -> None:

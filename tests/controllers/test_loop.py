@@ -46,12 +46,12 @@ def test_first_state_and_actions_replay_the_episode_exactly(env: lw.Env) -> None
         assert env.reward[0] == episode.rewards[k] and env.eval[0] == episode.evals[k]
 
 
-def test_the_seed_determines_the_episode(env: lw.Env) -> None:
+def test_equal_seeds_give_equal_episodes(env: lw.Env) -> None:
     one, same, other = (control(env, towards, seed=seed, steps=3) for seed in (1, 1, 2))
     assert torch.equal(one.states, same.states) and not torch.equal(one.states, other.states)
 
 
-def test_the_first_shift_is_zero_after_a_reset_and_one_otherwise(env: lw.Env) -> None:
+def test_first_shift_of_a_plan_is_zero_after_a_reset_and_otherwise_one(env: lw.Env) -> None:
     planner = StepPlanner(env)
     assert control(env, planner, seed=4, steps=4).done_reason == 0
     assert planner.shifts == [0, 1, 1, 1] and planner.resets == [4]
@@ -61,7 +61,7 @@ def test_the_first_shift_is_zero_after_a_reset_and_one_otherwise(env: lw.Env) ->
 
 
 @pytest.mark.parametrize("ratio, shifts", [(2.0, [0, 0, 1, 0, 1, 0, 1]), (0.25, [0, 4, 4, 4, 4, 4, 4])])
-def test_a_run_in_two_parts_shifts_plans_like_a_single_run(env: lw.Env, ratio: float, shifts: list[int]) -> None:
+def test_episode_in_two_parts_shifts_plans_like_a_single_episode(env: lw.Env, ratio: float, shifts: list[int]) -> None:
     planner = StepPlanner(env)
     planner.timestep = ratio * env.timestep
     control(env, planner, steps=3)
@@ -69,7 +69,7 @@ def test_a_run_in_two_parts_shifts_plans_like_a_single_run(env: lw.Env, ratio: f
     assert planner.shifts == shifts
 
 
-def test_replanning_every_n_steps_applies_the_actions_of_the_plan_in_between(env: lw.Env) -> None:
+def test_actions_of_the_plan_are_applied_between_replans(env: lw.Env) -> None:
     planner = StepPlanner(env)
     episode = control(env, planner, steps=8, replan_every=3)
     assert planner.shifts == [0, 3, 3] and episode.plan_steps.tolist() == [0, 3, 6]
@@ -81,7 +81,7 @@ def test_replanning_every_n_steps_applies_the_actions_of_the_plan_in_between(env
     assert planner.shifts[3:] == [2, 1], "the second call plans at step 8, its first, and at step 9"
 
 
-def test_replanning_counts_steps_of_the_plant(env: lw.Env) -> None:
+def test_replanning_interval_counts_steps_of_the_plant(env: lw.Env) -> None:
     planner = StepPlanner(env)
     planner.timestep = 2 * env.timestep
     episode = control(env, planner, steps=8, replan_every=4)
@@ -89,7 +89,7 @@ def test_replanning_counts_steps_of_the_plant(env: lw.Env) -> None:
     assert hundredths(episode.actions[:, 1]) == [0, 0, 1, 1, 0, 0, 1, 1]
 
 
-def test_an_mppi_plan_is_played_until_the_next_one() -> None:
+def test_actions_of_an_mppi_plan_are_applied_until_the_next_plan() -> None:
     plant = lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
     plan = lw.MPPI("point_mass", horizon=6, samples=8)
     whole = control(plant, plan, seed=1, steps=4, replan_every=4)
@@ -98,7 +98,7 @@ def test_an_mppi_plan_is_played_until_the_next_one() -> None:
     assert torch.equal(whole.actions, plan.actions[:4])
 
 
-def test_replanning_after_the_end_of_the_plan_is_refused(env: lw.Env) -> None:
+def test_replanning_interval_longer_than_the_plan_raises_an_error(env: lw.Env) -> None:
     for every, controller, message in (
         (0, StepPlanner(env), "replan_every must be a whole number from 1"),
         (9, StepPlanner(env), "needs a plan of 9 actions, but the controller has a plan of 8 actions: plan more often"),

@@ -51,14 +51,14 @@ def test_an_episode_can_be_replayed_bit_for_bit(env: lw.Env) -> None:
         assert one.reward.item() == episode.rewards[k]
 
 
-def test_an_episode_has_its_own_worlds_parameters() -> None:
+def test_episode_has_the_parameters_of_its_own_world() -> None:
     env = lw.make("point_mass", nworld=2, horizon=3, autoreset=False, success_distance=[0.1, 0.2])
     first, second = policy_episodes(env, lambda obs: torch.zeros(2, 2), 2)
     assert first.params["success_distance"] == pytest.approx([0.1])
     assert second.params["success_distance"] == pytest.approx([0.2])
 
 
-def test_environments_that_reset_or_never_end_are_refused(shared_env: SharedEnv) -> None:
+def test_environments_with_autoreset_or_without_horizon_raise_an_error(shared_env: SharedEnv) -> None:
     with pytest.raises(ValueError, match="without automatic resets"):
         next(policy_episodes(shared_env("hopper", nworld=3, horizon=60), push, 1))
     with pytest.raises(ValueError, match="may never end without a horizon"):

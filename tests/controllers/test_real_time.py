@@ -1,4 +1,4 @@
-"""Test the real-time loop, on a simulated clock with exact times and with a thread on the real clock."""
+"""Test the real-time loop on a simulated clock with exact times, and with a thread on the real clock."""
 
 import math
 import subprocess
@@ -23,13 +23,13 @@ def env() -> lw.Env:
     return lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
 
 
-def test_a_fast_planner_is_one_step_behind(env: lw.Env) -> None:
+def test_actions_of_a_fast_planner_are_one_step_old(env: lw.Env) -> None:
     episode = simulated_run(env, seconds=0.3, steps=6)
     assert episode.times.tolist() == pytest.approx([0, 1, 2, 3, 4, 5])
     assert episode.age_steps.tolist() == [0, 1, 1, 1, 1, 1]
     assert episode.ages.tolist() == pytest.approx([0, 1, 1, 1, 1, 1])
-    assert hundredths(episode.actions[:, 0]) == [0, 0, 1, 2, 3, 4]  # the step of the plan's state
-    assert hundredths(episode.actions[:, 1]) == [0, 1, 1, 1, 1, 1]  # the second action of each plan
+    assert hundredths(episode.actions[:, 0]) == [0, 0, 1, 2, 3, 4]  # the step from which the plan started.
+    assert hundredths(episode.actions[:, 1]) == [0, 1, 1, 1, 1, 1]  # Index of the applied action in its plan
     assert episode.wall_seconds == pytest.approx(6)
     report = control_report(episode)
     assert (report.misses, report.late_ticks, report.age_steps_max, report.deadline_ms) == (0, 0, 1, 1000)
@@ -39,7 +39,7 @@ def test_a_fast_planner_is_one_step_behind(env: lw.Env) -> None:
 
 def test_a_slow_planner_misses_its_deadlines(env: lw.Env) -> None:
     episode = simulated_run(env, seconds=2.5, steps=9)
-    # the plan from state 1 ends at 3.5; the next plan starts from the newest state and lasts from 3.5 to 6
+    # the plan from state 1 is ready at 3.5 s; the next plan starts from the newest state and is ready at 6 s
     assert episode.plan_of.tolist() == [0, 0, 0, 0, 1, 1, 2, 2, 2]
     assert episode.plan_steps[:3].tolist() == [0, 1, 3]
     assert episode.ages.tolist() == pytest.approx([0, 1, 2, 3, 3, 4, 3, 4, 5])
@@ -55,7 +55,7 @@ def test_the_last_action_of_a_plan_is_applied_until_the_next_plan(env: lw.Env) -
     assert hundredths(simulated_run(env, seconds=100, steps=4, horizon=1).actions[:, 1]) == [0, 0, 0, 0]
 
 
-def test_a_slow_step_does_not_delay_the_schedule(env: lw.Env) -> None:
+def test_slow_step_does_not_delay_later_steps(env: lw.Env) -> None:
     episode = simulated_run(env, seconds=0.1, steps=6, busy={1: 2.25})
     assert episode.times.tolist() == pytest.approx([0, 1, 3.25, 3.25, 4, 5])
     assert episode.late.tolist() == [False, False, True, True, False, False]
@@ -90,7 +90,7 @@ def test_a_slow_planner_in_a_thread_plans_while_the_plant_steps(env: lw.Env) -> 
         assert torch.equal(env.get_state()[0], episode.states[k + 1])
 
 
-def test_mppi_makes_the_same_plans_in_a_thread(env: lw.Env) -> None:
+def test_mppi_gives_the_same_plans_in_a_thread(env: lw.Env) -> None:
     mppi = lw.MPPI("point_mass", horizon=6, samples=4, nthread=1)
     episode = control_async(env, mppi, period=0.004, seed=5)
     mppi.reset(5)
@@ -104,7 +104,7 @@ def test_mppi_makes_the_same_plans_in_a_thread(env: lw.Env) -> None:
     assert torch.equal(control(env, mppi, seed=5, steps=4).states, control(env, mppi, seed=5, steps=4).states)
 
 
-def test_a_policy_acts_on_the_state_of_its_plan_until_the_episode_ends(env: lw.Env) -> None:
+def test_policy_acts_on_observed_states_until_the_episode_ends(env: lw.Env) -> None:
     episode = control_async(env, towards, period=0.003, steps=1000, seed=6)
     assert episode.steps == 40 and episode.truncated
     assert episode.age_steps[0] == 0 and (episode.age_steps[1:] >= 1).all()
@@ -114,7 +114,7 @@ def test_a_policy_acts_on_the_state_of_its_plan_until_the_episode_ends(env: lw.E
 
 
 @pytest.mark.parametrize("period", [0.0, math.nan, math.inf, "fast"])
-def test_a_period_that_is_not_positive_is_refused(env: lw.Env, period: object) -> None:
+def test_period_that_is_not_positive_raises_an_error(env: lw.Env, period: object) -> None:
     with pytest.raises(ValueError, match=f"period must be a positive number of seconds, not {period!r}"):
         control_async(env, towards, period=period)  # type: ignore[arg-type]
 
@@ -169,7 +169,7 @@ def test_an_exception_does_not_wait_for_an_unfinished_plan(env: lw.Env) -> None:
 
 
 @pytest.mark.long
-def test_a_program_ends_normally_while_mppi_plans() -> None:
+def test_program_exits_normally_while_mppi_is_planning() -> None:
     program = """
 import threading, time, torch, lyceum_warp as lw
 plan = lw.MPPI("point_mass", horizon=20, samples=4000, iterations=300, nthread=1)
@@ -190,7 +190,7 @@ except KeyboardInterrupt:
     assert done.returncode == 0 and done.stdout == "ended 1\n", done.stderr
 
 
-def test_another_clock_works_while_the_plant_waits(env: lw.Env) -> None:
+def test_custom_clock_waits_for_each_step(env: lw.Env) -> None:
     waited: list[float] = []
 
     class Working(Clock):
@@ -202,7 +202,7 @@ def test_another_clock_works_while_the_plant_waits(env: lw.Env) -> None:
     assert np.diff(waited) == pytest.approx(0.01) and len(waited) == episode.steps + 1
 
 
-def test_the_real_clock_never_waits_too_briefly() -> None:
+def test_real_clock_never_returns_before_the_requested_time() -> None:
     clock = Clock()
     for wait in (-1.0, 0.0, 0.0002, 0.004):
         moment = clock.now() + wait

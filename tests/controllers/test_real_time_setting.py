@@ -9,7 +9,7 @@ SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 
 
 class Machine:
-    """A machine whose planning time is a constant plus a part proportional to samples times horizon."""
+    """A simulated machine; its planning time is a constant plus a time proportional to samples times horizon."""
 
     def __init__(self, microseconds: float, constant: float = 1e-3, **faster: float) -> None:
         self.cost, self.constant, self.faster = 1e-6 * microseconds, constant, faster
@@ -22,7 +22,7 @@ class Machine:
 
 
 @pytest.mark.parametrize("microseconds", [0.1, 0.5, 1.0, 3.0, 7.0, 20.0])
-def test_the_largest_number_of_samples_that_meets_the_deadline_is_chosen(microseconds: float) -> None:
+def test_largest_number_of_samples_that_meets_the_deadline_is_chosen(microseconds: float) -> None:
     machine = Machine(microseconds)
     choice = choose_setting(SAMPLES, [32], [None], machine, deadline=0.015)
     times = {number: Machine(microseconds)(RealTimeSetting(number, 32)) for number in SAMPLES}
@@ -33,7 +33,7 @@ def test_the_largest_number_of_samples_that_meets_the_deadline_is_chosen(microse
     assert len(machine.measured) == len(set(machine.measured)) <= 5
 
 
-def test_the_choice_is_printed_in_one_line_with_the_next_larger_number_of_samples() -> None:
+def test_chosen_setting_is_printed_with_the_next_larger_number_of_samples() -> None:
     choice = choose_setting(SAMPLES, [32], ["fast"], Machine(3.5), deadline=0.015)
     assert str(choice) == "64 samples, horizon 32, physics fast: 8.17 ms of 15 ms; 128 would take 15.3 ms"
     assert str(choose_setting([64], [8], [None], Machine(1.0), deadline=0.02)) == (
@@ -41,7 +41,7 @@ def test_the_choice_is_printed_in_one_line_with_the_next_larger_number_of_sample
     )
 
 
-def test_a_shorter_horizon_is_tried_before_other_physics_and_both_only_if_necessary() -> None:
+def test_shorter_horizons_are_tried_before_other_physics() -> None:
     physics = ["exact", "fast"]
     assert choose_setting(SAMPLES, [32, 16], physics, Machine(10.0, fast=10.0), deadline=0.015).setting == (
         RealTimeSetting(32, 32, "exact")
@@ -55,15 +55,16 @@ def test_a_shorter_horizon_is_tried_before_other_physics_and_both_only_if_necess
     assert machine.measured[:2] == [RealTimeSetting(16, 32, "exact"), RealTimeSetting(16, 16, "exact")]
 
 
-def test_if_no_setting_meets_the_deadline_the_fastest_one_replans_less_often() -> None:
+def test_fastest_setting_replans_less_often_if_no_setting_meets_the_deadline() -> None:
     choice = choose_setting(SAMPLES, [32, 16], [None], Machine(100.0), deadline=0.01)
-    assert choice.setting == RealTimeSetting(16, 16) and choice.replan_every == 4  # 26.6 ms are 3.3 times 8 ms
+    # a plan takes 26.6 ms, which is 3.3 times the allowed 8 ms
+    assert choice.setting == RealTimeSetting(16, 16) and choice.replan_every == 4
     assert str(choice) == (
         "no setting meets the deadline; 16 samples, horizon 16: 26.6 ms of 10 ms, so there is a plan every 40 ms"
     )
 
 
-def test_a_measurement_takes_real_plans_and_restores_the_plant(shared_env: SharedEnv) -> None:
+def test_planning_time_is_measured_on_real_plans_and_the_plant_is_restored(shared_env: SharedEnv) -> None:
     plant = shared_env("point_mass", autoreset=False)
     plant.rand_reset(5)
     before = plant.get_state()

@@ -53,7 +53,7 @@ def test_episode_env_restores_and_continues_episodes(folder: Path) -> None:
     assert episode_env(loaded, horizon=7).horizon == 7
 
 
-def test_files_of_earlier_releases_are_read(folder: Path, tmp_path: Path) -> None:
+def test_episode_files_of_earlier_releases_are_loaded(folder: Path, tmp_path: Path) -> None:
     path = lw.control(lw.make("point_mass", autoreset=False, horizon=5), towards).save(tmp_path / "old.npz")
     with np.load(path) as file:
         arrays = dict(file)
@@ -65,7 +65,7 @@ def test_files_of_earlier_releases_are_read(folder: Path, tmp_path: Path) -> Non
     check_episode(episode_env(old), old[path])
 
 
-def test_a_task_of_a_file_is_found_again(task_file: TaskFile, tmp_path: Path) -> None:
+def test_episode_env_finds_the_task_file(task_file: TaskFile, tmp_path: Path) -> None:
     source = Path(lw.make("cartpole").task.task.__module__.replace(".", "/") + ".py")
     text = (Path(lw.__file__).parent.parent / source).read_text().replace("class Cartpole", "class MyPole")
     model = Path(lw.__file__).parent / "tasks"
@@ -88,7 +88,7 @@ def test_a_task_of_a_file_is_found_again(task_file: TaskFile, tmp_path: Path) ->
         episode_env(gone, task="point_mass")
 
 
-def test_episodes_of_two_tasks_are_refused(folder: Path, tmp_path: Path) -> None:
+def test_episodes_of_two_tasks_raise_an_error(folder: Path, tmp_path: Path) -> None:
     other = lw.control(lw.make("cartpole", autoreset=False, horizon=3), lambda state, obs: torch.zeros(1))
     path = other.save(tmp_path / "other.npz")
     first = min(folder.iterdir())
@@ -97,7 +97,7 @@ def test_episodes_of_two_tasks_are_refused(folder: Path, tmp_path: Path) -> None
         load_episodes([folder, path])
 
 
-def test_an_episode_of_another_model_is_refused(folder: Path, env: lw.Env, tmp_path: Path) -> None:
+def test_episode_of_another_model_raises_an_error(folder: Path, env: lw.Env, tmp_path: Path) -> None:
     first = min(folder.iterdir())
     plain = lw.make("point_mass", autoreset=False, horizon=3)
     path = lw.control(plain, towards).save(tmp_path / "plain.npz")
@@ -111,7 +111,7 @@ def test_an_episode_of_another_model_is_refused(folder: Path, env: lw.Env, tmp_p
         check_episode(plain, lw.Trajectory.load(first), "mine")
 
 
-def test_missing_broken_and_newer_files_are_reported_in_one_line(folder: Path, tmp_path: Path) -> None:
+def test_missing_damaged_and_newer_files_raise_a_one_line_error(folder: Path, tmp_path: Path) -> None:
     newer, broken, empty = tmp_path / "newer.npz", tmp_path / "broken.npz", tmp_path / "empty"
     np.savez(newer, info=np.array(json.dumps({"format": 2})))
     broken.write_bytes(min(folder.iterdir()).read_bytes()[:-100])
@@ -130,7 +130,7 @@ def test_missing_broken_and_newer_files_are_reported_in_one_line(folder: Path, t
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
-def test_a_task_file_that_others_can_write_is_not_run(
+def test_task_file_that_other_users_can_write_is_not_executed(
     episodes: list[lw.Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, ran = tmp_path / "tasks", tmp_path / "ran"
@@ -158,7 +158,7 @@ def test_a_task_file_that_others_can_write_is_not_run(
     assert ran.exists()
 
 
-def test_a_task_name_that_is_not_a_string_is_refused(episodes: list[lw.Trajectory], tmp_path: Path) -> None:
+def test_task_name_that_is_not_a_string_raises_an_error(episodes: list[lw.Trajectory], tmp_path: Path) -> None:
     path = dataclasses.replace(episodes[0], source={"task": ["a"]}).save(tmp_path / "episode.npz")
     with pytest.raises(ValueError, match=r"episode.npz is broken.*source has \['a'\] as its task"):
         load_episodes(path)

@@ -24,7 +24,7 @@ def episode(env: lw.Env) -> Trajectory:
     return control(env, towards, seed=3)
 
 
-def test_load_returns_everything_that_was_saved(episode: Trajectory, tmp_path: Path) -> None:
+def test_loaded_trajectory_equals_the_saved_trajectory(episode: Trajectory, tmp_path: Path) -> None:
     path = episode.save(tmp_path / "new" / "episode.npz")
     assert [file.name for file in path.parent.iterdir()] == ["episode.npz"]
     loaded = Trajectory.load(path)
@@ -37,7 +37,7 @@ def test_load_returns_everything_that_was_saved(episode: Trajectory, tmp_path: P
     assert loaded.params["success_distance"] == pytest.approx(0.05) and loaded.versions["torch"]
 
 
-def test_a_file_holds_the_names_of_columns_and_the_planners_settings(env: lw.Env, tmp_path: Path) -> None:
+def test_trajectory_file_contains_column_names_and_planner_settings(env: lw.Env, tmp_path: Path) -> None:
     plan = lw.MPPI("point_mass", horizon=4, samples=3, temperature=0.3, nthread=1)
     path = control(env, plan, steps=3, seed=7).save(tmp_path / "episode.npz")
     with np.load(path, allow_pickle=False) as file:
@@ -55,20 +55,20 @@ def test_a_file_holds_the_names_of_columns_and_the_planners_settings(env: lw.Env
     assert Trajectory.load(path).controller == controller
 
 
-def test_a_damaged_file_is_refused(episode: Trajectory, tmp_path: Path) -> None:
+def test_damaged_trajectory_file_raises_an_error(episode: Trajectory, tmp_path: Path) -> None:
     path = episode.save(tmp_path / "whole.npz")
     with zipfile.ZipFile(path) as archive:
         states = archive.getinfo("states.npy")
     whole, broken = path.read_bytes(), tmp_path / "broken.npz"
     half = len(whole) // 2
-    data = states.header_offset + 100 + states.compress_size // 2  # a byte inside the compressed states
+    data = states.header_offset + 100 + states.compress_size // 2  # damage a byte inside the compressed states
     for content in (b"", b"no zip", whole[:half], whole[:-1], whole[:data] + b"????????" + whole[data + 8 :]):
         broken.write_bytes(content)
         with pytest.raises(ValueError, match=r"broken\.npz is broken, or is not a trajectory"):
             Trajectory.load(broken)
 
 
-def test_arrays_that_do_not_fit_together_are_refused(episode: Trajectory, tmp_path: Path) -> None:
+def test_arrays_of_inconsistent_shapes_raise_an_error(episode: Trajectory, tmp_path: Path) -> None:
     broken = tmp_path / "broken.npz"
     with np.load(episode.save(tmp_path / "whole.npz")) as file:
         arrays = dict(file)
@@ -82,7 +82,7 @@ def test_arrays_that_do_not_fit_together_are_refused(episode: Trajectory, tmp_pa
             Trajectory.load(broken)
 
 
-def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
+def test_file_of_another_kind_raises_an_error(tmp_path: Path) -> None:
     np.save(tmp_path / "array.npy", np.zeros(3))
     with pytest.raises(ValueError, match="is broken, or is not a trajectory"):
         Trajectory.load(tmp_path / "array.npy")

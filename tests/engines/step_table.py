@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 
 Case = dict[str, str]
-"""A level for each factor, by the factor's name."""
+"""A dict from the names of factors to their levels."""
 
 GENERAL = "<general {place} {kind} {extra}/>"
 DRIVES = {
@@ -34,7 +34,7 @@ DRIVE_GROUPS = {
     "filtered": ("integrator", "filter", "filterexact"),
     "special": ("muscle", "dcmotor", "user"),
 }
-"""Groups of drives; a model has every drive of one group at every place."""
+"""Groups of actuators; a model applies each actuator of one group to each transmission."""
 
 PLACES = {
     "joint": 'joint="hip"',
@@ -45,7 +45,7 @@ PLACES = {
     "site": 'site="tip" gear="0 0 .3 0 .1 0"',
     "refsite": 'site="tip" refsite="here" gear="0 0 .3 0 0 0"',
 }
-"""Transmissions of actuators; adhesion is a separate factor."""
+"""Transmissions of actuators, except for adhesion, which is a separate factor."""
 
 EQUALITIES = {
     "none": "",
@@ -125,7 +125,7 @@ FIELDS = {
     "velocities": " ".join(STAGES[name] for name in ("camlight", "com velocity", "velocity")),
     "everything": " ".join(STAGES.values()).replace("subtree_linvel ", ""),
 }
-"""Requested fields, which may span several stages."""
+"""Sets of requested fields, which may span several stages."""
 
 FLAGS = {
     "": "",
@@ -167,7 +167,7 @@ REFUSED: list[tuple[Mapping[str, tuple[str, ...]], str]] = [
     ({"integrator": ("discrete",), "flex": ("rope",)}, "flex edge stiffness and damping are not supported"),
     ({"integrator": ("discrete",), "noslip": ("2",)}, "noslip solver not implemented for the discrete integrator"),
 ]  # fmt: skip
-"""Combinations that MuJoCo or MuJoCo Warp refuses, with their errors."""
+"""Combinations that MuJoCo or MuJoCo Warp rejects, with their errors."""
 
 UNKNOWN = {
     "mjTRN_SO3": "MuJoCo Warp refuses it",
@@ -194,14 +194,14 @@ UNKNOWN = {
     "mjDSBL_AUTORESET": "MuJoCo Warp refuses it",
     "mjNDISABLE": "it is a number of flags",
 }
-"""Members of MuJoCo's enums that occur in no model of the table, with the reasons."""
+"""Members of MuJoCo's enums that occur in no model of the table, each with a reason."""
 
 
 def xml(case: Case) -> str:
     delay = "" if case["delay"] == "none" else f'delay=".005" nsample="4" interp="{case["delay"]}"'
     actuators = []
     for drive, (name, place) in itertools.product(DRIVE_GROUPS[case["drives"]], PLACES.items()):
-        heavy = case["armature"] == "motors" and "site" not in place  # MuJoCo refuses armature at sites
+        heavy = case["armature"] == "motors" and "site" not in place  # MuJoCo rejects armature at sites
         extra = f'armature=".1" damping=".05" {delay}' if heavy else delay
         actuators.append(DRIVES[drive].format(place=f'name="{drive} {name}" {place}', extra=extra))
     if case["adhesion"] == "actuator":
@@ -214,7 +214,7 @@ def xml(case: Case) -> str:
     held = 'actuatorgravcomp="true"' if case["gravcomp"] == "actuator" else ""
     equality = EQUALITIES[case["equality"]].format(f'active="{case["active"]}"')
     rope = TENDONS[case["tendons"]]
-    wrapped = "" if case["tendons"] == "armature" else rope  # MuJoCo refuses armature of tendons around geoms
+    wrapped = "" if case["tendons"] == "armature" else rope  # MuJoCo rejects armature of tendons around geoms
     return f"""
     <mujoco>
       <option timestep="0.002" integrator="{case["integrator"]}" cone="{case["cone"]}" solver="{case["solver"]}"
@@ -279,12 +279,12 @@ def model_of(case: Case) -> mujoco.MjModel:
 
 
 def is_refused(case: Case) -> bool:
-    """Return whether MuJoCo or MuJoCo Warp refuses a case."""
+    """Return whether MuJoCo or MuJoCo Warp rejects a case."""
     return any(all(case.get(name) in levels for name, levels in match.items()) for match, _ in REFUSED)
 
 
 def singles() -> Iterator[Case]:
-    """Yield each level of each factor combined with the first levels of the other factors."""
+    """Yield a case for each level of each factor; the other factors have their first levels."""
     for name, levels in FACTORS.items():
         for level in levels:
             case = PLAIN | {name: level}
@@ -293,10 +293,10 @@ def singles() -> Iterator[Case]:
 
 @functools.cache
 def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
-    """Return cases that together contain each combination of one, two, three, ... levels of different factors.
+    """Return cases that together contain each combination of a given number of levels of different factors.
 
-    A greedy search: each case starts with a combination that is still missing, and the other factors take the level
-    that adds the most missing combinations. Refused combinations are omitted.
+    The search is greedy: each case starts with a missing combination, and the other factors take the levels that add
+    the most missing combinations. Combinations that an engine rejects are omitted.
     """
     rng = random.Random(seed)
     missing: dict[tuple[tuple[str, str], ...], None] = {}
@@ -307,7 +307,7 @@ def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
     while missing:
         first = next(iter(missing))
         if (case := _completed(dict(first), rng, missing, strength)) is None:
-            del missing[first]  # the combination is refused with all levels of the other factors
+            del missing[first]  # an engine rejects the combination with all levels of the other factors
             continue
         for part in itertools.combinations(((name, case[name]) for name in FACTORS), strength):
             missing.pop(part, None)
@@ -316,7 +316,8 @@ def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
 
 
 def _completed(case: Case, rng: random.Random, missing: Mapping[Any, None], strength: int) -> Case | None:
-    """Complete a case: in random order, each other factor takes the level that adds the most missing combinations."""
+    """Complete a case: in random order, each remaining factor takes the level that adds the most missing
+    combinations."""
     rest = [name for name in FACTORS if name not in case]
     rng.shuffle(rest)
     for name in rest:
@@ -334,7 +335,7 @@ def _completed(case: Case, rng: random.Random, missing: Mapping[Any, None], stre
 
 
 def title(case: Case) -> str:
-    """Return the levels of a case that differ from the plain case."""
+    """Return the levels in which a case differs from the plain case."""
     return ", ".join(f"{name}={level}" for name, level in case.items() if level != PLAIN[name]) or "plain"
 
 
@@ -359,4 +360,4 @@ ENUMS: dict[str, Reader] = {
     "mjtEnableBit": lambda m: _bits(mujoco.mjtEnableBit, m.opt.enableflags),
     "mjtDisableBit": lambda m: _bits(mujoco.mjtDisableBit, m.opt.disableflags),
 }
-"""MuJoCo's enums, with functions that list the members in a model."""
+"""MuJoCo's enums, each with a function that lists the members in a model."""

@@ -1,4 +1,4 @@
-"""Test the deterministic mode: contacts and rows are sorted, and graphs share scratch memory."""
+"""Test that the deterministic mode sorts contacts and constraint rows, and that its graphs share scratch memory."""
 
 import contextlib
 import copy
@@ -31,7 +31,7 @@ def without_allocators(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("without_allocators")
-def test_the_deterministic_engine_steps_as_the_warp_engine_does() -> None:
+def test_deterministic_engine_takes_the_same_steps_as_the_warp_engine() -> None:
     """On the CPU the two engines differ only in the order of sums."""
     envs = [lw.make("hopper", engine=engine, nworld=3, horizon=3) for engine in (DeterministicEngine, WarpEngine)]
     ordered, plain = envs
@@ -47,8 +47,8 @@ def test_the_deterministic_engine_steps_as_the_warp_engine_does() -> None:
 
 
 @pytest.mark.usefixtures("without_allocators")
-def test_scratch_is_reserved_before_graphs_are_captured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scratch is reserved for 256 worlds or more, if it fits into memory and into Warp's buffers."""
+def test_scratch_memory_is_reserved_before_graphs_are_captured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scratch memory is reserved for at least 256 worlds, if it fits into memory and into Warp's buffers."""
     engine: Any = lw.make("hopper", engine=DeterministicEngine, nworld=2).engine
     assert not engine._scratch.blocks
     engine.nworld = 1000
@@ -74,7 +74,7 @@ def test_scratch_is_reserved_before_graphs_are_captured(monkeypatch: pytest.Monk
 
 @pytest.fixture(scope="module", params=["dense", "sparse"])
 def forwarded(request: pytest.FixtureRequest) -> tuple[WarpEngine, CanonicalOrder]:
-    """Return an engine with humanoids on the ground, in contact and at limits, and the model's canonical order."""
+    """Return an engine with humanoids that touch the ground and reach joint limits, and the model's canonical order."""
     model = copy.copy(lw.make("humanoid").model)
     model.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{request.param.upper()}")
     engine = WarpEngine(model, 3, wp.get_device("cpu"), [describe(model, "qpos")])
@@ -111,7 +111,7 @@ def test_shuffled_contacts_are_sorted_into_the_same_order(forwarded: tuple[WarpE
     m.callback.passive = sort_rows
 
 
-def test_shuffled_rows_are_sorted_into_the_same_order(forwarded: tuple[WarpEngine, CanonicalOrder]) -> None:
+def test_shuffled_constraint_rows_are_sorted_into_the_same_order(forwarded: tuple[WarpEngine, CanonicalOrder]) -> None:
     engine, sorter = forwarded
     m, d = engine.m, engine.d
     mjw.fwd_position(m, d)
@@ -151,10 +151,10 @@ def test_shuffled_rows_are_sorted_into_the_same_order(forwarded: tuple[WarpEngin
     np.testing.assert_array_equal(d.contact.efc_address.numpy()[:n], addresses[:n])
 
 
-def test_a_contact_field_that_is_not_sorted_is_refused(
+def test_contact_field_without_a_sorting_rule_raises_an_error(
     forwarded: tuple[WarpEngine, CanonicalOrder], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A new version of MuJoCo Warp may add such a field."""
+    """A new version of MuJoCo Warp may add a contact field that is not sorted yet."""
     engine, _ = forwarded
     # type: ignore[attr-defined]
     known = {name: kind for name, kind in order.Contacts.vars.items() if name != "adhesion"}
@@ -182,7 +182,7 @@ class Capturing:
         self.freed.append(address)
 
 
-def test_captured_launches_share_their_scratch(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_captured_launches_share_scratch_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     device, empty = Capturing(), wp.empty
     monkeypatch.setattr(wp, "ScopedAllocator", lambda *args: contextlib.nullcontext())
     monkeypatch.setattr(wp, "empty", lambda shape, dtype, device: empty(shape, dtype=dtype, device="cpu"))
@@ -197,19 +197,19 @@ def test_captured_launches_share_their_scratch(monkeypatch: pytest.MonkeyPatch) 
             assert before.stop <= after.start
         assert pieces[0].start == launches[0][0].start and pieces[-1].stop <= pieces[0].start + 5120
     assert (scratch.peak, scratch.largest) == (4096, 4096)
-    more = scratch.allocate(2000)  # the block is full
+    more = scratch.allocate(2000)  # the scratch block is full
     assert more not in range(launches[0][0].start, launches[0][0].start + 5120)
     scratch.deallocate(more, 2000)
     assert not device.freed
     for within in (True, False):
-        # this memory belongs to the graph, or was allocated without a capture
+        # this memory belongs to the graph, or was allocated outside a capture
         device.stream.is_capturing, device.is_capturing = within, within
         assert scratch.allocate(300) == -300
         scratch.deallocate(-300, 300)
     assert device.freed == [-300, -300] and scratch.peak == 4096 + 2048
 
 
-def test_scratch_is_extrapolated_from_few_worlds() -> None:
+def test_scratch_size_is_extrapolated_from_few_worlds() -> None:
     def capture(nworld: int) -> Scratch:
         return types.SimpleNamespace(peak=1000 + 7 * nworld, largest=100 + 3 * nworld)  # type: ignore[return-value]
 

@@ -1,4 +1,4 @@
-"""Test model fields that differ between worlds, inputs, initial states and settling, on every engine."""
+"""Test per-world model fields, inputs, initial states and settling on every engine."""
 
 import copy
 from collections.abc import Mapping
@@ -60,7 +60,7 @@ def make(
     initial: np.ndarray | None = None,
     written: tuple[str, ...] = (),
 ) -> Engine:
-    """Return an engine after a reset, whose given model fields differ between worlds."""
+    """Return an engine after a reset; the named model fields may differ between its worlds."""
     kept = [describe(model, name) for name in (*STATE, *fields)]
     kept += [describe(model, name, written=True) for name in written]
     dynamics = [describe_model_field(model, name) for name in names]
@@ -76,7 +76,7 @@ def worlds(nworld: int = N, *chosen: int) -> wp.array:
 
 
 def draw(engine: Engine, seed: int = 0, *chosen: int) -> None:
-    """Scale every model field of the chosen worlds (by default all) by random factors, and apply the fields."""
+    """Scale the model fields of the chosen worlds (by default all worlds) by random factors, and apply them."""
     rng = np.random.default_rng(seed)
     for name in sorted(engine.dynamics):
         array, own = engine.arrays[name].numpy(), engine.nominal[name].numpy()
@@ -110,7 +110,7 @@ def state_of(engine: Engine) -> wp.array:
 
 
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
-def test_constants_equal_a_recompiled_models(engine: type[Engine]) -> None:
+def test_derived_constants_equal_those_of_a_recompiled_model(engine: type[Engine]) -> None:
     made = make(engine, "body_mass", "body_inertia", "body_ipos", "dof_armature", "actuator_gear", "geom_size")
     draw(made)
     for w in range(N):
@@ -140,7 +140,7 @@ def test_worlds_step_like_plain_mujoco_with_their_models(engine: type[Engine]) -
     draw(made)
     draw(plain)
     steps = [(run(made, 1), run(plain, 1)) for _ in range(5)]
-    assert np.ptp(steps[-1][1], axis=0).max() > 0.01  # the models move differently
+    assert np.ptp(steps[-1][1], axis=0).max() > 0.01  # worlds with different models move differently
     for got, expected in steps:
         if engine is MujocoEngine:
             np.testing.assert_array_equal(got, expected)
@@ -161,7 +161,7 @@ CHANGES: Mapping[str, float] = {
 )  # fmt: skip
 @pytest.mark.parametrize("name", CHANGES)
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
-def test_a_field_that_is_zero_in_the_model_can_act_in_a_single_world(engine: type[Engine], name: str) -> None:
+def test_model_field_of_zero_can_be_nonzero_in_a_single_world(engine: type[Engine], name: str) -> None:
     model = copy.copy(MODEL)
     if name == "wind":
         model.opt.density = 100.0
@@ -181,7 +181,7 @@ def test_a_field_that_is_zero_in_the_model_can_act_in_a_single_world(engine: typ
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_change_in_one_world_alters_no_other(engine: type[Engine]) -> None:
+def test_model_change_in_one_world_does_not_affect_other_worlds(engine: type[Engine]) -> None:
     changed, untouched = make(engine, *DRAWN), make(engine, *DRAWN)
     for made in (changed, untouched):
         draw(made, 1)
@@ -192,11 +192,11 @@ def test_a_change_in_one_world_alters_no_other(engine: type[Engine]) -> None:
     assert (got[1] != expected[1]).any()
 
 
-def test_per_world_fields_at_nominal_values_step_as_one_shared_model() -> None:
+def test_per_world_fields_with_nominal_values_give_the_steps_of_the_shared_model() -> None:
     np.testing.assert_array_equal(run(make(MujocoEngine, *DRAWN)), run(make(MujocoEngine)))
 
 
-def test_a_mass_that_is_not_positive_is_a_fault_of_its_world() -> None:
+def test_mass_that_is_not_positive_causes_a_fault_in_its_world() -> None:
     for engine in (MujocoEngine, WarpEngine):
         made = make(engine, "body_mass", "body_inertia")
         for name in ("body_mass", "body_inertia"):
@@ -208,7 +208,7 @@ def test_a_mass_that_is_not_positive_is_a_fault_of_its_world() -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_restored_state_brings_its_model(engine: type[Engine]) -> None:
+def test_restored_state_restores_its_model_fields(engine: type[Engine]) -> None:
     made, other = make(engine, *DRAWN), make(engine, *DRAWN)
     draw(made, 1)
     draw(other, 2)
@@ -223,12 +223,12 @@ def test_a_restored_state_brings_its_model(engine: type[Engine]) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_model_that_becomes_nominal_again_runs_as_before(engine: type[Engine]) -> None:
+def test_model_with_restored_nominal_values_gives_the_original_steps(engine: type[Engine]) -> None:
     made, untouched = make(engine, *DRAWN), make(engine, *DRAWN)
     draw(made)
     for name, nominal in made.nominal.items():
         made.arrays[name].numpy()[:] = nominal.numpy()
-    for _ in range(2):  # the second pass must change nothing
+    for _ in range(2):  # in the second pass the model is nominal
         made.apply_model(worlds())
     np.testing.assert_array_equal(run(made), run(untouched))
 
@@ -241,8 +241,10 @@ def test_a_model_that_becomes_nominal_again_runs_as_before(engine: type[Engine])
 )
 @pytest.mark.parametrize(("integrator", "current"), [("implicitfast", ()), ("RK4", ("xpos",))])
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_rollout_honours_the_model_of_each_state(engine: type[Engine], integrator: str, current: tuple[str]) -> None:
-    """The C engine runs the first case in one native call and the second step by step."""
+def test_rollout_uses_the_model_fields_of_each_state(
+    engine: type[Engine], integrator: str, current: tuple[str]
+) -> None:
+    """The C engine computes the first case in one native call, and the second case step by step."""
     model = copy.copy(MODEL)
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     source, planner = (make(engine, *DRAWN, fields=current, model=model) for _ in range(2))
@@ -252,7 +254,7 @@ def test_a_rollout_honours_the_model_of_each_state(engine: type[Engine], integra
     controls = wp.array(np.full((4, N, MODEL.nu), 0.3), dtype=float)
     names = ("qpos", "qvel", "body_mass", *current)
     buffers = {name: wp.zeros((5, *source.arrays[name].shape), dtype=source.arrays[name].dtype) for name in names}
-    for _ in range(2):  # no model changes in the second pass
+    for _ in range(2):  # in the second pass no model field changes
         planner.rollout(state, controls, 2, buffers)
         for t in range(4):
             for name, buffer in buffers.items():
@@ -268,13 +270,13 @@ def test_a_rollout_honours_the_model_of_each_state(engine: type[Engine], integra
 
 
 class WholeWarpEngine(WarpEngine):
-    """A Warp engine whose settling passes include all worlds, as in the deterministic engine."""
+    """A Warp engine that settles with forward passes of all worlds, as the deterministic engine does."""
 
     partial_refresh = False
 
 
 @pytest.mark.parametrize("engine", [*ENGINES, WholeWarpEngine])
-def test_settling_advances_only_the_masked_worlds(engine: type[Engine]) -> None:
+def test_settling_advances_only_masked_worlds(engine: type[Engine]) -> None:
     fields = ("xpos", "qfrc_constraint")
     made, alone = make(engine, *DRAWN, fields=fields), make(engine, *DRAWN, fields=fields)
     for either in (made, alone):
@@ -296,7 +298,7 @@ def test_settling_advances_only_the_masked_worlds(engine: type[Engine]) -> None:
     assert not made.fault.numpy().any()
 
 
-def test_models_are_applied_and_worlds_settled_within_graphs() -> None:
+def test_captured_graphs_apply_model_fields_and_settle_worlds() -> None:
     captured, direct = (make(WarpEngine, *DRAWN) for _ in range(2))
     mask = worlds(N, 0, 2)
 
@@ -310,7 +312,7 @@ def test_models_are_applied_and_worlds_settled_within_graphs() -> None:
 
     for engine, enabled in ((captured, True), (direct, False)):
         calls = Graphs(CPU, enabled=enabled).sequence(phases(engine))
-        for seed in range(4):  # the first iteration runs the launches, the second captures them
+        for seed in range(4):  # the first iteration runs the launches, and the second iteration captures them
             rng = np.random.default_rng(seed)
             for name in engine.dynamics:
                 array = engine.arrays[name].numpy()
@@ -322,7 +324,7 @@ def test_models_are_applied_and_worlds_settled_within_graphs() -> None:
 
 @pytest.mark.parametrize("name", ["xfrc_applied", "qfrc_applied", "mocap_pos"])
 @pytest.mark.parametrize("engine", ENGINES)
-def test_written_inputs_act_from_the_next_step_on(engine: type[Engine], name: str) -> None:
+def test_inputs_take_effect_in_the_next_step(engine: type[Engine], name: str) -> None:
     made = make(engine, written=(name,), fields=("xpos",))
     assert made.fields[name].written
     index = MODEL.body("box").id if name == "xfrc_applied" else 0
@@ -356,13 +358,13 @@ def test_worlds_reset_to_the_given_initial_state(engine: type[Engine], varied: t
     assert (made.arrays["qpos"].numpy()[0] != home).any()
 
 
-def test_an_initial_state_of_another_size_is_refused() -> None:
+def test_initial_state_of_another_size_raises_an_error() -> None:
     with pytest.raises(ValueError, match=r"an initial state has the shape .*, not \(3,\)"):
         make(MujocoEngine, initial=np.zeros(3))
 
 
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
-def test_worlds_of_different_models_take_more_memory(engine: type[Engine]) -> None:
+def test_worlds_with_different_models_need_more_memory(engine: type[Engine]) -> None:
     dynamics = [describe_model_field(MODEL, name) for name in DRAWN]
     floats = sum(field.size for field in dynamics)
     plain, varied = (bytes_per_world(engine, MODEL, CPU, [], fields) for fields in ((), dynamics))
@@ -378,8 +380,8 @@ SLIDERS = """<mujoco><worldbody>
 </worldbody></mujoco>"""
 
 
-def test_inverse_weights_of_sliding_or_turning_bodies_match_a_compiled_model() -> None:
-    """MuJoCo gives weight 0 to directions in which a body cannot move, unlike MuJoCo Warp's ``set_const``."""
+def test_inverse_weights_of_sliding_or_rotating_bodies_equal_those_of_a_compiled_model() -> None:
+    """In directions in which a body cannot move, MuJoCo's inverse weight is 0; MuJoCo Warp's ``set_const`` differs."""
     model = mujoco.MjModel.from_xml_string(SLIDERS)
     engine = make(WarpEngine, "body_mass", nworld=2, model=model)
     for scale in (1.0, 2.0):

@@ -1,5 +1,4 @@
-"""Test that both engines handle fields, controls, resets and options equally, even if no task of the package uses
-them."""
+"""Test that both engines treat fields, controls, resets and options equally."""
 
 import gc
 from pathlib import Path
@@ -88,7 +87,7 @@ def test_lagged_fields_belong_to_the_new_state_after_a_reset(file: Path, engine:
     torch.testing.assert_close(env.obs[:, :2], torch.full((2, 2), 0.5))
     for _ in range(6):
         env.step(torch.ones(2, 1))
-        if not env.done.any():  # these fields lag the state by one substep
+        if not env.done.any():  # these fields are one substep older than the state
             assert (env.obs[:, 0] != env.obs[:, 1]).all()
     assert env.truncated.all()
     torch.testing.assert_close(env.obs[:, :2], torch.full((2, 2), 0.5))
@@ -99,7 +98,7 @@ CLEARED = TASK.replace('lagged = ("sensordata",)', 'lagged = cleared = ("sensord
 
 @pytest.mark.parametrize(
     "fields", [[], ["xpos"], ["qacc"]]
-)  # the listed fields are computed at the start of an episode
+)  # the listed fields must be computed at the start of an episode
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_cleared_fields_are_zero_when_an_episode_begins(task_file: TaskFile, engine: str, fields: list[str]) -> None:
     env = lw.make(task_file("cleared.py", CLEARED), engine=engine, nworld=2, fields=fields)
@@ -120,7 +119,7 @@ def test_cleared_fields_are_zero_when_an_episode_begins(task_file: TaskFile, eng
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_controls_are_saved_and_reset_with_the_state(file: Path, engine: str) -> None:
-    """A filtered control continues from restored controls, and starts from zero after a reset."""
+    """A low-pass filter of the controls continues from restored controls, and starts from zero after a reset."""
     env = lw.make(file, engine=engine, nworld=2, horizon=0)
     action = torch.ones(2, 1)
 
@@ -142,7 +141,7 @@ def test_controls_are_saved_and_reset_with_the_state(file: Path, engine: str) ->
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_a_view_of_a_field_outlives_its_environment(engine: str) -> None:
+def test_view_of_a_field_stays_valid_after_its_environment_is_deleted(engine: str) -> None:
     field = lw.make("point_mass", engine=engine, nworld=64).field("qpos")
     before = field.clone()
     gc.collect()
@@ -151,8 +150,8 @@ def test_a_view_of_a_field_outlives_its_environment(engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_additional_fields_leave_the_numbers_unchanged(file: Path, engine: str) -> None:
-    """Only the size of the state changes: it gains the field of the acceleration stage."""
+def test_additional_fields_do_not_change_the_simulation(file: Path, engine: str) -> None:
+    """Only the size of the state changes, by the additional field of the acceleration stage."""
     plain = lw.make(file, engine=engine, nworld=2, seed=3)
     other = lw.make(file, engine=engine, nworld=2, seed=3, fields=["qacc_warmstart", "xpos", "qacc"])
     parts = list(plain.state_space.parts)
@@ -166,7 +165,7 @@ def test_additional_fields_leave_the_numbers_unchanged(file: Path, engine: str) 
 
 
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine, ToyEngine])
-def test_an_engine_keeps_the_described_fields_and_the_controls(engine: type[Engine]) -> None:
+def test_engine_has_arrays_for_the_requested_fields_and_the_controls(engine: type[Engine]) -> None:
     model = lw.gymnasium_model("hopper.xml").spec().compile()
     lagged, current = describe(model, "xpos", lagged=True), describe(model, "qpos")
     made = engine(model, 3, wp.get_device("cpu"), [lagged, current, current])
@@ -180,7 +179,7 @@ def test_an_engine_keeps_the_described_fields_and_the_controls(engine: type[Engi
         engine(model, 3, wp.get_device("cpu"), [lagged, describe(model, "xpos")])
 
 
-def test_a_reset_leaves_the_faults_of_other_worlds_unchanged() -> None:
+def test_reset_does_not_change_faults_of_other_worlds() -> None:
     env = lw.make("hopper", nworld=3)
     env.step()
     env.engine.batch.warning[2, mujoco.mjtWarning.mjWARN_INERTIA.value, 1] = 1  # type: ignore[attr-defined]
@@ -207,7 +206,7 @@ def test_integrator_and_solver_options_reach_the_engine(engine: str) -> None:
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_fields_that_the_task_does_not_read_are_kept_if_listed(engine: str) -> None:
+def test_listed_fields_are_computed_even_if_the_task_does_not_read_them(engine: str) -> None:
     """A sensor is enabled only if a listed field needs it."""
     env = lw.make("adroit_pen", engine=engine, fields=["sensordata", "cfrc_ext"])
     size = env.state_space.size  # cfrc_ext includes the contact forces
@@ -221,8 +220,8 @@ def test_fields_that_the_task_does_not_read_are_kept_if_listed(engine: str) -> N
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_a_rollout_leaves_the_state_fields_at_its_end(engine: str) -> None:
-    """The C engine rolls out the horizon in one native call."""
+def test_state_fields_are_those_of_the_last_step_after_a_rollout(engine: str) -> None:
+    """The C engine computes the whole rollout in one native call."""
     env = lw.make("hopper", engine=engine, nworld=2, autoreset=False, frame_skip=2)
     state = wp.from_torch(env.get_state())
     controls = wp.full((3, 2, env.model.nu), 0.5, dtype=float, device="cpu")
@@ -235,7 +234,7 @@ def test_a_rollout_leaves_the_state_fields_at_its_end(engine: str) -> None:
     assert (wp.to_torch(env.engine.ctrl) == 0.5).all()
 
 
-def test_the_deterministic_option_changes_nothing_on_the_cpu() -> None:
+def test_option_deterministic_has_no_effect_on_the_cpu() -> None:
     for engine in ("mujoco", "warp"):
         env = lw.make("point_mass", engine=engine, deterministic=True)
         assert env.replicate().options.physics.deterministic
@@ -243,7 +242,7 @@ def test_the_deterministic_option_changes_nothing_on_the_cpu() -> None:
         env.step()
 
 
-def test_the_contact_pool_has_room_for_one_world_with_all_contacts() -> None:
+def test_contact_buffer_has_room_for_one_world_with_all_contacts() -> None:
     env = lw.make("humanoid", engine="warp", nworld=4)
     engine = env.engine
     assert isinstance(engine, WarpEngine)
@@ -253,8 +252,8 @@ def test_the_contact_pool_has_room_for_one_world_with_all_contacts() -> None:
     assert lw.make("point_mass", engine="warp", nconmax=8).engine.naconmax == 8  # type: ignore[attr-defined]
 
 
-def test_partial_passes_give_the_same_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forward passes of only the restarting worlds give the same numbers as passes of all worlds."""
+def test_partial_and_full_forward_passes_give_equal_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forward passes of only the restarting worlds give the same results as passes of all worlds."""
     runs = []
     for partial in (True, False):
         monkeypatch.setattr(WarpEngine, "partial_refresh", partial)
@@ -276,7 +275,7 @@ def test_partial_passes_give_the_same_run(monkeypatch: pytest.MonkeyPatch) -> No
 def test_an_overflow_in_the_first_state_of_an_episode_is_reported(
     partial: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A world starts with too many contacts; the first step reports it."""
+    """A world starts with too many contacts, and the first step reports the overflow."""
     monkeypatch.setattr(WarpEngine, "partial_refresh", partial)
     spec = lw.gymnasium_model("humanoid.xml").spec()
     spec.body("torso").pos[2] = 0.1

@@ -27,7 +27,7 @@ def test_check_fit_names_the_largest_number_of_worlds(monkeypatch: pytest.Monkey
     check_fit(1000, 10**9, CPU)
 
 
-def test_check_fit_first_frees_torchs_cached_gpu_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_check_fit_first_frees_gpu_memory_that_torch_has_cached(monkeypatch: pytest.MonkeyPatch) -> None:
     free, gpu = [1000], types.SimpleNamespace(is_cuda=True, alias="cuda:0")
     monkeypatch.setattr(memory, "free_memory", lambda device: free[0])
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: free.__setitem__(0, 5000))
@@ -36,13 +36,13 @@ def test_check_fit_first_frees_torchs_cached_gpu_memory(monkeypatch: pytest.Monk
         check_fit(100, 46, gpu)  # type: ignore[arg-type]
 
 
-def test_the_warp_engines_memory_estimate_covers_its_arrays() -> None:
+def test_memory_estimate_of_the_warp_engine_covers_its_arrays() -> None:
     """The estimate includes MuJoCo Warp's data, the refresh group, and temporary arrays."""
     for task in ("hopper", "humanoid"):
         env = lw.make(task, engine="warp", nworld=64)
         engine: Any = env.engine
         found = sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays_in(engine.d)) / 64
-        pool = engine.spare * 500 / 64  # additional contacts, shared by all worlds
+        pool = engine.spare * 500 / 64  # memory of additional contacts, which all worlds share
         estimate = type(engine).bytes_per_world(env.model, engine.fields.values())
         assert found - pool < estimate < 1.6 * found, task
         assert estimate < env.bytes_per_world < 1.3 * estimate
@@ -63,7 +63,7 @@ def resident() -> int:
 
 
 @pytest.mark.parametrize("fields", [(), ("xpos",)])
-def test_the_c_engines_memory_estimate_covers_a_world_without_an_mjdata(fields: tuple[str, ...]) -> None:
+def test_memory_estimate_of_the_c_engine_covers_a_world_without_an_mjdata(fields: tuple[str, ...]) -> None:
     """An MjData takes 165 kB even for a small model."""
     env = lw.make("hopper", fields=fields, nthread=2)
     own = 4 * (2 * env.obs_space.size + 2 * env.action_space.size) + 8 * env.state_space.size

@@ -1,4 +1,4 @@
-"""Resolve device names and engine="auto", and place few worlds and a planner's samples."""
+"""Resolve device names and engine="auto", and choose devices for few worlds and for a planner's samples."""
 
 import types
 from typing import Any
@@ -33,14 +33,14 @@ def model() -> mujoco.MjModel:
 
 @pytest.fixture
 def gpu(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Return a stand-in for a CUDA device, which can be found but not used."""
+    """Return a fake CUDA device, which can be found but not used."""
     device = types.SimpleNamespace(is_cpu=False, is_cuda=True, alias="cuda:0", free_memory=10**9)
     found = placement.find_device
     monkeypatch.setattr(placement, "find_device", lambda name: device if str(name).startswith("cuda") else found(name))
     return device
 
 
-def test_find_device_takes_names_and_torch_devices() -> None:
+def test_find_device_accepts_names_and_torch_devices() -> None:
     assert find_device(None).is_cpu
     assert find_device(torch.device("cpu")).is_cpu  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="no device 'tpu' on this machine; it has 'cpu'"):
@@ -66,7 +66,7 @@ def test_open_engine_makes_the_named_engine(model: mujoco.MjModel) -> None:
             open_engine(engine, model, 2, cpu, [])  # type: ignore[arg-type]
 
 
-def test_options_are_read_from_the_signature_of_an_engine(model: mujoco.MjModel) -> None:
+def test_engine_options_are_read_from_its_signature(model: mujoco.MjModel) -> None:
     cpu = wp.get_device("cpu")
 
     class Curious(ToyEngine):
@@ -96,10 +96,10 @@ def test_options_are_read_from_the_signature_of_an_engine(model: mujoco.MjModel)
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp", ToyEngine])
-def test_worlds_that_do_not_fit_are_refused_before_the_engine_is_made(
+def test_too_many_worlds_for_the_memory_raise_an_error_before_the_engine_is_made(
     engine: Any, model: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Memory that the caller allocates is counted, too."""
+    """Memory that the caller allocates is also counted."""
     cpu = wp.get_device("cpu")
     each = placement.bytes_per_world(engine, model, cpu, [])
     assert each > 8 * mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION.value)
@@ -112,22 +112,22 @@ def test_worlds_that_do_not_fit_are_refused_before_the_engine_is_made(
         open_engine(engine, model, 6, cpu, [], reserved=each)
 
 
-def test_few_worlds_move_from_a_gpu_to_cpu_cores_with_auto_only() -> None:
+def test_few_worlds_move_from_a_gpu_to_cpu_cores_only_with_engine_auto() -> None:
     assert options_for_few_worlds("auto", "cuda:0") == ON_CPU
     for engine, device in (("auto", "cpu"), ("auto", None), ("warp", "cuda:0"), ("mujoco", "cpu"), (ToyEngine, "cuda")):
         assert options_for_few_worlds(engine, device) == {}
 
 
 def test_a_plant_moves_from_a_gpu_to_a_cpu_core(gpu: Any) -> None:
-    """On the GPU its steps would wait for the planner, so a plant with engine="warp" moves, too."""
+    """On the GPU the plant's steps would wait for the planner, so a plant with engine="warp" also moves."""
     for engine, device in (("auto", "cuda:0"), ("warp", "cuda:0")):
         assert options_for_plant(engine, device) == ON_CPU
     for engine, device in (("auto", None), ("warp", "cpu"), ("mujoco", "cpu"), (ToyEngine, "cuda:0")):
         assert options_for_plant(engine, device) == {}
 
 
-def test_place_samples_chooses_by_the_number_of_samples(gpu: Any) -> None:
-    """Only engine="auto" is moved; an explicit engine is used unchanged."""
+def test_place_samples_chooses_an_engine_by_the_number_of_samples(gpu: Any) -> None:
+    """Only engine="auto" chooses a device; an explicit engine is used unchanged."""
 
     def chosen(
         samples: int,
@@ -151,6 +151,6 @@ def test_place_samples_chooses_by_the_number_of_samples(gpu: Any) -> None:
     assert chosen(160, solver={"noslip_iterations": 3}) == ON_CPU
 
 
-def test_the_c_engine_refuses_a_gpu(model: mujoco.MjModel, gpu: Any) -> None:
+def test_c_engine_on_a_gpu_raises_an_error(model: mujoco.MjModel, gpu: Any) -> None:
     with pytest.raises(ValueError, match="runs on the CPU, not on 'cuda:0': use device='cpu' or engine='warp'"):
         open_engine("mujoco", model, 1, gpu, [])

@@ -1,5 +1,4 @@
-"""Test that a refresh equals a full forward pass bit for bit, but computes only the parts that fields and sensors
-need."""
+"""Test that a refresh equals a full forward pass bit for bit, but computes only the required parts."""
 
 from typing import Any
 
@@ -88,7 +87,7 @@ def only(engine: Engine, *worlds: int) -> wp.array:
 
 
 def begin(engine: Engine, mask: wp.array, seed: int) -> None:
-    """Begin episodes in the masked worlds, in random states, some beyond a limit or in contact."""
+    """Begin episodes of the masked worlds in random states, some of them beyond a limit or in contact."""
     rng, chosen = np.random.default_rng(seed), mask.numpy().astype(bool)
     engine.reset(mask)
     write(engine, "qpos", chosen, engine.arrays["qpos"].numpy() + 0.1 * rng.normal(size=engine.arrays["qpos"].shape))
@@ -118,7 +117,7 @@ def shown(engine: Engine) -> dict[str, np.ndarray]:
 
 
 def full_forward(engine: Engine) -> dict[str, np.ndarray]:
-    """Compute the same fields with MuJoCo's own forward pass in separate data."""
+    """Compute all derived fields with MuJoCo's own forward pass in separate data."""
     state = state_of(engine)[:, : engine.integration_size]
     spec, names = mujoco.mjtState.mjSTATE_INTEGRATION.value, [n for n in FIELDS.split() if n in engine.fields]
     if isinstance(engine, WarpEngine):
@@ -153,10 +152,7 @@ class WholeWarpEngine(WarpEngine):
     partial_refresh = False
 
 
-@pytest.fixture(
-    params=[MujocoEngine, WarpEngine, pytest.param(WholeWarpEngine, marks=pytest.mark.long)],
-    ids=["mujoco", "warp", "whole_warp"],
-)
+@pytest.fixture(params=[MujocoEngine, WarpEngine, WholeWarpEngine], ids=["mujoco", "warp", "whole_warp"])
 def kind(request: pytest.FixtureRequest) -> type[Engine]:
     engine: type[Engine] = request.param
     return engine
@@ -196,13 +192,15 @@ def test_a_refresh_equals_a_full_forward_pass(kind: type[Engine], sensors: str) 
 
 
 @pytest.mark.parametrize("sensors", ["cheap", "velocities of tendons", "mixed", "histories"])
-def test_a_refresh_on_warp_runs_no_collisions_and_no_constraints(sensors: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refresh_on_warp_computes_no_collisions_and_no_constraints(
+    sensors: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     engine = make(WarpEngine, sensors)
     engine.step(1)
     state = state_of(engine)
 
     def refuse(*args: Any, **options: Any) -> None:
-        raise AssertionError("more of a forward pass than is needed")
+        raise AssertionError("the refresh computed an unnecessary part of the forward pass")
 
     for name in ("forward", "fwd_position", "collision", "make_constraint", "solve"):
         monkeypatch.setattr(mjw, name, refuse)
@@ -212,10 +210,9 @@ def test_a_refresh_on_warp_runs_no_collisions_and_no_constraints(sensors: str, m
         begin(engine, only(engine, 1), 1)
 
 
+@pytest.mark.quick("mujoco", "warp")
 @pytest.mark.parametrize("sensors", ["mixed", "histories"])
-def test_sensors_of_the_acceleration_stage_keep_their_values_from_the_last_substep(
-    kind: type[Engine], sensors: str
-) -> None:
+def test_acceleration_sensors_keep_their_values_from_the_last_substep(kind: type[Engine], sensors: str) -> None:
     engine = make(kind, sensors)
     late = np.setdiff1d(np.arange(engine.model.nsensordata), early_sensor_columns(engine.model))
     engine.step(3)
@@ -223,7 +220,7 @@ def test_sensors_of_the_acceleration_stage_keep_their_values_from_the_last_subst
     assert np.abs(left[:, late]).max() > 0
     engine.refresh_current(everyone(engine))
     np.testing.assert_array_equal(shown(engine)["sensordata"], left)
-    # two worlds are pushed, as an event does
+    # push two worlds, as an event does
     before, chosen = state_of(engine), only(engine, 0, 2)
     write(engine, "qvel", chosen.numpy(), engine.arrays["qvel"].numpy() + 1.0)
     engine.commit(chosen)
@@ -233,14 +230,15 @@ def test_sensors_of_the_acceleration_stage_keep_their_values_from_the_last_subst
     np.testing.assert_array_equal(pushed[:, late], left[:, late])
     np.testing.assert_array_equal(pushed[[1, 3]], left[[1, 3]])
     assert (pushed[[0, 2]] != left[[0, 2]]).any()
-    # the sensors of a restored world belong to the restored state, also after another refresh
+    # the sensors of a restored world belong to the restored state, even after another refresh
     engine.step(1)
     put(engine, before, only(engine, 1))
     engine.refresh_current(everyone(engine))
     np.testing.assert_array_equal(shown(engine)["sensordata"][1], left[1])
 
 
-def test_no_refresh_adds_to_a_sensors_history(kind: type[Engine]) -> None:
+@pytest.mark.quick("mujoco", "warp")
+def test_refresh_does_not_extend_the_history_of_a_sensor(kind: type[Engine]) -> None:
     engine = make(kind, "histories")
     parts = mujoco.mj_stateSize(engine.model, mujoco.mjtState.mjSTATE_HISTORY.value)
     assert parts > 0
@@ -250,7 +248,7 @@ def test_no_refresh_adds_to_a_sensors_history(kind: type[Engine]) -> None:
         engine.refresh_current(everyone(engine))
         np.testing.assert_array_equal(state_of(engine), before)
         engine.refresh(only(engine, 1))
-        size = engine.integration_size  # acceleration-stage sensors of a restart belong to its first state
+        size = engine.integration_size  # after a restart, acceleration sensors belong to the first state of the episode
         np.testing.assert_array_equal(state_of(engine)[:, :size], before[:, :size])
     before = state_of(engine)
     begin(engine, only(engine, 2), 5)
@@ -263,6 +261,7 @@ def test_no_refresh_adds_to_a_sensors_history(kind: type[Engine]) -> None:
     np.testing.assert_array_equal(state_of(engine), state_of(fresh))
 
 
+@pytest.mark.quick("mujoco", "warp")
 def test_a_refresh_uses_the_equality_constraints_of_each_world(kind: type[Engine]) -> None:
     engine = make(kind, "mixed", '<joint joint1="knee" polycoef="-.3 0 0 0 0"/>')
     held = shown(engine)["sensordata"]
@@ -274,7 +273,8 @@ def test_a_refresh_uses_the_equality_constraints_of_each_world(kind: type[Engine
     assert (shown(engine)["sensordata"] != held).any(axis=1).tolist() == [False, True, False, False]
 
 
-def test_a_limit_sensor_is_zero_after_the_limit_is_left(kind: type[Engine]) -> None:
+@pytest.mark.quick("mujoco", "warp")
+def test_limit_sensor_is_zero_after_the_joint_leaves_its_limit(kind: type[Engine]) -> None:
     engine = make(kind, "limits")
     knee = int(engine.model.joint("knee").qposadr[0])
     column = state_columns(engine.model, "qpos").start + knee
@@ -290,9 +290,9 @@ def test_a_limit_sensor_is_zero_after_the_limit_is_left(kind: type[Engine]) -> N
         check_current(engine)
 
 
-def test_worlds_that_share_an_mjdata_do_not_mix_their_fields() -> None:
-    """The stage after the step runs in an MjData that worlds share. Fields that it does not compute hold another
-    world's values."""
+def test_worlds_that_share_an_mjdata_keep_their_own_fields() -> None:
+    """Worlds share the MjData in which the stage after the step runs. Fields that this stage does not compute contain
+    another world's values."""
     model, device = model_of(SENSORS["mixed"]), wp.get_device("cpu")
     for lagged, current in ((), ("xpos",)), (("cvel",), ("xpos",)), (("cvel", "xpos"), ("sensordata",)):
         fields = [describe(model, name, lagged=name in lagged) for name in (*lagged, *current, "qacc", "qvel")]
@@ -312,7 +312,7 @@ def test_worlds_that_share_an_mjdata_do_not_mix_their_fields() -> None:
             rows = np.concatenate([engine.arrays[field.name].numpy() for engine in apart])
             np.testing.assert_array_equal(together.arrays[field.name].numpy(), rows, err_msg=f"{field.name} {lagged}")
             assert len(np.unique(rows.reshape(4, -1), axis=0)) == 4, field.name
-    early = early_sensor_columns(model)  # these sensors belong to the current state, and the others to the last substep
+    early = early_sensor_columns(model)  # these sensors belong to the current state, and all others to the last substep
     for state, shown in zip(together.batch.state, together.arrays["sensordata"].numpy(), strict=True):
         data = mujoco.MjData(model)
         mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)

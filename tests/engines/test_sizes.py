@@ -1,5 +1,4 @@
-"""Test that contact and constraint buffers are large enough for everything a task may enable, or a warning is
-logged."""
+"""Test that contact and constraint buffers are large enough, or that a warning is logged."""
 
 import mujoco
 import pytest
@@ -12,7 +11,7 @@ from lyceum_warp.engines.warp.sizes import probe_sizes
 
 @pytest.fixture(autouse=True)
 def unknown_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Probe every model, also those of earlier runs of the tests."""
+    """Probe every model, even if an earlier run of the tests has probed it."""
     monkeypatch.setattr(sizes, "_known", {})
 
 
@@ -77,7 +76,7 @@ def test_buffers_have_room_for_welds_that_a_task_activates(
     assert not caplog.messages
 
 
-def test_buffers_too_small_for_first_states_log_a_warning(
+def test_buffers_too_small_for_the_first_states_log_a_warning(
     task_file: TaskFile, caplog: pytest.LogCaptureFixture
 ) -> None:
     lw.make(task_file("welded.py", TASK), engine="warp", nworld=2, njmax=8)
@@ -85,7 +84,9 @@ def test_buffers_too_small_for_first_states_log_a_warning(
     assert "begin with up to 48 constraints" in message and "njmax=8 and nconmax=" in message
 
 
-def test_drawn_fields_that_add_contacts_log_a_warning(task_file: TaskFile, caplog: pytest.LogCaptureFixture) -> None:
+def test_randomized_fields_that_add_contacts_log_a_warning(
+    task_file: TaskFile, caplog: pytest.LogCaptureFixture
+) -> None:
     drawing = TASK.replace("        s.eq_active[i] = True\n", "        s.geom_size[i][0] = 0.05\n")
     lw.make(task_file("drawing.py", drawing), engine="warp", nworld=2)
     (message,) = caplog.messages
@@ -118,7 +119,7 @@ def test_buffers_have_rows_for_inactive_constraints_of_every_type(kind: str) -> 
     assert probe_sizes(model)[1] - probe_sizes(without)[1] == -(-10 * EQUALITIES[kind] // 8) * 8
 
 
-def test_randomized_ranges_reserve_rows_for_every_limit() -> None:
+def test_buffers_have_rows_for_every_limit_if_ranges_are_randomized() -> None:
     joints = "".join(
         f'<body pos="{i} 0 0"><joint range="-900 900" limited="true"/><geom size=".1"/></body>' for i in range(20)
     )

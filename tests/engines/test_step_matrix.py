@@ -1,10 +1,8 @@
-"""Compare the Warp engine's step with MuJoCo Warp's bit for bit, for all kinds of model elements and fields of
-World."""
+"""Compare the Warp engine's steps with MuJoCo Warp's, bit for bit, for all kinds of model elements and fields."""
 
 import copy
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -38,7 +36,7 @@ def make(model: mujoco.MjModel, names: list[str], device: wp.Device, dynamics: S
 
 
 def begin(engine: WarpEngine, mask: wp.array, seed: int) -> None:
-    """Begin episodes in the masked worlds, in random states."""
+    """Begin episodes of the masked worlds in random states."""
     rng, chosen, model = np.random.default_rng(seed), mask.numpy(), engine.model
     engine.reset(mask)
     qpos, qvel = engine.arrays["qpos"].numpy(), engine.arrays["qvel"].numpy()
@@ -61,8 +59,8 @@ def state_of(engine: WarpEngine, m: mjw.Model, d: mjw.Data) -> np.ndarray:
 def plain(function: Callable[[mjw.Model, mjw.Data], None], m: mjw.Model, d: mjw.Data) -> None:
     """Run MuJoCo Warp's own step or forward pass, but let constraints read the current velocities.
 
-    MuJoCo Warp's ``make_constraint`` reads the bodies' velocities of the last forward pass. The engine recomputes them,
-    so that a step depends only on the state.
+    MuJoCo Warp's ``make_constraint`` reads the bodies' velocities of the last forward pass. The engine recomputes these
+    velocities, so that a step depends only on the state.
     """
 
     def make_constraint(m: mjw.Model, d: mjw.Data) -> None:
@@ -76,7 +74,7 @@ def plain(function: Callable[[mjw.Model, mjw.Data], None], m: mjw.Model, d: mjw.
 
 
 def check(case: Case, device: wp.Device) -> None:
-    """Compare steps and fields of an engine with MuJoCo Warp's own."""
+    """Compare steps and fields of an engine with those of MuJoCo Warp."""
     model, names = table.model_of(case), table.fields_of(case)
     engine = make(model, names, device)
     begin(engine, wp.full(N, True, dtype=bool, device=device), 1)
@@ -98,7 +96,7 @@ def check(case: Case, device: wp.Device) -> None:
     last = {name: getattr(d, name).numpy().copy() for name in names}
     set_state(m, d, found)
     plain(mjw.forward, m, d)
-    if "energy" in names:  # MuJoCo Warp's own forward pass loses the kinetic energy of an energy sensor
+    if "energy" in names:  # MuJoCo Warp's forward pass loses the kinetic energy if the model has an energy sensor
         mjw.energy_pos(m, d)
         mjw.energy_vel(m, d)
     late = np.setdiff1d(np.arange(model.nsensordata), early_sensor_columns(model))
@@ -124,20 +122,20 @@ def check_or_refuse(case: Case, device: wp.Device) -> None:
 
 
 @pytest.mark.parametrize("case", table.covering(1), ids=table.title)
-def test_a_step_equals_mujoco_warps_own_bit_for_bit(case: Case, device: wp.Device) -> None:
+def test_step_equals_that_of_mujoco_warp_bit_for_bit(case: Case, device: wp.Device) -> None:
     """The cases cover all levels of all factors."""
     check_or_refuse(case, device)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("case", table.covering(2), ids=table.title)
-def test_a_step_with_any_two_levels_equals_mujoco_warps_own(case: Case, device: wp.Device) -> None:
+def test_step_with_any_two_levels_equals_that_of_mujoco_warp(case: Case, device: wp.Device) -> None:
     check_or_refuse(case, device)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("part", range(PARTS))
-def test_a_step_with_any_three_levels_equals_mujoco_warps_own(part: int, device: wp.Device) -> None:
+def test_step_with_any_three_levels_equals_that_of_mujoco_warp(part: int, device: wp.Device) -> None:
     for case in table.covering(3)[part::PARTS]:
         try:
             check_or_refuse(case, device)
@@ -152,8 +150,8 @@ LADEN = table.PLAIN | {
 
 
 @pytest.mark.parametrize("asked", table.STAGES)
-def test_a_step_continues_from_the_fields_of_any_stage(asked: str, device: wp.Device) -> None:
-    """The step computes the parts that a field needs, and does not repeat parts that are already computed."""
+def test_step_reuses_fields_that_are_already_computed(asked: str, device: wp.Device) -> None:
+    """The step computes the parts that a field needs, but does not repeat parts that are already computed."""
     check(LADEN | {"asked": asked}, device)
 
 
@@ -166,11 +164,11 @@ OF_ANOTHER_MODEL = {
     "tendon_solref_fri": {"tendons": "friction"}, "tendon_solimp_fri": {"tendons": "friction"},
     "pair_solreffriction": {"cone": "elliptic"},
 }  # fmt: skip
-"""Levels that a model needs in addition to ``DRAWN`` for a field to have an effect."""
+"""Levels that give a field an effect, in addition to ``DRAWN``, by field."""
 
 
 def touching(model: mujoco.MjModel) -> np.ndarray:
-    """Return a state at limits, with contacts and saturated actuators, in all worlds, (N, integration size)."""
+    """Return states with contacts, saturated actuators and joints at their limits, (N, integration size)."""
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     data.qpos[model.joint("elbow").qposadr[0]] = 0.1
     data.qvel[:] = 0.05 * rng.normal(size=model.nv)
@@ -181,18 +179,13 @@ def touching(model: mujoco.MjModel) -> np.ndarray:
     return np.tile(state, (N, 1))
 
 
-def drawn_fields() -> list[Any]:
-    """Return all model fields; fields without derived constants are marked long."""
-    return [name if constants else pytest.param(name, marks=pytest.mark.long) for name, constants in _FIELDS.items()]
-
-
 @pytest.mark.quick(
-    "cpu-body_mass", "cpu-body_inertia", "cpu-body_ipos", "cpu-qpos0", "cpu-dof_armature", "cpu-actuator_gear",
-    "cpu-geom_size", "cpu-geom_gap", "cpu-cam_pos", "cpu-tendon_armature",
+    "body_mass", "body_inertia", "body_ipos", "qpos0", "dof_armature", "actuator_gear", "geom_size", "geom_gap",
+    "cam_pos", "tendon_armature",
 )  # fmt: skip
-@pytest.mark.parametrize("name", drawn_fields())
-def test_a_drawn_field_acts_as_in_an_edited_model(name: str, device: wp.Device) -> None:
-    """Some fields are zero in the model. Results are bitwise equal if no constants are derived."""
+@pytest.mark.parametrize("name", _FIELDS)
+def test_randomized_field_has_the_same_effect_as_an_edited_model(name: str, device: wp.Device) -> None:
+    """Some model fields are zero by default. Results are bitwise equal if no constants are derived from the field."""
     case = DRAWN | OF_ANOTHER_MODEL.get(name, {})
     spec = mujoco.MjSpec.from_string(table.xml(case))
     for body in spec.bodies[1:]:
@@ -237,14 +230,14 @@ def test_a_drawn_field_acts_as_in_an_edited_model(name: str, device: wp.Device) 
 
 
 @pytest.mark.parametrize(("levels", "reason"), table.REFUSED)
-def test_refused_combinations_are_refused(levels: dict[str, tuple[str, ...]], reason: str) -> None:
+def test_engines_reject_the_listed_combinations(levels: dict[str, tuple[str, ...]], reason: str) -> None:
     for chosen in itertools.product(*levels.values()):
         with pytest.raises((ValueError, NotImplementedError), match=reason):
             make(table.model_of(table.PLAIN | dict(zip(levels, chosen, strict=True))), [], wp.get_device("cpu"))
 
 
-def test_the_table_knows_every_member_of_mujocos_enums() -> None:
-    """A new MuJoCo element fails here until the table contains it or gives a reason for its absence."""
+def test_table_contains_every_member_of_the_mujoco_enums() -> None:
+    """This test fails for a new MuJoCo element until the table contains it or gives a reason for its absence."""
     models = [table.model_of(case) for case in table.singles()]
     for enum, members in table.ENUMS.items():
         found = {int(member) for model in models for member in members(model)}

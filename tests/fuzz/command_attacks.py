@@ -1,7 +1,7 @@
 """Run ``lyceum-warp`` with random command lines.
 
 A case is "COMMAND SEED", or the name of a minimal case in ``minimal_cases.py``. The flags are read from the help texts,
-so new ones are included.
+so new flags are included automatically.
 """
 
 import contextlib
@@ -45,15 +45,15 @@ SMALL: dict[str, dict[str, tuple[str, ...]]] = {
     "view": {},
     "bench": {},
 }  # fmt: skip
-"""Commands, with flags that make them quick."""
+"""Commands, each with flags that make it quick."""
 
 FIRST = {"tasks": "", "new": "my_task", "eval": "good", "export": "good"} | dict.fromkeys(
     ("train --resume good", "train --from good"), ""
 )
-"""First arguments of commands; the default is a task."""
+"""Arguments that follow a command; by default the name of a task."""
 
 _OMIT = ("--help", "--video", "--video-every", "--view", "--frame-skip")
-"""Flags that print or start other processes, and a flag with which a single native call can take hours."""
+"""Omitted flags: some print or start other processes, and with one of them a single native call can take hours."""
 
 
 @functools.cache
@@ -71,7 +71,7 @@ def _word(random: Random) -> str:
     if kind == 0:
         return str(random.choice(NUMBERS))
     if kind == 1:
-        return random.choice(TEXTS).replace("\0", "\1")  # an argument ends at a null byte
+        return random.choice(TEXTS).replace("\0", "\1")  # an argument cannot contain a null byte
     return random.choice(_WORDS)
 
 
@@ -135,7 +135,7 @@ def run(line: list[str]) -> str:
         warnings.simplefilter("ignore")
         try:
             code = cli.main(line)
-        except SystemExit as end:  # the parser prints a box
+        except SystemExit as end:  # the parser prints its error in a box
             code, parsed = end.code, False
         except KeyboardInterrupt:
             raise

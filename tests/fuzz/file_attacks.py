@@ -1,4 +1,4 @@
-"""Read randomly damaged files: files of runs, saved episodes, models and tables.
+"""Read randomly damaged files of runs, saved episodes, models and tables.
 
 A case is "KIND SEED", or the name of a minimal case in ``minimal_cases.py``.
 """
@@ -29,7 +29,7 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.viz.video import NoVideoError
 
 REFUSALS = (ValueError, OSError, ImportError, NoVideoError, FloatingPointError)
-"""Documented errors for bad files and arguments."""
+"""Documented error types for invalid files and arguments."""
 BASE, CASE, CANARY = Path("base").absolute(), Path("case").absolute(), Path("canary").absolute()
 
 TASK = """
@@ -149,13 +149,13 @@ READERS: dict[str, Callable[[], object]] = {
     "table": lambda: lw.make(SLIDE_PY, motion=CASE / "table.npy").step(),
 }  # fmt: skip
 WITHOUT = {"load alone": "run/policy.pt", "resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}
-"""Files that are deleted so that a reader falls back to another file."""
+"""Files to delete, so that a reader must use another file."""
 SLIDE_PY = str(BASE / "slide.py")
 _NEW = ("--trust", "--out", "case/new", "--iterations", "1", "--no-video", "--no-plot")
 
 
 class RefusedError(Exception):
-    """Raised if a command exits with 2 and prints one line to stderr."""
+    """A command exited with 2 and printed one line to stderr."""
 
 
 def command(*words: object) -> None:
@@ -165,7 +165,7 @@ def command(*words: object) -> None:
         code = cli.main([str(word) for word in words])
     lines = [line for line in err.getvalue().splitlines() if line.startswith("lyceum-warp: ")]
     if code == 2:
-        raise RefusedError(lines[-1] if lines else "without a line on stderr")
+        raise RefusedError(lines[-1] if lines else "the command printed no line to stderr")
     if code not in (0, 130):
         raise ProblemError(f"{words[0]} ended with {code}: {err.getvalue()[-300:]}")
 
@@ -214,13 +214,13 @@ def read(name: str, reader: str, change: Callable[[bytes], bytes]) -> str:
 
 def _check_refusal(where: str, kind: Kind, error: BaseException, before: Mapping[str, bytes]) -> None:
     if guarded.out_of_memory(error):
-        raise ProblemError(f"{where} takes too much memory", error)
+        raise ProblemError(f"{where}: reading takes too much memory", error)
     if not any(name in str(error) for name in (Path(kind.file).name, *kind.names)):
         raise ProblemError(f"{where}: the message does not name the file", error)
     after = content(CASE)
     changed = [name for name in before | after if before.get(name) != after.get(name)]
     if changed:
-        raise ProblemError(f"{where}: refused, but it changed {', '.join(changed)}", error)
+        raise ProblemError(f"{where}: the file was rejected, but the reader changed {', '.join(changed)}", error)
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -251,11 +251,11 @@ def _make(folder: Path) -> None:
     command("train", "point_mass", "--horizon", "8", "--out", folder / "run", *options)
     motion = f"motion={folder / 'table.npy'}"
     command("train", folder / "slide.py", "--out", folder / "kept", "--param", motion, *options)
-    for run in ("run", "kept"):  # shorten measured times, so that all files have the same length
+    for run in ("run", "kept"):  # round measured times, so that all files have the same length
         path = folder / run / "metrics.csv"
         path.write_text(re.sub(r"\d+\.\d{9,}", lambda found: found[0][:8], path.read_text()))
     config = json.loads((folder / "kept/config.json").read_text())
-    # without the originals, readers use the run's copies
+    # without the original files, readers use the run's copies
     config |= {"task": "/nowhere/slide.py", "params": {"motion": "/nowhere/table.npy"}}
     (folder / "kept/config.json").write_text(json.dumps(config, indent=2))
     plant = lw.make("point_mass", autoreset=False, horizon=4)

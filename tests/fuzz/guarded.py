@@ -1,7 +1,7 @@
 """Run attacks in a subprocess, each with a limited time and memory, and collect the problems.
 
-An attack program calls ``serve``; a test calls ``attacks``. ``python tests/fuzz/PROGRAM.py CASE ...`` repeats cases by
-hand, prints their tracebacks, and writes its files into the current directory.
+An attack program calls ``serve``; a test calls ``attacks``. ``python tests/fuzz/PROGRAM.py CASE ...`` repeats single
+cases, prints their tracebacks, and writes files into the current directory.
 """
 
 import contextlib
@@ -22,9 +22,9 @@ from typing import Any
 MEMORY = 512 * 2**20
 """Additional bytes of address space that a case may use after the warm-up."""
 PATIENCE = 3.0
-"""Seconds between interrupts like Ctrl-C, which must end a command."""
+"""Seconds between SIGINTs, which must end a command."""
 LIMIT = 60.0
-"""Seconds after which a case that ignores interrupts is killed with a traceback."""
+"""Seconds after which a case is killed with a traceback if it ignores SIGINT."""
 ROOT = Path(__file__).parents[2]
 
 
@@ -39,11 +39,11 @@ class Outcome:
 
 
 Attack = Callable[[str], str]
-"""Run a case and return its outcome; raise ProblemError if it breaks a rule."""
+"""Run a case and return its outcome; raise ProblemError if the case violates a rule."""
 
 
 class ProblemError(Exception):
-    """A case broke a rule; the message is one line."""
+    """A case violated a rule; the message is one line."""
 
     def __init__(self, text: str, error: BaseException | None = None) -> None:
         super().__init__(text if error is None else f"{text}: {place(error)}")
@@ -83,7 +83,7 @@ def serve(attack: Attack, warm_up: Callable[[], None]) -> None:
     with open(results, "a") if results else contextlib.nullcontext(sys.__stdout__) as file:
         for case in cases:
             print(json.dumps({"begin": case}), file=file, flush=True)
-            gc.collect()  # environments of earlier cases
+            gc.collect()  # free the environments of earlier cases
             size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
             resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, resource.RLIM_INFINITY))
             faulthandler.dump_traceback_later(LIMIT, exit=True)
@@ -96,7 +96,7 @@ def serve(attack: Attack, warm_up: Callable[[], None]) -> None:
 
 
 def _guarded(attack: Attack, case: str) -> Outcome:
-    """Run a case, and interrupt it like Ctrl-C if it takes too long."""
+    """Run a case, and interrupt it by SIGINT if it takes too long."""
     before = signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))
     try:
         signal.setitimer(signal.ITIMER_REAL, PATIENCE, PATIENCE)
@@ -106,7 +106,7 @@ def _guarded(attack: Attack, case: str) -> Outcome:
         return Outcome(case, "broke a rule", str(problem), text[-4000:])
     except KeyboardInterrupt:
         return Outcome(case, "interrupted")
-    except BaseException as error:  # a defect of the attack program
+    except BaseException as error:  # the attack program itself has failed
         return Outcome(case, "failed", f"the attack failed: {place(error)}", traceback.format_exc()[-4000:])
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)

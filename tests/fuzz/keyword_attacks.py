@@ -1,7 +1,7 @@
 """Call public functions with random values for each of their arguments.
 
 A case is "CALL SEED", or the name of a minimal case in ``minimal_cases.py``. The arguments are read from the
-signatures, so new ones are included.
+signatures, so new arguments are included automatically.
 """
 
 import dataclasses
@@ -35,12 +35,12 @@ OBJECTS: tuple[Any, ...] = (
     Path("x"), (1, 2), ("qpos",), ("nothing",), {"iterations": 1e9}, {"x": torch.zeros(2)}, frozenset(), "auto",
     "hopper", Exception("x"), iter(()), slice(2),
 )  # fmt: skip
-"""Values that a program may pass by mistake."""
+"""Invalid values that a program may pass by mistake."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Call:
-    """A function, valid arguments, and the names of keyword arguments that its signature does not list."""
+    """A function to call, with valid arguments and the keyword arguments that its signature does not list."""
 
     function: Callable[..., Any]
     valid: Callable[[], dict[str, Any]]
@@ -48,7 +48,7 @@ class Call:
 
     @property
     def names(self) -> list[str]:
-        """Return the names of the arguments to attack, without videos, which a subprocess makes."""
+        """Return the names of the arguments to attack; videos are excluded, because a subprocess makes them."""
         variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
         found = [name for name, p in inspect.signature(self.function).parameters.items() if p.kind not in variable]
         return [name for name in dict.fromkeys((*found, *self.more)) if name != "video_every"]
@@ -56,7 +56,7 @@ class Call:
 
 @functools.cache
 def _env(**options: Any) -> lw.Env:
-    """Make an environment that cases share and may leave in any state."""
+    """Make an environment that all cases share; a case may leave it in any state."""
     return lw.make("point_mass", horizon=4, **options)
 
 
@@ -128,7 +128,7 @@ def call(name: str, words: dict[str, Any]) -> str:
         except BaseException as error:
             raise ProblemError(shown, error) from error
     if guarded.out_of_memory(refusal):
-        raise ProblemError(f"{shown} takes too much memory", refusal)
+        raise ProblemError(f"{shown}: the call takes too much memory", refusal)
     text = str(refusal)
     named = [*words, *(word.replace("_", " ").removesuffix("s") for word in words), *map(_shown, words.values())]
     named += [repr(part) for value in words.values() if isinstance(value, (dict, tuple)) for part in value]
@@ -144,7 +144,7 @@ def _shown(value: Any) -> str:
 
 
 def warm_up() -> None:
-    """Make a run to load, and make every call once."""
+    """Make a run that calls can load, and make every call once."""
     torch.set_num_threads(1)
     HERE.mkdir(exist_ok=True)
     os.chdir(HERE)

@@ -88,7 +88,7 @@ FILES: dict[str, tuple[str, str, Change]] = {
     "a table whose header asks for 40 GB": ("table.npy", "table", _header),
     "a table whose header does not end": ("table.npy", "table", lambda data: data.replace(b"}", b"(", 1)),
 }  # fmt: skip
-"""Cases as (kind of file, reader, change). The file must be refused, or read if the change does not matter."""
+"""Cases as (kind of file, reader, change). A reader must reject the file, or read it if the change does not matter."""
 
 KEYWORDS: dict[str, tuple[str, dict[str, Any]]] = {
     "fields that are a tensor": ("make", {"fields": torch.tensor(3)}),

@@ -24,7 +24,7 @@ TEXTS = (
     "%s{}", "\u202e\u0301", "ä" * 20, "x" * 5000,
 )  # fmt: skip
 VALUES = (*NUMBERS, *TEXTS, None, True, False, [], {}, [0], [[1.5]], [None], {"x": 1}, {"": []})
-"""Values of JSON's types, most of them invalid anywhere."""
+"""Values of JSON's types; most of them are invalid everywhere."""
 
 
 class Canary:
@@ -64,14 +64,14 @@ def mutated_value(tree: Any, random: Random, values: tuple[Any, ...] = VALUES) -
             entries[name] = mutated_value(entries[name], random, values)
         return entries if isinstance(tree, dict) else list(entries.values())
     if isinstance(tree, torch.Tensor) and random.random() < 0.8:
-        huge = torch.zeros(1).expand(10**9)  # four bytes that claim a shape of 4 GB
+        huge = torch.zeros(1).expand(10**9)  # four bytes that declare a size of 4 GB
         other = tree.to(random.choice((torch.float64, torch.bool, torch.complex64, torch.int64)))
         return random.choice((huge, other, tree.flatten()[:-1], tree[None], tree.to_sparse(), tree * math.nan))
     return [tree] if random.random() < 0.1 else random.choice(values)
 
 
 def mutated_json(data: bytes, random: Random) -> bytes:
-    """Change bytes or an entry of a JSON document, or nest it too deeply."""
+    """Change bytes or an entry of a JSON document, or nest the document too deeply."""
     if random.random() < 0.3:
         return mutated_bytes(data, random)
     if random.random() < 0.05:

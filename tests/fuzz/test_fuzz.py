@@ -1,7 +1,6 @@
-"""Damage files, command lines and arguments at random; each must work or be refused with an error that gives the
-reason.
+"""Damage files, command lines and arguments at random; each must work or raise a documented error.
 
-A failure names its case and the command that repeats it.
+The message of a failure names the case and the command that repeats it.
 """
 
 import functools
@@ -29,19 +28,18 @@ FEW = {
         "export": 1, "plan": 1, "view": 1, "bench": 1,
     },
 }  # fmt: skip
-"""Numbers of cases of each kind, by attack program."""
+"""Number of cases of each kind, by attack program."""
 _MANY = {"file_attacks.py": 150, "keyword_attacks.py": 200, "command_attacks.py": 50}
 MANY = {program: dict.fromkeys(FEW[program], count) for program, count in _MANY.items()}
-"""The numbers for ``make test-all``."""
+"""Number of cases for ``make test-all``, by attack program."""
 MINIMAL: dict[str, Mapping[str, Any]] = {
     "file_attacks.py": FILES, "keyword_attacks.py": KEYWORDS, "command_attacks.py": COMMANDS,
 }  # fmt: skip
 
 
-def each(names: Mapping[str, Mapping[str, Any]]) -> list[Any]:
-    """Every program with each of its names; make test-all tries the command lines, which take longest."""
-    slow = {"command_attacks.py": pytest.mark.long}
-    return [pytest.param(program, name, marks=slow.get(program, ())) for program in names for name in names[program]]
+def each(names: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """Return every program with each of its names."""
+    return [(program, name) for program in names for name in names[program]]
 
 
 def cases(counts: Mapping[str, int], first: int) -> list[str]:
@@ -50,9 +48,9 @@ def cases(counts: Mapping[str, int], first: int) -> list[str]:
 
 @pytest.fixture(scope="module")
 def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Return ``outcomes(program, many)``, which runs the many cases of a program, or the few and the minimal ones.
+    """Return ``outcomes(program, many)``, which runs many cases of a program, or a few cases and all minimal cases.
 
-    The folder has the same path in every run of the tests.
+    The folder of the cases has the same path in every run of the tests.
     """
     cache = getattr(pytestconfig, "cache", None)
     parent = cache.mkdir("fuzz") if cache else tmp_path_factory.mktemp("fuzz")
@@ -68,9 +66,11 @@ def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFacto
     return run
 
 
-@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.long)], ids=["few", "many"])
+# command lines take longest
+@pytest.mark.quick(*(f"{program}-{kind}-few" for program, kind in each(FEW) if program != "command_attacks.py"))
+@pytest.mark.parametrize("many", [False, True], ids=["few", "many"])
 @pytest.mark.parametrize(("program", "kind"), each(FEW))
-def test_random_cases_work_or_are_refused_in_one_line(outcomes: Any, program: str, kind: str, many: bool) -> None:
+def test_random_cases_work_or_raise_a_one_line_error(outcomes: Any, program: str, kind: str, many: bool) -> None:
     count = (MANY if many else FEW)[program][kind]
     found = {case: o for case, o in outcomes(program, many).items() if case.rpartition(" ")[0] == kind}
     assert len(found) == count
@@ -82,7 +82,8 @@ def test_random_cases_work_or_are_refused_in_one_line(outcomes: Any, program: st
     assert not bad, "\n".join([f"{len(bad)} of {count} cases", *bad])
 
 
+@pytest.mark.quick("file_attacks.py", "keyword_attacks.py")
 @pytest.mark.parametrize(("program", "name"), each(MINIMAL))
-def test_minimal_case_is_refused(outcomes: Any, program: str, name: str) -> None:
+def test_minimal_case_raises_a_documented_error(outcomes: Any, program: str, name: str) -> None:
     outcome = outcomes(program, False)[name]
     assert not outcome.problem, f"{outcome.problem}\n    {replay(program, name)}\n{outcome.trace}"

@@ -60,7 +60,7 @@ def memory() -> tuple[int, int]:
     return wp.get_mempool_used_mem_current(CUDA), torch.cuda.memory_allocated()
 
 
-def test_a_call_that_waits_raises() -> None:
+def test_call_that_waits_for_the_device_raises_an_error() -> None:
     array = wp.zeros(3, dtype=float, device=CUDA)
     with nothing_waits():
         for waits in (array.numpy, lambda: wp.synchronize_device(CUDA), lambda: wp.to_torch(array).sum().item()):
@@ -69,7 +69,7 @@ def test_a_call_that_waits_raises() -> None:
 
 
 @pytest.mark.parametrize("task", ["hopper", "half_cheetah", "humanoid", "reach"])
-def test_steps_neither_wait_nor_allocate(task: str) -> None:
+def test_steps_do_not_wait_for_the_device_or_allocate_memory(task: str) -> None:
     env = lw.make(task, nworld=256, device=CUDA)
     generator = torch.Generator(CUDA).manual_seed(0)
     actions = 2 * torch.rand(16, *env.action.shape, generator=generator, device=CUDA) - 1
@@ -96,7 +96,7 @@ def test_steps_neither_wait_nor_allocate(task: str) -> None:
     assert env.episode_step.max() > 0
 
 
-def test_seeds_neither_wait_nor_allocate() -> None:
+def test_seeding_does_not_wait_for_the_device_or_allocate_memory() -> None:
     env = lw.make("hopper", nworld=64, device=CUDA)
     for seed in range(3):
         env.rand_reset(seed)
@@ -117,8 +117,8 @@ def run(env: lw.Env, steps: int) -> list[torch.Tensor]:
     return results
 
 
-def test_an_unused_torch_graph_does_not_break_a_capture() -> None:
-    """Any garbage collection may delete the graph, which CUDA forbids during a capture."""
+def test_deleted_torch_graph_does_not_break_a_capture() -> None:
+    """Garbage collection may delete the torch graph at any time, and CUDA forbids this during a capture."""
     env = lw.make("hopper", nworld=8, device=CUDA)
     env.step()
     graph, x = torch.cuda.CUDAGraph(), torch.zeros(4, device=CUDA)
@@ -147,8 +147,8 @@ def test_deterministic_graphs_equal_direct_launches(task: str) -> None:
         assert torch.equal(a, b)
 
 
-def test_a_capture_does_not_break_running_graphs() -> None:
-    """Graphs share memory, which a capture clears; nothing else waits for the device in between."""
+def test_capture_does_not_disturb_running_graphs() -> None:
+    """Graphs share memory that a capture clears, and no other call waits for the device in between."""
     replayed, direct = (
         lw.make("humanoid", nworld=1024, device=CUDA, deterministic=True, graphs=graphs) for graphs in (True, False)
     )
@@ -172,7 +172,7 @@ def test_deterministic_runs_are_equal_bit_for_bit(task: str) -> None:
         assert torch.equal(a, b)
 
 
-def test_memory_of_the_deterministic_mode_is_as_measured_in_advance() -> None:
+def test_deterministic_mode_uses_the_memory_that_was_measured_in_advance() -> None:
     def free() -> int:
         gc.collect()
         torch.cuda.empty_cache()
@@ -196,7 +196,7 @@ def test_memory_of_the_deterministic_mode_is_as_measured_in_advance() -> None:
         env.rand_reset()
         estimated, taken = sizes.bytes_of(nworld) + nworld * plain, before - free()
         assert 0.8 * estimated < taken < 1.2 * estimated, (nworld, estimated, taken)
-        assert made - free() < 0.1 * taken  # graphs reuse the reserved scratch
+        assert made - free() < 0.1 * taken  # graphs reuse the reserved scratch memory
         del env
     with pytest.raises(ValueError, match=r"nworld=\d+ at most"):
         lw.make("hopper", nworld=int(1.3 * most), device=CUDA, deterministic=True)
@@ -227,8 +227,8 @@ def test_restarting_worlds_get_the_fields_of_a_full_forward_pass(deterministic: 
     assert seen > 0
 
 
-def test_a_fault_among_few_humanoids_leaves_the_others_unchanged() -> None:
-    """The contact pool has room for an out-of-range world even if there are only a few worlds."""
+def test_fault_of_one_of_a_few_humanoids_does_not_change_the_others() -> None:
+    """The contact buffer has room for a world with excessive contacts even if there are only a few worlds."""
     from lyceum_warp.testing import CHECKS
 
     checks = [check for check in CHECKS if check.__name__ in ("check_bad_state", "check_bad_action")]
@@ -245,7 +245,7 @@ def test_few_worlds_of_an_evaluation_step_on_the_cpu() -> None:
     assert math.isfinite(next(npg).mean_return or math.nan)
 
 
-def test_memory_of_a_world_is_as_estimated() -> None:
+def test_worlds_use_the_estimated_memory() -> None:
     small, large = 1024, 8192
     sizes = []
     for nworld in (small, large):
@@ -262,12 +262,12 @@ def test_memory_of_a_world_is_as_estimated() -> None:
     assert 0.6 * estimate < each < 1.3 * estimate
 
 
-def test_too_many_worlds_are_refused_at_once() -> None:
+def test_too_many_worlds_raise_an_error_immediately() -> None:
     with pytest.raises(ValueError, match=r"100000000 worlds of humanoid need about .* use nworld=\d+ at most"):
         lw.make("humanoid", nworld=100_000_000, device=CUDA)
 
 
-def test_tables_are_read_on_the_device_and_change_under_graphs() -> None:
+def test_graphs_read_changed_tables_on_the_device() -> None:
     env = lw.make(Follow, nworld=64, device=CUDA)
     for motion in ([[0.0, 1.0], [0.5, 2.0]], [[4.0, 5.0], [6.0, 7.0]], [[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]):
         env.set_params(motion=torch.tensor(motion, device=CUDA))
@@ -280,7 +280,7 @@ def test_tables_are_read_on_the_device_and_change_under_graphs() -> None:
     assert env.obs[:, 1].unique().tolist() == [3.0]
 
 
-def test_a_rollout_with_groups_and_metrics_does_not_wait() -> None:
+def test_rollout_with_groups_and_metrics_does_not_wait_for_the_device() -> None:
     env = lw.make(Metered, nworld=64, device=CUDA)
     rollout = lw.Rollout(env, 50, groups=("critic",))
     policy = lw.GaussianPolicy(1, 1).to(CUDA)

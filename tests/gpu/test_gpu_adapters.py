@@ -14,7 +14,7 @@ N = 64
 
 
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep", "Disabled"])
-def test_a_step_with_tensors_never_waits(mode: str) -> None:
+def test_step_with_tensors_does_not_wait_for_the_device(mode: str) -> None:
     envs = GymnasiumVectorEnv(Full, N, torch=True, autoreset_mode=mode, device=CUDA)
     envs.reset(seed=0)
     action = torch.zeros(N, 3, device=CUDA)
@@ -29,7 +29,7 @@ def test_a_step_with_tensors_never_waits(mode: str) -> None:
     assert obs["policy"].device == torch.device(CUDA)
 
 
-def test_numpy_and_tensors_have_the_same_numbers() -> None:
+def test_numpy_arrays_and_tensors_have_the_same_values() -> None:
     arrays, tensors = (GymnasiumVectorEnv(Full, N, torch=t, device=CUDA, deterministic=True) for t in (False, True))
     arrays.reset(seed=3)
     tensors.reset(seed=3)
@@ -48,7 +48,7 @@ def test_numpy_and_tensors_have_the_same_numbers() -> None:
     assert ends
 
 
-def test_stable_baselines3_gets_arrays() -> None:
+def test_stable_baselines3_receives_numpy_arrays() -> None:
     env = StableBaselines3VecEnv(Full, N, device=CUDA)
     env.reset()
     for _ in range(25):

@@ -19,11 +19,11 @@ pytestmark = pytest.mark.gpu
 
 DRAWN = "body_mass body_inertia geom_friction geom_quat dof_damping dof_armature actuator_gear gravity".split()
 N = 200
-CHOSEN = [0, 3, *range(50, 150)]  # more worlds than a refresh group has
+CHOSEN = [0, 3, *range(50, 150)]  # the number of worlds exceeds the size of a refresh group
 
 
 def draws(model: mujoco.MjModel, turn: int) -> dict[str, np.ndarray]:
-    """Return factors for model fields in each world; in a few worlds they change from turn to turn."""
+    """Return factors for the model fields of each world; in a few worlds the factors change in every turn."""
     found = {}
     for name in DRAWN:
         size = describe_model_field(model, name).size
@@ -45,7 +45,7 @@ def write(engine: Engine, name: str, factors: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("kind", [WarpEngine, DeterministicEngine])
-def test_graphs_apply_models_and_settle_as_the_c_engine_does(kind: type[Engine]) -> None:
+def test_gpu_graphs_and_the_c_engine_apply_models_and_settle_equally(kind: type[Engine]) -> None:
     spec = gymnasium_model("hopper.xml").spec()
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC

@@ -1,4 +1,4 @@
-"""Inject faults into some of many worlds on a GPU, at random steps."""
+"""Inject faults into some worlds on a GPU at random steps."""
 
 import pytest
 import torch

@@ -42,7 +42,7 @@ def plant(task: str) -> lw.Env:
 @pytest.mark.parametrize("task, horizon", [("reach", 16), ("half_cheetah", 8), ("cartpole_swingup", 20)])
 def test_plans_agree_with_plans_on_the_cpu(task: str, horizon: int) -> None:
     env = plant(task)
-    # at a low temperature rounding could choose between samples
+    # at a low temperature, rounding errors could change the best sample
     gpu, cpu = (
         lw.MPPI(task, device=device, engine=engine, horizon=horizon, samples=30, temperature=10.0, seed=3)
         for device, engine in ((CUDA, "warp"), ("cpu", "mujoco"))
@@ -92,8 +92,8 @@ def test_actions_are_on_the_device_of_the_states(of_plants: str, of_plan: str) -
 
 
 @pytest.mark.parametrize("update", UPDATES)
-def test_every_update_gives_equal_results_on_gpu_and_cpu_for_equal_returns(update: str) -> None:
-    """The first improvement's returns differ by rounding, which may swap samples that are almost equal."""
+def test_plan_updates_with_equal_returns_are_equal_on_gpu_and_cpu(update: str) -> None:
+    """The returns of the first iteration differ by rounding, which may swap samples that are almost equal."""
     gpu, cpu = (
         lw.MPPI("reach", device=device, engine=engine, samples=200, seed=3, **UPDATES[update])
         for device, engine in ((CUDA, "warp"), ("cpu", "mujoco"))
@@ -149,7 +149,7 @@ def test_plans_in_several_models_are_equal_on_gpu_and_cpu(risk: Any) -> None:
     torch.testing.assert_close(gpu.model_returns.cpu(), cpu.model_returns, rtol=1e-3, atol=1e-3)
 
 
-def test_values_in_torch_and_in_warp_agree() -> None:
+def test_value_functions_in_torch_and_in_warp_agree() -> None:
     warp, tensor = (
         lw.MPPI("reach", device=CUDA, engine="warp", samples=64, value=value, temperature=10.0, deterministic=True)
         for value in (first_squared, PLANNERS["a value in torch"]["value"])

@@ -1,4 +1,4 @@
-"""Test PPO on a GPU: captured epochs equal eager ones, no call waits for the device, and resuming is exact."""
+"""Test that PPO on a GPU gives equal results with and without graphs, waits once per iteration, and resumes exactly."""
 
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ def made(**changes: Any) -> lw.PPO:
 @pytest.mark.parametrize("changes", [
     {}, {"std_type": "log", "whiten_minibatches": True, "minibatches": 5, "clip_value_loss": False},
 ])  # fmt: skip
-def test_captured_epochs_equal_direct_ones(changes: dict[str, Any]) -> None:
+def test_captured_epochs_equal_epochs_without_graphs(changes: dict[str, Any]) -> None:
     """The entropy weight changes between iterations; the graph must read it on the device."""
     changes = {"schedule": "fixed", "final_entropy_coef": 0.1, "entropy_decay": (1, 4)} | changes
     captured, direct = made(**changes), made(**changes)
@@ -37,7 +37,7 @@ def test_captured_epochs_equal_direct_ones(changes: dict[str, Any]) -> None:
     assert captured.minibatches.epoch.graph is not None and direct.minibatches.epoch.graph is None
 
 
-def test_the_learning_rate_adapts_within_a_graph() -> None:
+def test_learning_rate_adapts_within_a_graph() -> None:
     for wanted, rate in ((1e-9, 1e-5), (1e6, 1e-2)):
         ppo = made(desired_kl=wanted)
         assert [next(ppo).learning_rate for _ in range(3)] == pytest.approx([rate] * 3)
@@ -45,7 +45,7 @@ def test_the_learning_rate_adapts_within_a_graph() -> None:
 
 def test_an_iteration_waits_for_the_device_only_at_its_end() -> None:
     ppo = made()
-    for _ in range(2):  # the first call loads kernels, the second captures
+    for _ in range(2):  # the first call loads kernels, and the second call captures graphs
         next(ppo)
     with nothing_waits():
         ppo.sample()
@@ -54,13 +54,13 @@ def test_an_iteration_waits_for_the_device_only_at_its_end() -> None:
         ppo.divergence()
 
 
-def test_a_loaded_state_continues_with_new_graphs() -> None:
+def test_learner_captures_new_graphs_after_loading_a_state() -> None:
     one = made()
     for _ in range(3):
         next(one)
     other = made(learning_rate=2e-3)
     next(other)
-    next(other)  # the old graph holds the addresses of moments that loading replaces
+    next(other)  # the old graph contains addresses of the optimizer's moments, which loading replaces
     other.load_state_dict(one.state_dict())
     for _ in range(3):
         first, second = next(one), next(other)
@@ -68,13 +68,13 @@ def test_a_loaded_state_continues_with_new_graphs() -> None:
         assert second.value_loss == pytest.approx(first.value_loss, rel=2e-2, abs=1e-3)
 
 
-def test_a_run_continues_on_a_gpu(tmp_path: Path) -> None:
+def test_ppo_run_resumes_on_a_gpu(tmp_path: Path) -> None:
     for iterations, resume in ((2, False), (4, True)):
         run = lw.train(made(), tmp_path / "run", iterations=iterations, resume=resume)
     assert [row["iteration"] for row in run.rows()] == [1, 2, 3, 4]
 
 
-def test_it_learns_on_a_gpu() -> None:
+def test_ppo_learns_on_a_gpu() -> None:
     config = lw.PPOConfig(hidden=(32, 32), value_hidden=(32, 32), mean_every=60)
     ppo = lw.PPO(lw.make("point_mass", nworld=64, device=CUDA), config=config)
     rows = [next(ppo) for _ in range(60)]

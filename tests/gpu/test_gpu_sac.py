@@ -1,4 +1,4 @@
-"""Test SAC on a GPU: captured updates equal eager ones, no call waits for the device, and resuming is exact."""
+"""Test that SAC on a GPU gives equal results with and without graphs, waits once per iteration, and resumes exactly."""
 
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ def made(**changes: Any) -> lw.SAC:
 
 
 @pytest.mark.parametrize("changes", [{}, {"n_step": 3, "actor_every": 2, "critic_bound": "mean", "replay": 640}])
-def test_captured_updates_equal_direct_ones(changes: dict[str, Any]) -> None:
+def test_captured_updates_equal_updates_without_graphs(changes: dict[str, Any]) -> None:
     captured, direct = made(**changes), made(**changes)
     direct._learn.enabled = False
     for _ in range(3):
@@ -37,7 +37,7 @@ def test_captured_updates_equal_direct_ones(changes: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("changes", [{"bf16": True}, {"compiled": True}, {"compiled": True, "bf16": True}])
-def test_faster_arithmetic_has_nearly_the_same_losses(changes: dict[str, Any]) -> None:
+def test_faster_arithmetic_gives_nearly_equal_losses(changes: dict[str, Any]) -> None:
     fast, plain = made(**changes), made()
     for _ in range(3):
         one, other = next(fast), next(plain)
@@ -47,7 +47,7 @@ def test_faster_arithmetic_has_nearly_the_same_losses(changes: dict[str, Any]) -
 
 def test_an_iteration_waits_for_the_device_only_at_its_end() -> None:
     sac = made()
-    for _ in range(2):  # the first call loads kernels, the second captures
+    for _ in range(2):  # the first call loads kernels, and the second call captures graphs
         next(sac)
     sac.rollout.begin()
     with nothing_waits():
@@ -57,13 +57,13 @@ def test_an_iteration_waits_for_the_device_only_at_its_end() -> None:
             sac._learn()
 
 
-def test_a_state_is_continued_after_other_graphs() -> None:
+def test_learner_captures_new_graphs_after_loading_a_state() -> None:
     one = made()
     for _ in range(2):
         next(one)
     other = made()
     next(other)
-    next(other)  # the old graph holds the addresses of moments that loading replaces
+    next(other)  # the old graph contains addresses of the optimizer's moments, which loading replaces
     other.load_state_dict(one.state_dict())
     other.replay.load_state_dict(one.replay.state_dict())
     for _ in range(2):
@@ -72,13 +72,13 @@ def test_a_state_is_continued_after_other_graphs() -> None:
         assert second.temperature == pytest.approx(first.temperature, rel=1e-3)
 
 
-def test_a_run_continues_on_a_gpu(tmp_path: Path) -> None:
+def test_sac_run_resumes_on_a_gpu(tmp_path: Path) -> None:
     for iterations, resume in ((2, False), (4, True)):
         run = lw.train(made(), tmp_path / "run", iterations=iterations, resume=resume)
     assert [row["iteration"] for row in run.rows()] == [1, 2, 3, 4]
 
 
-def test_it_learns_on_a_gpu() -> None:
+def test_sac_learns_on_a_gpu() -> None:
     config = lw.SACConfig(hidden=(64, 64), value_hidden=(64, 64), mean_every=20, batch=1024, warmup=5000)
     sac = lw.SAC(lw.make("inverted_pendulum", nworld=64, device=CUDA), config=config)
     rows = [next(sac) for _ in range(20)]

@@ -1,4 +1,5 @@
-"""Test a task with every feature on a GPU: rules, equal numbers on the C engine, and no synchronization."""
+"""Test on a GPU that a task with every feature follows the rules, agrees with the C engine, and does not
+synchronize."""
 
 import pytest
 import torch
@@ -11,11 +12,11 @@ from lyceum_warp.testing import check_task
 pytestmark = pytest.mark.gpu
 
 
-def test_a_task_with_every_feature_keeps_the_rules_on_a_gpu() -> None:
+def test_task_with_every_feature_follows_the_rules_on_a_gpu() -> None:
     check_task(Full, device="cuda", steps=50)
 
 
-def test_worlds_on_a_gpu_equal_the_c_engines() -> None:
+def test_worlds_on_a_gpu_equal_worlds_of_the_c_engine() -> None:
     gpu, cpu = (lw.make(Full, nworld=200, device=device, seed=3) for device in ("cuda", "cpu"))
     generator = torch.Generator().manual_seed(0)
     for _ in range(50):
@@ -32,7 +33,7 @@ def test_worlds_on_a_gpu_equal_the_c_engines() -> None:
 
 
 @pytest.mark.parametrize("task", [Full, "go1_velocity"], ids=["full", "go1_velocity"])
-def test_a_step_with_every_feature_waits_for_nothing(task: type[lw.Task] | str) -> None:
+def test_step_with_every_feature_does_not_wait_for_the_device(task: type[lw.Task] | str) -> None:
     env = lw.make(task, nworld=64, device="cuda")
     for _ in range(5):
         env.step()

@@ -28,7 +28,7 @@ def test_steps_and_frames_do_not_wait_for_the_device() -> None:
         session.stage.live.request((4, 5), 4)
 
 
-def test_any_world_is_shown_after_one_frame() -> None:
+def test_chosen_world_is_shown_after_one_frame() -> None:
     env = lw.make("hopper", nworld=4096, device="cuda")
     session = Session(env, controllers={"policy": pushing}, seed=0)
     session.obey(SetWorld(3000))
@@ -54,7 +54,7 @@ def test_any_world_is_shown_after_one_frame() -> None:
     assert np.isfinite(session.stage.frame().samples).all() and all("fault" not in message for message in messages)
 
 
-def test_continuing_after_stepping_back_gives_identical_numbers() -> None:
+def test_steps_after_stepping_back_give_identical_states() -> None:
     env = lw.make("hopper", nworld=64, device="cuda", deterministic=True)
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=1)
     states = [env.get_state()]

@@ -1,4 +1,4 @@
-"""Test that phases of launches become graphs that compute the same numbers in the same order."""
+"""Test that phases are captured as graphs that compute the same numbers in the same order."""
 
 import gc
 import threading
@@ -45,15 +45,15 @@ def graphs(**options: bool) -> Graphs:
     return Graphs(wp.get_device("cpu"), **options)
 
 
-def test_consecutive_phases_become_one_graph_that_is_replayed_from_the_third_call_on() -> None:
+def test_consecutive_phases_are_captured_as_one_graph_and_replayed_from_the_third_call() -> None:
     digits = Digits()
     calls = graphs().sequence([digits.phase(1), digits.phase(2, engine=True), digits.phase(3)])
     assert len(calls) == 1
     assert [digits.after(calls) for _ in range(4)] == [123] * 4
-    assert digits.calls == 6  # the first call launches, the second captures
+    assert digits.calls == 6  # the first call launches, and the second call captures
 
 
-def test_engine_calls_stay_between_graphs_if_they_are_not_made_of_launches() -> None:
+def test_engine_calls_without_launches_run_between_graphs() -> None:
     digits = Digits()
     phases = [digits.phase(1), digits.phase(2), digits.phase(3, engine=True), digits.phase(4)]
     calls = graphs(capture_engine=False).sequence(phases)
@@ -69,7 +69,7 @@ def follow(digit: int, number_inout: wp.array[int], first: int):
     number_inout[w] = 10 * number_inout[w] + digit
 
 
-def test_threads_share_the_worlds_in_phases_that_allow_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_share_worlds_in_phases_that_allow_it(monkeypatch: pytest.MonkeyPatch) -> None:
     digits, sizes = wp.zeros(5, dtype=int, device="cpu"), []
     launch = wp.launch
 
@@ -92,7 +92,8 @@ def test_threads_share_the_worlds_in_phases_that_allow_it(monkeypatch: pytest.Mo
         for call in calls:
             call()
         assert digits.numpy().tolist() == [1234] * 5
-    # the first calls launch for all worlds, the second ones capture them, later ones capture two parts if possible
+    # the first calls launch for all worlds, the second calls capture them, and later calls capture two parts if
+    # possible
     assert sizes == [5, 5, 5, 5, 5, 5, 5, 5, *(2, 2, 3, 3), *(2, 3)]
 
 
@@ -102,8 +103,9 @@ def count_down(number_inout: wp.array[int], turns_inout: wp.array[int]):
     turns_inout[0] = turns_inout[0] + 1
 
 
-def test_a_graph_holds_only_the_launches_of_its_own_thread() -> None:
-    """Meanwhile another thread launches, copies, loops and captures its own graphs; it must get its own results."""
+def test_graph_contains_only_launches_of_its_own_thread() -> None:
+    """During the capture another thread launches, copies, loops and captures its own graphs, and must get its own
+    results."""
     mine, captured = Digits(), []
     cpu, number, turns, copied = wp.get_device("cpu"), *(wp.full(1, 3, dtype=int, device="cpu") for _ in range(3))
     own = Digits()
@@ -124,7 +126,7 @@ def test_a_graph_holds_only_the_launches_of_its_own_thread() -> None:
         thread.start()
         thread.join()
 
-    # the package's captures take a lock, so this one uses Warp directly
+    # this capture uses Warp directly, because the package's captures take a lock
     mine.phase(1).run()
     with wp.ScopedCapture(device=cpu) as capture:
         mine.phase(1).run()
@@ -168,14 +170,14 @@ def test_kernels_with_tiles_have_separate_tiles_in_every_thread() -> None:
     assert not wrong
 
 
-def test_without_graphs_every_phase_is_called_directly() -> None:
+def test_phases_are_called_directly_if_graphs_are_disabled() -> None:
     digits = Digits()
     phases = [digits.phase(1), digits.phase(2)]
     calls = graphs(enabled=False).sequence(phases)
     assert calls == tuple(phase.run for phase in phases)
 
 
-def test_forget_captures_changed_launches_again() -> None:
+def test_changed_launches_are_captured_again_after_forget() -> None:
     digits, made = Digits(), graphs()
     digit = [1]
     calls = made.sequence([Phase("digit", lambda: wp.launch(append, 1, [digit[0], digits.number], device="cpu"))])
@@ -187,12 +189,12 @@ def test_forget_captures_changed_launches_again() -> None:
 
 
 def test_unused_objects_are_deleted_after_a_capture() -> None:
-    """Deleting a torch graph during a capture would make the capture fail."""
+    """A capture fails if a torch graph is deleted at the same time."""
     digits, captures, deleted = Digits(), 0, []
 
     class Unused:
         def __init__(self) -> None:
-            self.itself = self  # only the garbage collector can delete the cycle
+            self.itself = self  # only the garbage collector can delete this cycle
 
         def __del__(self) -> None:
             deleted.append(captures)
@@ -200,7 +202,7 @@ def test_unused_objects_are_deleted_after_a_capture() -> None:
     def run() -> None:
         nonlocal captures
         captures += 1
-        [[] for _ in range(10_000)]  # enough new objects to trigger a collection
+        [[] for _ in range(10_000)]  # create enough new objects to trigger a collection
         captures += 1
 
     calls = Graphs(wp.get_device("cpu"), enabled=True).sequence([digits.phase(1), Phase("run", run)])

@@ -44,7 +44,7 @@ print(built.modules, built.known)
 """
 
 
-def test_compiling_is_reported_and_done_once(
+def test_kernels_are_compiled_once_with_progress_messages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A subprocess compiles into a new cache, from which this process then loads the kernels."""
@@ -65,7 +65,7 @@ def test_compiling_is_reported_and_done_once(
 
 
 @pytest.mark.long
-def test_kernels_of_a_new_task_are_reported_on_the_c_engine_too(
+def test_c_engine_also_reports_compilation_for_a_new_task(
     shared_env: SharedEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shared_env("point_mass").step()  # this step loads the package's own kernels
@@ -78,5 +78,5 @@ def test_kernels_of_a_new_task_are_reported_on_the_c_engine_too(
     modules = len(list(tmp_path.rglob("*.o")))
     env.step()
     lw.make(str(file), engine="mujoco")
-    assert len(list(tmp_path.rglob("*.o"))) == modules  # the step compiles no additional module
+    assert len(list(tmp_path.rglob("*.o"))) == modules  # the step must compile no additional module
     assert capsys.readouterr().err == ""

@@ -1,5 +1,4 @@
-"""Test that a rehearsal finds the kernels that a function would launch, and that Warp still has the names it relies
-on."""
+"""Test that a rehearsal lists the kernels that a function would launch, and that Warp has the names that it needs."""
 
 import inspect
 import subprocess
@@ -47,7 +46,7 @@ def launch(mask: wp.array, row: wp.array, rows: wp.array) -> None:
 
 @pytest.fixture
 def arrays() -> tuple[wp.array, wp.array, wp.array]:
-    """Return a mask, a row of ones and three rows of zeros."""
+    """Return arrays for the test kernel: a mask, a row of ones and three rows of zeros."""
     mask = wp.full(3, True, dtype=bool, device="cpu")
     return mask, wp.full(2, 1, dtype=wp.float64, device="cpu"), wp.zeros((3, 2), dtype=wp.float64, device="cpu")
 
@@ -56,7 +55,7 @@ def test_a_rehearsal_lists_launches_without_running_them(arrays: tuple[wp.array,
     flag = wp.zeros(1, dtype=int, device="cpu")
     with rehearse() as rehearsal:
         launch(*arrays)
-        wp.capture_if(flag, on_true=lambda: launch(*arrays))  # this launch runs for any flag
+        wp.capture_if(flag, on_true=lambda: launch(*arrays))  # this launch does not depend on the flag
         wp.capture_while(flag, while_body=lambda: launch(*arrays))
     assert list(rehearsal.modules) == [(fill_rows64.module, None)]
     assert not arrays[2].numpy().any()
@@ -68,7 +67,7 @@ def originals() -> list[object]:
     return [getattr(owner, name) for owner, names in REPLACED.items() for name in names]
 
 
-def test_a_rehearsal_restores_warp_also_after_an_error(arrays: tuple[wp.array, wp.array, wp.array]) -> None:
+def test_rehearsal_restores_warp_after_success_and_after_an_error(arrays: tuple[wp.array, wp.array, wp.array]) -> None:
     before = originals()
     with pytest.raises(ZeroDivisionError), rehearse():
         assert not set(originals()) & set(before)
@@ -76,8 +75,8 @@ def test_a_rehearsal_restores_warp_also_after_an_error(arrays: tuple[wp.array, w
     assert originals() == before
 
 
-def test_overlapping_rehearsals_of_two_threads_take_turns(arrays: tuple[wp.array, wp.array, wp.array]) -> None:
-    """The second waits for the first, and Warp is restored at the end."""
+def test_rehearsals_in_two_threads_run_one_after_the_other(arrays: tuple[wp.array, wp.array, wp.array]) -> None:
+    """The second rehearsal waits for the first, and Warp is restored at the end."""
     before, order = originals(), []
     inside, release = threading.Event(), threading.Event()
 
@@ -99,7 +98,7 @@ def test_overlapping_rehearsals_of_two_threads_take_turns(arrays: tuple[wp.array
     threads[1].start()
     threads[1].join(0.2)
     assert threads[1].is_alive() and not order
-    launch(*arrays)  # other threads launch as usual
+    launch(*arrays)  # launches of other threads run as usual
     assert arrays[2].numpy().all()
     release.set()
     for thread in threads:
@@ -108,7 +107,7 @@ def test_overlapping_rehearsals_of_two_threads_take_turns(arrays: tuple[wp.array
     assert originals() == before
 
 
-# names in Warp; if they are missing, update graphs/rehearsal.py and graphs/compile_ahead.py
+# if Warp lacks one of these names, update graphs/rehearsal.py and graphs/compile_ahead.py
 
 
 def test_warp_has_the_functions_that_a_rehearsal_replaces() -> None:
@@ -141,7 +140,7 @@ def test_warp_has_the_internals_that_compiling_ahead_reads(arrays: tuple[wp.arra
 
 @pytest.mark.long
 def test_a_rehearsal_finds_every_module_that_a_step_loads() -> None:
-    """Runs in a subprocess: MuJoCo Warp launches kernels only through the patched functions."""
+    """A subprocess checks that MuJoCo Warp launches kernels only through the patched functions."""
     done = subprocess.run([sys.executable, "-c", WHOLE_STEP], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()

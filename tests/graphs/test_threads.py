@@ -1,4 +1,4 @@
-"""Test that environments in parallel threads give the same numbers as in one thread."""
+"""Test that environments give the same results in parallel threads as in one thread."""
 
 import threading
 from collections.abc import Callable
@@ -61,5 +61,5 @@ def test_environments_in_threads_equal_environments_in_one_thread() -> None:
 
 
 @pytest.mark.long
-def test_environments_in_threads_equal_environments_in_one_thread_every_time() -> None:
+def test_repeated_runs_of_environments_in_threads_equal_a_run_in_one_thread() -> None:
     check(times=20, envs=2)

@@ -1,4 +1,4 @@
-"""Test worker threads: they run the parts of a graph in parallel, raise any part's error, and end with their pool."""
+"""Test that worker threads run calls in parallel, raise the error of any call, and end with their pool."""
 
 import gc
 import signal
@@ -15,7 +15,7 @@ def own_threads() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if thread.name.startswith("lyceum_warp_")}
 
 
-def test_calls_run_side_by_side_on_the_threads() -> None:
+def test_calls_run_in_parallel_threads() -> None:
     together, threads = threading.Barrier(3), []
 
     def call() -> None:
@@ -43,14 +43,14 @@ def test_threads_start_on_demand_and_end_with_the_last_reference() -> None:
     assert not own_threads() - before
 
 
-def test_an_interrupt_waits_for_running_calls() -> None:
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell makes background processes ignore it
+def test_interrupt_waits_for_running_calls() -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # background processes of a shell ignore SIGINT
     ended: list[bool] = []
     begun = threading.Event()
 
     def late() -> None:
         begun.wait()
-        time.sleep(0.05)  # the caller is waiting by now
+        time.sleep(0.05)  # the caller is now waiting
         signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)  # type: ignore[arg-type]
         time.sleep(0.2)
         ended.append(True)

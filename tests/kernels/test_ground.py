@@ -1,4 +1,4 @@
-"""Compare heights of a height field with MuJoCo's rays, and level changes with their definition."""
+"""Compare heights of a height field with MuJoCo's rays, and changes of the terrain level with their definition."""
 
 import mujoco
 import numpy as np
@@ -28,7 +28,7 @@ def ground(model: mujoco.MjModel) -> wp.array:
 
 
 def ray_heights(model: mujoco.MjModel, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Heights and normals of the ground at points, (n,) and (n, 3), from MuJoCo's rays; NaN where no ray hits."""
+    """Return heights and normals of the ground at points, (n,) and (n, 3), from MuJoCo's rays, or NaN without a hit."""
     data, hit, normal = mujoco.MjData(model), np.zeros(1, np.int32), np.zeros(3)
     mujoco.mj_forward(model, data)
     heights, normals = np.full(len(points), np.nan), np.zeros((len(points), 3))
@@ -59,14 +59,14 @@ def looked_up(ground: wp.array, points: np.ndarray) -> np.ndarray:
 
 
 def cells() -> tuple[np.ndarray, np.ndarray]:
-    """The minimum corner of each cell, (cells, 2), and a cell's side lengths, (2,)."""
+    """Return the minimum corner of each cell, (cells, 2), and the side lengths of a cell, (2,)."""
     x = OFFSET[0] + np.linspace(-SIZE[0], SIZE[0], NCOL)
     y = OFFSET[1] + np.linspace(-SIZE[1], SIZE[1], NROW)
     corners = np.stack(np.meshgrid(x[:-1], y[:-1]), axis=-1).reshape(-1, 2)
     return corners, np.array([x[1] - x[0], y[1] - y[0]])
 
 
-def test_heights_and_normals_in_both_triangles_of_every_cell_equal_mujocos_rays(
+def test_heights_and_normals_in_both_triangles_of_each_cell_equal_those_of_mujoco_rays(
     model: mujoco.MjModel, ground: wp.array
 ) -> None:
     corners, sides = cells()
@@ -82,23 +82,23 @@ def test_heights_and_normals_in_both_triangles_of_every_cell_equal_mujocos_rays(
     assert found[:, 4].all()
 
 
-def test_heights_on_edges_and_diagonals_equal_mujocos_rays(model: mujoco.MjModel, ground: wp.array) -> None:
+def test_heights_on_edges_and_diagonals_equal_those_of_mujoco_rays(model: mujoco.MjModel, ground: wp.array) -> None:
     corners, sides = cells()
     along = np.array([(0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5), (0.25, 0.25), (1.0, 1.0)])
     points = (corners[:, None] + sides * along).reshape(-1, 2)
-    # MuJoCo's rays miss the outline itself
+    # MuJoCo's rays miss the outer edge of the field
     inside = (abs(points - OFFSET[:2]) < np.array(SIZE[:2]) - 1e-9).all(axis=1)
     heights, _ = ray_heights(model, points[inside])
     assert len(heights) > 200 and np.isfinite(heights).all()
     np.testing.assert_allclose(looked_up(ground, points[inside])[:, 0], heights, atol=1e-6)
-    # the heights of the outline are the model's own numbers
+    # the heights at the outer edge are the numbers in the model
     numbers = OFFSET[2] + SIZE[2] * model.hfield_data.reshape(NROW, NCOL)
     x = OFFSET[0] + np.linspace(-SIZE[0], SIZE[0], NCOL)
     top = np.stack([x, np.full(NCOL, OFFSET[1] + SIZE[1])], axis=1)
     np.testing.assert_allclose(looked_up(ground, top)[:, 0], numbers[-1], atol=1e-6)
 
 
-def test_a_point_outside_has_the_height_of_the_nearest_edge_point(ground: wp.array) -> None:
+def test_point_outside_the_field_has_the_height_of_the_nearest_edge_point(ground: wp.array) -> None:
     center, half = np.array(OFFSET[:2]), np.array(SIZE[:2])
     points = center + np.array([(3.0, 0.3), (-9.0, 0.3), (0.3, 2.0), (0.3, -1e6), (5.0, 5.0)])
     nearest = np.clip(points, center - half, center + half)
@@ -137,7 +137,7 @@ def levels(level: int, walked: float, commanded: float, rng: wp.array2d[wp.uint3
 
 
 def next_levels(level: int, walked: float, commanded: float) -> np.ndarray:
-    """The next levels of worlds with different random numbers, on five levels of patches of 8 m."""
+    """Return the next levels of worlds with different random numbers, for five levels of patches of 8 m."""
     rng = wp.array(np.arange(2000, dtype=np.uint32).reshape(-1, 1), dtype=wp.uint32, device="cpu")
     out = wp.zeros(len(rng), dtype=int, device="cpu")
     wp.launch(levels, len(rng), [level, walked, commanded, rng, out], device="cpu")
@@ -149,12 +149,12 @@ def next_levels(level: int, walked: float, commanded: float) -> np.ndarray:
     ("level", "walked", "commanded", "wanted"),
     [(2, 4.1, 10.0, 3), (2, 3.9, 10.0, 1), (2, 3.9, 7.0, 2), (0, 0.0, 10.0, 0), (2, 0.0, 0.0, 2), (3, 4.1, 0.0, 4)],
 )
-def test_levels_rise_and_fall_with_the_distance_walked(
+def test_terrain_level_changes_with_the_walked_distance(
     level: int, walked: float, commanded: float, wanted: int
 ) -> None:
     assert (next_levels(level, walked, commanded) == wanted).all()
 
 
-def test_a_random_level_follows_the_last_one() -> None:
+def test_terrain_level_is_random_after_the_highest_level() -> None:
     counts = np.bincount(next_levels(4, 4.1, 10.0), minlength=5)
     assert len(counts) == 5 and (abs(counts - 400) < 90).all()

@@ -1,4 +1,4 @@
-"""Test spline plans: interpolation between knots, and the grid on which the horizon moves."""
+"""Test how spline plans interpolate between knots, and shift their knots over time."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,9 @@ def interpolated(
 
 @pytest.mark.parametrize("spline", SPLINES)
 @pytest.mark.parametrize("horizon, count", [(12, 4), (13, 4), (7, 5), (5, 5), (9, 1)])
-def test_interpolated_actions_equal_the_plain_version_at_every_phase(horizon: int, count: int, spline: str) -> None:
+def test_interpolated_actions_equal_the_plain_implementation_at_every_phase(
+    horizon: int, count: int, spline: str
+) -> None:
     number = knots.knot_count(horizon, count, spline)
     values = np.random.default_rng(1).normal(size=(number, 3, 2)).astype(np.float32)
     grid = Grid(horizon, count, spline)
@@ -35,7 +37,7 @@ def test_interpolated_actions_equal_the_plain_version_at_every_phase(horizon: in
 
 
 @pytest.mark.parametrize("spline, degree", [("zero", 0), ("linear", 1), ("cubic", 2)])
-def test_knots_of_a_polynomial_give_the_polynomial(spline: str, degree: int) -> None:
+def test_spline_through_points_of_a_polynomial_equals_the_polynomial(spline: str, degree: int) -> None:
     """A cubic spline with slopes from central differences reproduces parabolas exactly."""
     horizon, count = 12, 3
     number = knots.knot_count(horizon, count, spline)
@@ -52,14 +54,14 @@ def test_interpolated_actions_stay_within_the_bounds() -> None:
     np.testing.assert_allclose(bounded, np.minimum(free, 1.0))
 
 
-def test_the_worlds_of_a_sample_are_consecutive() -> None:
+def test_worlds_of_a_sample_get_the_same_actions_and_are_consecutive() -> None:
     values = np.arange(10.0).reshape(5, 2, 1)
     found = interpolated(values, 4, 4, "zero", models=3)
     np.testing.assert_array_equal(found[..., 0], np.repeat(values[:4, :, 0], 3, axis=1))
 
 
 @pytest.mark.parametrize("horizon, count", [(12, 4), (13, 4), (7, 5), (5, 5), (9, 1)])
-def test_passed_knots_add_up_over_steps(horizon: int, count: int) -> None:
+def test_number_of_passed_knots_follows_the_steps(horizon: int, count: int) -> None:
     phase, passed, steps = (wp.zeros(1, dtype=int, device="cpu") for _ in range(3))
     time = total = 0
     for shift in (0, 1, 1, 3, horizon, 2 * horizon + 1, 1):
@@ -71,7 +73,7 @@ def test_passed_knots_add_up_over_steps(horizon: int, count: int) -> None:
 
 @pytest.mark.parametrize("spline", SPLINES)
 @pytest.mark.parametrize("horizon, count", [(12, 4), (13, 4), (7, 5), (5, 5), (9, 1), (128, 32)])
-def test_a_plan_has_the_knots_of_its_last_step_at_every_phase(horizon: int, count: int, spline: str) -> None:
+def test_plan_has_enough_knots_for_its_last_step_at_every_phase(horizon: int, count: int, spline: str) -> None:
     number = knots.knot_count(horizon, count, spline)
     last = max(((horizon - 1) * count + time * count % horizon) // horizon for time in range(horizon))
     assert number == last + {"zero": 1, "linear": 2, "cubic": 4}[spline]

@@ -1,4 +1,4 @@
-"""Compare planning noise and weights with their formulas, and check value functions in Warp."""
+"""Compare planning noise and sample weights with their formulas, and check value functions in Warp."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def test_noise_is_standard_normal_and_independent(many: MPPI) -> None:
             assert abs(product) < 5 / np.sqrt(16 * (4000 - lag)), f"samples {lag} apart are correlated"
 
 
-def test_samples_have_distinct_random_keys_that_differ_from_a_plants() -> None:
+def test_samples_have_distinct_random_keys_that_differ_from_those_of_the_plant() -> None:
     """Planner and plant have equal seeds and world indices."""
     n = 256
     found, plants = [], []
@@ -65,7 +65,7 @@ def test_samples_have_distinct_random_keys_that_differ_from_a_plants() -> None:
 
 
 @pytest.mark.parametrize("betas", [(0.25, 0.8, 0.0), (1.0, 0.0, 0.0), (0.5, 0.3, 0.2)])
-def test_smoothed_noise_has_the_spread_of_the_formula(betas: tuple[float, float, float]) -> None:
+def test_smoothed_noise_has_the_standard_deviation_of_the_formula(betas: tuple[float, float, float]) -> None:
     """The default weights scale the standard deviation by 1, 1, 0.838, 0.716, ..."""
     plan = MPPI("point_mass", horizon=12, samples=4000, noise=[0.02, 0.05], smoothing=betas)
     plan(plan.state_of())
@@ -87,14 +87,14 @@ def test_noise_has_the_given_covariance() -> None:
     np.testing.assert_allclose(np.cov(added.T), wanted, atol=3e-5)
 
 
-def test_equivalent_forms_of_the_noise_give_equal_samples() -> None:
+def test_equal_noise_as_number_vector_or_matrix_gives_equal_samples() -> None:
     plans = [MPPI("point_mass", horizon=10, noise=noise) for noise in (0.1, [0.1, 0.1], np.diag([0.01, 0.01]))]
     for plan in plans:
         plan(plan.state_of())
         torch.testing.assert_close(plan.sampled, plans[0].sampled)
 
 
-def test_noise_of_a_sample_is_independent_of_the_number_of_samples() -> None:
+def test_noise_of_a_sample_does_not_depend_on_the_number_of_samples() -> None:
     few, more = (MPPI("point_mass", horizon=6, samples=n, seed=2) for n in (8, 50))
     for _ in range(3):
         few(few.state_of()), more(more.state_of())
@@ -102,14 +102,14 @@ def test_noise_of_a_sample_is_independent_of_the_number_of_samples() -> None:
 
 
 @pytest.mark.parametrize("temperature", [0.01, 1.0, 100.0])
-def test_weights_are_positive_and_add_up_to_one(temperature: float) -> None:
+def test_sample_weights_are_positive_and_sum_to_one(temperature: float) -> None:
     plan = MPPI("reach", temperature=temperature)
     plan(first_state(0))
     assert plan.weights.sum().item() == pytest.approx(1, abs=1e-5) and (plan.weights >= 0).all()
 
 
 @pytest.mark.parametrize("temperature", [1e-6, 1e-30])
-def test_a_low_temperature_follows_the_best_sample(temperature: float) -> None:
+def test_plan_with_low_temperature_equals_the_best_sample(temperature: float) -> None:
     plan = MPPI("reach", temperature=temperature)
     plan(first_state(0))
     best = plan.returns.argmax()
@@ -119,14 +119,14 @@ def test_a_low_temperature_follows_the_best_sample(temperature: float) -> None:
 
 
 @pytest.mark.parametrize("temperature", [1e9, 1e60])
-def test_a_high_temperature_averages_all_samples(temperature: float) -> None:
+def test_plan_with_high_temperature_is_the_mean_of_all_samples(temperature: float) -> None:
     plan = MPPI("reach", temperature=temperature)
     plan(first_state(0))
     torch.testing.assert_close(plan.actions, plan.sampled.mean(1))
     assert plan.summary["effective_samples"] == pytest.approx(plan.samples)
 
 
-def test_weights_differ_by_the_exponential_of_returns_over_temperature() -> None:
+def test_sample_weights_are_exponentials_of_returns_over_temperature() -> None:
     plan = MPPI("reach", temperature=3.0)
     plan(first_state(0))
     ratio = ((plan.returns[0] - plan.returns[1]) / 3.0).exp()
@@ -144,6 +144,6 @@ def value_of_whole_numbers(obs: Row[int]) -> float:
 
 
 @pytest.mark.parametrize("value", [value_of_two, value_of_whole_numbers], ids=["two arguments", "int"])
-def test_a_value_in_warp_with_other_arguments_is_refused(value: wp.Function) -> None:
+def test_warp_value_function_with_wrong_arguments_raises_an_error(value: wp.Function) -> None:
     with pytest.raises(ValueError, match=r"must be written as value\(obs: Row\[float\]\) -> float"):
         planning.value_kernel(value)

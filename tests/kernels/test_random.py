@@ -27,7 +27,7 @@ def draw(
 
 @wp.kernel(enable_backward=False)
 def draw_vectors(rng_inout: wp.array2d[wp.uint32], one_out: wp.array2d[float], many_out: wp.array2d[float]):
-    """Draw five numbers one by one, and the same five as two vectors from a copy of the stream."""
+    """Draw five numbers one by one, and the same numbers as two vectors from a copy of the stream."""
     i = wp.tid()
     for k in range(5):
         one_out[i, k] = uniform(rng_inout[2 * i], float(-k), float(k + 1))
@@ -48,13 +48,13 @@ def draws(counters: np.ndarray) -> np.ndarray:
     return values.numpy()
 
 
-def test_the_same_counters_give_the_same_draws_in_any_order() -> None:
+def test_equal_counters_give_equal_draws_in_any_order() -> None:
     counters = np.array(list(itertools.product(range(3), range(4), range(3), range(3))))
     order = np.random.default_rng(0).permutation(len(counters))
     np.testing.assert_array_equal(draws(counters)[order], draws(counters[order]))
 
 
-def test_a_vector_has_the_draws_of_its_elements_in_turn() -> None:
+def test_random_vector_equals_separate_draws_of_its_elements() -> None:
     rng = wp.array(np.repeat(np.arange(100), 2)[:, None], dtype=wp.uint32, device="cpu")
     one, many = (wp.zeros((100, 5), dtype=float, device="cpu") for _ in range(2))
     wp.launch(draw_vectors, 100, [rng, one, many], device="cpu")
@@ -66,7 +66,7 @@ def test_a_vector_has_the_draws_of_its_elements_in_turn() -> None:
 
 
 def test_different_counters_give_different_draws() -> None:
-    """Counters with equal sums give different draws, too."""
+    """Even counters with equal sums give different draws."""
     counters = np.array(list(itertools.product(range(6), range(6), range(6), range(6))))
     found = draws(counters)
     assert len(np.unique(found[:, 0])) > 0.999 * len(counters)
@@ -82,7 +82,7 @@ def test_draws_are_independent_along_every_counter(counter: str) -> None:
     check_uniform(np.stack([values[:-1, 0], values[1:, 0]], axis=1))
 
 
-def test_seed_worlds_starts_only_masked_worlds_and_counts_from_the_first() -> None:
+def test_seed_worlds_seeds_only_masked_worlds_and_adds_the_index_of_the_first_world() -> None:
     mask = wp.array([True, False, True], dtype=bool, device="cpu")
     seed = wp.array([5], dtype=int, device="cpu")
     keys, episodes = [], []

@@ -54,7 +54,7 @@ def unit(rows: np.ndarray) -> np.ndarray:
 
 
 def inputs() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return two quaternions, a vector and an angle per row, in float32; the first rows are edge cases."""
+    """Return rows of two quaternions, a vector and an angle in float32; the first rows are edge cases."""
     rng = np.random.default_rng(0)
     a, b = (unit(rng.normal(size=(N, 4))) for _ in range(2))
     v, angle = rng.normal(size=(N, 3)), rng.uniform(-7, 7, N)
@@ -77,7 +77,7 @@ def found() -> dict[str, np.ndarray]:
 
 
 def mju(function: Callable[..., None], size: int, *columns: np.ndarray) -> np.ndarray:
-    """Return the results of one of MuJoCo's functions, row by row."""
+    """Return the results of a MuJoCo function, row by row."""
     results = np.zeros((N, size))
     for row, *values in zip(results, *(column.astype(float) for column in columns), strict=True):
         function(row, *values)
@@ -88,20 +88,20 @@ def check(found: np.ndarray, expected: np.ndarray, tolerance: float = 2e-6) -> N
     np.testing.assert_allclose(found.reshape(expected.shape), expected, atol=tolerance, rtol=tolerance)
 
 
-def test_products_inverses_and_matrices_equal_mujocos(found: dict[str, np.ndarray]) -> None:
+def test_products_inverses_and_matrices_equal_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
     a, b, _, _ = inputs()
     check(found["mul"], mju(mujoco.mju_mulQuat, 4, a, b))
     check(found["inverse"], mju(mujoco.mju_negQuat, 4, a))
     check(found["to_mat"].reshape(N, 9), mju(mujoco.mju_quat2Mat, 9, a))
 
 
-def test_rotated_vectors_equal_mujocos(found: dict[str, np.ndarray]) -> None:
+def test_rotated_vectors_equal_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
     a, _, v, _ = inputs()
     check(found["rotate"], mju(mujoco.mju_rotVecQuat, 3, v, a), 5e-6)
     check(found["rotate_inverse"], mju(mujoco.mju_rotVecQuat, 3, v, mju(mujoco.mju_negQuat, 4, a)), 5e-6)
 
 
-def test_quaternions_from_axis_and_angle_equal_mujocos(found: dict[str, np.ndarray]) -> None:
+def test_quaternions_from_axis_and_angle_equal_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
     _, _, v, angle = inputs()
     length = np.linalg.norm(v.astype(float), axis=1)
     axis = v / np.maximum(length, 1e-30)[:, None]
@@ -110,11 +110,11 @@ def test_quaternions_from_axis_and_angle_equal_mujocos(found: dict[str, np.ndarr
     assert found["from_axis_angle"][0].tolist() == found["from_rotvec"][0].tolist() == [1, 0, 0, 0]
 
 
-def test_rotation_vectors_equal_mujocos(found: dict[str, np.ndarray]) -> None:
+def test_rotation_vectors_equal_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
     a, b, _, _ = inputs()
     check(found["to_rotvec"], mju(lambda row, q: mujoco.mju_quat2Vel(row, q, 1.0), 3, a), 1e-5)
     difference = mju(mujoco.mju_subQuat, 3, a, b)
-    close = np.linalg.norm(difference, axis=1) < 3.1  # near pi both signs are correct
+    close = np.linalg.norm(difference, axis=1) < 3.1  # both signs of the rotation vector are correct near pi
     assert close.mean() > 0.95
     check(found["difference"][close], difference[close], 1e-5)
     check(found["angle"], np.linalg.norm(difference, axis=1), 1e-5)
@@ -129,7 +129,7 @@ def test_small_rotations_do_not_lose_precision(found: dict[str, np.ndarray]) -> 
     np.testing.assert_allclose(found["from_rotvec"][1], [1, 0.5e-6, 0, 0], rtol=1e-6)
 
 
-def test_quaternion_to_matrix_and_back_is_the_identity(found: dict[str, np.ndarray]) -> None:
+def test_conversion_from_quaternion_to_matrix_and_back_is_the_identity(found: dict[str, np.ndarray]) -> None:
     a, _, _, _ = inputs()
     largest = np.abs(a).argmax(axis=1)
     assert set(largest) == {0, 1, 2, 3}
@@ -137,7 +137,7 @@ def test_quaternion_to_matrix_and_back_is_the_identity(found: dict[str, np.ndarr
     check(sign * found["from_mat"], a.astype(float))
 
 
-def test_euler_angles_equal_mujocos(found: dict[str, np.ndarray]) -> None:
+def test_euler_angles_equal_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
     a, _, v, _ = inputs()
 
     def from_euler(angles: np.ndarray) -> np.ndarray:
@@ -153,7 +153,7 @@ def test_euler_angles_equal_mujocos(found: dict[str, np.ndarray]) -> None:
 
 
 def test_random_rotations_are_uniform_and_independent() -> None:
-    """Two components of a uniform unit quaternion have a squared length from U(0, 1) and a uniform angle."""
+    """Any two components of a uniform unit quaternion have a squared length from U(0, 1) and a uniform angle."""
     n = 4000
     rng, quats = (wp.zeros((n, k), dtype=t, device="cpu") for k, t in ((1, wp.uint32), (2, wp.vec4)))
     wp.launch(draw, n, [rng, quats], device="cpu")
@@ -212,7 +212,7 @@ class Floating(lw.Task):
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_a_velocity_in_a_bodys_frame_equals_a_velocimeters(engine: str) -> None:
+def test_velocity_in_a_body_frame_equals_that_of_a_velocimeter(engine: str) -> None:
     env = lw.make(Floating, engine=engine, nworld=8)
     put_at_random(env, np.random.default_rng(0), 1.0, 2.0)
     env.step()

@@ -32,7 +32,7 @@ def tolerance(x: np.ndarray, bounds: tuple[float, float], margin: float, sigmoid
 
 
 @pytest.mark.parametrize("name", SIGMOIDS)
-def test_tolerance_has_dm_controls_values(name: str) -> None:
+def test_tolerance_equals_that_of_dm_control(name: str) -> None:
     rewards = pytest.importorskip("dm_control.utils.rewards", reason="dm_control is the oracle of tolerance")
     x = np.linspace(-5.0, 5.0, 201, dtype=np.float32)
     values = (0.05, 0.1, 0.7) + ((0.0,) if name in ("cosine", "linear", "quadratic") else ())
@@ -45,7 +45,7 @@ def test_tolerance_has_dm_controls_values(name: str) -> None:
     np.testing.assert_array_equal(tolerance(x, (-1.0, 0.5), 0.0, SIGMOIDS[name], 0.1), wanted)
 
 
-def test_tolerance_has_dm_controls_defaults() -> None:
+def test_tolerance_has_the_defaults_of_dm_control() -> None:
     rewards = pytest.importorskip("dm_control.utils.rewards", reason="dm_control is the oracle of tolerance")
     x = np.linspace(-5.0, 5.0, 101, dtype=np.float32)
     out = wp.zeros((len(x), 3), dtype=float, device="cpu")
@@ -107,7 +107,7 @@ def struct(rows: dict[str, np.ndarray]) -> Rows:
     return made
 
 
-def test_put_writes_numbers_vectors_and_rows_one_after_another(rows: dict[str, np.ndarray], struct: Rows) -> None:
+def test_put_writes_numbers_vectors_and_rows_in_sequence(rows: dict[str, np.ndarray], struct: Rows) -> None:
     out, last = wp.zeros(80, dtype=float, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
     wp.launch(write_rows, 1, [struct, out, last], device="cpu")
     parts = [
@@ -148,7 +148,7 @@ def angles(a: wp.array[wp.vec3], b: wp.array[wp.vec3], out: wp.array[float]):
     out[i] = lw.angle_between(a[i], b[i])
 
 
-def test_angle_between_is_exact_for_small_and_for_straight_angles() -> None:
+def test_angle_between_is_exact_for_angles_near_zero_and_pi() -> None:
     """An arc cosine in float32 would return 0 for angles below 2e-4."""
     wanted = np.array([0.0, 1e-5, 1e-3, 0.5, np.pi / 2, 3.0, np.pi - 1e-5, np.pi])
     a = np.tile([2.0, 0.0, 0.0], (len(wanted), 1))
@@ -169,7 +169,7 @@ def grasps(distance: wp.array[float], finger: wp.array[float], out: wp.array2d[f
 
 
 def test_grasp_terms_reward_open_fingers_on_the_way_and_closed_fingers_at_the_target() -> None:
-    cases = {  # columns: distance, finger; expected near, reach, grasp
+    cases = {  # columns: distance and finger, then the expected near, reach and grasp
         (0.0, 0.005): (1.0, 1.0, 1.0),
         (0.0, 0.04): (1.0, 1.0, 0.0),
         (0.02, 0.04): (0.1, 1.0 / 1.6, 0.45),
@@ -198,7 +198,7 @@ def velocities(b: Bodies, world: wp.array[wp.spatial_vector], local: wp.array[wp
     local[i] = lw.local_velocity(b.cvel[i], b.com[i], b.pos[i], b.quat[i])
 
 
-def test_velocities_of_bodies_are_mujocos() -> None:
+def test_body_velocities_equal_those_of_mujoco() -> None:
     model = lw.gymnasium_model("humanoid.xml").spec().compile()
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     data.qpos[:] += rng.uniform(-0.5, 0.5, model.nq)
@@ -225,8 +225,8 @@ def stand_up(yaw: wp.array[float], qpos: wp.array2d[float], after: wp.array[int]
     after[i] = lw.put_upright(qpos[i], 1, wp.vec3(0.1, -0.2, 0.3), yaw[i])
 
 
-def test_put_upright_turns_a_free_body_about_the_vertical() -> None:
-    """The first coordinate belongs to another joint and does not change."""
+def test_put_upright_rotates_a_free_body_about_the_vertical() -> None:
+    """The first coordinate of qpos belongs to another joint and does not change."""
     spec = mujoco.MjSpec.from_string(
         "<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body>"
         "<body name='free'><freejoint/><geom size='.1'/></body></worldbody></mujoco>"

@@ -41,7 +41,7 @@ TARGETS = {
     "reacher": (("geom_pos", "target"),),
     "swimmer": (("geom_pos", "target"),),
 }
-"""Fields of the model that an episode draws."""
+"""Model fields that dm_control randomizes in each episode."""
 STARTS, SEGMENTS, STEPS, RESETS = 5, 25, 40, 300
 
 
@@ -57,7 +57,7 @@ def state(domain: str, physics: Any) -> dict[str, np.ndarray]:
 
 
 def begin_segment(physics: Any, action: np.ndarray) -> None:
-    """Round the state, and compute what follows from it."""
+    """Round the state to float32, and compute all derived quantities."""
     for name in ("qpos", "qvel", "act"):
         getattr(physics.data, name)[:] = getattr(physics.data, name).astype(np.float32)
     physics.set_control(action)
@@ -72,7 +72,7 @@ def round_target(domain: str, physics: Any) -> None:
 
 
 def stored(domain: str, task: str) -> dict[str, Any]:
-    """Return the rows of a task: (starts, segments, size), or (resets, size) for initial states."""
+    """Return the arrays of a task to store: (starts, segments, size), or (resets, size) for initial states."""
     env = suite.load(domain, task, task_kwargs={"random": 0})
     physics, spec = env.physics, env.action_spec()
     rng = np.random.default_rng(0)

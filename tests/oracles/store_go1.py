@@ -51,7 +51,8 @@ def model_arrays(model: mujoco.MjModel) -> dict[str, Any]:
     bodies = names(model, kind.mjOBJ_BODY, model.nbody)
     geoms = names(model, kind.mjOBJ_GEOM, model.ngeom)
     rows = {
-        "body": [i for i, name in enumerate(bodies) if name != "terrain"],  # an additional body, fixed to the world
+        # the model has an additional body, which is fixed to the world
+        "body": [i for i, name in enumerate(bodies) if name != "terrain"],
         "geom": [i for i, name in enumerate(geoms) if name],
         "actuator": actuators(model),
     }
@@ -70,7 +71,7 @@ def actuators(model: mujoco.MjModel) -> list[int]:
 
 
 def trajectories(model: mujoco.MjModel) -> dict[str, Any]:
-    """Run the C engine under random controls: two trajectories start in the default pose, two tumble."""
+    """Run the C engine under random controls; two trajectories start in the default pose, and two start tumbling."""
     rng = np.random.default_rng(0)
     home, order = model.key_qpos[0], actuators(model)
     qpos, controls = np.zeros((TRAJECTORIES, SUBSTEPS + 1, 19)), np.zeros((TRAJECTORIES, SUBSTEPS, 12))
@@ -95,7 +96,7 @@ def trajectories(model: mujoco.MjModel) -> dict[str, Any]:
 
 
 def judged_states(env: ManagerBasedRlEnv) -> dict[str, Any]:
-    """Return states under random actions, and the values of mjlab's functions there, with up-to-date contacts."""
+    """Return states under random actions, and mjlab's function values in these states, with up-to-date contacts."""
     torch.manual_seed(0)
     robot, command = env.scene["robot"], env.command_manager.get_term("twist")
     feet = env.scene["feet_ground_contact"]
@@ -113,7 +114,8 @@ def judged_states(env: ManagerBasedRlEnv) -> dict[str, Any]:
         if step % EVERY:
             continue
         kept = {name: value.clone() for name, value in vars(feet._air_time_state).items()}, swing.peak_heights.clone()
-        feet.update(env.physics_dt)  # update timers and contacts to this state; the step left them one substep behind
+        # update timers and contacts to this state, because they are one substep old after the step
+        feet.update(env.physics_dt)
         swing.peak_heights[:] = 0.15 * torch.rand_like(swing.peak_heights)
         origins = env.scene.env_origins
         qpos = env.sim.data.qpos.clone()

@@ -18,7 +18,7 @@ TASKS = ["cartpole", "cartpole_swingup"]
 
 @pytest.fixture(scope="module")
 def dm_cartpole() -> mujoco.MjModel:
-    """Load dm_control's cartpole from its file, without importing dm_control."""
+    """Load the file of dm_control's cartpole without importing dm_control."""
     package = importlib.util.find_spec("dm_control")
     if package is None or not package.submodule_search_locations:
         pytest.skip("dm_control, whose cartpole.xml is the reference, is not installed: pip install dm_control")
@@ -26,7 +26,7 @@ def dm_cartpole() -> mujoco.MjModel:
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_model_has_dm_controls_masses_joints_and_motor(
+def test_model_has_the_masses_joints_and_motor_of_dm_control(
     shared_env: SharedEnv, dm_cartpole: mujoco.MjModel, task: str
 ) -> None:
     ours, theirs = shared_env(task).model, dm_cartpole
@@ -44,7 +44,8 @@ def test_model_has_dm_controls_masses_joints_and_motor(
 
 
 class Physics:
-    """The interface of dm_control's cartpole physics; its own class (1.0.50) does not support MuJoCo 4 models."""
+    """A class with the interface of dm_control's cartpole physics, because dm_control's own class (1.0.50) does not
+    support MuJoCo 4."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model, self.data = model, mujoco.MjData(model)
@@ -83,8 +84,8 @@ def balance_task(*, swing_up: bool = False, sparse: bool = False) -> Any:
 
 
 @pytest.mark.parametrize("sparse", [False, True])
-def test_cartpole_has_dm_controls_reward_and_observation(shared_env: SharedEnv, sparse: bool) -> None:
-    """States are random, near the goal and far from it; actions exceed the control range."""
+def test_cartpole_has_the_reward_and_observation_of_dm_control(shared_env: SharedEnv, sparse: bool) -> None:
+    """The states are random, near the goal and far from it, and some actions exceed the control range."""
     env = shared_env("cartpole", nworld=NWORLD, autoreset=False, sparse=sparse)
     theirs, balanced, physics = balance_task(sparse=sparse), balance_task(sparse=True), Physics(env.model)
     rng, rewards = np.random.default_rng(0), []

@@ -1,9 +1,8 @@
 """Compare dm_control's suite with the package's tasks of the same names, on the C engine.
 
 dm_control 1.0.50 does not run on MuJoCo 4, so ``store_dm_control.py`` stored five episodes of each task with MuJoCo
-3.17. MuJoCo 3.17 and 4.0 compute these models alike: from equal states, also 40 steps later, results differ only by the
-rounding of the stored numbers to float32, and of observations and rewards. Initial states must have the same
-distribution.
+3.17. MuJoCo 3.17 and 4.0 compute equal results for these models: even 40 steps after equal states, numbers differ only
+by rounding to float32. Initial states must have the same distribution.
 """
 
 import functools
@@ -23,15 +22,14 @@ from lyceum_warp.tasks.dm import TASKS
 
 DATA = Path(__file__).parent.parent / "data" / "dm_control"
 LAST_SUBSTEP = ("touch", "imu", "force_torque")
-"""Parts of observations that the last substep computed, and that therefore are not functions of the state."""
+"""Parts of observations that the last substep computes, so that they are not functions of the state."""
 RESETS = 512
-QUICK = ("dm/cartpole_swingup", "dm/finger_turn_hard", "dm/manipulator_bring_ball", "dm/walker_walk")
-EVERY = [pytest.param(task, marks=() if task in QUICK else pytest.mark.long) for task in TASKS]
+quick = pytest.mark.quick("dm/cartpole_swingup", "dm/finger_turn_hard", "dm/manipulator_bring_ball", "dm/walker_walk")
 
 
 @functools.cache
 def stored(task: str) -> dict[str, np.ndarray]:
-    """Return what dm_control stored for a task; rows are (starts * segments, size)."""
+    """Return the stored arrays of a task, (starts * segments, size)."""
     domain = TASKS[task].removeprefix("dm_")
     name = task.removeprefix(f"dm/{domain}_")
     with np.load(DATA / f"{domain}.npz") as file:
@@ -77,7 +75,7 @@ ARGUMENTS: Mapping[str, tuple[object, ...]] = {
     "dm/swimmer_swimmer15": (15,),
     "dm/swimmer_swimmer6": (6,),
 }
-"""Arguments of dm_control's function that makes a model."""
+"""Arguments for dm_control's function that makes a model."""
 FIELDS = (
     "body_mass body_inertia body_pos body_quat body_ipos body_iquat body_invweight0 "
     "geom_type geom_size geom_pos geom_quat geom_friction geom_contype geom_conaffinity geom_condim geom_solref "
@@ -92,7 +90,7 @@ KINDS = {
 
 
 def dm_controls_model(task: str) -> mujoco.MjModel:
-    """Compile the XML that dm_control's Python makes, on this MuJoCo."""
+    """Compile the XML that dm_control generates, with the installed MuJoCo."""
     module = importlib.import_module(f"dm_control.suite.{TASKS[task].removeprefix('dm_')}")
     make = getattr(module, "make_model", None) or module.get_model_and_assets
     made = make(*ARGUMENTS.get(task, ()))
@@ -103,8 +101,9 @@ def dm_controls_model(task: str) -> mujoco.MjModel:
         return mujoco.MjModel.from_xml_string(xml if isinstance(xml, str) else xml.decode(), assets)
 
 
-@pytest.mark.parametrize("task", EVERY)
-def test_the_model_is_the_one_that_dm_controls_python_makes(shared_env: SharedEnv, task: str) -> None:
+@quick
+@pytest.mark.parametrize("task", TASKS)
+def test_model_equals_the_model_that_dm_control_makes(shared_env: SharedEnv, task: str) -> None:
     ours, theirs = shared_env(task, nworld=len(rows(task, "qpos")), autoreset=False).model, dm_controls_model(task)
     for field in FIELDS:
         kind, count = KINDS[field.partition("_")[0]]
@@ -118,7 +117,7 @@ def test_the_model_is_the_one_that_dm_controls_python_makes(shared_env: SharedEn
             np.testing.assert_allclose(named[0][name], named[1][name], rtol=1e-9, atol=1e-12, err_msg=f"{field} {name}")
     for field in ("dof_armature", "dof_frictionloss", "dof_M0", "qpos0", "qpos_spring"):
         np.testing.assert_allclose(getattr(ours, field), getattr(theirs, field), rtol=1e-9, atol=1e-12, err_msg=field)
-    # ours may have keyframes of its own, for the probe of MuJoCo Warp's capacities
+    # the package's model may have additional keyframes, which probe the sizes of MuJoCo Warp's buffers
     np.testing.assert_allclose(ours.key_qpos[: theirs.nkey], theirs.key_qpos, rtol=1e-9, atol=1e-12)
     damping = theirs.dof_damping.copy()
     if task == "dm/finger_spin":  # dm_control sets this field at each reset
@@ -126,12 +125,14 @@ def test_the_model_is_the_one_that_dm_controls_python_makes(shared_env: SharedEn
     np.testing.assert_allclose(ours.dof_damping, damping)
     for field in ("timestep", "integrator", "cone", "gravity", "density", "viscosity"):
         assert np.array_equal(getattr(ours.opt, field), getattr(theirs.opt, field)), field
-    without_sensors = ours.opt.disableflags & ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # for tasks that read no sensor
+    # sensors are disabled for tasks that do not read them
+    without_sensors = ours.opt.disableflags & ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
     assert without_sensors == theirs.opt.disableflags
 
 
-@pytest.mark.parametrize("task", EVERY)
-def test_a_task_has_dm_controls_sizes_and_times(shared_env: SharedEnv, task: str) -> None:
+@quick
+@pytest.mark.parametrize("task", TASKS)
+def test_task_has_the_sizes_and_time_steps_of_dm_control(shared_env: SharedEnv, task: str) -> None:
     env, theirs = shared_env(task, nworld=len(rows(task, "qpos")), autoreset=False), stored(task)
     sizes = {name: part.stop - part.start for name, part in env.obs_space.parts.items()}
     assert list(sizes.items()) == list(zip(theirs["parts"].tolist(), theirs["sizes"].tolist(), strict=True))
@@ -139,12 +140,14 @@ def test_a_task_has_dm_controls_sizes_and_times(shared_env: SharedEnv, task: str
     assert env.model.opt.timestep == pytest.approx(theirs["timestep"])
     np.testing.assert_allclose(env.action_space.low, theirs["minimum"])
     np.testing.assert_allclose(env.action_space.high, theirs["maximum"])
-    # an episode has a first step, middle steps and a last step; a discount of 1 shows that the time limit ended it
+    # an episode has a first step, middle steps and a last step; a discount of 1 shows that the time limit ended the
+    # episode
     assert (theirs["step_type"] == [0, *(env.task.task.horizon - 1) * [1], 2]).all() and (theirs["discount"] == 1).all()
 
 
-@pytest.mark.parametrize("task", EVERY)
-def test_observations_and_rewards_are_dm_controls_on_its_states(shared_env: SharedEnv, task: str) -> None:
+@quick
+@pytest.mark.parametrize("task", TASKS)
+def test_observations_and_rewards_in_stored_states_equal_those_of_dm_control(shared_env: SharedEnv, task: str) -> None:
     env = segments(shared_env, task)
     state, columns = env.get_state(), current_columns(task)
     np.testing.assert_allclose(
@@ -154,8 +157,9 @@ def test_observations_and_rewards_are_dm_controls_on_its_states(shared_env: Shar
     np.testing.assert_allclose(rewards, rows(task, "reward"), rtol=1e-5, atol=2e-6)
 
 
-@pytest.mark.parametrize("task", EVERY)
-def test_a_step_from_dm_controls_state_gives_its_next_state_observation_and_reward(
+@quick
+@pytest.mark.parametrize("task", TASKS)
+def test_step_from_a_stored_state_gives_the_next_state_observation_and_reward_of_dm_control(
     shared_env: SharedEnv, task: str
 ) -> None:
     env = segments(shared_env, task)
@@ -178,17 +182,20 @@ def check_positions(env: lw.Env, wanted: np.ndarray, name: str) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("task", TASKS)
-def test_forty_steps_from_each_of_dm_controls_states_end_as_its_own(shared_env: SharedEnv, task: str) -> None:
-    """The segments are all steps of five episodes."""
+def test_forty_steps_from_each_stored_state_give_the_final_state_of_dm_control(
+    shared_env: SharedEnv, task: str
+) -> None:
+    """The segments together contain all steps of five episodes."""
     env = segments(shared_env, task)
     for _ in range(40):
         env.step()
     check_positions(env, rows(task, "end_qpos"), "qpos")
 
 
-@pytest.mark.parametrize("task", EVERY)
-def test_episodes_start_as_dm_controls(shared_env: SharedEnv, task: str) -> None:
-    """Each number of the initial state has the same distribution, by the two-sample test of Kolmogorov and Smirnov."""
+@quick
+@pytest.mark.parametrize("task", TASKS)
+def test_initial_states_have_the_distribution_of_dm_control(shared_env: SharedEnv, task: str) -> None:
+    """The two-sample Kolmogorov-Smirnov test compares the distribution of each number of the initial state."""
     theirs = stored(task)
     env = lw.make(task, nworld=RESETS)
     env.rand_reset(seed=1)
@@ -209,6 +216,6 @@ def test_episodes_start_as_dm_controls(shared_env: SharedEnv, task: str) -> None
             assert gap < 2.2 * np.sqrt(1 / len(a) + 1 / len(b)), f"{name} {column}"
 
 
-def test_the_margin_of_point_mass_is_the_size_of_its_target() -> None:
+def test_margin_of_point_mass_is_the_size_of_its_target() -> None:
     env = lw.make("dm/point_mass_easy", target_size=0.1)
     assert env.task.params["margin"] == env.task.params["target_size"] == pytest.approx(0.1)

@@ -1,8 +1,8 @@
 """Compare the C engine with the Warp engine for every task of the package.
 
-Both engines run the same task functions on different physics: the C engine in float64, the Warp engine in float32. With
-pyramidal friction cones MuJoCo Warp uses a different contact frame for a capsule on a plane, so trajectories differ.
-These tests use elliptic cones, which do not depend on the contact frame.
+Both engines run the same task functions on different physics: the C engine uses float64, and the Warp engine float32.
+With pyramidal friction cones MuJoCo Warp uses a different contact frame for a capsule on a plane, so trajectories
+differ. These tests use elliptic cones, which do not depend on the contact frame.
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import SAME_MODELS, SharedEnv, long_if_alike
+from conftest import SharedEnv
 from form_tasks import Drawn, Pushed
 
 import lyceum_warp as lw
@@ -23,8 +23,11 @@ from lyceum_warp.tasks.velocity import TASKS as VELOCITY
 
 NWORLD = 32
 TASKS = package_task_names()
-LARGE = ("adroit_pen", "ant", "g1_velocity", "go1_rough_velocity", "humanoid", "humanoid_stand", "panda_lift")
-"""Tasks whose models take seconds to simulate on the Warp engine; make test-all runs them."""
+# small models that together have most features
+quick = pytest.mark.quick(
+    "cartpole", "cartpole_swingup", "go1_velocity", "half_cheetah", "hopper", "inverted_pendulum", "point_mass",
+    "reach", "soft_ball",
+)  # fmt: skip
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 FORCE_PARTS = ("contact_force", "touch", "imu", "force_torque")
@@ -38,13 +41,14 @@ PARAMS: dict[str, dict[str, Any]] = {
     "go1_velocity": {"fall_angle": 0.5},
     "soft_ball": {"reach": 0.15},
 }
-"""Parameters with which random field values end some episodes, and solver limits for robots whose own limits stop the
-solver before it converges (the engines would then differ by more than rounding)."""
+"""Parameters by task. With these parameters, random field values end some episodes. Some robots get higher solver
+limits, because the engines agree up to rounding only if the solver converges."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """Bounds of the engines' difference after one substep: maximum over coordinates, quantiles over worlds."""
+    """Bounds on the difference between the engines after one substep: quantiles over worlds of the maximum over
+    coordinates."""
 
     qpos_median: float
     qpos_p95: float
@@ -54,7 +58,7 @@ class Bounds:
 
 # Each bound is three to four times the difference measured with mujoco and mujoco_warp 4.0.0 on the CPU, over 320
 # states along random rollouts. A float32 position of about 1 has a precision of 6e-8.
-ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median, 95 %
+ONE_STEP = {  #                         measured: median and 95 % quantile of qpos, then of qvel
     "adroit_door": Bounds(1.5e-7, 7e-7, 2e-5, 3.5e-4),  # 4.1e-8, 1.9e-7; 6.2e-6, 9.6e-5
     "adroit_hammer": Bounds(6e-7, 8e-7, 3e-4, 4e-4),  # 1.6e-7, 2.2e-7; 8.0e-5, 1.1e-4
     # in the worst 5 % the pen lies on the boxes of the palm
@@ -70,12 +74,12 @@ ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median
     "h1_velocity": Bounds(2.4e-7, 7e-7, 1.7e-5, 1.8e-4),  # 5.9e-8, 1.7e-7; 4.3e-6, 4.5e-5
     "spot_velocity": Bounds(2.4e-7, 8e-7, 8e-6, 2e-4),  # 6.0e-8, 1.9e-7; 2.0e-6, 5.1e-5
     "t1_velocity": Bounds(2.5e-7, 1.4e-6, 4.4e-5, 3.4e-4),  # 6.2e-8, 3.5e-7; 1.1e-5, 8.6e-5
-    # on a height field C makes a contact with each triangle, MuJoCo Warp at most four for a pair of geoms
+    # on a height field the C engine creates a contact per triangle, and MuJoCo Warp at most four per pair of geoms
     "g1_rough_velocity": Bounds(3e-4, 8e-3, 8e-2, 2.2),  # 8.5e-5, 2.2e-3; 2.1e-2, 5.6e-1
     "go1_rough_velocity": Bounds(1.2e-5, 1.4e-3, 2e-3, 3e-1),  # 3.0e-6, 3.7e-4; 5.1e-4, 7.5e-2
     "go1_velocity": Bounds(4e-7, 1.5e-6, 4e-5, 3e-4),  # 9.8e-8, 4.4e-7; 1.1e-5, 8.7e-5
     "half_cheetah": Bounds(1e-7, 1e-6, 1e-5, 1e-4),  # 3.2e-8, 2.9e-7; 3.0e-6, 2.9e-5
-    # contacts of arms and fingers are rare; MuJoCo Warp finds fewer contact points than C between two boxes
+    # contacts of arms and fingers are rare; MuJoCo Warp finds fewer contact points between two boxes than the C engine
     "herb_reach": Bounds(4e-7, 8e-7, 5e-5, 2e-4),  # 1.1e-7, 2.2e-7; 1.3e-5, 4.8e-5
     "hopper": Bounds(1e-7, 2e-7, 1e-6, 5e-6),  # 3.0e-8, 5.5e-8; 2.9e-7, 1.6e-6
     "humanoid": Bounds(2e-7, 4e-7, 3e-5, 1.2e-4),  # 5.6e-8, 1.1e-7; 8.8e-6, 3.9e-5
@@ -90,7 +94,7 @@ ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median
     "pusher": Bounds(1.5e-7, 3e-7, 6e-7, 2e-6),  # 4.3e-8, 8.0e-8; 1.8e-7, 5.4e-7
     "reach": Bounds(5e-7, 2e-6, 5e-5, 2e-4),  # 1.5e-7, 5.8e-7; 1.5e-5, 5.8e-5
     "reacher": Bounds(1.2e-7, 5e-7, 7e-7, 2e-6),  # 3.5e-8, 1.6e-7; 2.0e-7, 6.5e-7
-    # MuJoCo Warp merges flex contacts that are less than 1 mm apart, C does not; hard squeezes differ
+    # only MuJoCo Warp merges flex contacts that are less than 1 mm apart, so strong squeezes differ
     "soft_ball": Bounds(3e-8, 3e-3, 2.5e-6, 6e-1),  # 8.5e-9, 8.8e-4; 6.8e-7, 1.8e-1
     "swimmer": Bounds(8e-8, 2e-7, 6e-7, 3e-6),  # 2.4e-8, 5.7e-8; 2.0e-7, 9.0e-7
     "walker2d": Bounds(1.2e-7, 2e-7, 2e-5, 8e-5),  # 3.7e-8, 5.8e-8; 6.2e-6, 2.4e-5
@@ -112,29 +116,29 @@ SUITE_ONE_STEP = {
     "swimmer": Bounds(9e-7, 3e-6, 4e-4, 1.5e-3),  # with 15 links: 2.5e-7, 8.5e-7; 1.2e-4, 4.3e-4
     "walker": Bounds(2e-7, 4e-7, 9e-6, 4e-5),  # 5.9e-8, 1.1e-7; 2.6e-6, 1.1e-5
 }
-"""The bounds of dm_control's suite, by domain."""
+"""Bounds for the tasks of dm_control's suite, by domain."""
 ONE_STEP |= {name: SUITE_ONE_STEP[module.removeprefix("dm_")] for name, module in SUITE.items()}
 
 
 @dataclasses.dataclass
 class Engines:
-    """One task on both engines, with one substep per step, and states that both can represent."""
+    """A task on both engines with one substep per step, and states that both engines can represent."""
 
     task: str
     c: lw.Env
     warp: lw.Env
     states: list[torch.Tensor]
-    """States along a random rollout of the unchanged task, (NWORLD, size) each, rounded to float32."""
+    """States along a random rollout of the task, (NWORLD, size) each, rounded to float32."""
 
     def action(self, rng: np.random.Generator) -> torch.Tensor:
-        """Return random actions for every world, some beyond the control range."""
+        """Return random actions for every world; some of them exceed the control range."""
         return random_action(self.c, rng, 1.3)
 
 
 def random_action(env: lw.Env, rng: np.random.Generator, reach: float) -> torch.Tensor:
     low, high = env.action_space.low, env.action_space.high
     assert low is not None and high is not None
-    low, high = np.nan_to_num(low, neginf=-1.0), np.nan_to_num(high, posinf=1.0)  # unbounded actions get bounds
+    low, high = np.nan_to_num(low, neginf=-1.0), np.nan_to_num(high, posinf=1.0)  # unbounded actions are limited
     values = (low + high) / 2 + reach * (high - low) / 2 * rng.uniform(-1.0, 1.0, env.action.shape)
     return torch.from_numpy(values.astype(np.float32))
 
@@ -160,7 +164,7 @@ def device(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-@pytest.fixture(scope="module", params=long_if_alike(TASKS, *SAME_MODELS, *LARGE))
+@pytest.fixture(scope="module", params=TASKS)
 def engines(request: pytest.FixtureRequest, device: str, shared_env: SharedEnv) -> Iterator[Engines]:
     task = request.param
     options = {"nworld": NWORLD, "cone": "elliptic", "frame_skip": 1, "autoreset": False, "horizon": 0}
@@ -185,9 +189,9 @@ def relative_error(a: torch.Tensor, b: torch.Tensor) -> float:
 
 
 def check_same(ours: Outcome, other: Outcome, force_parts: dict[str, slice] | None = None) -> None:
-    """Compare numbers within 1e-5, and flags exactly.
+    """Compare numbers with a tolerance of 1e-5, and flags exactly.
 
-    Force parts of the observation are compared within 1e-3 of their maximum, or 0.01 N if a task clips them.
+    The tolerance for force parts of the observation is 1e-3 of their maximum, or 0.01 N if a task clips them.
     """
     forces = torch.zeros(ours["obs"].shape[1], dtype=torch.bool)
     for part in (force_parts or {}).values():
@@ -219,15 +223,17 @@ def judge(env: lw.Env, before: Outcome, action: torch.Tensor, after: Outcome) ->
     return result
 
 
+@quick
 def test_both_engines_have_the_same_spaces(engines: Engines) -> None:
-    """A state of one engine can be set on the other."""
+    """The state of one engine can be set on the other engine."""
     assert engines.c.state_space == engines.warp.state_space
     assert engines.c.obs_space == engines.warp.obs_space
     assert engines.c.timestep == engines.warp.timestep
 
 
-def test_equal_field_values_give_equal_results(engines: Engines) -> None:
-    """The values are random, near those of simulated states."""
+@quick
+def test_equal_field_values_give_equal_results_on_both_engines(engines: Engines) -> None:
+    """The field values are random, and close to values in simulated states."""
     rng = torch.Generator().manual_seed(0)
     numpy_rng = np.random.default_rng(1)
     fallen = 0
@@ -251,7 +257,8 @@ def test_equal_field_values_give_equal_results(engines: Engines) -> None:
     assert 0 < fallen < 4 * NWORLD or engines.c.task.functions["terminated"] is None
 
 
-def test_equal_positions_and_velocities_give_equal_observations(engines: Engines) -> None:
+@quick
+def test_equal_positions_and_velocities_give_equal_observations_on_both_engines(engines: Engines) -> None:
     """Each engine computes all other fields from positions and velocities."""
     parts = {name: part for name, part in engines.c.obs_space.parts.items() if name in FORCE_PARTS}
     largest = 0.0
@@ -259,7 +266,7 @@ def test_equal_positions_and_velocities_give_equal_observations(engines: Engines
         results = []
         for env in (engines.c, engines.warp):
             env.set_state(state.to(env.action.device))
-            # a state includes fields of the last substep; the reset phases recompute them on each engine
+            # a state includes fields of the last substep, which the reset phases recompute on each engine
             for phase in env.worlds.reset_phases(randomly=False):
                 if phase.name not in ("restart", "settle"):
                     phase.run()
@@ -269,8 +276,9 @@ def test_equal_positions_and_velocities_give_equal_observations(engines: Engines
     assert largest >= 1.0 or not parts, "no state has a contact, so nothing was compared"
 
 
-def test_after_one_substep_the_engines_differ_by_rounding(engines: Engines) -> None:
-    """States and actions are equal; ONE_STEP holds the bounds."""
+@quick
+def test_engines_differ_only_by_rounding_after_one_substep(engines: Engines) -> None:
+    """Both engines get equal states and actions, and ONE_STEP contains the bounds."""
     assert engines.task in ONE_STEP, f"add bounds of {engines.task} to ONE_STEP; pytest -rP shows the differences"
     rng = np.random.default_rng(3)
     errors: dict[str, list[torch.Tensor]] = {"qpos": [], "qvel": []}
@@ -297,10 +305,10 @@ def test_after_one_substep_the_engines_differ_by_rounding(engines: Engines) -> N
     [(Pushed, {}), (Pushed, {"reach": 0.0}), (Pushed, {"force": 0.0}), (Drawn, {}), (Drawn, {"spread": 0.0})],
     ids=["pushes_and_moves", "pushes", "moves_a_mocap_body", "draws", "draws_gravity"],
 )
-def test_the_engines_agree_over_fifty_steps_with_written_inputs_and_randomized_models(
+def test_engines_agree_over_fifty_steps_with_inputs_and_randomized_models(
     task: type[lw.Task], params: dict[str, float], device: str
 ) -> None:
-    """``control`` writes inputs; masses, frictions and gravity are random; the steps take 150 substeps."""
+    """Masses, frictions and gravity are random, ``control`` writes inputs, and the fifty steps take 150 substeps."""
     c = lw.make(task, nworld=8, seed=1, **params)
     warp = lw.make(task, nworld=8, seed=1, engine="warp", device=device, **params)
     start, rng, worst, far = positions_of(c), np.random.default_rng(0), 0.0, 0.0

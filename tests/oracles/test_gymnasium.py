@@ -1,8 +1,8 @@
 """Compare tasks with their Gymnasium environments on the C engine.
 
-Both environments run the same C code in float64. From equal states, warm start included, they differ only by rounding
-of observations and rewards to float32. The tests read the tasks' attribute ``gymnasium`` and Gymnasium's registry and
-signatures, so they include new tasks automatically.
+Both environments run the same C code in float64. From equal states and warm starts, observations and rewards of both
+environments differ only by rounding to float32. The tests read the tasks' attribute ``gymnasium`` and Gymnasium's
+registry and signatures, so they include new tasks automatically.
 """
 
 import dataclasses
@@ -42,15 +42,16 @@ def has(task: str, function: str) -> bool:
     return function in find_task(task).scope
 
 
-# tasks with contact forces are compared with SensorStage below
+# tasks with contact forces are compared with SensorStage
 WITH_FORCES = [task for task in TASKS if "cfrc_ext" in fields(task)]
 
 
 class SensorStage:
-    """Mixin for a Gymnasium environment: Newton solver, and contact forces from the last substep's sensor stage.
+    """A mixin for Gymnasium environments, which uses the Newton solver and the contact forces of the last substep's
+    sensor stage.
 
-    Gymnasium computes ``cfrc_ext`` again after the last substep. Here a sensor makes the model compute it, as in
-    lyceum_warp.
+    Gymnasium computes ``cfrc_ext`` again after the last substep. With the mixin, a sensor makes MuJoCo compute this
+    field, as in lyceum_warp.
     """
 
     def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -73,7 +74,7 @@ def unchanged(task: str) -> type[mujoco_env.MujocoEnv]:
 
 @functools.cache
 def oracle(task: str) -> type[mujoco_env.MujocoEnv]:
-    """Return Gymnasium's class, with the mixin above if the task observes contact forces."""
+    """Return Gymnasium's class, with the mixin ``SensorStage`` if the task observes contact forces."""
     base = unchanged(task)
     return type(base.__name__, (SensorStage, base), {}) if task in WITH_FORCES else base
 
@@ -119,7 +120,7 @@ class Step:
 
 
 class Pair:
-    """One world and Gymnasium's environment, in the same states and with the same actions."""
+    """A world and Gymnasium's environment that take the same actions from the same states."""
 
     def __init__(self, ours: lw.Env, theirs: Any, seed: int = 0) -> None:
         assert ours.nworld == 1
@@ -131,7 +132,8 @@ class Pair:
         self.held = self.action()
 
     def put(self, change: Callable[[mujoco.MjData], None] = lambda data: None) -> None:
-        """Reset Gymnasium, apply a change, and copy the state with a warm start to both, rounded to float32."""
+        """Reset Gymnasium's environment, apply a change, and copy its state, rounded to float32, and a warm start to
+        both."""
         data = self.theirs.data
         mujoco.mj_resetData(self.theirs.model, data)
         self.theirs.reset_model()
@@ -144,17 +146,17 @@ class Pair:
         state = self.ours.get_state()
         parts = self.ours.state_space.split(state[0])
         for name in parts.keys() - {"step", "key", "episode", "done_reason", "metrics"}:
-            # lagged fields come from the forward pass above
+            # lagged fields come from the previous forward pass
             parts[name].copy_(torch.from_numpy(np.ravel(getattr(data, name))))
-        parts["done_reason"].zero_()  # the shared state has not ended
+        parts["done_reason"].zero_()  # the shared state is not terminal
         self.ours.set_state(state)
 
     def action(self) -> np.ndarray:
-        """Return a random action; one in four is beyond the control range."""
+        """Return a random action; one action in four exceeds the control range."""
         return np.float32(self.middle + 1.33 * self.reach * self.rng.uniform(-1.0, 1.0, self.middle.shape))
 
     def step(self) -> Step:
-        if self.rng.random() < 0.7:  # otherwise repeat the last action, so that the robot moves further
+        if self.rng.random() < 0.7:  # otherwise the last action is repeated, so that the robot moves further
             self.held = self.action()
         self.ours.step(torch.from_numpy(self.held[None]))
         obs, reward, terminated, truncated, info = self.theirs.step(self.held.astype(np.float64))
@@ -174,7 +176,7 @@ class Pair:
         )
 
     def run(self, nstep: int, restart: int = 200) -> list[Step]:
-        """Step both from a shared state; after a termination or ``restart`` steps, restart from a new one."""
+        """Step both from a shared state; after a termination or ``restart`` steps, restart from a new state."""
         steps: list[Step] = []
         since = restart
         for _ in range(nstep):
@@ -200,13 +202,13 @@ def test_every_mujoco_environment_of_gymnasium_has_a_task() -> None:
     assert sorted(latest) == sorted(IDS[task] for task in TASKS)
 
 
-def test_every_named_environment_is_registered() -> None:
+def test_every_gymnasium_id_of_a_task_is_registered() -> None:
     """A misspelt id would silently exclude a task from all comparisons."""
     assert not {name: id for name, id in IDS.items() if id not in gymnasium.registry}
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_a_thousand_steps_equal_gymnasiums(task: str) -> None:
+def test_a_thousand_steps_equal_those_of_gymnasium(task: str) -> None:
     """Some random actions exceed the control range."""
     pair = Pair(make_ours(task), make_theirs(task))
     assert pair.ours.timestep == pytest.approx(pair.theirs.dt, rel=1e-12)
@@ -218,7 +220,8 @@ def test_a_thousand_steps_equal_gymnasiums(task: str) -> None:
     steps = pair.run(1000, min(horizon, 200))
     obs_error, reward_error = max(step.obs_error for step in steps), max(step.reward_error for step in steps)
     ends = sum(step.gym_terminated for step in steps)
-    print(f"{task}: obs within {obs_error:.1e}, reward within {reward_error:.1e}, {ends} ends")  # shown by pytest -rP
+    # pytest -rP shows this line
+    print(f"{task}: error of observations {obs_error:.1e} and rewards {reward_error:.1e}, {ends} terminations")
     check(steps)
     assert ends >= 10 if has(task, "terminated") else ends == 0
     for step in steps:
@@ -227,7 +230,7 @@ def test_a_thousand_steps_equal_gymnasiums(task: str) -> None:
 
 
 def evaluation(info: Mapping[str, Any]) -> float | None:
-    """Return the expected metric, if Gymnasium's info contains it: a distance, a height or a position."""
+    """Return the expected metric (a distance, a height or a position) if Gymnasium's info contains it."""
     if "reward_dist" in info:
         return -info["reward_dist"]
     if "reward_linup" in info:
@@ -242,15 +245,15 @@ def evaluation(info: Mapping[str, Any]) -> float | None:
         ("inverted_double_pendulum", lambda data: data.site("tip").xpos[2]),
     ],
 )
-def test_a_pendulum_is_evaluated_by_its_angle_or_height(task: str, metric: Callable[[mujoco.MjData], float]) -> None:
+def test_evaluation_of_a_pendulum_is_its_angle_or_height(task: str, metric: Callable[[mujoco.MjData], float]) -> None:
     pair = Pair(make_ours(task), make_theirs(task))
     pair.put()
     for _ in range(20):
         assert pair.step().eval == pytest.approx(metric(pair.theirs.data), abs=1e-6)
 
 
-def test_the_force_at_the_end_of_the_rail_equals_gymnasiums() -> None:
-    """The test places the cart there, because the pole falls earlier under random actions."""
+def test_force_at_the_end_of_the_rail_equals_that_of_gymnasium() -> None:
+    """The test places the cart at the end of the rail, because the pole falls earlier under random actions."""
     pair = Pair(make_ours("inverted_double_pendulum"), make_theirs("inverted_double_pendulum"))
 
     def drive_to_the_end(data: mujoco.MjData) -> None:
@@ -266,7 +269,7 @@ def test_the_force_at_the_end_of_the_rail_equals_gymnasiums() -> None:
     assert any(0.0 < abs(force) < 10.0 for force in forces), "every force is clipped"
 
 
-def test_a_cylinder_is_pushed_as_in_gymnasium() -> None:
+def test_pushed_cylinder_moves_as_in_gymnasium() -> None:
     """The test places the cylinder beside the hand, which random actions hardly ever reach."""
     pair = Pair(make_ours("pusher"), make_theirs("pusher"))
     model, (low, high) = pair.theirs.model, pair.theirs.model.jnt_range[:7].T
@@ -284,12 +287,12 @@ def test_a_cylinder_is_pushed_as_in_gymnasium() -> None:
         start = pair.theirs.data.qpos[7:9].copy()
         check([pair.step() for _ in range(10)])
         moved.append(np.linalg.norm(pair.theirs.data.qpos[7:9] - start))
-    assert min(moved) > 5e-4  # m; an untouched cylinder does not move
+    assert min(moved) > 5e-4  # distance in m; an untouched cylinder does not move
 
 
 @pytest.mark.quick("ant")
 @pytest.mark.parametrize("task", WITH_FORCES)
-def test_gymnasiums_unchanged_class_differs_only_in_contact_forces(task: str) -> None:
+def test_unchanged_gymnasium_class_differs_only_in_contact_forces(task: str) -> None:
     """With the Newton solver and without contact costs, everything except the contact forces agrees."""
     weights = {name: 0.0 for name in keywords(task) if name in ("contact_cost_weight", "impact_cost_weight")}
     assert weights
@@ -302,7 +305,7 @@ def test_gymnasiums_unchanged_class_differs_only_in_contact_forces(task: str) ->
     for step in steps:
         assert relative_error(np.delete(step.obs, forces), np.delete(step.gym_obs, forces)) <= 1e-5
         assert step.reward_error <= 1e-4
-    # if these agree one day, remove the note in tasks/humanoid.py
+    # if this assertion fails because contact forces agree, remove the note in tasks/humanoid.py
     assert max(relative_error(step.obs[forces], step.gym_obs[forces]) for step in steps) > 1e-3
 
 
@@ -312,9 +315,8 @@ RANGES = [(task, name) for task in HEALTHY for name in inspect.signature(unchang
 
 
 @pytest.mark.parametrize(("task", "bounded"), [*((task, None) for task in HEALTHY), *RANGES])
-def test_states_are_terminal_as_in_gymnasium(task: str, bounded: str | None) -> None:
-    """Random states lie on both sides of all bounds, or on both sides of a single range while the other ranges are
-    wide."""
+def test_terminal_states_are_those_of_gymnasium(task: str, bounded: str | None) -> None:
+    """Random states lie on both sides of all bounds, or on both sides of one range while the other ranges are wide."""
     wide = {name: (-1e6, 1e6) for other, name in RANGES if other == task and bounded not in (None, name)}
     if bounded is not None and math.isinf(max(keywords(task)[bounded])):
         wide[bounded] = (keywords(task)[bounded][0], 2.0)
@@ -340,8 +342,8 @@ def share_of_ill_states(ours: lw.Env, theirs: Any, spread: float) -> float:
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_the_first_observation_equals_gymnasiums_in_the_same_state(task: str) -> None:
-    """Both the random and the fixed reset are compared."""
+def test_first_observation_equals_that_of_gymnasium_in_the_same_state(task: str) -> None:
+    """The test compares both the random and the fixed reset."""
     ours, theirs = make_ours(task, nworld=16), make_theirs(task)
     for start in (ours.rand_reset, ours.reset):
         start()
@@ -356,16 +358,17 @@ def test_the_first_observation_equals_gymnasiums_in_the_same_state(task: str) ->
 
 
 RESETS = [
-    pytest.param(task, times, marks=() if times == 1.0 else pytest.mark.long)
+    (task, times)
     for task in TASKS
     for times in (1.0, 3.0)
     if times == 1.0 or "reset_noise_scale" in inspect.signature(unchanged(task)).parameters
 ]
 
 
+@pytest.mark.quick("1.0")
 @pytest.mark.parametrize(("task", "times"), RESETS)
-def test_random_resets_have_the_distribution_of_gymnasiums(task: str, times: float) -> None:
-    """Each side resets 2,000 times, with Gymnasium's noise scale and with three times this scale."""
+def test_random_resets_have_the_distribution_of_gymnasium(task: str, times: float) -> None:
+    """Both environments reset 2,000 times, with Gymnasium's noise scale and with three times this scale."""
     option = {} if times == 1.0 else {"reset_noise_scale": keywords(task)["reset_noise_scale"] * times}
     theirs, ours = make_theirs(task, **option), make_ours(task, nworld=250, **option)
     theirs.reset(seed=0)
@@ -382,7 +385,7 @@ def test_random_resets_have_the_distribution_of_gymnasiums(task: str, times: flo
 
 
 def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
-    """Compare two (n, k) samples: each coordinate, and each pair of coordinates.
+    """Compare the distributions of two (n, k) samples, for each coordinate and each pair of coordinates.
 
     Fewer than one in 10,000 pairs of samples from equal distributions exceeds these thresholds; the seeds are fixed.
     """
@@ -392,16 +395,16 @@ def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
     fixed = spread < 1e-9
     np.testing.assert_allclose(b[:, fixed], a[:, fixed], atol=1e-6)
     a, b = ((x - middle)[:, ~fixed] / spread[~fixed] for x in (a, b))
-    # the mean and the standard deviation; the fourth moment determines the latter's error
+    # compare means and standard deviations; the kurtosis determines the error of a standard deviation
     kurtosis = np.mean(a**4, axis=0)
     assert np.abs(b.mean(axis=0)).max() < 5.0 * math.sqrt(2.0 / n)
     assert (np.abs(b.std(axis=0) - 1.0) < 5.0 * np.sqrt((kurtosis - 1.0) / (2.0 * n))).all()
-    # bounded coordinates have nearly the same extremes
+    # compare the extremes of bounded coordinates
     bounded = kurtosis < 2.3
     for edge in (np.min, np.max):
         assert np.abs(edge(a, axis=0) - edge(b, axis=0))[bounded].max(initial=0.0) < 0.05 * np.ptp(a)
     assert (ks_distance(a, b) < 2.6 * math.sqrt(2.0 / n)).all()
-    # dependence between coordinates: their correlation, and the distances of pairs from the mean
+    # compare the correlations of coordinates, and the distances of pairs of coordinates from the mean
     assert np.abs(np.corrcoef(a.T) - np.corrcoef(b.T)).max() < 5.5 * math.sqrt(2.0 / n)
     pairs = np.array(list(itertools.combinations(range(a.shape[1]), 2)))[:200].T
     lengths = [np.hypot(x[:, pairs[0]], x[:, pairs[1]]) for x in (a, b)]
@@ -428,7 +431,7 @@ def keywords(task: str) -> dict[str, Any]:
 
 
 def variants(default: Any) -> list[Any]:
-    """Return values that differ from the default; for a range, return the side to narrow."""
+    """Return values that differ from the default; for a range, return the sides to narrow."""
     if isinstance(default, bool):
         return [not default]
     if isinstance(default, tuple):
@@ -438,20 +441,12 @@ def variants(default: Any) -> list[Any]:
     return [2.5 * default, 0.3 * default]
 
 
-def cases() -> list[Any]:
-    """Return (task, parameter, variant) for every parameter.
-
-    All variants after the first are marked long, and the humanoids, whose parameters are similar to the ant's.
-    """
-    found = []
-    for task in TASKS:
-        for name, default in keywords(task).items():
-            if name == "reset_noise_scale":
-                continue  # the tests of distributions above cover this parameter
-            for i, variant in enumerate(variants(default)):
-                marks = pytest.mark.long if i or task.startswith("humanoid") else ()
-                found.append(pytest.param(task, name, variant, marks=marks))
-    return found
+PARAMETERS = [
+    (task, name, variants(default))
+    for task in TASKS
+    for name, default in keywords(task).items()
+    if name != "reset_noise_scale"  # the tests of distributions above cover this parameter
+]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -504,7 +499,7 @@ def narrowed(task: str, name: str, side: str) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_every_parameter_of_gymnasium_has_its_default(task: str) -> None:
+def test_every_gymnasium_parameter_exists_with_the_same_default(task: str) -> None:
     ours = make_ours(task)
     for name, default in keywords(task).items():
         if name == "frame_skip":
@@ -515,11 +510,15 @@ def test_every_parameter_of_gymnasium_has_its_default(task: str) -> None:
             assert isinstance(value, bool) == isinstance(default, bool), name
 
 
-@pytest.mark.parametrize(("task", "name", "variant"), cases())
-def test_a_parameter_has_the_same_effect_as_in_gymnasium(task: str, name: str, variant: Any) -> None:
+# the humanoids' parameters are similar to the ant's
+@pytest.mark.quick(*(f"{task}-{name}-{first}" for task, name, (first, *_) in PARAMETERS if "humanoid" not in task))
+@pytest.mark.parametrize(
+    ("task", "name", "variant"), [(task, name, value) for task, name, values in PARAMETERS for value in values]
+)
+def test_parameter_has_the_same_effect_as_in_gymnasium(task: str, name: str, variant: Any) -> None:
     """Compare the effect on results and on the size of the observation.
 
-    Some ranges exclude the initial state, which Gymnasium checks only after a step, so worlds reset automatically.
+    Worlds reset automatically, because some ranges exclude the initial state, which Gymnasium checks only after a step.
     """
     value = narrowed(task, name, variant) if variant in ("low", "high") else variant
     default, changed = default_numbers(task), numbers(task, **{name: value})
@@ -543,7 +542,7 @@ def test_a_parameter_has_the_same_effect_as_in_gymnasium(task: str, name: str, v
         assert 0 < sum(step.gym_terminated for step in steps) < len(steps)
 
 
-def test_ants_main_body_is_an_index_or_a_name() -> None:
+def test_main_body_of_ant_may_be_an_index_or_a_name() -> None:
     pair = Pair(make_ours("ant", main_body="aux_3"), make_theirs("ant", main_body="aux_3"))
     check(pair.run(20))
     assert pair.ours.task.parameters.values["main_body"] == pair.theirs.model.body("aux_3").id

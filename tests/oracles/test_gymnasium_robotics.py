@@ -30,7 +30,7 @@ IDS = {
     for name in lw.task_names()
     if (task := find_task(name)).__module__.startswith("lyceum_warp.tasks.")
 }
-"""The environment that each task of the package names."""
+"""Ids of Gymnasium environments by task."""
 
 ENTRIES = {
     name: str(spec.entry_point)
@@ -51,7 +51,7 @@ def geoms(pair: mujoco.MjsPair) -> set[str]:
 
 @functools.cache
 def oracle_class(name: str) -> type[MujocoEnv]:
-    """Return their environment with the task's changes to the model, and without duplicate contact pairs."""
+    """Return the Gymnasium-Robotics class with the task's changes to the model, and without duplicate contact pairs."""
     registered: Any = load_env_creator(ENTRIES[name])
 
     class Oracle(registered):  # type: ignore[misc]
@@ -67,12 +67,12 @@ def oracle_class(name: str) -> type[MujocoEnv]:
 
 
 def registered(name: str) -> Any:
-    """Make their unchanged environment."""
+    """Make the unchanged Gymnasium-Robotics environment."""
     return gymnasium.make(IDS[name], disable_env_checker=True).unwrapped
 
 
 class Pair:
-    """One world and their environment, in the same states and under the same controls.
+    """A world and a Gymnasium-Robotics environment that get the same states and controls.
 
     Args:
         ours: The world.
@@ -82,21 +82,22 @@ class Pair:
     def __init__(self, ours: lw.Env, theirs: Any) -> None:
         self.ours, self.theirs = ours, theirs
         self.places = {field: getattr(theirs.model, field).copy() for field in ("body_pos", "body_quat", "site_pos")}
-        """Fields of their model, copied before random resets change them."""
+        """Fields of Gymnasium-Robotics' model, copied before random resets change them."""
         self.theirs.reset(seed=0)
         self.rng = np.random.default_rng(0)
         self.goals = 0
-        """Steps of the episode in which their goal was achieved."""
+        """Number of steps of the episode in which Gymnasium-Robotics reports the goal as achieved."""
         self._simulate, self.theirs.do_simulation = self.theirs.do_simulation, self._with_our_controls
 
     def _with_our_controls(self, ctrl: np.ndarray, frames: int) -> None:
-        # actions become controls in float32 here and in float64 there; over many steps the difference would grow
+        # this package computes controls in float32 and Gymnasium-Robotics in float64; the difference would grow over
+        # many steps
         ours = self.ours.state_space.split(self.ours.get_state())["ctrl"][0].numpy()
         np.testing.assert_allclose(ours, ctrl, atol=2e-7)
         self._simulate(ours, frames)
 
     def reset(self) -> None:
-        """Begin an episode in one of our random initial states."""
+        """Begin an episode in a random initial state of this package."""
         self.ours.rand_reset()
         first = self.ours.obs[0].numpy().astype(np.float64)
         self.put()
@@ -104,7 +105,7 @@ class Pair:
         self.goals = 0
 
     def put(self, **values: np.ndarray) -> None:
-        """Put both into our state, after replacing some of its fields."""
+        """Put both environments into the state of the world, after replacing some of its fields."""
         model, data = self.theirs.model, self.theirs.data
         for field, own in self.places.items():
             getattr(model, field)[:] = own
@@ -126,7 +127,8 @@ class Pair:
         self.ours.set_state(state)
 
     def _move(self, body: str, pos: np.ndarray, quat: np.ndarray) -> None:
-        """Place a mocap body of our model; their model may have a mocap body, a fixed body or a site instead."""
+        """Place a mocap body; Gymnasium-Robotics' model may have a mocap body, a fixed body or a site with this
+        name."""
         model, data = self.theirs.model, self.theirs.data
         if (id := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body)) < 0:
             model.site(body).pos[:] = pos
@@ -144,7 +146,7 @@ class Pair:
         self.goals += self.success
 
     def check(self) -> None:
-        """Compare the results of the step, up to float32 rounding."""
+        """Compare the results of a step, up to float32 rounding."""
         assert relative_error(self.ours.obs[0].numpy().astype(np.float64), self.obs) <= 1e-5
         assert relative_error(self.ours.reward.item(), float(self.reward)) <= 1e-5
         assert self.ours.terminated.item() == self.terminated
@@ -165,14 +167,14 @@ class Special:
     """A state that random actions do not reach."""
 
     reward: float
-    """The reward that their next step returns, within 0.1."""
+    """Expected reward of Gymnasium-Robotics' next step, within 0.1."""
     joints: dict[str, float]
-    """Positions of some joints."""
+    """Positions of joints by their names."""
     moved: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
-    """Poses of some mocap bodies."""
+    """Poses of mocap bodies by their names."""
 
     def fields(self, env: lw.Env) -> dict[str, np.ndarray]:
-        """Return the fields of this state that differ from the environment's own."""
+        """Return the fields in which this state differs from the environment's current state."""
         parts = env.state_space.split(env.get_state()[0])
         fields = {name: parts[name].numpy().copy() for name in ("qpos", "mocap_pos", "mocap_quat")}
         for joint, value in self.joints.items():
@@ -184,13 +186,13 @@ class Special:
 
 
 def pen(reward: float, angle: float, up: float) -> Special:
-    """Return a state with the pen at a height above the palm, at an angle to the target."""
+    """Return a state in which the pen has a given height above the palm and a given angle to the target."""
     turn = (np.pi / 2 - angle) / 2
     return Special(reward, {"OBJTx": -up}, {"target": (0.2, 0.2, 0.2, np.cos(turn), 0.0, np.sin(turn), 0.0)})
 
 
 def ball(reward: float, up: float, aside: float) -> Special:
-    """Return a state with the ball at a height and a sideways distance; the target is 0.2 m above the table."""
+    """Return a state in which the ball has a given height and lateral distance; the target is 0.2 m above the table."""
     joints = {"OBJTx": aside, "OBJTy": 0.0, "OBJTz": up - 0.035}
     return Special(reward, joints, {"target": (0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0)})
 
@@ -207,7 +209,7 @@ SPECIAL = {
     "adroit_pen": [pen(61.0, 0.1, 0.0), pen(10.9, 0.38, 0.0), pen(0.8, 0.1, 0.2), pen(-5.6, 2.0, -0.2)],
     "adroit_relocate": [ball(0.0, 0.035, 0.15), ball(0.8, 0.2, 0.15), ball(10.9, 0.2, 0.08), ball(30.9, 0.2, 0.01)],
 }
-"""States that reach the bonuses of the rewards, and success."""
+"""States with reward bonuses or success, by task."""
 
 
 @pytest.fixture(params=TASKS)
@@ -220,7 +222,8 @@ MakePair = Callable[..., Pair]
 
 @pytest.fixture
 def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
-    """Return ``make_pair(theirs, sparse=True)``, which pairs our environment with theirs, by default the oracle."""
+    """Return ``make_pair(theirs, sparse=True)``, which pairs an environment of this package with one of
+    Gymnasium-Robotics."""
 
     def make(theirs: Any = None, **params: Any) -> Pair:
         ours = shared_env(task, autoreset=False, horizon=0, nthread=1, **params)
@@ -230,8 +233,8 @@ def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
 
 
 @pytest.mark.quick("adroit_pen", "adroit_hammer")
-def test_random_actions_lead_to_the_same_numbers(make_pair: MakePair) -> None:
-    """Run five episodes of 200 steps from random initial states; a quarter of the actions is out of range."""
+def test_results_under_random_actions_equal_gymnasium_robotics(make_pair: MakePair) -> None:
+    """Run five episodes of 200 steps from random initial states; a quarter of the actions are out of range."""
     pair = make_pair()
     for _ in range(5):
         pair.reset()
@@ -246,8 +249,9 @@ def pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
     return list(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
 
 
-def test_their_unchanged_environment_agrees_until_contacts_differ(make_pair: MakePair, task: str) -> None:
-    """Compare with their unchanged model until a contact occurs that ours lacks or that theirs counts twice."""
+def test_unchanged_gymnasium_robotics_environment_agrees_until_contacts_differ(make_pair: MakePair, task: str) -> None:
+    """Compare with the unchanged model until a contact occurs that the package's model lacks or the unchanged model
+    counts twice."""
     pair = make_pair(registered(task))
     ours, theirs = pair.ours.model, pair.theirs.model
     ghosts = set(np.flatnonzero(ours.geom_contype != theirs.geom_contype))
@@ -267,7 +271,7 @@ def test_their_unchanged_environment_agrees_until_contacts_differ(make_pair: Mak
 
 
 @pytest.mark.parametrize("reward_type", ["dense", "sparse"])
-def test_bonuses_and_success_equal_theirs(make_pair: MakePair, task: str, reward_type: str) -> None:
+def test_bonuses_and_success_equal_gymnasium_robotics(make_pair: MakePair, task: str, reward_type: str) -> None:
     pair = make_pair(oracle_class(task)(reward_type=reward_type), sparse=reward_type == "sparse")
     assert task in SPECIAL, "add states that reach the bonuses and success"
     rewards, successes = set(), 0
@@ -285,7 +289,7 @@ def test_bonuses_and_success_equal_theirs(make_pair: MakePair, task: str, reward
     assert reward_type == "dense" or rewards == {10.0, -0.1}
 
 
-def test_spaces_and_parameters_equal_theirs(shared_env: SharedEnv, task: str) -> None:
+def test_spaces_and_parameters_equal_gymnasium_robotics(shared_env: SharedEnv, task: str) -> None:
     ours, theirs = shared_env(task, autoreset=False, horizon=0, nthread=1), registered(task)
     low, high = theirs.action_space.low, theirs.action_space.high
     assert ours.obs.shape == (1, *theirs.observation_space.shape)
@@ -301,11 +305,11 @@ KINDS = {
     "site": mujoco.mjtObj.mjOBJ_SITE, "tendon": mujoco.mjtObj.mjOBJ_TENDON,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR, "sensor": mujoco.mjtObj.mjOBJ_SENSOR, "dof": None, "wrap": None,
 }  # fmt: skip
-"""Kinds of elements, with the types for looking up their names."""
+"""Kinds of elements, with the MuJoCo types for looking up their names."""
 
 
 def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, str]]:
-    """Return the fields in which elements of their model differ from ours, with the elements' names."""
+    """Return the fields in which elements of the two models differ, with the elements' names."""
     found = set()
     for kind, named in KINDS.items():
         fields = [name for name in dir(theirs) if name.startswith(f"{kind}_")]
@@ -317,7 +321,7 @@ def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, 
     return found
 
 
-def test_model_equals_theirs_except_for_edits(shared_env: SharedEnv, task: str) -> None:
+def test_model_equals_gymnasium_robotics_except_for_edits(shared_env: SharedEnv, task: str) -> None:
     """The models may differ only in bodies that a reset moves, duplicate pairs, and the order of sensor sites."""
     ours, theirs = shared_env(task, autoreset=False, horizon=0, nthread=1).model, registered(task).model
     moved = mocap_bodies(ours)
@@ -333,8 +337,8 @@ def test_model_equals_theirs_except_for_edits(shared_env: SharedEnv, task: str) 
         assert getattr(ours.opt, name) == getattr(theirs.opt, name), name
 
 
-def test_fixed_resets_give_the_initial_positions_of_their_model(make_pair: MakePair, task: str) -> None:
-    """Positions equal the positions of their model before any reset."""
+def test_fixed_resets_give_the_initial_positions_of_the_model(make_pair: MakePair, task: str) -> None:
+    """Positions equal those of Gymnasium-Robotics' model before any reset."""
     pair = make_pair(registered(task))
     pair.ours.reset()
     pair.put()
@@ -345,7 +349,7 @@ def test_fixed_resets_give_the_initial_positions_of_their_model(make_pair: MakeP
 
 
 @pytest.mark.usefixtures("freed")
-def test_random_resets_have_their_distribution(task: str) -> None:
+def test_random_resets_have_the_distribution_of_gymnasium_robotics(task: str) -> None:
     """Compare each number of the first observations by a Kolmogorov-Smirnov test, and their correlations."""
     n, m = 400, 1000
     env, original = lw.make(task, engine="mujoco", nworld=m, nthread=1), registered(task)

@@ -1,7 +1,7 @@
 """Compare go1_velocity with mjlab's Mjlab-Velocity-Flat-Unitree-Go1: model, observations, rewards and terminations.
 
-The tests read mjlab's numbers from a file that store_go1.py wrote, so they do not need mjlab. mjlab's poses and
-contacts are current, because a forward pass preceded each observation.
+The tests read mjlab's numbers from a file that store_go1.py wrote, so they do not need mjlab. The stored poses and
+contacts are current, because mjlab ran a forward pass before each observation.
 """
 
 from pathlib import Path
@@ -22,7 +22,7 @@ TERMS = [name.removeprefix("weight/") for name in STORED if name.startswith("wei
 NWORLD = len(STORED["env/qpos"])
 
 
-def test_model_has_mjlabs_bodies_and_geoms(shared_env: SharedEnv) -> None:
+def test_model_has_the_bodies_and_geoms_of_mjlab(shared_env: SharedEnv) -> None:
     model = shared_env("go1_velocity").model
     assert [model.body(i).name for i in range(model.nbody)] == STORED["bodies"].tolist()
     assert [model.geom(i).name for i in range(model.ngeom)] == ["floor", *STORED["geoms"][1:].tolist()]
@@ -31,18 +31,18 @@ def test_model_has_mjlabs_bodies_and_geoms(shared_env: SharedEnv) -> None:
 
 
 @pytest.mark.parametrize("name", MODEL)
-def test_model_fields_equal_mjlabs(shared_env: SharedEnv, name: str) -> None:
+def test_model_fields_equal_those_of_mjlab(shared_env: SharedEnv, name: str) -> None:
     np.testing.assert_allclose(getattr(shared_env("go1_velocity").model, name), STORED[f"model/{name}"], rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_model_has_mjlabs_options(shared_env: SharedEnv, name: str) -> None:
+def test_model_has_the_options_of_mjlab(shared_env: SharedEnv, name: str) -> None:
     np.testing.assert_array_equal(getattr(shared_env("go1_velocity").model.opt, name), STORED[f"option/{name}"])
 
 
 @pytest.mark.parametrize("i", range(4))
-def test_trajectories_of_the_model_equal_mjlabs(shared_env: SharedEnv, i: int) -> None:
-    """Run 200 substeps of MuJoCo under equal controls, standing and tumbling, with self-collisions."""
+def test_trajectories_of_the_model_equal_those_of_mjlab(shared_env: SharedEnv, i: int) -> None:
+    """Run 200 substeps of a standing and of a tumbling robot under equal controls, with self-collisions."""
     model = shared_env("go1_velocity").model
     data, wanted = mujoco.MjData(model), STORED["trajectory/qpos"][i]
     data.qpos, data.qvel = wanted[0], STORED["trajectory/qvel0"][i]
@@ -95,12 +95,12 @@ def mjlabs_states(env: lw.Env, *, heading: bool) -> torch.Tensor:
 
 @pytest.mark.parametrize("heading", [False, True])
 @pytest.mark.parametrize(("group", "theirs"), [("policy", "actor"), ("critic", "critic")])
-def test_observations_equal_mjlabs(env: lw.Env, group: str, theirs: str, heading: bool) -> None:
+def test_observations_equal_those_of_mjlab(env: lw.Env, group: str, theirs: str, heading: bool) -> None:
     found = env.get_obs(mjlabs_states(env, heading=heading), group=group)
     np.testing.assert_allclose(found.numpy(), STORED[f"env/{theirs}"], rtol=2e-5, atol=2e-5)
 
 
-def test_stored_states_hold_every_kind_of_command_and_contact() -> None:
+def test_stored_states_contain_every_kind_of_command_and_contact() -> None:
     assert 0 < stored("standing").sum() < stored("heading_controlled").sum() < NWORLD
     contact = stored("critic")[:, 56:60]
     assert 0.2 < contact.mean() < 0.8
@@ -108,11 +108,11 @@ def test_stored_states_hold_every_kind_of_command_and_contact() -> None:
 
 
 @pytest.mark.parametrize("term", TERMS)
-def test_terms_of_the_reward_equal_mjlabs(env: lw.Env, term: str) -> None:
-    """Each term is compared alone, with mjlab's weight and all other weights zero."""
+def test_reward_terms_equal_those_of_mjlab(env: lw.Env, term: str) -> None:
+    """Each term is compared alone, with mjlab's weight; all other weights are zero."""
     after = mjlabs_states(env, heading=False)
     before = after.clone()
-    if term == "soft_landing":  # mjlab's forces are current, ours are one substep late
+    if term == "soft_landing":  # mjlab's forces are current, and those of this package are one substep old
         times = env.state_space.split(after)["contact_time"]
         times += 0.005 * (times > 0)
     weight = float(STORED[f"weight/{term}"])
@@ -126,16 +126,16 @@ def test_terms_of_the_reward_equal_mjlabs(env: lw.Env, term: str) -> None:
     assert np.unique(wanted).size > 5
 
 
-def test_weights_equal_mjlabs() -> None:
+def test_reward_weights_equal_those_of_mjlab() -> None:
     assert find_task("go1_velocity").rewards == {term: STORED[f"weight/{term}"] for term in TERMS}
 
 
-def test_terminations_equal_mjlabs(env: lw.Env) -> None:
+def test_terminations_equal_those_of_mjlab(env: lw.Env) -> None:
     state = mjlabs_states(env, heading=False)
     assert np.array_equal(env.get_terminated(state).numpy(), STORED["env/fell"])
 
 
-def test_actions_become_mjlabs_targets(env: lw.Env) -> None:
+def test_actions_give_the_servo_targets_of_mjlab(env: lw.Env) -> None:
     env.set_state(mjlabs_states(env, heading=False))
     env.step(stored("action").float())
     np.testing.assert_allclose(env.field("ctrl").numpy(), STORED["env/target"], atol=1e-6)

@@ -19,7 +19,7 @@ STEPS, N = 12, 8
 
 @pytest.fixture(autouse=True)
 def double() -> Iterator[None]:
-    """Use float64: in float32, Adam amplifies rounding errors of tiny gradients to full steps."""
+    """Use float64, because in float32 Adam would amplify rounding errors of tiny gradients to full steps."""
     torch.set_default_dtype(torch.float64)
     yield
     torch.set_default_dtype(torch.float32)
@@ -44,7 +44,7 @@ def samples(ppo: lw.PPO) -> dict[str, torch.Tensor]:
 
 
 def theirs(ppo: lw.PPO, given: dict[str, torch.Tensor]) -> Any:
-    """Return rsl_rl's PPO with the same weights, and a storage with the samples."""
+    """Return rsl_rl's PPO with the same weights, and an rsl_rl storage with the samples."""
     env = ppo.env
     other = OnPolicyRunner(RslRlVecEnv(env), runner_config(env, ppo.config), None, "cpu").alg
     for network in (other.actor, other.critic):
@@ -71,7 +71,7 @@ def test_an_update_gives_the_same_parameters_as_rsl_rl(
 ) -> None:
     config = lw.PPOConfig(**{"hidden": (16, 8), "value_hidden": (8,), "num_steps": STEPS, "normalize": False} | changes)
     ppo = lw.PPO(shared_env(Metered, nworld=N, horizon=10), config=config)
-    for module in (ppo.policy, ppo.value):  # with last layers near zero, gradients are small
+    for module in (ppo.policy, ppo.value):  # gradients are small if the last layers are near zero
         torch.nn.init.xavier_uniform_(module.network[-1].weight, generator=torch.Generator().manual_seed(0))
     given = samples(ppo)
     other = theirs(ppo, given)

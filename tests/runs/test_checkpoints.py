@@ -1,4 +1,4 @@
-"""Read broken, foreign and missing files of policies and states."""
+"""Test that damaged, invalid and missing files of policies and states raise one-line errors."""
 
 from pathlib import Path
 from random import Random
@@ -21,7 +21,7 @@ def run(tmp_path: Path) -> Run:
 
 
 class Mine(torch.nn.Module):
-    """A user's policy, which has no shape."""
+    """A user's policy without a shape attribute."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -36,7 +36,7 @@ class Foreign:
 
 
 @pytest.mark.parametrize("kind", ["empty", "truncated", "text", "foreign", "code", "list", "newer", "partial", "shape"])
-def test_broken_and_foreign_checkpoints_are_refused_in_one_line(run: Run, kind: str) -> None:
+def test_damaged_and_invalid_checkpoints_raise_a_one_line_error(run: Run, kind: str) -> None:
     path, whole = run.policy, run.policy.read_bytes()
     content = read_checkpoint(path, parts=("iteration", "policy"))
     fix = "restore the file from a copy, or train again into another folder"
@@ -69,7 +69,7 @@ def test_broken_and_foreign_checkpoints_are_refused_in_one_line(run: Run, kind: 
 
 
 def read_or_refused(path: Path, data: bytes, bit: int) -> dict[str, Any] | None:
-    """Read a file after one bit was flipped; return None if the file is refused."""
+    """Flip one bit of a file, and read the file; return None if reading raises an error."""
     damaged = bytearray(data)
     damaged[bit // 8] ^= 1 << bit % 8
     path.write_bytes(damaged)
@@ -80,7 +80,7 @@ def read_or_refused(path: Path, data: bytes, bit: int) -> dict[str, Any] | None:
         return None
 
 
-def test_every_flipped_bit_of_a_tensor_is_refused(run: Run) -> None:
+def test_flipped_bit_of_a_tensor_raises_an_error(run: Run) -> None:
     data, random = run.checkpoint.read_bytes(), Random(0)
     weights = read_checkpoint(run.checkpoint)["policy"]["state"]["network.0.weight"].numpy().tobytes()
     first = 8 * data.index(weights)
@@ -88,9 +88,10 @@ def test_every_flipped_bit_of_a_tensor_is_refused(run: Run) -> None:
         assert read_or_refused(run.checkpoint, data, first + random.randrange(8 * len(weights))) is None
 
 
-@pytest.mark.parametrize("every", [61, pytest.param(7, marks=pytest.mark.long)])
-def test_a_file_with_a_flipped_bit_has_the_same_content_or_is_refused(run: Run, every: int) -> None:
-    """One of every seven bits marks a zip entry as a folder, so that torch reads no numbers."""
+@pytest.mark.quick("61")
+@pytest.mark.parametrize("every", [61, 7])
+def test_checkpoint_with_a_flipped_bit_has_the_same_content_or_raises_an_error(run: Run, every: int) -> None:
+    """One of the tested bits marks a zip entry as a folder, so that torch reads no numbers."""
     data = run.checkpoint.read_bytes()
     saved = read_checkpoint(run.checkpoint)
     weights = saved["policy"].pop("state")
@@ -101,7 +102,7 @@ def test_a_file_with_a_flipped_bit_has_the_same_content_or_is_refused(run: Run, 
             assert all(torch.equal(state[name], tensor) for name, tensor in weights.items())
 
 
-def test_a_missing_checkpoint_is_reported(run: Run) -> None:
+def test_missing_checkpoint_raises_an_error_that_names_it(run: Run) -> None:
     run.policy.unlink()
     run.checkpoint.unlink()
     with pytest.raises(FileNotFoundError, match=r"there is no checkpoint .*checkpoint\.pt: train the run first"):
@@ -119,8 +120,8 @@ def test_a_policy_of_any_class_is_saved_without_a_value_function(tmp_path: Path)
         load_value(run)
 
 
-def test_a_module_of_the_package_is_recreated_from_its_class_and_shape(tmp_path: Path) -> None:
-    """A value function in place of a policy represents policies of later releases."""
+def test_network_of_the_package_is_recreated_from_its_class_and_shape(tmp_path: Path) -> None:
+    """A value function that is stored as a policy represents an unknown policy class of a later release."""
     run = Run.create(tmp_path / "run", {})
     run.save(policy_content(1, ValueFunction(3, (4,))), {})
     loaded = load(run)
@@ -128,7 +129,7 @@ def test_a_module_of_the_package_is_recreated_from_its_class_and_shape(tmp_path:
 
 
 @pytest.mark.parametrize("name", ["os.system", "lyceum_warp.cli.__main__.main", "lyceum_warp.algos.npg.NPG"])
-def test_a_file_can_only_create_modules_of_the_package(name: str, run: Run) -> None:
+def test_checkpoint_can_only_create_networks_of_the_package(name: str, run: Run) -> None:
     content = read_checkpoint(run.policy, parts=("iteration", "policy"))
     content["policy"]["class"] = name
     torch.save(content, run.policy)

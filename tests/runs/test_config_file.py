@@ -27,7 +27,7 @@ from lyceum_warp.runs.folder import Run
         ({"algorithm": "npg", "npg_seed": -1}, "npg_seed must be a whole number"),
     ],
 )
-def test_an_entry_of_another_type_is_refused_with_the_name_of_the_file(
+def test_error_of_an_entry_with_a_wrong_type_names_the_file(
     entries: dict[str, Any], words: str, tmp_path: Path
 ) -> None:
     (tmp_path / "config.json").write_text(json.dumps({"format": 1, **entries}))
@@ -35,14 +35,16 @@ def test_an_entry_of_another_type_is_refused_with_the_name_of_the_file(
         Run.open(tmp_path)
 
 
-def test_a_configuration_that_is_nested_too_deep_is_refused(tmp_path: Path) -> None:
+def test_configuration_with_too_many_nested_levels_raises_an_error(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text("[" * 100_000)
     with pytest.raises(ValueError, match="is not the configuration of a run"):
         Run.open(tmp_path)
 
 
 @pytest.mark.parametrize("command", ["eval", "resume"])
-def test_an_error_of_a_setting_names_the_file(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_error_of_an_invalid_setting_names_the_file(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run", iterations=1)
     run.amend(engine="x")
     arguments = {"eval": ["eval", str(run.folder)],
@@ -51,7 +53,7 @@ def test_an_error_of_a_setting_names_the_file(command: str, tmp_path: Path, caps
     refused(capsys, "'x'", f"(with the settings in {run.folder / 'config.json'})")
 
 
-def test_a_damaged_table_is_refused_before_anything_is_written(
+def test_damaged_metrics_table_raises_an_error_before_anything_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run", iterations=2)

@@ -23,7 +23,7 @@ def read(config: dict[str, Any]) -> Configuration:
 
 
 @pytest.mark.parametrize("kind", ["npg", "ppo"])
-def test_a_learner_is_rebuilt_from_its_description(kind: str) -> None:
+def test_learner_is_recreated_from_its_configuration(kind: str) -> None:
     learner_class, config_class = ALGORITHMS[kind]
     env = lw.make(
         "hopper", nworld=2, seed=3, horizon=20, integrator="euler", solver={"iterations": 7}, fields=["xpos"],
@@ -58,7 +58,7 @@ def test_physics_of_a_run_are_read_from_its_configuration(saved: dict[str, objec
         assert found.hyperparameters == lw.NPGConfig(hidden=(8,))
 
 
-def test_options_that_earlier_releases_stored_as_parameters_are_options() -> None:
+def test_options_in_the_parameters_of_earlier_releases_are_read_as_options() -> None:
     params = {"mass": 2, "horizon": 9, "nthread": 2, "frame_skip": 3, "graphs": False}
     found = read(BASE | {"engine": "warp", "device": "cuda:0", "params": params, "options": {"horizon": 5}})
     assert found.params == {"mass": 2}
@@ -68,20 +68,20 @@ def test_options_that_earlier_releases_stored_as_parameters_are_options() -> Non
     }  # fmt: skip
 
 
-def test_the_configuration_of_a_users_learner_has_no_hyperparameters() -> None:
+def test_configuration_of_a_user_defined_learner_has_no_hyperparameters() -> None:
     found = read(BASE | {"algorithm": "mine"})
     assert found.hyperparameters is None and found.options.nworld == 3
 
 
 def test_processes_on_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The number of threads is not saved with the run, so a different number of processes may continue it."""
+    """The number of threads is not saved, so that a different number of processes can continue the run."""
     monkeypatch.setattr("lyceum_warp.runs.configuration.cpu_cores", lambda: 6)
     learner = read(BASE | {"nworld": 4}).learner(Team(1, 2, "cpu", neighbours=2))
     assert (learner.env.options.nthread, learner.env.nworld, learner.env.first_world) == (3, 2, 2)
     assert describe(learner)["nworld"] == 4 and describe(learner)["options"] == {}
 
 
-def test_a_separate_seed_of_the_algorithm_is_kept() -> None:
+def test_separate_seed_of_the_algorithm_is_saved() -> None:
     env = lw.make("point_mass", nworld=2)
     assert "npg_seed" not in describe(algorithm(env))
     config = describe(algorithm(env, seed=3))

@@ -20,14 +20,14 @@ def run(tmp_path: Path) -> Run:
     return run
 
 
-def test_create_writes_the_versions(run: Run) -> None:
+def test_new_run_folder_contains_the_package_versions(run: Run) -> None:
     versions = json.loads((run.folder / "versions.json").read_text())
     assert versions["torch"] == torch.__version__
     packages = {"lyceum_warp", "mujoco", "mujoco_warp", "warp_lang", "numpy"}
     assert packages | {"python", "platform", "cpu"} <= versions.keys()
 
 
-def test_read_returns_the_saved_state(run: Run) -> None:
+def test_run_reads_back_the_saved_state(run: Run) -> None:
     state = Run.open(run.folder).read()["state"]
     assert state["counter"] == 5
     assert state["tensor"].tolist() == [0, 1, 2]
@@ -44,11 +44,11 @@ def test_read_returns_the_saved_state(run: Run) -> None:
     [({"task": "dm/walker_walk"}, "dm/walker_walk"), ({"task": "a/mine.py:Mine"}, "mine"),
      ({"task": "a/mine.py:Mine", "kept": {"name": "other"}}, "other")],
 )  # fmt: skip
-def test_a_run_knows_the_name_of_its_task(tmp_path: Path, config: dict[str, object], name: str) -> None:
+def test_run_has_the_name_of_its_task(tmp_path: Path, config: dict[str, object], name: str) -> None:
     assert Run.create(tmp_path / "run", config).task_name == name
 
 
-def test_create_refuses_a_folder_with_content(run: Run, tmp_path: Path) -> None:
+def test_create_in_a_folder_with_content_raises_an_error(run: Run, tmp_path: Path) -> None:
     before = {path: path.read_bytes() for path in run.folder.iterdir()}
     with pytest.raises(ValueError, match=r"contains a run: use another folder, or continue the run"):
         Run.create(run.folder, {})
@@ -59,7 +59,7 @@ def test_create_refuses_a_folder_with_content(run: Run, tmp_path: Path) -> None:
             Run.create(place, {})
 
 
-def test_create_leaves_no_folder_when_the_configuration_is_bad(tmp_path: Path) -> None:
+def test_create_with_an_invalid_configuration_leaves_no_folder(tmp_path: Path) -> None:
     with pytest.raises(TypeError):
         Run.create(tmp_path / "run", {"task": object()})
     assert not (tmp_path / "run").exists()
@@ -78,7 +78,7 @@ Run.create(sys.argv[1], {}, files={"old.py": b"old"})
 """
 
 
-def test_a_killed_creation_leaves_a_folder_for_another_run(tmp_path: Path) -> None:
+def test_run_can_be_created_in_the_folder_of_a_killed_creation(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     assert subprocess.run([sys.executable, "-c", KILLED, str(folder)], check=False).returncode == -9
     assert list(folder.iterdir())
@@ -87,18 +87,18 @@ def test_a_killed_creation_leaves_a_folder_for_another_run(tmp_path: Path) -> No
     assert [path.name for path in run.task_folder.iterdir()] == ["mine.py"]
 
 
-def test_create_refuses_temporary_files_of_other_programs(tmp_path: Path) -> None:
+def test_create_in_a_folder_with_temporary_files_of_other_programs_raises_an_error(tmp_path: Path) -> None:
     (tmp_path / "mine.tmp").write_text("")
     with pytest.raises(ValueError, match="is not an empty folder"):
         Run.create(tmp_path, {})
 
 
-def test_open_of_an_empty_folder_finds_no_run(tmp_path: Path) -> None:
+def test_opening_an_empty_folder_raises_an_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"there is no run in .*: it has no config\.json"):
         Run.open(tmp_path)
 
 
-def test_open_refuses_a_foreign_configuration(tmp_path: Path) -> None:
+def test_opening_a_configuration_of_another_program_raises_an_error(tmp_path: Path) -> None:
     for text in ("{", "[]", "{}", '"text"'):
         (tmp_path / "config.json").write_text(text)
         with pytest.raises(ValueError, match=r"config\.json is not the configuration of a run"):
@@ -108,13 +108,13 @@ def test_open_refuses_a_foreign_configuration(tmp_path: Path) -> None:
         Run.open(tmp_path)
 
 
-def test_open_refuses_a_run_of_a_newer_release(tmp_path: Path) -> None:
+def test_opening_a_run_of_a_newer_release_raises_an_error(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(json.dumps({"format": FORMAT + 1}))
     with pytest.raises(ValueError, match=r"newer lyceum_warp \(format 2, this one reads up to 1\): pip install --up"):
         Run.open(tmp_path)
 
 
-def test_load_returns_the_same_policy(run: Run) -> None:
+def test_loaded_policy_equals_the_saved_policy(run: Run) -> None:
     policy = GaussianPolicy(3, 2, (8, 4), normalize=True)
     policy.normalizer.update(3.0 + 2.0 * torch.randn(100, 3))  # type: ignore[operator]
     run.save(content(1, policy), {})
@@ -126,7 +126,7 @@ def test_load_returns_the_same_policy(run: Run) -> None:
         assert not loaded(obs).requires_grad
 
 
-def test_a_failed_save_keeps_the_old_checkpoint(run: Run) -> None:
+def test_old_checkpoint_remains_after_a_failed_save(run: Run) -> None:
     """A file size limit simulates a full disk."""
     before, limits = run.checkpoint.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limits[1]))
@@ -139,7 +139,7 @@ def test_a_failed_save_keeps_the_old_checkpoint(run: Run) -> None:
     assert not list(run.folder.glob("*.tmp"))
 
 
-def test_saving_a_checkpoint_keeps_the_previous_one(run: Run, caplog: pytest.LogCaptureFixture) -> None:
+def test_previous_checkpoint_remains_after_a_save(run: Run, caplog: pytest.LogCaptureFixture) -> None:
     run.save(content(1, GaussianPolicy(3, 2)), {"counter": 6})
     assert run.read()["iteration"] == 1
     run.checkpoint.write_bytes(b"PK half")
@@ -151,7 +151,7 @@ def test_saving_a_checkpoint_keeps_the_previous_one(run: Run, caplog: pytest.Log
         run.read()
 
 
-def test_changed_versions_are_returned_and_noted(run: Run) -> None:
+def test_changed_package_versions_are_returned_and_logged(run: Run) -> None:
     now = json.loads((run.folder / "versions.json").read_text())
     assert run.changed(now) == {}
     assert run.changed(now | {"torch": "9.9"}) == {"torch": (torch.__version__, "9.9")}

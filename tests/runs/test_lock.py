@@ -41,7 +41,7 @@ def run(tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-def test_a_second_writer_is_refused_until_the_first_ends(tmp_path: Path) -> None:
+def test_second_writer_raises_an_error_until_the_first_writer_ends(tmp_path: Path) -> None:
     with pytest.raises(KeyError), RunLock(tmp_path):
         line = rf"the run in {tmp_path} is being written by process {os.getpid()} on {platform.node()}: end this"
         with pytest.raises(ValueError, match=line), RunLock(tmp_path):
@@ -52,7 +52,9 @@ def test_a_second_writer_is_refused_until_the_first_ends(tmp_path: Path) -> None
         pass
 
 
-def test_a_run_that_another_process_writes_is_not_resumed(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_resuming_a_run_that_another_process_writes_raises_an_error(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     held(run)
     before = {path: path.read_bytes() for path in run.iterdir()}
     process = f"process {os.getppid()} on {platform.node()}"
@@ -68,12 +70,12 @@ def test_a_run_that_another_process_writes_is_not_resumed(run: Path, capsys: pyt
     assert len(metrics(run)) == 4 and not (run / "lock").exists()
 
 
-def test_take_over_without_resume_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_take_over_without_resume_prints_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["train", "point_mass", "--take-over", "--out", str(tmp_path / "run")]) == 2
     refused(capsys, "--take-over has no effect without --resume")
 
 
-def test_the_lock_of_a_killed_process_is_taken_over(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_lock_of_a_killed_process_is_taken_over(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     killed = subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path)])
     killed.wait(60)
     with RunLock(tmp_path):
@@ -82,7 +84,7 @@ def test_the_lock_of_a_killed_process_is_taken_over(tmp_path: Path, caplog: pyte
     assert caplog.messages == [gone]
 
 
-def test_a_later_process_with_the_same_pid_does_not_hold_a_lock(tmp_path: Path) -> None:
+def test_lock_is_free_if_its_pid_belongs_to_a_later_process(tmp_path: Path) -> None:
     held(tmp_path, started="1")
     with RunLock(tmp_path):
         pass
@@ -108,10 +110,10 @@ def test_a_held_lock_gets_a_heartbeat(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("content", ["host", "damaged"])
-def test_the_lock_of_another_host_is_only_taken_over_on_request(
+def test_lock_of_another_host_is_taken_over_only_with_take_over(
     content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The lock's age does not matter, because the clocks of hosts differ."""
+    """The age of the lock does not matter, because the clocks of two hosts may differ."""
     held(tmp_path, seconds=1e6)
     if content == "damaged":
         (tmp_path / "lock").write_text("half a li")
@@ -127,10 +129,8 @@ def test_the_lock_of_another_host_is_only_taken_over_on_request(
     assert notes == [f"the run in {tmp_path} is taken over from {who}, on request"]
 
 
-def test_a_writer_whose_lock_was_taken_over_writes_nothing_more(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """When the writer ends, it does not remove the new holder's lock."""
+def test_writer_stops_writing_after_its_lock_was_taken_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At its end, the old writer does not remove the lock of the new writer."""
     folder, found, takers = tmp_path / "run", {}, []
 
     def callback(iteration: lw.Iteration) -> None:
@@ -147,7 +147,7 @@ def test_a_writer_whose_lock_was_taken_over_writes_nothing_more(
     takers[0].__exit__()
 
 
-def test_only_one_of_many_processes_gets_a_free_lock(tmp_path: Path) -> None:
+def test_only_one_of_many_writers_gets_a_free_lock(tmp_path: Path) -> None:
     for _ in range(20):
         held(tmp_path, started="1")
         ready, got = threading.Barrier(8), []

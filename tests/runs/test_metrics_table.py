@@ -12,7 +12,7 @@ def table(tmp_path: Path) -> Path:
 
 
 def test_a_new_column_is_empty_in_earlier_rows(table: Path) -> None:
-    """An update of the task or package may add a column; the order of a row's names does not matter."""
+    """A newer task or package may add a column, and the order of the names in a row does not matter."""
     append_row(table, {"iteration": 1, "kl": 0.5})
     append_row(table, {"iteration": 2, "kl": None, "metrics/forward, m": 1.5})
     append_row(table, {"metrics/forward, m": 2.5, "iteration": 3})
@@ -23,7 +23,7 @@ def test_a_new_column_is_empty_in_earlier_rows(table: Path) -> None:
     ]
 
 
-def test_rows_are_read_with_every_digit(table: Path) -> None:
+def test_numbers_of_metrics_rows_are_read_exactly(table: Path) -> None:
     rows = [{"iteration": i, "value": i / 3, "mean": None if i % 2 else 1e-30, "bad": float("nan")} for i in (1, 2, 3)]
     for row in rows:
         append_row(table, row)
@@ -36,7 +36,7 @@ def test_rows_are_read_with_every_digit(table: Path) -> None:
     assert [row["mean"] for row in read] == [None, 1e-30, None]
 
 
-def test_cut_rows_drops_rows_after_the_checkpoint(table: Path) -> None:
+def test_cut_rows_removes_rows_after_the_checkpoint(table: Path) -> None:
     cut_rows(table, 2)  # without a table
     for i in (1, 2, 3):
         append_row(table, {"iteration": i, "value": 0.5})
@@ -53,7 +53,7 @@ def test_cut_rows_drops_rows_after_the_checkpoint(table: Path) -> None:
     assert [row["iteration"] for row in read_metrics(table)] == [1]
 
 
-def test_a_table_of_another_kind_is_refused(table: Path) -> None:
+def test_file_that_is_not_a_metrics_table_raises_an_error(table: Path) -> None:
     table.write_text("iteration,value\n1,apple\n")
     with pytest.raises(ValueError, match=r"metrics\.csv is not a table of metrics: line 2"):
         read_metrics(table)
@@ -62,8 +62,8 @@ def test_a_table_of_another_kind_is_refused(table: Path) -> None:
         read_metrics(table)
 
 
-@pytest.mark.parametrize("place", [0, 12, 16])  # two names and a number
-def test_a_byte_that_is_not_text_is_refused_and_stays(place: int, table: Path) -> None:
+@pytest.mark.parametrize("place", [0, 12, 16])  # damage each of the two column names, and a number
+def test_metrics_table_with_an_invalid_byte_raises_an_error_and_is_not_changed(place: int, table: Path) -> None:
     damaged = bytearray(b"iteration,value\n1,2\n2,3\n")
     damaged[place] = 0xFF
     table.write_bytes(damaged)

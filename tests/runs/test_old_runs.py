@@ -1,4 +1,4 @@
-"""Load, evaluate and resume runs of earlier releases."""
+"""Test that runs of earlier releases are loaded, evaluated and resumed."""
 
 import shutil
 from pathlib import Path
@@ -21,19 +21,19 @@ def old_run(tmp_path: Path) -> Path:
     return Path(shutil.copytree(OLD, tmp_path / "run"))
 
 
-def test_the_policy_and_the_value_function_of_an_old_run_load(old_run: Path) -> None:
+def test_policy_and_value_function_of_an_old_run_are_loaded(old_run: Path) -> None:
     policy, value = lw.load(old_run), lw.load_value(old_run)
     assert policy(torch.zeros(2, policy.nobs)).shape == (2, 3)
     assert value(torch.zeros(2, policy.nobs), torch.zeros(2)).shape == (2,)
     assert value.discount == 0.995
 
 
-def test_an_old_run_is_evaluated_in_its_own_physics(old_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_old_run_is_evaluated_with_its_own_physics(old_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["eval", str(old_run), "--episodes", "2"]) == 0
     assert "hopper: 2 episodes of the mean policy" in capsys.readouterr().out
 
 
-def test_an_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["train", "--resume", str(old_run), "--iterations", "3", *QUIET]
     assert main(arguments) == 0
     assert [row["iteration"] for row in Run.open(old_run).rows()] == [1, 2, 3]
@@ -42,8 +42,8 @@ def test_an_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.
 
 
 @pytest.mark.parametrize("gamma", [0.9, 0.995])
-def test_the_value_function_of_an_old_run_keeps_its_scale(gamma: float, old_run: Path) -> None:
-    """The file lacks the scale, which was 1 / (1 - gamma)."""
+def test_value_function_of_an_old_run_has_the_scale_of_its_release(gamma: float, old_run: Path) -> None:
+    """The file of the old run lacks the scale, which was 1 / (1 - gamma)."""
     content = torch.load(old_run / "checkpoint.pt", weights_only=True)
     content["value"]["shape"] |= {"scale": 1.0 / (1.0 - gamma), "discount": gamma}
     torch.save(content, old_run / "checkpoint.pt")
@@ -54,19 +54,19 @@ def test_the_value_function_of_an_old_run_keeps_its_scale(gamma: float, old_run:
     npg.load_state_dict(run.read()["state"])
     obs, step = torch.linspace(-1.0, 1.0, 22).view(2, 11), torch.zeros(2)
     torch.testing.assert_close(npg.value(obs, step), lw.load_value(old_run)(obs, step))
-    # early releases predicted the network's output times this factor
+    # early releases multiplied the network's output by this factor
     plain = npg.value.network(obs).squeeze(-1) / (1.0 - gamma)
     torch.testing.assert_close(npg.value(obs, step), plain)
 
 
 @pytest.fixture(params=["command", "python", "task_file"])
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A run of two iterations by release 0.1: from the command line, from Python with the user's model, or of a task
-    file whose model, mesh and table exist only in the run's copy."""
+    """A run of two iterations by release 0.1. The run was started from the command line, from Python with a user's
+    model, or with a task file whose model, mesh and table exist only in the run's copy."""
     return Path(shutil.copytree(DATA / "runs_0_1" / request.param, tmp_path / "run"))
 
 
-def test_a_run_of_0_1_loads_and_is_evaluated(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_of_release_0_1_is_loaded_and_evaluated(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     policy = lw.load(run)
     assert policy.act(torch.zeros(2, policy.nobs)).shape == (2, policy.nact)
     assert lw.load_value(run).discount == 0.995
@@ -74,7 +74,7 @@ def test_a_run_of_0_1_loads_and_is_evaluated(run: Path, capsys: pytest.CaptureFi
     assert "2 episodes of the mean policy" in capsys.readouterr().out
 
 
-def test_a_run_of_0_1_resumes_and_starts_another_run(run: Path, tmp_path: Path) -> None:
+def test_run_of_release_0_1_is_resumed_and_starts_another_run(run: Path, tmp_path: Path) -> None:
     before = Run.open(run)
     assert main(["train", "--resume", str(run), "--trust", "--iterations", "4", *QUIET]) == 0
     after = Run.open(run)
@@ -88,11 +88,11 @@ def test_a_run_of_0_1_resumes_and_starts_another_run(run: Path, tmp_path: Path) 
 
 @pytest.fixture
 def rsl_rl_run(tmp_path: Path) -> Path:
-    """A run that rsl_rl's PPO trained, under the former algorithm name rsl-rl."""
+    """A run of rsl_rl's PPO, whose algorithm name was rsl-rl in early releases."""
     return Path(shutil.copytree(RSL_RL, tmp_path / "rsl_rl"))
 
 
-def test_a_run_of_rsl_rl_loads_is_evaluated_and_exported(rsl_rl_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_of_rsl_rl_is_loaded_evaluated_and_exported(rsl_rl_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     policy, value = lw.load(rsl_rl_run), lw.load_value(rsl_rl_run)
     obs = torch.linspace(-9.0, 9.0, 12).view(2, 6)
     assert policy.act(obs).shape == (2, 2) and value(obs, torch.zeros(2)).shape == (2,)

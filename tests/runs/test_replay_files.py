@@ -1,4 +1,4 @@
-"""Test the replay buffer in a run's folder: killed saves, and the files that a save writes."""
+"""Test how a run's folder stores the replay buffer, and that killed saves lose nothing."""
 
 import signal
 from collections.abc import Callable
@@ -43,10 +43,10 @@ class Killed(BaseException):
     (replay_files, "write_content", 0), (replay_files, "write_content", 7), (Run, "save", 0),
     (saving, "clean_replay", 0),
 ])  # fmt: skip
-def test_a_run_whose_save_was_killed_at_any_file_continues_identically(
+def test_run_continues_identically_after_its_save_was_killed_at_any_file(
     owner: Any, name: str, calls: int, whole: list[dict[str, Any]], tmp_path: Path
 ) -> None:
-    """Each iteration overwrites 12 of 20 steps, so the kill comes while the checkpoint's files are being replaced."""
+    """Each iteration overwrites 12 of 20 steps, so a save replaces files of the last checkpoint when it is killed."""
     sac, function = made(), getattr(owner, name)
     left = [calls]
 
@@ -70,7 +70,7 @@ def test_an_interrupted_run_continues_identically(whole: list[dict[str, Any]], t
         if iteration.iteration == 3:
             signal.raise_signal(signal.SIGINT)
 
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may make its children ignore SIGINT
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # child processes of a shell may ignore SIGINT
     try:
         with pytest.raises(KeyboardInterrupt):
             lw.train(made(), tmp_path / "run", iterations=5, callback=interrupting)
@@ -81,8 +81,10 @@ def test_an_interrupted_run_continues_identically(whole: list[dict[str, Any]], t
     np.testing.assert_equal(numbers(tmp_path / "run"), whole)
 
 
-def test_a_save_writes_only_the_parts_that_have_grown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A part has 4 of 200 steps; an iteration fills three parts."""
+def test_save_writes_only_the_parts_of_the_buffer_that_have_grown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A part of the buffer has 4 of 200 steps, and an iteration fills three parts."""
     written: list[str] = []
     write: Callable[..., None] = replay_files.write_content
 

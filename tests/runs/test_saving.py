@@ -1,4 +1,4 @@
-"""Test when a run is saved, and that an unwritable folder ends the run but keeps its last save."""
+"""Test when a run is saved, and that a run with an unwritable folder ends with its last save intact."""
 
 import os
 import resource
@@ -29,7 +29,9 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("seconds, wait", [(0.02, SHARE * 0.02), (1.0, SAVE_SECONDS), (9.0, LONG * 9.0)])
-def test_saving_takes_a_small_fraction_of_the_time(seconds: float, wait: float, npg: lw.NPG, tmp_path: Path) -> None:
+def test_saving_takes_a_small_fraction_of_the_training_time(
+    seconds: float, wait: float, npg: lw.NPG, tmp_path: Path
+) -> None:
     run = Run.create(tmp_path / "run", {})
     with RunLock(run.folder) as lock:
         saver = Saver(run, lock, npg)
@@ -54,8 +56,9 @@ def trained_with(folder: Path, at_three: Callable[[], Any]) -> OSError:
     return raised.value
 
 
-def test_a_file_that_cannot_be_written_ends_the_run_and_leaves_its_last_save(six: Path, tmp_path: Path) -> None:
-    """A file size limit simulates a full disk: the policy fits, but the complete state does not."""
+def test_run_ends_with_its_last_save_intact_if_a_file_cannot_be_written(six: Path, tmp_path: Path) -> None:
+    """A file size limit simulates a full disk; it allows the policy's file, but not the larger file of the complete
+    state."""
     folder, limits = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
     size = 2 * os.path.getsize(six / "policy.pt")
     assert size < os.path.getsize(six / "checkpoint.pt")
@@ -70,7 +73,7 @@ def test_a_file_that_cannot_be_written_ends_the_run_and_leaves_its_last_save(six
     assert metrics(folder) == metrics(six)
 
 
-def test_an_incomplete_row_does_not_stop_a_resumed_run(six: Path, tmp_path: Path) -> None:
+def test_resumed_run_removes_an_incomplete_metrics_row(six: Path, tmp_path: Path) -> None:
     folder, limits = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def limit() -> None:
@@ -86,7 +89,7 @@ def test_an_incomplete_row_does_not_stop_a_resumed_run(six: Path, tmp_path: Path
     assert metrics(folder) == metrics(six)
 
 
-def test_a_command_reports_a_folder_that_cannot_be_written_in_one_line(
+def test_command_prints_one_line_if_the_folder_cannot_be_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_text("mine")

@@ -1,4 +1,4 @@
-"""Copy a run's task, and test which files later commands use after a move or an edit."""
+"""Test that a run copies its task, and which files are used after the task is moved or edited."""
 
 import shutil
 from pathlib import Path
@@ -97,12 +97,12 @@ def returns(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     capsys.readouterr()
     assert cli.main(["eval", *arguments, "--episodes", "2"]) == 0
     output = capsys.readouterr()
-    print(output.err)  # ``refused`` reads this line
+    print(output.err)  # the function ``refused`` reads this line
     return next(line for line in output.out.splitlines() if line.strip().startswith("return"))
 
 
-def test_a_run_resumes_after_its_task_has_moved(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The model's includes and meshes and the tables move with the task."""
+def test_run_resumes_after_its_task_was_moved(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The included files, meshes and tables are moved together with the task."""
     out = trained(folder)
     before = returns(capsys, str(out))
     assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
@@ -123,7 +123,7 @@ def test_a_run_resumes_after_its_task_has_moved(folder: Path, capsys: pytest.Cap
         shutil.rmtree(folder / "moved")
 
 
-def test_the_copies_are_the_files_byte_for_byte(folder: Path) -> None:
+def test_copied_task_files_are_identical(folder: Path) -> None:
     mine = folder / "mine"
     (mine / "robot" / "scene.xml").write_bytes(SCENE.replace("\n", "\r\n").encode() + b"<!-- 1e0 == 1.000 -->")
     env = lw.make(str(mine / "slide.py"), nworld=1, goal=mine / "goal.npy")
@@ -144,8 +144,8 @@ URDF = """<robot name="arm"><mujoco><compiler meshdir="../meshes" strippath="tru
 
 
 @pytest.mark.parametrize("kind", ["attached", "urdf", "python"])
-def test_all_files_of_a_model_are_copied(kind: str, folder: Path) -> None:
-    """The models attach another model, come from a URDF, or are made in Python."""
+def test_run_copies_all_files_of_a_model(kind: str, folder: Path) -> None:
+    """The models attach another model, are read from a URDF, or are made in Python."""
     robot = folder / "mine" / "robot"
     (robot / "arm.urdf").write_text(URDF)
     (robot / "whole.xml").write_text(
@@ -173,7 +173,9 @@ def test_all_files_of_a_model_are_copied(kind: str, folder: Path) -> None:
     assert kept["model"] == {"attached": "robot/whole.xml", "urdf": "robot/arm.urdf", "python": "robot/model.xml"}[kind]
 
 
-def test_an_edited_task_is_reported_and_the_runs_copy_is_used(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_edited_task_is_reported_and_the_copy_of_the_run_is_used(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = trained(folder)
     before = returns(capsys, str(out))
     file = folder / "mine" / "slide.py"
@@ -215,7 +217,7 @@ def test_modules_that_a_task_imports_are_copied_with_it(folder: Path, capsys: py
         shutil.rmtree(folder / "moved")
 
 
-def test_an_edited_model_is_reported_and_the_runs_copy_is_used(
+def test_edited_model_is_reported_and_the_copy_of_the_run_is_used(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = trained(folder)
@@ -231,7 +233,7 @@ def test_an_edited_model_is_reported_and_the_runs_copy_is_used(
 
 
 @pytest.mark.parametrize("moved", [False, True])
-def test_a_run_started_from_another_run_uses_its_copy_of_the_model(
+def test_run_started_from_another_run_uses_the_model_copy_of_that_run(
     moved: bool, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, robot, warm = trained(folder), folder / "mine" / "robot", folder / "warm"
@@ -250,14 +252,14 @@ def test_a_run_started_from_another_run_uses_its_copy_of_the_model(
     env = env_of(warm)
     assert np.array_equal(env.model.body_mass, masses)
     assert cli.main(["train", "--resume", str(warm), "--iterations", "2", *QUIET]) == 0
-    if not moved:  # a task given by name is used in its current version
+    if not moved:  # the task is given by name, so its current version is used
         arguments[4] = str(folder / "new")
         assert cli.main([*arguments, "1", str(folder / "mine" / "slide.py")]) == 0
         env = env_of(folder / "new")
         assert env.model.body_mass[-1] == 9.0
 
 
-def test_a_run_keeps_a_model_that_was_made_in_python(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_saves_a_model_that_was_made_in_python(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec = lw.gymnasium_model("hopper.xml").spec()
     spec.option.gravity = [0.0, 0.0, -30.0]
     env = lw.make("hopper", nworld=2, model=spec, horizon=20)
@@ -269,7 +271,7 @@ def test_a_run_keeps_a_model_that_was_made_in_python(tmp_path: Path, capsys: pyt
 
 
 def test_resuming_in_python_reports_a_changed_task_and_model(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """The changed files are used, because the algorithm was made from them."""
+    """Training uses the changed files, because the algorithm was made from them."""
     file, table, out = folder / "mine" / "slide.py", folder / "mine" / "goal.npy", folder / "run"
 
     def train(iterations: int, **words: Any) -> None:
@@ -288,11 +290,11 @@ def test_resuming_in_python_reports_a_changed_task_and_model(folder: Path, caplo
     assert caplog.messages == [f"{file} {changed}", f"the model of the task 'slide' {changed}"]
 
 
-def test_a_task_defined_in_a_program_is_evaluated_from_a_file(
+def test_run_of_a_task_without_a_file_is_evaluated_with_a_given_task(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=SMALL), tmp_path / "run", iterations=1)
-    Run.open(tmp_path / "run").amend(task=None)  # for a class in a notebook, the configuration has no task
+    Run.open(tmp_path / "run").amend(task=None)  # the configuration has no task if the task is a class in a notebook
     assert cli.main(["eval", str(tmp_path / "run")]) == 2
     refused(
         capsys,
@@ -320,7 +322,7 @@ EDITS = [
     lambda text: "",
     None,
 ]
-"""Edits of a task's files during training; None deletes a file."""
+"""Edits of a task's files during training; None deletes the file."""
 
 
 def test_a_run_copies_the_source_that_it_started_with(folder: Path) -> None:

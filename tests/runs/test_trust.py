@@ -1,4 +1,4 @@
-"""Test that another user's run folder runs no code and reads no files that it names until this user trusts it."""
+"""Test that the code and files in another user's run folder are not used until this user trusts the folder."""
 
 import json
 import shutil
@@ -29,7 +29,8 @@ SOURCE = tiny_task.changed(
 
 @pytest.fixture(scope="module")
 def made(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make runs of a task file and of a task of the package; the path is constant, for Warp's cache."""
+    """Make runs of a task file and of a task of the package, at a constant path, so that Warp reuses compiled
+    kernels."""
     cache = getattr(pytestconfig, "cache", None)
     folder = Path(cache.mkdir("trust")) if cache else tmp_path_factory.mktemp("trust")
     shutil.rmtree(folder)
@@ -45,15 +46,15 @@ def made(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture
 def witness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the path of a file that the task file writes whenever it is run."""
+    """Return the path of a file that the task file writes when it is executed."""
     monkeypatch.setenv("WITNESS", str(tmp_path / "witness"))
     return tmp_path / "witness"
 
 
 @pytest.fixture
 def theirs(made: Path, witness: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Copy the run of the task file as another user would receive it: elsewhere, without the original files,
-    untrusted."""
+    """Copy the task file's run as another user would receive it: at another path, untrusted and without the original
+    files."""
     folder = made / "theirs"
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(made / "own", folder, copy_function=shutil.copy)
@@ -77,7 +78,7 @@ def commands(folder: Path, out: Path) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("name", ["eval", "view", "resume", "from"])
-def test_a_foreign_run_is_refused_until_it_is_trusted(
+def test_run_of_another_user_raises_an_error_until_it_is_trusted(
     name: str, theirs: Path, witness: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
@@ -99,7 +100,7 @@ def test_a_foreign_run_is_refused_until_it_is_trusted(
     arguments = [word if word != "2" else "3" for word in command]
     assert cli.main(arguments) == 0  # the run is trusted from now on
     (theirs / "task" / "told.py").write_text(SOURCE + "\n")
-    assert cli.main(command) == 2  # a changed copy is not trusted
+    assert cli.main(command) == 2  # a copy with changes is not trusted
 
 
 def outside(folder: Path) -> Path:
@@ -156,10 +157,10 @@ ATTACKS = [names_a_task, names_a_file_outside, names_an_absolute_file, brings_a_
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_a_run_of_a_named_task_is_refused_once_it_names_a_file(
+def test_edited_run_that_names_a_file_raises_an_error(
     attack: Callable[[Path], Path], made: Path, witness: Path, tmp_path: Path
 ) -> None:
-    """The folder was trusted before it was edited."""
+    """The run's folder was trusted before it was edited."""
     folder = Path(shutil.copytree(made / "named", tmp_path / "named"))
     file = attack(folder)
     run = Run.open(folder)
@@ -173,7 +174,7 @@ def test_a_run_of_a_named_task_is_refused_once_it_names_a_file(
 
 
 @pytest.mark.parametrize("link", ["file", "folder"])
-def test_a_link_out_of_the_folder_is_refused(link: str, made: Path, witness: Path, tmp_path: Path) -> None:
+def test_link_out_of_the_run_folder_raises_an_error(link: str, made: Path, witness: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(made / "own", tmp_path / "own"))
     change(folder, task="/home/other/told.py:Told")
     kept = folder / "task" / "told.py"
@@ -192,7 +193,7 @@ def test_a_link_out_of_the_folder_is_refused(link: str, made: Path, witness: Pat
     assert not witness.exists()
 
 
-def test_own_runs_may_move_and_their_tasks_change(made: Path, tmp_path: Path) -> None:
+def test_own_runs_stay_trusted_after_a_move_and_a_task_edit(made: Path, tmp_path: Path) -> None:
     folder, file = tmp_path / "moved", made / "told.py"
     shutil.copytree(made / "own", folder)
     assert cli.main(["eval", str(folder), "--episodes", "1"]) == 0
@@ -203,18 +204,22 @@ def test_own_runs_may_move_and_their_tasks_change(made: Path, tmp_path: Path) ->
         file.write_text(SOURCE)
 
 
-def test_a_run_of_a_named_task_needs_no_record(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_of_a_task_of_the_package_needs_no_trust(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert cli.main(["eval", str(made / "named"), "--episodes", "1"]) == 0
 
 
-def test_a_policy_is_loaded_and_exported_without_the_task(theirs: Path, witness: Path, tmp_path: Path) -> None:
+def test_policy_of_an_untrusted_run_is_loaded_and_exported_without_the_task(
+    theirs: Path, witness: Path, tmp_path: Path
+) -> None:
     assert lw.load(theirs).nobs == 1 and lw.load_value(theirs).discount > 0
     assert cli.main(["export", str(theirs), "--to", str(tmp_path / "policy.pt2")]) == 0
     assert not witness.exists() and not (tmp_path / "state").exists()
 
 
-def test_training_continues_with_a_message_if_the_run_cannot_be_recorded(
+def test_training_continues_with_a_message_if_the_run_cannot_be_added_to_trusted_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").write_text("")
@@ -224,6 +229,6 @@ def test_training_continues_with_a_message_if_the_run_cannot_be_recorded(
     assert f"need --trust for the run in {tmp_path / 'run'}" in line
 
 
-def test_trust_without_a_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_trust_without_a_run_prints_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["train", "point_mass", "--trust", "--out", str(tmp_path / "run")]) == 2
     refused(capsys, "--trust has no effect without --resume or --from")

@@ -1,4 +1,4 @@
-"""Run a robot in plain MuJoCo with only the policy's ONNX file, and compare with the environment."""
+"""Run a robot in plain MuJoCo with only the policy's ONNX file, and compare it with the environment."""
 
 import copy
 import json
@@ -27,7 +27,7 @@ CALM = {
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Run the page's program, and return its global variables."""
+    """Run the program in the documentation page, and return its global variables."""
     pytest.importorskip("onnxruntime")
     (program,) = re.findall(r"^```python title=robot_loop.py\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
     assert "lyceum_warp" not in program
@@ -37,7 +37,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def walking_policy(env: lw.Env) -> lw.GaussianPolicy:
-    """Make a policy with moving actions and statistics of its observations."""
+    """Make a policy with nonzero actions and observation statistics."""
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, normalize=True)
     policy.observe(env.obs + 0.3 * torch.randn(200, 1, env.obs_space.size))
     with torch.no_grad():
@@ -45,15 +45,9 @@ def walking_policy(env: lw.Env) -> lw.GaussianPolicy:
     return policy.requires_grad_(False)
 
 
-@pytest.mark.parametrize(
-    ("task", "steps"),
-    [
-        ("go1_velocity", 25),
-        pytest.param("spot_velocity", 25, marks=pytest.mark.long),
-        pytest.param("g1_velocity", 10, marks=pytest.mark.long),
-    ],
-)
-def test_the_pages_loop_does_what_the_environment_does(
+@pytest.mark.quick("go1_velocity")
+@pytest.mark.parametrize(("task", "steps"), [("go1_velocity", 25), ("spot_velocity", 25), ("g1_velocity", 10)])
+def test_control_loop_in_the_documentation_equals_the_environment(
     page: dict[str, Any], task: str, steps: int, tmp_path: Path
 ) -> None:
     torch.manual_seed(0)
@@ -87,7 +81,7 @@ def test_the_pages_loop_does_what_the_environment_does(
     assert moved > 0.3 and not env.done.any()
 
 
-def test_the_loop_of_the_page_walks_for_the_given_time(page: dict[str, Any], tmp_path: Path) -> None:
+def test_control_loop_in_the_documentation_walks_for_the_given_time(page: dict[str, Any], tmp_path: Path) -> None:
     env = lw.make("go1_velocity")
     file = lw.export_policy(walking_policy(env), tmp_path / "policy.onnx", env=env)
     model = copy.copy(env.model)
@@ -96,7 +90,7 @@ def test_the_loop_of_the_page_walks_for_the_given_time(page: dict[str, Any], tmp
     assert data.time == pytest.approx(0.5)
 
 
-def test_metadata_name_the_robots_parts(page: dict[str, Any], tmp_path: Path) -> None:
+def test_onnx_metadata_name_the_joints_and_observations_of_the_robot(page: dict[str, Any], tmp_path: Path) -> None:
     env = lw.make("go1_velocity")
     policy = walking_policy(env)
     meta = page["Policy"](str(lw.export_policy(policy, tmp_path / "policy.onnx", env=env)), env.model).meta
@@ -118,7 +112,7 @@ def test_metadata_name_the_robots_parts(page: dict[str, Any], tmp_path: Path) ->
     assert meta["commands"]["forward_velocity"] == [-2.0, 3.0] and meta["force_limit"][2] == pytest.approx(35.55)
 
 
-def test_the_command_writes_metadata_of_the_runs_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_command_writes_metadata_of_the_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     runtime = pytest.importorskip("onnxruntime")
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
     run = lw.train(lw.NPG(lw.make("point_mass", nworld=2, frame_skip=3), config=config), tmp_path / "run", iterations=1)
@@ -133,6 +127,6 @@ def test_the_command_writes_metadata_of_the_runs_task(tmp_path: Path, capsys: py
     assert [part["name"] for part in json.loads(found["observations"])] == list(env.obs_space.parts)
     assert json.loads(found["actions"]) == [{"name": name, "size": 1} for name in env.action_space.parts]
     capsys.readouterr()
-    run.amend(task="nowhere.py")  # a policy remains useful without its task
+    run.amend(task="nowhere.py")  # a policy can also be exported without its task
     assert metadata() == {}
     assert "the file has no metadata on the robot: " in capsys.readouterr().err

@@ -59,7 +59,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 
 class Leave(lw.Task):
-    """A pole that may start in, and later leave, states for which ``terminated`` holds."""
+    """A pole that may start in states for which ``terminated`` holds, and may leave these states."""
 
     model, frame_skip, obs, horizon = "inverted_pendulum.xml", 2, {"angle": 1, "speed": 1}, 50
 
@@ -69,7 +69,7 @@ ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
 
 @ENGINES
 @pytest.mark.parametrize("autoreset", [True, False])
-def test_a_fresh_state_does_not_end_an_episode(autoreset: bool, engine: str) -> None:
+def test_terminal_initial_state_does_not_end_an_episode(autoreset: bool, engine: str) -> None:
     env = lw.make(Leave, nworld=N, engine=engine, autoreset=autoreset)
     env.rand_reset(0)
     fresh = env.get_state()
@@ -83,7 +83,7 @@ def test_a_fresh_state_does_not_end_an_episode(autoreset: bool, engine: str) -> 
     assert not env.done.any()
 
 
-def test_a_next_step_reset_does_not_count_as_an_episode() -> None:
+def test_reset_step_in_next_step_mode_does_not_count_as_an_episode() -> None:
     envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(
         GymnasiumVectorEnv(Leave, N, autoreset_mode=AutoresetMode.NEXT_STEP)
     )
@@ -97,7 +97,7 @@ def test_a_next_step_reset_does_not_count_as_an_episode() -> None:
     assert envs.episode_count > N
 
 
-def test_a_reset_clears_the_end_of_the_previous_episode() -> None:
+def test_reset_clears_the_done_reason_of_the_previous_episode() -> None:
     env = GymnasiumEnv(Leave)
     for seed in range(8):
         _, info = env.reset(seed=seed)
@@ -108,14 +108,14 @@ def test_a_reset_clears_the_end_of_the_previous_episode() -> None:
 
 @pytest.mark.quick("0")
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_rule_gives_the_same_result_alone_and_after_the_other_rules(seed: int) -> None:
+def test_rule_gives_the_same_result_alone_and_after_other_rules(seed: int) -> None:
     rule = next(check for check in CHECKS if check.__name__ == "check_set_state_shows")
     check_task(Leave, steps=20, seed=seed, nworld=8)
     check_task(Leave, steps=20, seed=seed, nworld=8, checks=[rule])
 
 
 @ENGINES
-def test_a_fault_truncates_for_the_same_reason_on_both_engines(engine: str) -> None:
+def test_fault_truncates_an_episode_for_the_same_reason_on_both_engines(engine: str) -> None:
     env = lw.make(Leave, nworld=3, engine=engine, push=[1.0, -1.0, 1.0])
     env.reset()
     env.step(torch.full_like(env.action, 0.5))

@@ -1,4 +1,4 @@
-"""Define tasks in a notebook, whose cells run in one module and may run again."""
+"""Define tasks in a notebook, whose cells run in one module and may run repeatedly."""
 
 import sys
 import types
@@ -17,7 +17,7 @@ from lyceum_warp.binding.registry import find_task
 def notebook(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
     module = types.ModuleType("notebook_of_a_test")
     monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))  # undoes a cell's registrations after the test
+    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))  # undo the registrations of cells after the test
     return module
 
 
@@ -25,8 +25,8 @@ def run_cell(module: types.ModuleType, file: Path) -> None:
     exec(compile(file.read_text(), str(file), "exec"), vars(module))
 
 
-def test_a_task_keeps_the_functions_of_its_own_cell(notebook: types.ModuleType, tmp_path: Path) -> None:
-    """Each cell redefines World, Params and observe; only the first one defines evaluate."""
+def test_notebook_task_uses_the_functions_of_its_own_cell(notebook: types.ModuleType, tmp_path: Path) -> None:
+    """Each cell redefines World, Params and observe, and only the first cell defines evaluate."""
     evaluate = "def evaluate(s: World, p: Params) -> float:\n    return 1.0"
     first = tiny_task.with_function(evaluate)
     second = tiny_task.changed(("s.qpos[0]", "2.0"), ("class Tiny", "class Other"))
@@ -38,10 +38,11 @@ def test_a_task_keeps_the_functions_of_its_own_cell(notebook: types.ModuleType, 
     assert tiny.eval.item() == 1.0
     assert torch.equal(tiny.obs, tiny.field("qpos")[:, :1])
     assert other.obs.item() == 2.0
-    assert torch.equal(other.eval, other.reward)  # the default function, not the function of the first cell
+    # the second cell uses the default evaluation, not the function of the first cell
+    assert torch.equal(other.eval, other.reward)
 
 
-def test_a_cell_that_is_run_again_replaces_its_registered_task(notebook: types.ModuleType, tmp_path: Path) -> None:
+def test_repeated_notebook_cell_replaces_its_registered_task(notebook: types.ModuleType, tmp_path: Path) -> None:
     cell = tiny_task.changed(("class Tiny", "@lw.register\nclass FromNotebook"))
     file = tiny_task.write(tmp_path, cell, "cell.py")
     run_cell(notebook, file)

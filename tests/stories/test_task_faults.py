@@ -1,5 +1,4 @@
-"""Test that invalid values written by a task affect only their world, are reported by name, and never produce an
-invalid state."""
+"""Test that invalid values of a task affect only their own world, are reported, and never enter the state."""
 
 import mujoco
 import pytest
@@ -82,7 +81,7 @@ ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
 
 
 @ENGINES
-def test_a_metric_that_is_not_written_is_zero(engine: str) -> None:
+def test_metric_that_the_task_does_not_write_is_zero(engine: str) -> None:
     env = lw.make(Faulty, nworld=2, engine=engine)
     found = []
     for _ in range(4):
@@ -106,7 +105,7 @@ def test_a_non_finite_metric_does_not_enter_the_state(engine: str) -> None:
 
 @ENGINES
 @pytest.mark.parametrize("name", ["remembered", "lasting"])
-def test_memory_that_is_not_finite_is_a_fault_of_its_world(name: str, engine: str) -> None:
+def test_non_finite_memory_causes_a_fault_in_its_world(name: str, engine: str) -> None:
     env = lw.make(Faulty, nworld=3, engine=engine)
     env.step()
     env.set_params(**{name: [1.0, float("inf"), 1.0]})
@@ -118,7 +117,7 @@ def test_memory_that_is_not_finite_is_a_fault_of_its_world(name: str, engine: st
 
 
 @ENGINES
-def test_a_draw_that_cannot_be_simulated_is_a_fault_of_its_world(engine: str) -> None:
+def test_invalid_randomized_model_field_causes_a_fault_in_its_world(engine: str) -> None:
     env = lw.make(Faulty, nworld=3, engine=engine, damping=[1.0, 1.0, 1.0])
     with pytest.raises(ValueError, match="dof_damping of world 1 is -1 and must be 0 or more"):
         lw.make(Faulty, nworld=3, engine=engine, damping=[1.0, -1.0, 1.0])
@@ -130,20 +129,20 @@ def test_a_draw_that_cannot_be_simulated_is_a_fault_of_its_world(engine: str) ->
     assert [lw.Done(reason) for reason in env.done_reason.tolist()] == [0, lw.Done.MODEL, 0]
     assert env.reward[1] == 0.0
     env.set_params(damping=[1.0, 1.0, 1.0])
-    env.step()  # this episode began with the invalid draw
+    env.step()  # this episode began with the invalid model field
     env.step()
     assert env.done_reason.tolist() == [0, 0, 0]
     assert env.fault_counts["model"] == 2
 
 
-def test_state_of_gives_a_robots_state_the_nominal_model_by_default() -> None:
+def test_state_of_uses_the_nominal_model_by_default() -> None:
     plan = lw.MPPI(Faulty, samples=2, horizon=2)
     columns = plan.env.state_space.parts["body_mass"]
     assert plan.state_of(qpos=[0.0])[columns].tolist() == [0.0, 1.0]
     assert plan.state_of(body_mass=[0.0, 2.0])[columns].tolist() == [0.0, 2.0]
 
 
-def test_an_event_that_writes_memory_keeps_the_physics_in_double_precision() -> None:
+def test_physics_stay_in_double_precision_if_an_event_writes_memory() -> None:
     env = lw.make(Faulty, nworld=1, engine="mujoco", horizon=0)
     time = env.state_space.parts["time"]
     for _ in range(1000):
@@ -151,7 +150,7 @@ def test_an_event_that_writes_memory_keeps_the_physics_in_double_precision() -> 
     assert env.get_state()[0, time].item() == pytest.approx(10.0, abs=1e-9)
 
 
-def test_the_memory_of_a_world_counts_its_model_fields() -> None:
+def test_bytes_per_world_include_randomized_model_fields() -> None:
     drawn, plain = lw.make("hopper", dynamics=["body_mass", "geom_friction"]), lw.make("hopper")
     state = 8 * (drawn.state_space.shape[0] - plain.state_space.shape[0])
     assert state == 8 * 20  # a number in the state takes eight bytes

@@ -1,4 +1,5 @@
-"""Test the task form through the public interface: dynamics that differ between worlds, groups, noise, custom actions.
+"""Test features of the task form through the public interface, such as randomized dynamics, observation groups and
+noise.
 
 The rules of ``check_task`` cover each feature for any task; these tests need particular tasks.
 """
@@ -83,7 +84,7 @@ def step_without_events(env: lw.Env, action: torch.Tensor) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_randomised_world_continues_in_another_environment(engine: str) -> None:
+def test_randomized_world_continues_identically_in_another_environment(engine: str) -> None:
     first, other = (lw.make(Drawn, nworld=3, engine=engine, seed=seed) for seed in (1, 2))
     actions = random_actions(first, 12)
     for action in actions[:4]:
@@ -99,7 +100,7 @@ def test_a_randomised_world_continues_in_another_environment(engine: str) -> Non
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_draws_do_not_accumulate_over_resets(engine: str) -> None:
+def test_randomized_masses_do_not_accumulate_over_resets(engine: str) -> None:
     env = lw.make(Drawn, nworld=4, engine=engine)
     masses = []
     for _ in range(1000 if engine == "mujoco" else 100):
@@ -115,7 +116,7 @@ def test_draws_do_not_accumulate_over_resets(engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_randomizing_one_world_changes_no_other(engine: str) -> None:
+def test_randomizing_one_world_does_not_change_other_worlds(engine: str) -> None:
     env, still = (lw.make(Drawn, nworld=3, engine=engine, horizon=0) for _ in range(2))
     mask = torch.tensor([False, True, False])
     for i, action in enumerate(random_actions(env, 8)):
@@ -157,7 +158,7 @@ def test_model_fields_can_be_set_in_an_environment_of_any_task(engine: str) -> N
     assert torch.equal(other.field("body_mass"), masses)
 
 
-def test_getters_judge_states_with_the_dynamics_of_the_state() -> None:
+def test_getters_use_the_dynamics_of_the_given_state() -> None:
     env = lw.make(Drawn, nworld=2, horizon=0)
     before = env.get_state()
     action = random_actions(env, 1)[0]
@@ -173,7 +174,9 @@ def test_getters_judge_states_with_the_dynamics_of_the_state() -> None:
 @pytest.mark.quick("cost-128-mujoco", "noise-256-mujoco", "noise-256-warp")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(("name", "reason"), [("cost", lw.Done.REWARD), ("noise", lw.Done.OBSERVATION)])
-def test_a_number_that_is_not_finite_is_a_fault_of_its_world(name: str, reason: lw.Done, engine: str) -> None:
+def test_non_finite_value_of_a_task_function_causes_a_fault_in_its_world(
+    name: str, reason: lw.Done, engine: str
+) -> None:
     env, fine = (lw.make(Full, nworld=3, engine=engine, horizon=0) for _ in range(2))
     others = torch.tensor([True, False, True])
     value = env.task.params[name]
@@ -185,7 +188,7 @@ def test_a_number_that_is_not_finite_is_a_fault_of_its_world(name: str, reason: 
         assert env.done_reason.tolist() == [0, int(reason), 0]
         assert env.truncated[1] and env.reward[1] == 0 and (env.episode_metrics["cost"][1] == 0)
         for obs in (*env.obs_groups.values(), *env.final_obs_groups.values()):
-            assert torch.isfinite(obs).all()  # learners never see such values, not even after the reset
+            assert torch.isfinite(obs).all()  # learners never receive non-finite values, not even after the reset
         if reason == lw.Done.OBSERVATION:
             assert torch.equal(env.final_obs[1], good)
         assert torch.equal(env.get_state()[others], fine.get_state()[others])
@@ -199,16 +202,16 @@ def test_a_number_that_is_not_finite_is_a_fault_of_its_world(name: str, reason: 
     assert env.get_reward(before, action, after)[1] != 0  # the fault does not persist after its episode
 
 
-def test_a_rejected_draw_changes_no_lasting_memory() -> None:
+def test_rejected_initial_state_does_not_change_lasting_memory() -> None:
     env = lw.make(Full, nworld=8)
     tip = env.field("site_xpos")[:, 0, 0]
     for count in range(2, 12):
         env.rand_reset()
-        assert (tip >= 0.2).all()  # half of the draws are rejected
+        assert (tip >= 0.2).all()  # the task rejects half of the initial states
         assert (env.obs_groups["critic"][:, 10] == count).all()
 
 
-def test_startup_draws_lasting_memory_once_for_each_world() -> None:
+def test_startup_randomizes_lasting_memory_once_per_world() -> None:
     env = lw.make(Gifted, nworld=8, seed=3)
     drawn = env.obs[:, 1].clone()
     assert drawn.unique().numel() == 8 and (drawn >= 1).all() and (drawn < 2).all()
@@ -220,7 +223,7 @@ def test_startup_draws_lasting_memory_once_for_each_world() -> None:
     assert torch.equal(env.obs[:, 1], drawn)
 
 
-def test_lasting_memory_in_a_planners_state_is_not_randomized_by_startup() -> None:
+def test_startup_does_not_randomize_lasting_memory_in_a_planner_state() -> None:
     plan = lw.MPPI(Gifted, samples=4, horizon=2)
     columns = plan.env.state_space.parts["practice"]
     assert plan.env.get_state()[0, columns].item() >= 1
@@ -228,7 +231,7 @@ def test_lasting_memory_in_a_planners_state_is_not_randomized_by_startup() -> No
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_model_fields_that_events_change_are_nominal_again_after_a_reset(engine: str) -> None:
+def test_model_fields_that_events_change_are_nominal_after_a_reset(engine: str) -> None:
     env = lw.make(Full, nworld=4, engine=engine, horizon=0)
     for action in random_actions(env, 4):
         env.step(action)
@@ -294,7 +297,7 @@ def test_a_planner_uses_the_model_in_the_state_unless_nominal_model_is_set(task:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_inputs_that_a_reset_draws_act_in_steps_and_in_rollouts(engine: str) -> None:
+def test_inputs_drawn_at_a_reset_act_in_steps_and_rollouts(engine: str) -> None:
     env = lw.make(Windy, nworld=2, engine=engine, autoreset=False, horizon=0)
     loop = OpenLoop(lw.make(Windy, nworld=2, engine=engine, autoreset=False, seed=3), 6)
     state = env.get_state()[0].clone()
@@ -338,7 +341,7 @@ def test_a_rollout_equals_steps_without_events(engine: str) -> None:
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_planner_plans_for_a_task_with_every_feature(engine: str) -> None:
+def test_planner_accepts_a_task_with_every_feature(engine: str) -> None:
     env = lw.make(Full, nworld=2, engine=engine)
     plan = lw.MPPI(Full, engine=engine, samples=8, horizon=4)
     for _ in range(3):
@@ -348,7 +351,7 @@ def test_a_planner_plans_for_a_task_with_every_feature(engine: str) -> None:
     assert torch.isfinite(plan.returns).all() and plan.summary["failed_samples"] == 0.0
 
 
-def test_actions_of_a_task_have_its_names_and_its_range() -> None:
+def test_action_space_has_the_names_and_range_of_the_task() -> None:
     env = lw.make(Pushed, nworld=2)
     assert dict(env.action_space.parts) == {"elbow": slice(0, 1), "push": slice(1, 2), "hand": slice(2, 3)}
     assert env.action_space.low.tolist() == [-1.0] * 3 and env.action.shape == (2, 3)
@@ -366,7 +369,7 @@ PASSIVE = """<mujoco><worldbody><geom type="plane" size="3 3 .1"/>
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_model_without_actuators_is_pushed_by_control(engine: str, tmp_path: Path) -> None:
+def test_control_can_push_a_model_without_actuators(engine: str, tmp_path: Path) -> None:
     (tmp_path / "ball.xml").write_text(PASSIVE)
     source = tiny_task.changed(
         ("    qpos: Row[float]", "    qpos: Row[float]\n    xfrc_applied: Row[wp.spatial_vector]"),
@@ -520,7 +523,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
 
 
 @pytest.mark.parametrize(("changes", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_in_the_task_form_raises_one_line_that_names_it(
+def test_error_in_the_task_form_raises_one_line_that_names_it(
     changes: list[tuple[str, str]], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=message) as caught:
@@ -528,7 +531,7 @@ def test_a_mistake_in_the_task_form_raises_one_line_that_names_it(
     assert "\n" not in str(caught.value)
 
 
-def test_wrong_dynamics_are_refused_and_change_nothing() -> None:
+def test_invalid_dynamics_raise_an_error_and_change_nothing() -> None:
     with pytest.raises(
         ValueError, match="there is no model field 'body_mas' that can differ .*: did you mean body_mass"
     ):

@@ -1,6 +1,7 @@
-"""Test mistakes in a task file: one line names the mistake and its fix, and the corrected file then loads.
+"""Test that an error in a task file raises one line with its fix, and that the corrected file is loaded.
 
-tests/binding tests the same messages by module. The mistakes here were made by newcomers.
+Tests in tests/binding check the same messages, module by module. New users of the package made the mistakes in this
+file.
 """
 
 from pathlib import Path
@@ -86,7 +87,7 @@ MISTAKES: dict[str, tuple[tuple[str, str], str]] = {
 
 
 @pytest.mark.parametrize(("change", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_in_a_task_file_raises_one_line_that_names_it(
+def test_error_in_a_task_file_raises_one_line_that_names_it(
     change: tuple[str, str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tiny_task.write(tmp_path, OTHER_FILE, "other_rewards.py")
@@ -97,7 +98,7 @@ def test_a_mistake_in_a_task_file_raises_one_line_that_names_it(
     assert "\n" not in str(caught.value)
 
 
-def test_a_corrected_file_is_reloaded_and_old_environments_keep_their_task(task_file: TaskFile) -> None:
+def test_corrected_task_file_is_reloaded_and_old_environments_keep_their_task(task_file: TaskFile) -> None:
     name, line = "fixed_later.py", "obs[0] = s.qpos[0]"
     old = lw.make(task_file(name, tiny_task.TINY))
     broken = task_file(name, tiny_task.changed((line, "obs[0] = 2.0 * s.qpos[0")))
@@ -111,13 +112,13 @@ def test_a_corrected_file_is_reloaded_and_old_environments_keep_their_task(task_
         assert torch.equal(env.obs, 2.0 * x + 1.0 if env is new else x)
 
 
-def test_a_misspelt_keyword_is_refused_with_a_suggestion() -> None:
+def test_error_of_a_misspelt_keyword_suggests_the_correct_one() -> None:
     for word, meant in (("num_envs", "nworld"), ("ctrl_cost_wieght", "ctrl_cost_weight"), ("horzion", "horizon")):
         with pytest.raises(ValueError, match=f"the task 'hopper' has no parameter '{word}': did you mean {meant}"):
             lw.make("hopper", **{word: 4})
 
 
-def test_replacing_a_buffer_is_refused_with_the_way_to_write_into_it() -> None:
+def test_error_of_a_replaced_buffer_explains_how_to_write_into_it() -> None:
     env = lw.make("hopper", nworld=2)
     with pytest.raises(
         AttributeError, match=r"env\.action is a buffer at a fixed address: write into the buffer, as env\.action"

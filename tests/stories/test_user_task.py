@@ -1,4 +1,4 @@
-"""Test a user's task in its own file, with every feature that a task may use, on both engines."""
+"""Test on both engines a user's task file that uses every feature of tasks."""
 
 import importlib.util
 import sys
@@ -205,12 +205,13 @@ def random_steps(env: lw.Env, n: int, seed: int = 0) -> None:
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
-def test_the_task_keeps_the_rules(module: ModuleType, engine: str) -> None:
+def test_user_task_follows_the_rules(module: ModuleType, engine: str) -> None:
     check_task("follow_target", engine=engine, steps=100, frame_skip=2, gain=np.array([0.5, 1.0, 1.5, 2.0]))
 
 
-@pytest.mark.parametrize("engine", ["mujoco", pytest.param("warp", marks=pytest.mark.long)])
-def test_scaled_actions_under_rk4_keep_the_rules(module: ModuleType, path: Path, engine: str) -> None:
+@pytest.mark.quick("mujoco")
+@pytest.mark.parametrize("engine", ENGINES)
+def test_user_task_with_scaled_actions_and_rk4_follows_the_rules(module: ModuleType, path: Path, engine: str) -> None:
     spec = mujoco.MjSpec.from_string(module.XML)
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     check_task(f"{path}:ScaledActions", engine=engine, steps=100, model=spec, nworld=3)
@@ -218,10 +219,10 @@ def test_scaled_actions_under_rk4_keep_the_rules(module: ModuleType, path: Path,
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_fields_equal_mj_forward_of_the_state(module: ModuleType, engine: str) -> None:
-    """The fields are current after a step, an automatic reset, set_state and rand_reset, even if the task reads none of
+    """All fields are current after a step, an automatic reset, set_state and rand_reset, even if the task does not read
     them.
 
-    The accelerometer's reading is from the start of the last substep; only after a reset does it match the state.
+    The accelerometer's value is from the start of the last substep, and matches the state only after a reset.
     """
     env = lw.make("follow_target", engine=engine, nworld=3, horizon=5, fields=["xipos"])
     centers = env.field("xipos")
@@ -274,7 +275,7 @@ def test_acceleration_sensors_belong_to_the_last_substep(module: ModuleType, eng
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_an_additional_field_of_the_acceleration_stage_joins_the_state(module: ModuleType, engine: str) -> None:
+def test_additional_acceleration_field_is_part_of_the_state(module: ModuleType, engine: str) -> None:
     plain, env = (lw.make("follow_target", engine=engine, nworld=2, fields=fields) for fields in ((), ["qacc"]))
     assert env.state_space.size == plain.state_space.size + 2
     acceleration = env.field("qacc")
@@ -290,7 +291,9 @@ def test_an_additional_field_of_the_acceleration_stage_joins_the_state(module: M
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_controls_come_from_the_task_or_are_scaled_to_their_ranges(module: ModuleType, path: Path, engine: str) -> None:
+def test_controls_are_computed_by_the_task_or_scaled_to_their_ranges(
+    module: ModuleType, path: Path, engine: str
+) -> None:
     env = lw.make("follow_target", engine=engine, nworld=2, gain=[1.0, 10.0])
     env.reset()
     env.step(torch.full((2, 2), 0.5))
@@ -305,7 +308,7 @@ def test_controls_come_from_the_task_or_are_scaled_to_their_ranges(module: Modul
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_memory_advances_with_draws_and_is_cleared_by_a_reset(module: ModuleType, engine: str) -> None:
+def test_memory_advances_with_random_numbers_and_is_cleared_by_a_reset(module: ModuleType, engine: str) -> None:
     env = lw.make("follow_target", engine=engine, nworld=2, horizon=3, seed=4)
     first = []
     for i in range(2):
@@ -324,7 +327,7 @@ def test_memory_advances_with_draws_and_is_cleared_by_a_reset(module: ModuleType
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_set_params_takes_effect_with_the_next_step(module: ModuleType, engine: str) -> None:
+def test_set_params_takes_effect_in_the_next_step(module: ModuleType, engine: str) -> None:
     env, other = (lw.make("follow_target", engine=engine, nworld=2, seed=1, cost=cost) for cost in (0.0, 2.0))
     action = torch.full((2, 2), 0.5)
     for _ in range(3):
@@ -354,7 +357,7 @@ def test_set_params_takes_effect_with_the_next_step(module: ModuleType, engine: 
     assert env.task.params["limit"] == 3
 
 
-def test_a_state_beyond_the_limit_is_terminated(module: ModuleType) -> None:
+def test_episode_terminates_in_a_state_beyond_the_limit(module: ModuleType) -> None:
     env = lw.make("follow_target", nworld=2, limit=1)
     state = env.get_state()
     state[0, env.state_space.parts["qpos"].start] = 1.2

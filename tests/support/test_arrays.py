@@ -15,12 +15,12 @@ def test_flat_has_one_row_per_world_in_the_same_memory(dtype: type, shape: tuple
     assert alias.ptr == array.ptr
 
 
-def test_flat_keeps_the_memory_alive() -> None:
+def test_flat_view_keeps_the_memory_alive() -> None:
     alias = flat(wp.full((2, 3), 5.0, dtype=float, device="cpu"))
     assert alias.numpy().tolist() == [[5.0] * 3] * 2
 
 
-def test_a_torch_view_shares_memory() -> None:
+def test_torch_view_shares_memory_with_the_warp_array() -> None:
     array = wp.zeros((2, 3), dtype=float, device="cpu")
     torch_view(array).fill_(2.0)
     assert array.numpy().tolist() == [[2.0] * 3] * 2
@@ -40,7 +40,7 @@ def test_launch_rows_of_an_empty_array_launches_nothing() -> None:
 
 
 @pytest.mark.parametrize("widths", [[1], [3, 2, 1, 4], [2, 0, 1, 3, 2, 1, 5]])
-def test_several_rows_are_copied_to_their_own_targets(widths: list[int]) -> None:
+def test_several_rows_are_copied_to_separate_targets(widths: list[int]) -> None:
     mask = wp.array([True, False, True], dtype=bool, device="cpu")
     rows = [wp.full((3, width), 0.5 + k, dtype=float, device="cpu") for k, width in enumerate(widths)]
     wide = [wp.zeros((3, width), dtype=wp.float64, device="cpu") for width in widths]

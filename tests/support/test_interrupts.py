@@ -8,7 +8,7 @@ from lyceum_warp.support.interrupts import Interrupted, obeyed, postponed, signa
 
 @pytest.fixture(autouse=True)
 def default_handlers() -> Iterator[None]:
-    """Restore the default handlers: a shell that starts the tests in the background makes them ignore SIGINT."""
+    """Set the default handlers, because a shell that starts the tests in the background makes them ignore SIGINT."""
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -17,7 +17,7 @@ def default_handlers() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-def test_the_first_signal_raises_and_later_ones_are_ignored() -> None:
+def test_first_signal_raises_interrupted_and_later_signals_are_ignored() -> None:
     with signals():
         with pytest.raises(Interrupted) as raised:
             signal.raise_signal(signal.SIGTERM)
@@ -27,7 +27,7 @@ def test_the_first_signal_raises_and_later_ones_are_ignored() -> None:
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
-def test_a_postponed_signal_is_raised_at_the_end_of_the_context() -> None:
+def test_postponed_signal_raises_interrupted_at_the_end_of_the_context() -> None:
     with signals():
         with pytest.raises(Interrupted) as raised, postponed() as noted:
             signal.raise_signal(signal.SIGTERM)
@@ -37,7 +37,7 @@ def test_a_postponed_signal_is_raised_at_the_end_of_the_context() -> None:
         signal.raise_signal(signal.SIGTERM)
 
 
-def test_signals_are_ignored_after_the_caller_raised_a_postponed_one() -> None:
+def test_signals_are_ignored_after_the_caller_has_raised_interrupted() -> None:
     with signals():
         with pytest.raises(Interrupted), postponed() as noted:
             signal.raise_signal(signal.SIGTERM)
@@ -45,7 +45,7 @@ def test_signals_are_ignored_after_the_caller_raised_a_postponed_one() -> None:
         signal.raise_signal(signal.SIGTERM)
 
 
-def test_a_signal_after_postponed_without_signals_raises() -> None:
+def test_signal_raises_interrupted_after_a_postponed_context_without_signals() -> None:
     with signals():
         with postponed():
             pass
@@ -53,7 +53,7 @@ def test_a_signal_after_postponed_without_signals_raises() -> None:
             signal.raise_signal(signal.SIGTERM)
 
 
-def test_with_insist_a_second_signal_is_handled_at_once() -> None:
+def test_second_signal_raises_immediately_if_insist_is_true() -> None:
     reached = []
     with signals():
         with pytest.raises(Interrupted) as raised, postponed(insist=True):
@@ -69,7 +69,7 @@ def test_with_insist_a_second_signal_is_handled_at_once() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_second_signal_raises_within_obeyed_and_a_third_is_ignored() -> None:
+def test_second_signal_raises_within_obeyed_and_the_third_is_ignored() -> None:
     with signals():
         with pytest.raises(Interrupted):
             signal.raise_signal(signal.SIGINT)
@@ -80,7 +80,7 @@ def test_a_second_signal_raises_within_obeyed_and_a_third_is_ignored() -> None:
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
-def test_obeyed_does_not_replace_ignored_signals_and_other_handlers() -> None:
+def test_obeyed_does_not_replace_ignored_signals_or_other_handlers() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with signals():
         with pytest.raises(Interrupted):

@@ -11,7 +11,7 @@ def test_cpu_cores_counts_the_cores_of_this_process(monkeypatch: pytest.MonkeyPa
     assert cpu_cores() == 3
 
 
-def test_cpu_cores_counts_all_if_the_system_does_not_say(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cpu_cores_counts_all_cores_if_the_affinity_is_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     assert cpu_cores() == (os.cpu_count() or 1)
 

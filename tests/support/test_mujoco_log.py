@@ -9,7 +9,7 @@ from lyceum_warp.support.mujoco_log import quiet
 XML = '<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
 
 
-def test_a_warning_goes_to_the_log_and_not_to_a_file(
+def test_mujoco_warning_is_logged_and_not_written_to_a_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""Test that Warp starts without printing that a CUDA driver is missing."""
+"""Test that Warp does not print at its start that a CUDA driver is missing."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ def printed(program: str) -> tuple[str, str]:
 
 
 @WITHOUT_GPU
-def test_an_environment_on_the_cpu_prints_nothing_and_a_missing_driver_is_one_line_with_the_cause() -> None:
+def test_missing_driver_prints_nothing_for_a_cpu_environment_and_one_line_for_a_gpu() -> None:
     program = """
 from lyceum_warp import Row
 import lyceum_warp as lw
@@ -30,12 +30,12 @@ main(["check", "hopper", "--device", "cuda"])
 
 
 @WITHOUT_GPU
-def test_warp_prints_the_remark_without_the_package() -> None:
-    """If this fails, the test above proves nothing."""
+def test_warp_alone_prints_that_the_driver_is_missing() -> None:
+    """If this test fails, the previous test proves nothing."""
     assert "CUDA" in printed("import warp as wp; wp.config.log_level = wp.LOG_WARNING; wp.init()")[1]
 
 
-def test_other_output_at_the_start_of_warp_is_kept() -> None:
+def test_other_output_at_the_start_of_warp_is_still_printed() -> None:
     program = """
 import logging, os, sys
 logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")

@@ -1,4 +1,4 @@
-"""The formulas of go1_velocity in NumPy, based on MuJoCo's own kinematics."""
+"""Compute the formulas of go1_velocity in NumPy from MuJoCo's own kinematics."""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ STILL: dict[str, Any] = {**NOISELESS, "command_seconds": NEVER, "push_seconds": 
 
 
 class State:
-    """The parts of the worlds' states in float64, with derived kinematics from MuJoCo."""
+    """The parts of all worlds' states in float64, with MuJoCo's kinematics."""
 
     def __init__(self, env: lw.Env, state: torch.Tensor | None = None) -> None:
         parts = env.state_space.split(env.get_state() if state is None else state)
@@ -89,7 +89,7 @@ class State:
 
 
 def expected_terms(s0: State, action: np.ndarray, s1: State, model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Return the weighted terms of the reward, per second, each (nworld,)."""
+    """Return the weighted reward terms per second, each (nworld,)."""
     c = s0.command()
     amount = np.linalg.norm(c[:, :2], axis=1) + np.abs(c[:, 2])
     active, std = amount > 0.05, np.where(amount[:, None] < 0.05, [0.05, 0.05, 0.1], [0.3, 0.3, 0.6])

@@ -1,6 +1,6 @@
 """Test parameters and metrics of adroit_hammer, adroit_door and adroit_relocate.
 
-oracles/test_gymnasium_robotics.py compares the tasks with the originals.
+The tests in oracles/test_gymnasium_robotics.py compare these tasks with the original ones.
 """
 
 from typing import Any
@@ -28,15 +28,15 @@ def steps(env: lw.Env, n: int = 5) -> None:
         env.step(2 * torch.rand(env.action.shape, generator=rng) - 1)
 
 
-def test_metrics_add_up_to_the_reward(shared_env: SharedEnv, task: str) -> None:
+def test_sum_of_the_metrics_equals_the_reward(shared_env: SharedEnv, task: str) -> None:
     env = shared_env(task, nworld=4, nthread=1)
     steps(env)
     torch.testing.assert_close(sum(env.metrics.values()), env.reward)
     assert (env.metrics["bonus"] == 0).all()
 
 
-def test_palm_weight_sets_the_sign_of_the_first_term(shared_env: SharedEnv, task: str) -> None:
-    """The planner's settings reward a near palm; the task itself, like the original, rewards a distant palm."""
+def test_palm_weight_determines_the_sign_of_the_first_reward_term(shared_env: SharedEnv, task: str) -> None:
+    """The settings for planners reward a near palm, and the task itself, like the original, rewards a distant palm."""
     env, turned = (shared_env(task, nworld=4, nthread=1, palm_weight=weight) for weight in (0.1, -0.1))
     assert lw.MPPI(task, horizon=2, samples=2, nthread=1).env.task.params["palm_weight"] == -1.0
     for each in (env, turned):
@@ -49,8 +49,8 @@ def test_palm_weight_sets_the_sign_of_the_first_term(shared_env: SharedEnv, task
         assert torch.equal(turned.metrics[name], env.metrics[name])
 
 
-def test_success_is_a_distance_below_its_threshold(task: str) -> None:
-    """The thresholds lie on both sides of the worlds' values."""
+def test_task_succeeds_if_a_distance_is_below_its_threshold(task: str) -> None:
+    """The thresholds are above the distances of some worlds and below those of others."""
     env = lw.make(task, engine="mujoco", nworld=4, nthread=1)
     steps(env)
     assert not env.success.any()

@@ -1,6 +1,6 @@
 """Test the adroit_pen task's parameters and memory.
 
-oracles/test_gymnasium_robotics.py compares it with the original.
+The tests in oracles/test_gymnasium_robotics.py compare this task with the original one.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ def formula(obs: np.ndarray, near: float, goal: float, reach: np.ndarray | float
     return reward - 5.0 * (obs[:, 26] < drop)
 
 
-def test_every_threshold_takes_effect() -> None:
+def test_every_threshold_changes_rewards_or_terminations() -> None:
     """``goal_distance`` differs between worlds."""
     n = 400
     rng = np.random.default_rng(0)
@@ -32,7 +32,7 @@ def test_every_threshold_takes_effect() -> None:
     parts["qpos"][:, 27:] = torch.from_numpy(rng.uniform(-1.5, 1.5, (n, 3)))
     env.set_state(state)
     assert not env.reward.any()
-    # set_state restores the lagged fields, so the new positions show only after a step
+    # set_state restores the lagged fields, so the new positions have an effect only after a step
     counts, terms = np.zeros(n), set()
     for _ in range(6):
         env.step(torch.zeros(n, 24))
@@ -48,8 +48,8 @@ def test_every_threshold_takes_effect() -> None:
     assert 10 < env.success.sum() < n - 10
 
 
-def test_success_needs_more_than_20_steps_at_the_goal() -> None:
-    """A reset clears the count; the count is part of the state."""
+def test_task_succeeds_after_more_than_20_steps_at_the_goal() -> None:
+    """A reset clears the count of steps at the goal, which is part of the state."""
     env = lw.make("adroit_pen", engine="mujoco", nworld=3, horizon=0, goal_similarity=-2.0, goal_distance=10.0)
     still = torch.zeros(3, 24)
     for i in range(25):
@@ -72,12 +72,12 @@ def test_success_needs_more_than_20_steps_at_the_goal() -> None:
 
 def test_a_smaller_target_range_gives_smaller_angles() -> None:
     env = lw.make("adroit_pen", engine="mujoco", nworld=200, target_range=np.linspace(0.01, 0.4, 200), seed=2)
-    upright = env.obs[:, 38].numpy()  # the cosine of the tilt is the product of both cosines
+    upright = env.obs[:, 38].numpy()  # the cosine of the tilt is the product of the cosines of both angles
     assert (upright >= np.cos(np.linspace(0.01, 0.4, 200)) ** 2 - 1e-6).all()
     assert 0.7 < upright.min() < 0.95
 
 
-def test_the_target_has_no_contacts() -> None:
+def test_target_has_no_contacts() -> None:
     """A pen inside the target moves as if the target were far away."""
     env = lw.make("adroit_pen", engine="mujoco", nworld=2, nthread=1)
     state = env.get_state()

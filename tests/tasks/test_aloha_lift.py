@@ -1,6 +1,6 @@
 """Test the aloha_lift task: its model, a scripted lift, and resets.
 
-test_panda_lift.py tests the terms of its reward.
+The tests in test_panda_lift.py check the reward terms.
 """
 
 import mujoco
@@ -28,7 +28,8 @@ def test_simple_shapes_replace_colliding_meshes_without_changing_masses(shared_e
 
 
 def test_a_scripted_grasp_lifts_the_pot_in_every_world(shared_env: SharedEnv) -> None:
-    """The grippers go to the handles, close and rise; success within an episode, with a reward of nearly 6.5."""
+    """The grippers move to the handles, close and rise, and the task succeeds within an episode with a reward of nearly
+    6.5."""
     env = shared_env("aloha_lift", nworld=3, autoreset=False)
     model, start = env.model, positions(env)[0]
     waypoints = np.zeros((3, 3, 14))
@@ -40,7 +41,7 @@ def test_a_scripted_grasp_lifts_the_pot_in_every_world(shared_env: SharedEnv) ->
             handle = data.site(f"lift/{side}_handle").xpos
             inwards = data.body("partnet_100015/").xpos - handle
             inwards = np.array([*inwards[:2], 0.0]) / np.linalg.norm(inwards[:2])
-            # the gripper points 52 degrees down, one finger above the other
+            # the gripper points downwards by 52 degrees, with one finger above the other
             x, y = 0.61 * inwards - [0.0, 0.0, 0.79], 0.79 * inwards + [0.0, 0.0, 0.61]
             axes = np.stack([x, y, np.cross(x, y)], axis=1)
             names = [f"{side}\\{joint}" for joint in JOINTS]
@@ -59,8 +60,8 @@ def test_a_scripted_grasp_lifts_the_pot_in_every_world(shared_env: SharedEnv) ->
 
 @pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("place", [None, (0.05, 0.01, 0.1)])
-def test_random_resets_draw_the_pots_place_and_yaw(place: tuple[float, ...] | None) -> None:
-    """Both handles stay within reach: the yaw is drawn around 90 degrees."""
+def test_random_resets_draw_the_position_and_yaw_of_the_pot(place: tuple[float, ...] | None) -> None:
+    """Both handles stay within reach, because the yaw is drawn around 90 degrees."""
     env = lw.make("aloha_lift", engine="mujoco", nworld=1000, **({} if place is None else {"place": place}))
     env.rand_reset(0)
     qpos, qvel = positions(env)

@@ -44,7 +44,7 @@ def put_balls(env: lw.Env, place: np.ndarray) -> torch.Tensor:
     return state
 
 
-def test_arm_starts_above_the_ball_and_holds_still_without_speeds(shared_env: SharedEnv) -> None:
+def test_arm_starts_above_the_ball_and_stands_still_with_zero_actions(shared_env: SharedEnv) -> None:
     env = shared_env("arm_hand_pickup")
     model = env.model
     assert (model.nq, model.nv, model.nu) == (16, 15, 9)
@@ -59,8 +59,8 @@ def test_arm_starts_above_the_ball_and_holds_still_without_speeds(shared_env: Sh
     assert env.eval.item() == pytest.approx(0.035, abs=1e-3)
 
 
-def test_observation_and_reward_equal_lyceums_formulas(shared_env: SharedEnv) -> None:
-    """The ball is in the hand, at its edge, or far away."""
+def test_observation_and_reward_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
+    """In the compared states, the ball is in the hand, at the hand's edge, or far away."""
     env = shared_env("arm_hand_pickup", nworld=64, autoreset=False)
     rng = np.random.default_rng(0)
     state = env.get_state()
@@ -79,15 +79,15 @@ def test_observation_and_reward_equal_lyceums_formulas(shared_env: SharedEnv) ->
 
 
 @pytest.mark.usefixtures("freed")
-def test_random_resets_draw_the_balls_place() -> None:
+def test_random_resets_draw_the_position_of_the_ball() -> None:
     env = lw.make("arm_hand_pickup", engine="mujoco", nworld=2000)
     qpos, qvel = positions(env)
     check_uniform(qpos[:, 9:11] / np.float32([0.15, 0.1]))
     assert np.ptp(qpos[:, :9], axis=0).max() == 0 and not qvel.any()
 
 
-def test_success_needs_a_fifth_of_a_second_at_the_goal(shared_env: SharedEnv) -> None:
-    """The test puts the ball back before each step, because a step moves it by millimetres."""
+def test_task_succeeds_after_a_fifth_of_a_second_at_the_goal(shared_env: SharedEnv) -> None:
+    """The test moves the ball back before each step, because a step moves the ball by millimetres."""
     env = shared_env("arm_hand_pickup", nworld=2, autoreset=False)
     for i in range(10):
         assert not env.success.any(), i
@@ -98,8 +98,8 @@ def test_success_needs_a_fifth_of_a_second_at_the_goal(shared_env: SharedEnv) ->
     assert env.success.tolist() == [True, False]
 
 
-def test_the_hand_can_pick_up_the_ball_and_hold_it_at_the_goal(shared_env: SharedEnv) -> None:
-    """A scripted hand descends and closes; inverse kinematics with its Jacobian then moves it to the goal."""
+def test_scripted_hand_picks_up_the_ball_and_holds_it_at_the_goal(shared_env: SharedEnv) -> None:
+    """The scripted hand descends and closes; inverse kinematics with the hand's Jacobian then moves it to the goal."""
     model = shared_env("arm_hand_pickup").model
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)

@@ -22,7 +22,7 @@ def test_motors_are_servos_within_the_torques_of_the_model(shared_env: SharedEnv
     assert env.field("ctrl")[1, motor].item() == pytest.approx(0.4)
 
 
-def test_a_push_changes_the_momentum_by_its_impulse_at_its_time() -> None:
+def test_push_changes_the_momentum_by_its_impulse_at_the_given_time() -> None:
     options = {"nworld": 16, "autoreset": False, "seed": 3}
     pushed, free = (lw.make("humanoid_stand", push_times=[time], **options) for time in (0.03, 9.0))
     for env in (pushed, free):
@@ -39,7 +39,7 @@ def test_a_push_changes_the_momentum_by_its_impulse_at_its_time() -> None:
     assert directions.min() < -1.0 and directions.max() > 1.0
 
 
-def test_capture_is_the_distance_of_the_capture_point_from_the_feet(shared_env: SharedEnv) -> None:
+def test_metric_capture_is_the_distance_between_capture_point_and_feet(shared_env: SharedEnv) -> None:
     env = shared_env("humanoid_stand", nworld=2, autoreset=False, fields=["qvel"])
     env.reset()
     state = env.get_state()
@@ -52,7 +52,7 @@ def test_capture_is_the_distance_of_the_capture_point_from_the_feet(shared_env: 
     assert moving - still == pytest.approx(np.sqrt(height / 9.81), rel=0.15)
 
 
-def test_a_planner_keeps_the_humanoid_up_which_falls_without_it(shared_env: SharedEnv) -> None:
+def test_humanoid_stands_with_a_planner_and_falls_without_one(shared_env: SharedEnv) -> None:
     env = shared_env("humanoid_stand", autoreset=False)
     plan = lw.MPPI("humanoid_stand", samples=16, nthread=1)
     assert plan.env.options.physics.timestep == 0.015 and plan.timestep == env.timestep
@@ -67,7 +67,7 @@ def test_humanoid_get_up_starts_lying_and_does_not_terminate_while_lying(shared_
     env = shared_env("humanoid_get_up", nworld=16, autoreset=False)
     qpos = env.field("qpos")
     assert (qpos[:, 2] < 0.4).all()
-    # z component of the torso's x axis, which points up if the robot lies on its back
+    # the z component of the torso's x axis; this axis points up if the robot lies on its back
     forward = 2.0 * (qpos[:, 4] * qpos[:, 6] - qpos[:, 3] * qpos[:, 5])
     assert forward.max() > 0.7 and forward.min() < -0.7
     for _ in range(5):

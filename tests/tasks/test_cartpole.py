@@ -1,6 +1,6 @@
 """Test the cartpole task: resets, success and the end of an episode.
 
-oracles/test_dm_control.py compares its rewards.
+The tests in oracles/test_dm_control.py compare the rewards with dm_control's.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ def put(env: lw.Env, qpos: np.ndarray) -> None:
     env.set_state(state)
 
 
-def test_resets_start_near_the_upright_pole() -> None:
+def test_resets_start_with_a_nearly_upright_pole() -> None:
     env = lw.make("cartpole", engine="mujoco", nworld=2000)
     env.rand_reset(0)
     qpos, qvel = positions(env)
@@ -30,7 +30,7 @@ def test_resets_start_near_the_upright_pole() -> None:
     assert not np.any(positions(env))
 
 
-def test_success_needs_a_centred_cart_and_an_upright_pole(shared_env: SharedEnv) -> None:
+def test_task_succeeds_with_a_centred_cart_and_an_upright_pole(shared_env: SharedEnv) -> None:
     env = shared_env("cartpole", nworld=6, autoreset=False)
     upright, tilted = np.arccos(0.995) - 1e-4, np.arccos(0.995) + 1e-4
     put(env, np.array([[0, 0], [0.249, upright], [-0.249, -upright], [0.251, 0], [0, tilted], [0, np.pi]]))

@@ -1,4 +1,5 @@
-"""Test the cartpole_swingup task: Lyceum's formulas and resets. oracles/test_dm_control.py compares its model."""
+"""Test the cartpole_swingup task: Lyceum's formulas and resets. The tests in oracles/test_dm_control.py compare the
+model with dm_control's."""
 
 import mujoco
 import numpy as np
@@ -38,8 +39,8 @@ def cartpole_reward(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, a
     return upright * centred * small_control * small_velocity
 
 
-def test_reward_evaluation_and_observation_equal_lyceums_formulas(shared_env: SharedEnv) -> None:
-    """The states are random, beyond the rail and the margins; the actions exceed the control range.
+def test_reward_evaluation_and_observation_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
+    """The states are random, and some lie beyond the rail and the margins; some actions exceed the control range.
 
     The reward receives the given action, not the clipped control.
     """
@@ -64,7 +65,7 @@ def test_reward_evaluation_and_observation_equal_lyceums_formulas(shared_env: Sh
         check_formula(env.obs, np.stack([qpos[:, 0], zz, xz, qvel[:, 0], qvel[:, 1]], axis=1))
         assert not env.terminated.any()
 
-    # the reward of any transition depends on the state after it
+    # the reward of a transition depends on the state after the transition
     after = put_at_random(env, rng, position=3.0, velocity=6.0)
     check_formula(
         env.get_reward(before, action, after),

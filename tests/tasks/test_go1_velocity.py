@@ -1,6 +1,6 @@
-"""Test the go1_velocity task: formulas, contact timers, commands, pushes, random draws and curriculum.
+"""Test the formulas, contact timers, commands, pushes, randomization and curriculum of the go1_velocity task.
 
-tests/oracles/test_mjlab.py compares it with mjlab.
+The tests in tests/oracles/test_mjlab.py compare the task with mjlab's.
 """
 
 import itertools
@@ -55,7 +55,7 @@ def test_forces_are_zero_until_the_first_substep(shared_env: SharedEnv) -> None:
     assert (env.field("sensordata")[:, 2::3].abs() > 1.0).any(dim=1).float().mean() > 0.9  # the robots stand
 
 
-def test_noise_of_the_policys_observations_is_uniform_and_the_critic_has_none(shared_env: SharedEnv) -> None:
+def test_policy_observations_have_uniform_noise_and_critic_observations_have_none(shared_env: SharedEnv) -> None:
     env = shared_env("go1_velocity", nworld=1000)
     roll_out(env, 2)
     clean = shared_env("go1_velocity", nworld=1000, **NOISELESS)
@@ -67,7 +67,7 @@ def test_noise_of_the_policys_observations_is_uniform_and_the_critic_has_none(sh
     check_uniform(noise[:, :33] / (sizes * (1 + 1e-3)))
 
 
-def test_every_term_of_the_reward_equals_its_formula(shared_env: SharedEnv) -> None:
+def test_every_reward_term_equals_its_formula(shared_env: SharedEnv) -> None:
     env = shared_env("go1_velocity", nworld=NWORLD, autoreset=False, **STILL)
     seen = dict.fromkeys(env.metrics, 0)
     for action in random_steps(env, 24, 1.6):
@@ -89,7 +89,7 @@ def test_every_term_of_the_reward_equals_its_formula(shared_env: SharedEnv) -> N
     assert min(seen[name] for name in terms) > 20
 
 
-def test_clocks_count_substeps_in_contact_and_in_the_air(shared_env: SharedEnv) -> None:
+def test_foot_timers_count_substeps_in_contact_and_in_the_air(shared_env: SharedEnv) -> None:
     """Compare with MuJoCo's own contacts after every substep."""
     env = shared_env("go1_velocity", nworld=4, autoreset=False, **STILL)
     model = mujoco.MjModel.from_xml_path(GO1)
@@ -120,7 +120,9 @@ def test_clocks_count_substeps_in_contact_and_in_the_air(shared_env: SharedEnv) 
     assert landings > 20
 
 
-def test_peak_heights_grow_in_the_air_and_end_at_landings_not_at_resets(shared_env: SharedEnv) -> None:
+def test_peak_heights_of_feet_grow_in_the_air_and_are_cleared_at_landings_but_not_at_resets(
+    shared_env: SharedEnv,
+) -> None:
     env = shared_env("go1_velocity", nworld=16, autoreset=False, **STILL)
     landings, before = 0, State(env)
     for action in random_steps(env, 30):
@@ -138,7 +140,7 @@ def test_peak_heights_grow_in_the_air_and_end_at_landings_not_at_resets(shared_e
 
 
 @pytest.mark.usefixtures("freed")
-def test_commands_have_mjlabs_distribution() -> None:
+def test_commands_have_the_distribution_of_mjlab() -> None:
     env = lw.make("go1_velocity", nworld=4000, seed=0)
     s = State(env)
     vx, vy, yaw = s.drawn.T
@@ -155,12 +157,12 @@ def test_commands_have_mjlabs_distribution() -> None:
 
 
 def command_of(env: lw.Env) -> torch.Tensor:
-    """The drawn velocity, the heading and the timer of each world's command, (nworld, 5)."""
+    """Return the drawn velocity, the heading and the timer of each world's command, (nworld, 5)."""
     parts = env.state_space.split(env.get_state())
     return torch.cat([parts[name] for name in ("drawn_velocity", "heading_target", "command_timer")], dim=1)
 
 
-def test_commands_change_when_their_time_is_over(shared_env: SharedEnv) -> None:
+def test_commands_change_when_their_timers_expire(shared_env: SharedEnv) -> None:
     env = shared_env("go1_velocity", nworld=NWORLD, autoreset=False, **NOISELESS, push_seconds=NEVER)
     action = torch.zeros(NWORLD, 12)
     changes, before = 0, command_of(env)
@@ -173,11 +175,11 @@ def test_commands_change_when_their_time_is_over(shared_env: SharedEnv) -> None:
         torch.testing.assert_close(command[~due, 4], before[~due, 4] - DT, atol=1e-6, rtol=0)
         assert (command[due, 4] >= 3).all() and (command[due, 4] <= 8).all()
         changes, before = changes + int(due.sum()), command
-    assert 0.4 * NWORLD < changes < 0.8 * NWORLD  # the steps take 6 s, commands change every 3 to 8 s
+    assert 0.4 * NWORLD < changes < 0.8 * NWORLD  # the steps take 6 s, and commands change every 3 to 8 s
 
 
-def test_headings_determine_the_yaw_rate_of_their_worlds(shared_env: SharedEnv) -> None:
-    """The robot turns in the shorter direction, at most at the maximum yaw rate."""
+def test_target_headings_determine_the_commanded_yaw_rate(shared_env: SharedEnv) -> None:
+    """The robot turns in the shorter direction, and not faster than the maximum yaw rate."""
     env = shared_env("go1_velocity", nworld=4, autoreset=False, **STILL)
     state = env.get_state()
     parts = env.state_space.split(state)
@@ -194,7 +196,7 @@ def test_headings_determine_the_yaw_rate_of_their_worlds(shared_env: SharedEnv) 
     assert not env.obs[:, 45:].any()
 
 
-def test_the_curriculum_widens_commands_at_each_stage() -> None:
+def test_curriculum_widens_the_command_ranges_at_each_stage() -> None:
     env = lw.make("go1_velocity", nworld=1000, **NOISELESS)
     for steps, low, high, yaw in ((119_998, -1, 1, 0.5), (119_999, -1.5, 2, 0.7), (239_999, -2, 3, 0.7)):
         state = env.get_state()
@@ -211,7 +213,7 @@ def test_the_curriculum_widens_commands_at_each_stage() -> None:
             assert bounds[1] >= values.max() > bounds[1] - 0.02 * width
 
 
-def test_pushes_add_velocity_in_the_worlds_axes(shared_env: SharedEnv) -> None:
+def test_pushes_add_velocities_along_world_axes(shared_env: SharedEnv) -> None:
     pushed = shared_env("go1_velocity", nworld=1000, autoreset=False, **NOISELESS, command_seconds=NEVER)
     weak = {"push_velocity": (0.0, 0.0, 0.0), "push_spin": (0.0, 0.0, 0.0)}
     still = shared_env("go1_velocity", nworld=1000, autoreset=False, **NOISELESS, command_seconds=NEVER, **weak)
@@ -289,7 +291,7 @@ def test_an_episode_ends_when_the_trunk_tilts_by_more_than_seventy_degrees(share
     assert env.get_terminated(state).tolist() == [False, True, False, True]
 
 
-def test_actions_move_the_servos_targets_away_from_the_default_pose(shared_env: SharedEnv) -> None:
+def test_actions_move_the_servo_targets_away_from_the_default_pose(shared_env: SharedEnv) -> None:
     """Actions are not clipped; the servos' force limits bound their effect."""
     env = shared_env("go1_velocity", nworld=NWORLD)
     bias, action = State(env).bias, 10 * random_steps(env, 1)[0]
@@ -300,7 +302,7 @@ def test_actions_move_the_servos_targets_away_from_the_default_pose(shared_env: 
     assert env.model.actuator_forcerange[:3, 1].tolist() == [23.7, 23.7, 35.55]
 
 
-def test_both_engines_agree_after_a_step(shared_env: SharedEnv) -> None:
+def test_both_engines_agree_on_go1_velocity_after_a_step(shared_env: SharedEnv) -> None:
     """Compare observations, memory and rewards from states along random steps."""
     mine, theirs = (shared_env("go1_velocity", engine=engine, nworld=4, **STILL) for engine in ("mujoco", "warp"))
     for action in random_steps(mine, 12):

@@ -1,4 +1,4 @@
-"""Test the herb_reach task: HERB's published numbers, formulas, resets, reachable targets, success."""
+"""Test the published numbers, formulas, resets, reachable targets and success of the herb_reach task."""
 
 import mujoco
 import numpy as np
@@ -12,7 +12,8 @@ import lyceum_warp as lw
 NWORLD = 64
 SIDES = ("left", "right")
 
-MASSES = {  # masses, kg, from Barrett D1005 AC-02; for the BH280 hand from Barrett's mass properties
+# masses in kg; the arm's are from Barrett D1005 AC-02, and those of the BH280 hand from Barrett's mass properties
+MASSES = {
     "wam_base": 9.97059584,
     "wam1": 10.76768767,
     "wam2": 3.87493756,
@@ -31,7 +32,7 @@ MASSES = {  # masses, kg, from Barrett D1005 AC-02; for the BH280 hand from Barr
     "finger2_1": 0.062139,
     "finger2_2": 0.04166,
 }
-ARM = {  # range in rad (Barrett D1001, tables 5 and 6; HERB turns the first joint by pi), peak torque in N m
+ARM = {  # ranges in rad and peak torques in N m (Barrett D1001, tables 5 and 6; HERB turns the first joint by pi)
     "j1": (np.pi - 2.6, np.pi + 2.6, 77.3),
     "j2": (-2.0, 2.0, 160.6),
     "j3": (-2.8, 2.8, 95.6),
@@ -51,7 +52,7 @@ INERTIAS = {
     "wam5": (0.00005029, 0.00007582, 0.00006270, 0.00000020, -0.00000005, -0.00000359),
     "wam6": (0.00055516, 0.00024367, 0.00045358, 0.00000061, -0.00000074, -0.00004590),
 }
-# Denavit-Hartenberg: a in m, alpha in rad, d in m; Barrett D1001, table 5, with the hand's palm as the tool
+# Denavit-Hartenberg parameters a in m, alpha in rad and d in m (Barrett D1001, table 5, with the palm as the tool)
 CHAIN = ((0, -np.pi / 2, 0), (0, np.pi / 2, 0), (0.045, -np.pi / 2, 0.55), (-0.045, np.pi / 2, 0),
          (0, -np.pi / 2, 0.3), (0, np.pi / 2, 0), (0, 0, 0.072 + 0.095))  # fmt: skip
 
@@ -84,7 +85,7 @@ def test_model_has_the_published_masses_limits_and_torques(shared_env: SharedEnv
 
 @pytest.mark.parametrize("side", SIDES)
 def test_model_has_the_published_inertias(shared_env: SharedEnv, side: str) -> None:
-    """Barrett's frames are rotated about x by +90 and -90 degrees alternately, relative to the model's."""
+    """Relative to the model's frames, Barrett's frames are rotated about x by +90 and -90 degrees alternately."""
     model = shared_env("herb_reach").model
     for i, (name, values) in enumerate(INERTIAS.items()):
         body = model.body(f"{side}/{name}")
@@ -97,8 +98,8 @@ def test_model_has_the_published_inertias(shared_env: SharedEnv, side: str) -> N
         )
 
 
-def test_palms_have_the_positions_of_the_published_chain(shared_env: SharedEnv) -> None:
-    """The transforms are Denavit-Hartenberg's, from the first joint on, at random angles."""
+def test_palms_have_the_positions_of_the_published_kinematics(shared_env: SharedEnv) -> None:
+    """The expected positions are products of Denavit-Hartenberg transforms at random angles."""
     model = shared_env("herb_reach").model
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     for _ in range(20):
@@ -126,8 +127,8 @@ def test_arms_do_not_move_without_torque(shared_env: SharedEnv) -> None:
     np.testing.assert_allclose(positions(env)[0], before, atol=1e-3)
 
 
-def test_a_finger_moves_with_one_motor(shared_env: SharedEnv) -> None:
-    """The fingertip turns by 45 degrees if the finger turns by 140 degrees; both spread joints move together."""
+def test_one_motor_moves_both_joints_of_a_finger(shared_env: SharedEnv) -> None:
+    """The fingertip turns by 45 degrees when the finger turns by 140 degrees, and both spread joints move together."""
     env = shared_env("herb_reach", nworld=1, autoreset=False)
     env.reset()
     action = torch.zeros(1, 22)
@@ -155,7 +156,7 @@ def targets(env: lw.Env) -> np.ndarray:
 
 
 def put_targets(env: lw.Env, offset: np.ndarray) -> None:
-    """Put the targets at offsets from the palms, (nworld, 2) in metres along x, with the arms at rest."""
+    """Place the targets at offsets from the palms along x, (nworld, 2) in metres, and stop the arms."""
     state = env.get_state()
     parts = env.state_space.split(state)
     parts["qvel"][:] = 0.0
@@ -166,7 +167,7 @@ def put_targets(env: lw.Env, offset: np.ndarray) -> None:
 
 
 def test_reward_evaluation_and_observation_equal_their_formulas(shared_env: SharedEnv) -> None:
-    """States after a step, far from the targets and close to them, cover every term of the reward."""
+    """The states after a step, far from the targets and close to them, cover every reward term."""
     env = shared_env("herb_reach", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
     for near in (False, True):
@@ -194,7 +195,7 @@ def test_reward_evaluation_and_observation_equal_their_formulas(shared_env: Shar
 
 
 @pytest.mark.usefixtures("freed")
-def test_random_resets_draw_targets_before_each_shoulder_and_arms_near_home() -> None:
+def test_random_resets_draw_targets_in_front_of_each_shoulder_and_arms_near_home() -> None:
     env = lw.make("herb_reach", engine="mujoco", nworld=2000)
     env.rand_reset(0)
     low, high = np.float32([0.6, 0.1, 0.7]), np.float32([0.95, 0.6, 1.3])
@@ -210,8 +211,9 @@ def test_random_resets_draw_targets_before_each_shoulder_and_arms_near_home() ->
     np.testing.assert_allclose(targets(env)[0], [[0.8, 0.35, 1.0], [0.8, -0.35, 1.0]], atol=1e-6)
 
 
-def test_both_hands_reach_their_targets_at_once(shared_env: SharedEnv) -> None:
-    """For the boxes' corners and random targets, inverse kinematics finds angles within limits and without contacts."""
+def test_both_hands_can_reach_their_targets_at_the_same_time(shared_env: SharedEnv) -> None:
+    """Inverse kinematics finds joint angles within limits and without contacts, for random targets and the corners of
+    their boxes."""
     env = shared_env("herb_reach", nworld=16)
     model, rng = env.model, np.random.default_rng(0)
     corners = np.stack(np.meshgrid([0.6, 0.95], [0.1, 0.6], [0.7, 1.3]), axis=-1).reshape(-1, 1, 3)
@@ -222,7 +224,7 @@ def test_both_hands_reach_their_targets_at_once(shared_env: SharedEnv) -> None:
 
 
 def reachable(model: mujoco.MjModel, goals: np.ndarray, start: np.ndarray) -> bool:
-    """Return whether damped least squares, from given angles, brings both palms to their targets without contacts."""
+    """Return whether damped least squares moves both palms from given angles to their targets without contacts."""
     data, jacobian = mujoco.MjData(model), np.zeros((3, 30))
     arms = np.r_[0:7, 15:22]
     data.qpos[arms] = start[arms]
@@ -241,8 +243,8 @@ def reachable(model: mujoco.MjModel, goals: np.ndarray, start: np.ndarray) -> bo
     return False
 
 
-def test_success_needs_both_hands_for_ten_steps() -> None:
-    """Success needs both hands; a step off the target restarts the count, and a reset clears it."""
+def test_task_succeeds_after_both_hands_are_at_their_targets_for_ten_steps() -> None:
+    """Both hands must be at their targets; a step off a target and a reset clear the count."""
     env = lw.make("herb_reach", engine="mujoco", nworld=4, autoreset=False, horizon=0)
     offset = np.array([[0.0, 0.0], [0.06, 0.0], [0.0, 0.06], [0.045, -0.045]])
     put_targets(env, offset)
@@ -259,5 +261,5 @@ def test_success_needs_both_hands_for_ten_steps() -> None:
     assert env.success.tolist() == [False, False, False, True]
     env.rand_reset(0)
     assert not env.success.any()
-    env.set_state(state)  # the count is part of the state
+    env.set_state(state)  # the count of steps at the targets is part of the state
     assert env.success.tolist() == [True, False, False, True]

@@ -1,4 +1,4 @@
-"""Test the panda_lift task: robot, scripted grasp, reward terms (also of aloha_lift), resets and success."""
+"""Test the robot, a scripted grasp, reward terms (also of aloha_lift), resets and success of the panda_lift task."""
 
 import mujoco
 import numpy as np
@@ -18,7 +18,7 @@ def cube(env: lw.Env) -> np.ndarray:
 
 
 def put_cube(env: lw.Env, height: float) -> None:
-    """Put the cube in the air beside the hand, in every world."""
+    """Place the cube in the air beside the hand in every world."""
     state = env.get_state()
     env.state_space.split(state)["qpos"][:, 9:] = torch.tensor([0.3, 0.5, height, 1.0, 0.0, 0.0, 0.0])
     env.set_state(state)
@@ -45,7 +45,7 @@ def test_only_simple_shapes_collide(shared_env: SharedEnv) -> None:
 
 
 def test_arm_without_actions_stands_still(shared_env: SharedEnv) -> None:
-    """Gravity is compensated; an action of 1 moves a servo target by 1 rad/s."""
+    """The servos compensate gravity, and an action of 1 moves a servo target by 1 rad/s."""
     env = shared_env("panda_lift", nworld=2, autoreset=False)
     before = positions(env)[0][:, :9]
     for _ in range(50):
@@ -58,13 +58,13 @@ def test_arm_without_actions_stands_still(shared_env: SharedEnv) -> None:
 
 
 def test_a_scripted_grasp_lifts_the_cube_in_every_world(shared_env: SharedEnv) -> None:
-    """The gripper descends, closes and rises: the lift succeeds within an episode, with a reward of nearly 6.5."""
+    """The gripper descends, closes and rises, and the lift succeeds within an episode with a reward of nearly 6.5."""
     env = shared_env("panda_lift", nworld=4, autoreset=False)
     start, at = positions(env)[0], cube(env)
     waypoints = np.zeros((3, 4, 8))
     for world in range(4):
         yaw = 2.0 * np.arctan2(at[world, 6], at[world, 3])
-        yaw -= np.round(yaw / (0.5 * np.pi)) * 0.5 * np.pi  # yaw of the edge nearest to the fingers
+        yaw -= np.round(yaw / (0.5 * np.pi)) * 0.5 * np.pi  # the yaw of the edge that is nearest to the fingers
         y, z = np.array([-np.sin(yaw), np.cos(yaw), 0.0]), np.array([0.0, 0.0, -1.0])
         axes = np.stack([np.cross(y, z), y, z], axis=1)
         for i, height in enumerate((0.12, 0.02, 0.2)):
@@ -82,7 +82,7 @@ def test_a_scripted_grasp_lifts_the_cube_in_every_world(shared_env: SharedEnv) -
 @pytest.mark.parametrize(
     ("task", "effort", "height", "rest"), [("panda_lift", 0.01, 11, 0.02), ("aloha_lift", 0.005, 18, 0.0658)]
 )
-def test_reward_weighs_terms_between_0_and_1(
+def test_reward_is_a_weighted_sum_of_terms_between_0_and_1(
     shared_env: SharedEnv, task: str, effort: float, height: int, rest: float
 ) -> None:
     env = shared_env(task, nworld=16)
@@ -97,8 +97,9 @@ def test_reward_weighs_terms_between_0_and_1(
         np.testing.assert_allclose(env.eval, positions(env)[0][:, height] - rest, atol=1e-6)
 
 
-def test_success_needs_ten_steps_in_a_row_above_the_goal() -> None:
-    """A falling cube is above the goal for 7 steps from 0.5 m and 13 from 1.6 m; the state includes the count."""
+def test_task_succeeds_after_ten_consecutive_steps_above_the_goal() -> None:
+    """A falling cube is above the goal for 7 steps from 0.5 m and for 13 steps from 1.6 m; the count is part of the
+    state."""
     env = lw.make("panda_lift", engine="mujoco", nworld=1, autoreset=False, horizon=0)
     for height, steps in ((0.5, 0), (1.6, 4)):
         env.rand_reset(0)
@@ -117,7 +118,7 @@ def test_success_needs_ten_steps_in_a_row_above_the_goal() -> None:
 
 @pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("area", [None, (0.4, 0.5, 0.0, 0.3)])
-def test_random_resets_draw_the_cubes_place_and_yaw(area: tuple[float, ...] | None) -> None:
+def test_random_resets_draw_the_position_and_yaw_of_the_cube(area: tuple[float, ...] | None) -> None:
     env = lw.make("panda_lift", engine="mujoco", nworld=2000, **({} if area is None else {"area": area}))
     env.rand_reset(0)
     found = cube(env)

@@ -12,7 +12,7 @@ def distance_to_target(qpos: np.ndarray) -> np.ndarray:
     return np.linalg.norm(qpos[:, :2] - qpos[:, 2:], axis=1)
 
 
-def test_reward_evaluation_observation_and_success_equal_lyceums_formulas(shared_env: SharedEnv) -> None:
+def test_reward_evaluation_observation_and_success_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
     env = shared_env("point_mass", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
     for _ in range(5):
@@ -38,7 +38,7 @@ def test_reward_evaluation_observation_and_success_equal_lyceums_formulas(shared
     assert 10 < env.success.sum() < NWORLD - 10
 
 
-def test_a_push_accelerates_only_the_agent(shared_env: SharedEnv) -> None:
+def test_action_accelerates_only_the_agent(shared_env: SharedEnv) -> None:
     """The acceleration is gear / (mass + armature); the target does not move."""
     env = shared_env("point_mass", nworld=2, autoreset=False)
     env.reset()
@@ -47,7 +47,7 @@ def test_a_push_accelerates_only_the_agent(shared_env: SharedEnv) -> None:
     assert np.array_equal(env.model.jnt_range, np.tile([-1.4, 1.4], (4, 1)))
     env.step(torch.tensor([[1.0, 0.0], [0.0, -3.0]]))  # -3 is clipped to -1
     qpos, qvel = positions(env)
-    # one semi-implicit Euler step from rest, damping 0.1 taken implicitly
+    # one semi-implicit Euler step from rest, with implicit damping of 0.1
     speed = 0.02 * 4.0 / (0.3 + 0.01 + 0.02 * 0.1)
     np.testing.assert_allclose(qvel, [[speed, 0, 0, 0], [0, -speed, 0, 0]], rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(qpos, [[0.02 * speed, 0, 1, 0], [0, -0.02 * speed, 1, 0]], rtol=1e-6, atol=1e-9)

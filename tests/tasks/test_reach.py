@@ -1,4 +1,4 @@
-"""Test the reach task: the published arm, Lyceum's formulas, resets, and success by the mean over ten steps."""
+"""Test the published arm, Lyceum's formulas, resets and success of the reach task."""
 
 import mujoco
 import numpy as np
@@ -11,7 +11,7 @@ import lyceum_warp as lw
 
 NWORLD = 256
 
-BODIES = {  # parent, position in it, mass, moments of inertia (capsules and spheres of 1,000 kg/m^3)
+BODIES = {  # parent body, position relative to it, mass, moments of inertia (capsules and spheres of 1,000 kg/m^3)
     "shoulder": ("world", (0, -0.6, 0), 24.311738, (1.2153105, 1.2145685, 0.1205579)),
     "lift": ("shoulder", (0.1, 0, 0), 10.471976, (0.1267109, 0.1267109, 0.0481711)),
     "upper_roll": ("lift", (0, 0, 0), 0.284838, (0.0012536, 0.0012536, 0.0000556)),
@@ -34,7 +34,7 @@ JOINTS = {  # body, axis, range, damping, gear
 RANGES = np.array([joint[2] for joint in JOINTS.values()])
 
 
-def test_model_has_the_published_arms_masses_joints_and_motors(shared_env: SharedEnv) -> None:
+def test_model_has_the_masses_joints_and_motors_of_the_published_arm(shared_env: SharedEnv) -> None:
     """The paper's code contains the published arm."""
     env = shared_env("reach")
     model = env.model
@@ -67,7 +67,7 @@ def test_only_palm_and_table_collide(shared_env: SharedEnv) -> None:
     assert model.site("target").size[0] == 0.05
 
 
-def test_three_seconds_of_controls_end_in_the_original_arms_position(shared_env: SharedEnv) -> None:
+def test_arm_has_the_position_of_the_original_arm_after_three_seconds_of_controls(shared_env: SharedEnv) -> None:
     """Smooth controls push one joint against its limit. The expected numbers were computed with the original arm."""
     model = shared_env("reach").model
     data = mujoco.MjData(model)
@@ -99,8 +99,8 @@ def reward(error: np.ndarray) -> np.ndarray:
     return -np.abs(error).sum(axis=1) - 5.0 * np.sqrt((error**2).sum(axis=1))
 
 
-def test_reward_evaluation_and_observation_equal_lyceums_formulas(shared_env: SharedEnv) -> None:
-    """The test compares states after steps and states that are set; each world has a different target."""
+def test_reward_evaluation_and_observation_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
+    """The test compares states after steps and states from set_state; each world has a different target."""
     env = shared_env("reach", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
     assert env.obs.shape == (NWORLD, 20)
@@ -126,7 +126,7 @@ def targets(env: lw.Env) -> np.ndarray:
 @pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("scale", [None, (0.1, 0.5, 0.0)])
 def test_random_resets_draw_the_target_from_its_box(scale: tuple[float, float, float] | None) -> None:
-    """The arm starts at zero and at rest; each world draws its own target."""
+    """The arm starts at rest with all joints at zero, and each world draws its own target."""
     env = lw.make("reach", engine="mujoco", nworld=2000, **({} if scale is None else {"target_range": scale}))
     env.rand_reset(0)
     size = np.array(scale or (0.3, 0.2, 0.25))
@@ -163,8 +163,9 @@ def put_targets(env: lw.Env, distance: np.ndarray) -> None:
     env.set_state(state)
 
 
-def test_success_needs_ten_steps_at_the_target() -> None:
-    """Success takes ten steps also with a larger distance. A reset clears the count, which is part of the state."""
+def test_task_succeeds_after_ten_steps_at_the_target() -> None:
+    """Even with a larger success distance, success takes ten steps. A reset clears the count of steps at the target,
+    which is part of the state."""
     env = lw.make("reach", engine="mujoco", nworld=3, success_distance=np.array([0.05, 0.05, 0.99]), horizon=0)
     put_targets(env, np.array([0.0, 0.06, 0.0]))
     still = torch.zeros(3, 7)
@@ -180,11 +181,11 @@ def test_success_needs_ten_steps_at_the_target() -> None:
     assert env.success.tolist() == [False, False, True]
     env.reset()
     assert not env.success.any()
-    env.set_state(state)  # task memory belongs to the state
+    env.set_state(state)  # the state includes task memory
     assert env.success.tolist() == [True, False, True]
 
 
-def test_success_is_the_mean_of_the_last_ten_distances(shared_env: SharedEnv) -> None:
+def test_success_depends_on_the_mean_of_the_last_ten_distances(shared_env: SharedEnv) -> None:
     """The targets jump every six steps."""
     env = shared_env("reach", nworld=64, autoreset=False, horizon=0)
     rng = np.random.default_rng(0)

@@ -1,4 +1,5 @@
-"""Check velocity tasks on rough ground: foot heights and scans against MuJoCo, levels, and the end of the field."""
+"""Test velocity tasks on rough ground: compare foot heights and scans with MuJoCo, and check levels and the field's
+edge."""
 
 from collections.abc import Mapping
 
@@ -6,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from conftest import SharedEnv, long_if_alike
+from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp.tasks.velocity.rough import TERRAIN
@@ -34,7 +35,7 @@ def ray_height(model: mujoco.MjModel, data: mujoco.MjData, x: float, y: float) -
 
 
 def put(env: lw.Env, world: int, x: float, y: float) -> None:
-    """Put a robot on the ground at a point, upright."""
+    """Place an upright robot on the ground at a point."""
     data = mujoco.MjData(env.model)
     mujoco.mj_forward(env.model, data)
     around = np.linspace(-0.4, 0.4, 9)
@@ -47,7 +48,7 @@ def put(env: lw.Env, world: int, x: float, y: float) -> None:
 
 @pytest.mark.quick("go1_rough_velocity")
 @pytest.mark.parametrize("task", TASKS)
-def test_heights_contacts_and_scans_on_every_kind_of_patch_equal_mujocos(task: str, env: lw.Env) -> None:
+def test_heights_contacts_and_scans_on_every_kind_of_patch_equal_those_of_mujoco(task: str, env: lw.Env) -> None:
     env.reset()
     for world, (x, y, _) in enumerate(TERRAIN.origins[LAST]):
         put(env, world, x + 2.0, y + 0.3)
@@ -73,7 +74,7 @@ def test_heights_contacts_and_scans_on_every_kind_of_patch_equal_mujocos(task: s
         points = data.qpos[:2] + grid[::7] @ np.array([forward, [-forward[1], forward[0]]])
         scan = [data.qpos[2] - ray_height(model, data, x, y) for x, y in points]
         np.testing.assert_allclose(critic["height_scan"][world, ::7], scan, atol=2e-4)
-    # a foot may stand on an edge that is not below a corner of its sole
+    # an edge of the ground may carry a foot between the corners of its sole
     assert equal > 0.8 * NWORLD * len(feet) and touched > NWORLD / 2
     noise = (parts(env, "policy")["height_scan"] - parts(env, "critic")["height_scan"]).abs()
     assert noise.max() <= 0.1 + 1e-5 and noise.mean() > 0.03
@@ -81,7 +82,7 @@ def test_heights_contacts_and_scans_on_every_kind_of_patch_equal_mujocos(task: s
 
 @pytest.mark.quick("go1_rough_velocity")
 @pytest.mark.parametrize("task", TASKS)
-def test_robots_begin_on_the_patch_of_their_level_and_climb_by_walking(task: str, env: lw.Env) -> None:
+def test_robots_start_on_the_patch_of_their_level_and_rise_a_level_by_walking(task: str, env: lw.Env) -> None:
     def memory(name: str) -> torch.Tensor:
         return env.state_space.split(env.get_state())[name][:, 0].int()
 
@@ -112,9 +113,12 @@ def test_an_episode_ends_outside_the_field(task: str, env: lw.Env) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("task", long_if_alike(TASKS))
-def test_a_robot_that_falls_on_rough_ground_is_not_thrown_away_by_mujoco_warp(task: str, shared_env: SharedEnv) -> None:
-    """The G1's own soles are boxes, for which MuJoCo Warp finds contacts with normals that point down."""
+@pytest.mark.quick("go1_rough_velocity")
+@pytest.mark.parametrize("task", TASKS)
+def test_falling_robot_on_rough_ground_has_bounded_velocities_under_mujoco_warp(
+    task: str, shared_env: SharedEnv
+) -> None:
+    """The soles of the original G1 are boxes, for which MuJoCo Warp finds contacts with normals that point down."""
     env = shared_env(task, engine="warp", nworld=24)
     rng = np.random.default_rng(0)
     for _ in range(60):

@@ -1,4 +1,4 @@
-"""Test the soft_ball task: squeezing and lifting the ball, observations, rewards, resets and ends of episodes."""
+"""Test the soft_ball task: squeezing and lifting the ball, observations, rewards, resets and terminations."""
 
 import mujoco
 import numpy as np
@@ -11,7 +11,7 @@ import lyceum_warp as lw
 from lyceum_warp.engines.warp.sizes import probe_sizes
 
 OPEN, CLOSED = -1.0, 0.7
-LOW = -1.0  # the gripper's height at which it surrounds the ball on the floor
+LOW = -1.0  # height at which the gripper surrounds the ball on the floor
 
 
 def vertices(env: lw.Env) -> np.ndarray:
@@ -32,7 +32,7 @@ def hold(env: lw.Env, steps: int, *action: float) -> None:
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_a_gripped_ball_is_squeezed_and_lifted_to_the_target(shared_env: SharedEnv, engine: str) -> None:
+def test_gripper_squeezes_the_ball_and_lifts_it_to_the_target(shared_env: SharedEnv, engine: str) -> None:
     """The fingers compress the ball by millimetres, and the ball bulges upwards."""
     env = shared_env("soft_ball", engine=engine, nworld=1, autoreset=False)
     env.reset()
@@ -48,7 +48,7 @@ def test_a_gripped_ball_is_squeezed_and_lifted_to_the_target(shared_env: SharedE
     assert env.eval.item() < 0.03 and env.metrics["near"] > 0.9 and env.metrics["lifted"] > 0.9
 
 
-def test_observation_and_reward_follow_the_balls_vertices(shared_env: SharedEnv) -> None:
+def test_observation_and_reward_equal_formulas_of_the_ball_vertices(shared_env: SharedEnv) -> None:
     env = shared_env("soft_ball", nworld=8, autoreset=False)
     rng = np.random.default_rng(0)
     for _ in range(30):
@@ -73,7 +73,7 @@ def test_observation_and_reward_follow_the_balls_vertices(shared_env: SharedEnv)
 
 @pytest.mark.parametrize("axis", range(3))
 def test_a_crushed_or_lost_ball_ends_the_episode(shared_env: SharedEnv, axis: int) -> None:
-    """The ball is scaled to 80 % and 60 % of its width along an axis, and moved by 0.3 and 0.45 m."""
+    """The test scales the ball to 80 % and 60 % of its width along an axis, and moves it by 0.3 and 0.45 m."""
     env = shared_env("soft_ball", nworld=4, autoreset=False)
     env.reset()
     corners = np.array([env.model.body(f"ball_{i // 4}_{i // 2 % 2}_{i % 2}").pos for i in range(8)])
@@ -99,8 +99,8 @@ def test_random_resets_place_ball_and_target(shared_env: SharedEnv) -> None:
     assert abs(np.corrcoef(ball[:, 0], target[:, 0])[0, 1]) < 0.4
 
 
-def test_sizes_for_a_flex_hold_bursts_of_contacts(shared_env: SharedEnv) -> None:
-    """Pressing the fingers into the ball needs more than twice as many constraints as the probe's peak."""
+def test_constraint_buffers_of_a_flex_model_hold_bursts_of_contacts(shared_env: SharedEnv) -> None:
+    """Fingers that press into the ball need more than twice as many constraints as the probe's peak."""
     model = shared_env("soft_ball").model
     assert probe_sizes(model) >= (256, 512)
     env = shared_env("soft_ball", engine="warp", nworld=4, autoreset=False)

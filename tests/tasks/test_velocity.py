@@ -1,11 +1,10 @@
-"""Compare the feet, contacts and forces of every velocity task with MuJoCo's, and check that other joints keep their
-pose."""
+"""Compare the feet, contacts and forces of every velocity task with MuJoCo's."""
 
 import mujoco
 import numpy as np
 import pytest
 import torch
-from conftest import SharedEnv, long_if_alike
+from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task, package_task_names
@@ -41,8 +40,9 @@ def feet(env: lw.Env, world: int) -> tuple[mujoco.MjData, list[bool]]:
     return data, [any(int(model.site_bodyid[foot]) in found for found in bodies) for foot in env.task.params["feet"]]
 
 
-@pytest.mark.parametrize("task", long_if_alike(ROBOTS))
-def test_heights_and_contacts_of_feet_equal_mujocos(task: str, env: lw.Env) -> None:
+@pytest.mark.quick("g1_velocity")
+@pytest.mark.parametrize("task", ROBOTS)
+def test_heights_and_contacts_of_feet_equal_those_of_mujoco(task: str, env: lw.Env) -> None:
     n = len(env.task.params["feet"])
     touched = 0
     for _ in range(5):
@@ -57,9 +57,11 @@ def test_heights_and_contacts_of_feet_equal_mujocos(task: str, env: lw.Env) -> N
     assert 0.1 < touched / (5 * NWORLD * n) < 0.99
 
 
-@pytest.mark.parametrize("task", long_if_alike(ROBOTS))
-def test_velocities_of_feet_equal_mujocos(task: str, env: lw.Env) -> None:
-    """Compare the metric: the squared horizontal speed of feet in contact, times the weight and the step's duration."""
+@pytest.mark.quick("g1_velocity")
+@pytest.mark.parametrize("task", ROBOTS)
+def test_velocities_of_feet_equal_those_of_mujoco(task: str, env: lw.Env) -> None:
+    """The metric foot_slip is the squared horizontal speed of feet in contact, times the weight and the step's
+    duration."""
     random_steps(env, 12, 1.0)
     env.set_params(least_command=-1.0)
     random_steps(env, 1, 1.0)
@@ -78,9 +80,10 @@ def test_velocities_of_feet_equal_mujocos(task: str, env: lw.Env) -> None:
     assert np.count_nonzero(found) > NWORLD / 4
 
 
-@pytest.mark.parametrize("task", long_if_alike(ROBOTS))
-def test_a_standing_robots_feet_carry_its_weight(task: str, env: lw.Env) -> None:
-    """At rest the forces on a robot's feet add up to its weight, and joints without actions keep the home pose."""
+@pytest.mark.quick("g1_velocity")
+@pytest.mark.parametrize("task", ROBOTS)
+def test_feet_of_a_standing_robot_carry_its_weight(task: str, env: lw.Env) -> None:
+    """At rest the sum of the forces on a robot's feet is its weight, and joints without actions keep the home pose."""
     total = []
     for _ in range(12):
         env.step(torch.zeros(env.action.shape))
@@ -96,7 +99,8 @@ def test_a_standing_robots_feet_carry_its_weight(task: str, env: lw.Env) -> None
         assert np.abs(env.field("qpos").numpy()[:, at] - home).max() < 0.15
 
 
-@pytest.mark.parametrize("task", long_if_alike(ROBOTS))
+@pytest.mark.quick("g1_velocity")
+@pytest.mark.parametrize("task", ROBOTS)
 def test_resets_put_the_robot_above_the_ground(task: str, env: lw.Env) -> None:
     env.reset()
     critic = env.obs_spaces["critic"].split(env.obs_groups["critic"])
@@ -112,7 +116,7 @@ def test_robots_with_equal_sizes_share_their_kernels(task: str, shared_env: Shar
     assert go1.task.kernels is spot.task.kernels
 
 
-def test_tasks_lists_exactly_the_tasks_of_the_familys_modules() -> None:
+def test_velocity_tasks_are_exactly_those_of_the_velocity_modules() -> None:
     assert set(TASKS) <= set(package_task_names())
     for name, module in TASKS.items():
         assert find_task(name).__module__ == f"lyceum_warp.tasks.velocity.{module}"

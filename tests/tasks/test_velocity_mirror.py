@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from conftest import SharedEnv, long_if_alike
+from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp import walkers
@@ -66,7 +66,7 @@ def symmetric(model: mujoco.MjModel, mirror: lw.Mirror) -> mujoco.MjModel:
 
 
 @pytest.mark.parametrize("task", ROBOTS)
-def test_mirrored_states_and_actions_step_to_mirrored_states(task: str) -> None:
+def test_mirrored_states_and_actions_give_mirrored_next_states(task: str) -> None:
     made = bound(task)
     p = SimpleNamespace(**made.params)
     mirror, home = walkers.mirror(made.model, p), walkers.home_qpos(made.model)
@@ -105,13 +105,14 @@ MEMORY = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("task", long_if_alike(ROBOTS, "g1_velocity"))
+@pytest.mark.quick("go1_velocity")
+@pytest.mark.parametrize("task", ROBOTS)
 def test_observations_of_mirrored_states_are_mirrored(task: str, shared_env: SharedEnv) -> None:
     bound(task)
     noises = ("linear_velocity", "angular_velocity", "gravity", "joint_position", "joint_velocity")
     own = {f"{name}_noise": 0.0 for name in noises} | {"push_seconds": (1e6, 1e6)}
     if task == "go1_velocity":
-        own["imu"] = (0.01, 0.0, 0.02)  # the robot's velocimeter is on one side
+        own["imu"] = (0.01, 0.0, 0.02)  # the velocimeter is on one side of the robot
     env = shared_env(task, nworld=16, **own)
     mirror = walkers.mirror(env.model, SimpleNamespace(**env.task.params))
     for _ in range(15):
@@ -128,7 +129,7 @@ def test_observations_of_mirrored_states_are_mirrored(task: str, shared_env: Sha
         assert (image - rows).abs().mean() > 0.05
 
 
-def test_a_scan_of_the_ground_is_mirrored() -> None:
+def test_height_scan_of_the_ground_is_mirrored() -> None:
     made = bound("go1_rough_velocity")
     p = SimpleNamespace(**made.params)
     order, signs = walkers.mirror(made.model, p).parts["height_scan"]
@@ -136,7 +137,7 @@ def test_a_scan_of_the_ground_is_mirrored() -> None:
     assert set(signs) == {1.0}
 
 
-def test_a_robot_without_a_mirror_image_is_refused() -> None:
+def test_robot_without_a_mirror_image_raises_an_error() -> None:
     made = bound("go1_velocity")
     p = SimpleNamespace(**made.params)
     p.joints = p.joints[:3]

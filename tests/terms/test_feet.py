@@ -1,4 +1,4 @@
-"""Test clocks and swings of feet over many substeps."""
+"""Test the contact timers and swings of feet over many substeps."""
 
 import numpy as np
 from term_calls import N, call
@@ -6,8 +6,8 @@ from term_calls import N, call
 DT, SUBSTEP, SKIP = 0.02, 0.005, 4
 
 
-def test_clocks_and_swings_follow_a_contact_sequence() -> None:
-    """Each world has its own contact sequence; its clocks are compared with counts of substeps."""
+def test_foot_timers_and_swings_follow_a_contact_sequence() -> None:
+    """Each world has its own contact sequence, and the test compares the timers with counts of substeps."""
     rng = np.random.default_rng(1)
     touching = rng.random((N, 200)) < 0.5
     touching = np.repeat(touching, rng.integers(1, 5), axis=1)[:, :200]
@@ -39,7 +39,7 @@ def test_clocks_and_swings_follow_a_contact_sequence() -> None:
     assert all((rows[name][:, [0, 2]] == 0).all() for name in clocks)
 
 
-def test_contact_sensors_run_the_clocks_of_all_feet() -> None:
+def test_contact_sensors_update_the_timers_of_all_feet() -> None:
     rng = np.random.default_rng(2)
     sensordata = rng.integers(0, 2, (N, 6)) * rng.uniform(0.1, 5.0, (N, 6))
     clocks = {"contact_time": rng.random((N, 3)), "air_time": rng.random((N, 3))}

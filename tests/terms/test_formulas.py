@@ -21,7 +21,7 @@ def unit(rows: np.ndarray) -> np.ndarray:
 
 
 def clocks(steps: int) -> np.ndarray:
-    """Draw whole numbers of substeps, half of them 0."""
+    """Draw random numbers of substeps, half of which are 0."""
     return SUBSTEP * RNG.integers(1, steps, (N, FEET)) * RNG.integers(0, 2, (N, FEET))
 
 
@@ -52,7 +52,7 @@ VALUES: dict[str, Any] = {
     "qpos": QPOS, "qvel": normal(12), "qacc": normal(12), "qfrc_actuator": normal(12), "row": normal(6),
     "sensordata": normal(24), "subtree_angmom": normal(4, 3), "base": 2, "site_xpos": normal(6, 3),
 }  # fmt: skip
-"""Functions that return a value for each argument, shared or per world."""
+"""Functions that make an argument's value, which is shared or has one entry per world."""
 
 
 def total(rows: np.ndarray) -> np.ndarray:
@@ -213,7 +213,7 @@ def test_term_equals_its_formula(name: str) -> None:
     np.testing.assert_allclose(call(name, **values).result, wanted, rtol=2e-5, atol=2e-6)
 
 
-def test_a_dc_motor_brakes_above_its_no_load_speed_and_is_free_below_its_limits() -> None:
+def test_dc_motor_brakes_above_its_no_load_speed_and_is_unlimited_below_its_limits() -> None:
     found = {
         (torque, velocity): call(
             "dc_motor_torque", torque=torque, joint_velocity=velocity,

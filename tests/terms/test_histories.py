@@ -8,12 +8,12 @@ WIDTH = 3
 
 
 @pytest.mark.parametrize("length", [1, 2, 4])
-def test_a_history_holds_the_last_values_and_repeats_the_first_value_until_full(length: int) -> None:
+def test_history_contains_the_last_values_and_repeats_the_first_value_until_full(length: int) -> None:
     rng, values = np.random.default_rng(0), []
     history = np.zeros((N, 1 + length * WIDTH))
     assert call("history_length", history=history, width=WIDTH).result[0] == length
     assert not call("put_history", target=np.ones(length * WIDTH), history=history, width=WIDTH).after["target"].any()
-    for _ in range(3 * length + 2):  # enough values for the counter to wrap around
+    for _ in range(3 * length + 2):  # the number of values is large enough for the counter to wrap around
         values.append(rng.standard_normal((N, WIDTH)).astype(np.float32))
         history = call("push_history", history=history, value=values[-1]).after["history"]
         kept = [values[max(len(values) - 1 - age, max(len(values) - length, 0))] for age in range(length + 1)]
@@ -24,7 +24,7 @@ def test_a_history_holds_the_last_values_and_repeats_the_first_value_until_full(
         np.testing.assert_array_equal(written, np.hstack(kept[length - 1 :: -1]))
 
 
-def test_an_action_is_delayed_by_each_worlds_delay() -> None:
+def test_actions_are_delayed_by_the_delay_of_their_world() -> None:
     rng = np.random.default_rng(0)
     delay = call("draw_delay", delay=[0.0], least=0, most=3).after["delay"]
     assert {*delay.ravel()} == {0.0, 1.0, 2.0, 3.0}

@@ -1,4 +1,4 @@
-"""Compare changed inertias with clouds of point masses that are mapped one by one."""
+"""Compare changed inertias with clouds of point masses that are changed in the same way."""
 
 import mujoco
 import numpy as np
@@ -9,7 +9,8 @@ RNG = np.random.default_rng(0)
 
 
 def of_points(mass: np.ndarray, points: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Compute mass, centre of mass, and inertia about it in the body's axes, of point masses (k,) at (k, 3)."""
+    """Compute mass, centre of mass and inertia of point masses (k,) at (k, 3), about their centre and in the body's
+    axes."""
     centre = mass @ points / mass.sum()
     x = points - centre
     second = np.einsum("k,ki,kj->ij", mass, x, x)
@@ -34,8 +35,8 @@ def tensor(moments: np.ndarray, quat: np.ndarray) -> np.ndarray:
 
 
 def bodies(thickness: float) -> tuple[list[tuple[np.ndarray, np.ndarray]], dict[str, np.ndarray]]:
-    """Draw six point masses per world in a flat cloud, and make the fields of two bodies; the second body consists of
-    them."""
+    """Draw a flat cloud of six point masses per world, and make the fields of two bodies; the second body consists of
+    these masses."""
     clouds = [
         (RNG.uniform(0.1, 2.0, 6), RNG.standard_normal((6, 3)) * [1.0, 0.3, thickness] + RNG.standard_normal(3))
         for _ in range(N)
@@ -50,7 +51,7 @@ def bodies(thickness: float) -> tuple[list[tuple[np.ndarray, np.ndarray]], dict[
 
 @pytest.mark.parametrize("size", [0.1, 0.8])
 @pytest.mark.parametrize("thickness", [0.5, 1e-3])
-def test_changed_inertia_is_the_inertia_of_mapped_points(size: float, thickness: float) -> None:
+def test_changed_inertia_equals_the_inertia_of_changed_point_masses(size: float, thickness: float) -> None:
     clouds, before = bodies(thickness)
     changes = {name: RNG.uniform(-size, size, (N, 3)) for name in ("stretch", "shear", "shift")}
     density = RNG.uniform(-size, size, N)
@@ -79,7 +80,7 @@ def test_a_change_of_density_keeps_the_principal_axes() -> None:
         np.testing.assert_allclose(after[name], before[name], atol=2e-6)
 
 
-def test_drawn_inertias_differ_within_their_bounds() -> None:
+def test_randomized_inertias_differ_between_worlds_within_their_bounds() -> None:
     _, before = bodies(0.5)
     still = {name: np.zeros(3) for name in ("stretch", "shear")}
     after = call("draw_inertia", body=1, density=0.2, shift=[0.1, 0.2, 0.0], **still, **before).after

@@ -13,7 +13,7 @@ from lyceum_warp import Row, terms
 from lyceum_warp.binding.writes import find_writes, written_fields
 
 
-def test_an_argument_has_one_type_and_a_meaning_in_all_functions() -> None:
+def test_argument_name_has_one_type_and_one_documented_meaning_in_all_functions() -> None:
     kinds = defaultdict(set)
     for overloads in KERNELS.values():
         for function, _ in overloads:
@@ -23,7 +23,7 @@ def test_an_argument_has_one_type_and_a_meaning_in_all_functions() -> None:
     assert {*kinds} == {*terms.ARGUMENTS}
 
 
-# a library function writes the fields that its caller passes
+# the library functions in these tests write the fields that the caller passes
 
 
 @wp.struct
@@ -103,7 +103,7 @@ def robots(s: World, rng: Row[wp.uint32]):
         (robots, "encoder_bias body_mass body_ipos body_inertia body_iquat"),
     ],
 )
-def test_passing_a_field_to_a_function_that_writes_it_counts_as_a_write(function: wp.Function, fields: str) -> None:
+def test_field_passed_to_a_function_that_writes_it_counts_as_written(function: wp.Function, fields: str) -> None:
     assert written_fields(function) == {*fields.split()}
     assert {write.use for write in find_writes(function)} <= {None}
 
@@ -174,7 +174,7 @@ class Box(lw.Task):
 """
 
 
-def test_a_task_draws_robots_and_pushes_them_with_library_functions(task_file: TaskFile) -> None:
+def test_task_randomizes_and_pushes_robots_with_library_functions(task_file: TaskFile) -> None:
     source = TASK.replace("{further}", "terms.add_uniform_noise(obs, 0.01, rng)")
     env = lw.make(str(task_file("library_box.py", source)), nworld=16, horizon=0)
     env.rand_reset(seed=0)
@@ -192,7 +192,7 @@ def test_a_task_draws_robots_and_pushes_them_with_library_functions(task_file: T
     assert np.isfinite(env.reward.numpy()).all()
 
 
-def test_a_library_function_may_write_only_fields_that_its_caller_may_write(task_file: TaskFile) -> None:
+def test_library_function_that_writes_a_read_only_field_raises_an_error(task_file: TaskFile) -> None:
     source = TASK.replace("{further}", "terms.push(s.qpos, s.qvel, wp.vec3(0.5), wp.vec3(0.5), rng)")
     with pytest.raises(ValueError, match=r"observe of the task .* writes s\.qvel in push \(pushes\.py, line \d+\)"):
         lw.make(str(task_file("library_push.py", source)), nworld=1)

@@ -6,8 +6,8 @@ from checks import check_uniform
 from term_calls import N, call
 
 
-def test_a_push_adds_uniform_velocities_in_the_worlds_axes() -> None:
-    """MuJoCo keeps a free joint's angular velocity in the body's axes."""
+def test_push_adds_uniform_velocities_along_world_axes() -> None:
+    """MuJoCo stores a free joint's angular velocity in the body's axes."""
     rng = np.random.default_rng(0)
     qpos, qvel = rng.standard_normal((N, 9)), rng.standard_normal((N, 8))
     qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)

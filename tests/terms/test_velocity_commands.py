@@ -1,4 +1,4 @@
-"""Check velocity commands: their draws, timers and headings."""
+"""Check the distributions, timers and headings of velocity commands."""
 
 import numpy as np
 import pytest
@@ -7,11 +7,11 @@ from term_calls import N, call
 
 
 def near(share: np.ndarray, wanted: float) -> bool:
-    """Return whether a share of N draws is within five standard errors."""
+    """Return whether a share of N random draws is within five standard errors of its probability."""
     return bool(abs(share.mean() - wanted) < 5.0 * np.sqrt(wanted * (1.0 - wanted) / len(share)))
 
 
-def test_a_command_is_drawn_from_its_ranges() -> None:
+def test_velocity_command_is_drawn_from_its_ranges() -> None:
     low, high = np.array([-1.0, -0.5, -2.0]), np.array([3.0, 0.5, 0.0])
     velocity = call("draw_velocity", drawn_velocity=np.zeros((1, 3)), command_low=low, command_high=high)
     check_uniform((velocity.after["drawn_velocity"][:, 0] - (low + high) / 2) / ((high - low) / 2))
@@ -24,7 +24,7 @@ def test_a_command_is_drawn_from_its_ranges() -> None:
     assert {*standing.ravel()} == {0.0, 1.0} and near(standing, 0.1)
 
 
-def test_a_share_of_commands_is_forward_only() -> None:
+def test_given_share_of_commands_is_forward_only() -> None:
     before = np.random.default_rng(0).uniform(-1.0, 1.0, (N, 1, 3))
     drawn = call("draw_forward_only", drawn_velocity=before, forward_share=0.2, least_forward_velocity=0.3)
     after = drawn.after["drawn_velocity"][:, 0]
@@ -34,7 +34,7 @@ def test_a_share_of_commands_is_forward_only() -> None:
     np.testing.assert_allclose(after[~forward], before[~forward, 0], rtol=1e-6)
 
 
-def test_a_timer_is_due_after_its_seconds() -> None:
+def test_timer_expires_after_its_seconds() -> None:
     timer, due = np.array([0.1]), []
     for _ in range(6):
         due.append(bool(call("is_due", timer=timer).result[0]))
@@ -43,7 +43,7 @@ def test_a_timer_is_due_after_its_seconds() -> None:
 
 
 @pytest.mark.parametrize(("standing", "controlled"), [(0, 0), (0, 1), (1, 0), (1, 1)])
-def test_a_command_is_zero_or_turns_towards_its_heading(standing: int, controlled: int) -> None:
+def test_command_is_zero_or_turns_the_robot_towards_its_heading(standing: int, controlled: int) -> None:
     rng = np.random.default_rng(0)
     drawn, target, heading = rng.uniform(-1, 1, (N, 1, 3)), rng.uniform(-3, 3, (N, 1)), rng.uniform(-3, 3, N)
     found = call(

@@ -1,4 +1,4 @@
-"""Test the settings to try, which must differ from the task and fit the engine, and their flags and Python lines."""
+"""Test the physics settings that ``tune`` tries, and the flags and Python lines that it prints for them."""
 
 import mujoco
 import pytest
@@ -10,8 +10,8 @@ from lyceum_warp.cli.arguments import Physics, given
 from lyceum_warp.tuning.candidates import Setting, candidates, combined, flags, not_tried, task_line
 
 
-def test_settings_of_hopper_are_below_its_limits_and_keep_its_control_interval(shared_env: SharedEnv) -> None:
-    env = shared_env("hopper", solver={"iterations": 3})  # RK4, 4 substeps of 2 ms
+def test_settings_for_hopper_lower_its_limits_and_keep_its_control_time_step(shared_env: SharedEnv) -> None:
+    env = shared_env("hopper", solver={"iterations": 3})  # hopper uses RK4 and 4 substeps of 2 ms
     settings = candidates(env)
     names = [setting.name for setting in settings]
     assert [name for name in names if name.startswith("iterations")] == ["iterations=2", "iterations=1"]
@@ -25,11 +25,11 @@ def test_settings_of_hopper_are_below_its_limits_and_keep_its_control_interval(s
         if setting.group == "substeps"
     )
     limited = next(setting for setting in settings if setting.name == "ls_iterations=10")
-    assert limited.physics == {"solver": {"iterations": 3, "ls_iterations": 10}}  # the given limit is kept
+    assert limited.physics == {"solver": {"iterations": 3, "ls_iterations": 10}}  # the given limit stays unchanged
     assert not {"noslip", "impratio", "room"} & {setting.group for setting in settings}
 
 
-def test_an_elliptic_cone_and_noslip_add_settings(shared_env: SharedEnv) -> None:
+def test_elliptic_cone_and_noslip_add_settings(shared_env: SharedEnv) -> None:
     spec = lw.gymnasium_model("hopper.xml").spec()
     spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10
     spec.option.noslip_iterations = 5
@@ -38,7 +38,7 @@ def test_an_elliptic_cone_and_noslip_add_settings(shared_env: SharedEnv) -> None
     assert found["noslip_iterations=0"] == {"solver": {"noslip_iterations": 0}}
 
 
-def test_what_an_engine_does_not_take_is_named(shared_env: SharedEnv) -> None:
+def test_settings_that_an_engine_does_not_support_are_listed(shared_env: SharedEnv) -> None:
     own = shared_env("point_mass")
     assert "nconmax" in " ".join(not_tried(own)) and "PGS" in " ".join(not_tried(own))
     env = shared_env("point_mass", engine="warp", nconmax=10, njmax=30)
@@ -53,7 +53,7 @@ COARSE = Setting("1 x 8 ms, implicitfast", "substeps",
                  {"frame_skip": 1, "timestep": 0.008, "integrator": "implicitfast"})  # fmt: skip
 
 
-def test_a_combination_takes_one_setting_of_each_group_without_conflicts() -> None:
+def test_combined_setting_has_one_setting_of_each_group_without_conflicts() -> None:
     finer = Setting("2 x 4 ms", "substeps", {"frame_skip": 2, "timestep": 0.004})
     both = combined([COARSE, EULER, LIMITED, finer, SEARCH])
     assert both is not None and both.parts == (COARSE, LIMITED, SEARCH)
@@ -61,7 +61,7 @@ def test_a_combination_takes_one_setting_of_each_group_without_conflicts() -> No
     assert combined([COARSE, EULER, finer]) is None and combined([]) is None
 
 
-def test_printed_flags_and_the_printed_task_line_select_the_setting() -> None:
+def test_printed_flags_and_printed_python_line_select_the_setting() -> None:
     both = combined([COARSE, LIMITED, SEARCH])
     assert both is not None
     wanted = lw.PhysicsOptions(**both.physics)

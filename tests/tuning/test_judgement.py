@@ -1,4 +1,4 @@
-"""Intervals of differences of returns, and verdicts."""
+"""Test intervals of differences between returns, and verdicts on settings."""
 
 import math
 from typing import Any
@@ -9,7 +9,7 @@ import pytest
 from lyceum_warp.tuning.judgement import Difference, difference, episodes_needed, verdict
 
 
-def test_an_interval_covers_the_difference_and_shrinks_with_more_episodes() -> None:
+def test_interval_covers_the_difference_of_returns_and_shrinks_with_more_episodes() -> None:
     rng = np.random.default_rng(1)
     reference = rng.normal(-100.0, 10.0, 2000)
     returns = reference + rng.normal(3.0, 20.0, 2000)
@@ -25,7 +25,7 @@ def test_equal_returns_differ_by_zero_even_if_all_are_zero() -> None:
         assert difference(returns, returns) == Difference(0.0, 0.0, 0.0, 5)
 
 
-def test_returns_that_were_all_zero_show_nothing() -> None:
+def test_reference_returns_of_zero_give_no_verdict() -> None:
     found = difference(np.zeros(5), np.arange(5.0))
     assert not found.within(0.05) and not found.beyond(0.05)
 
@@ -50,11 +50,11 @@ def row(*bounds: tuple[float, float], **entries: Any) -> dict[str, Any]:
         ({"refused": "MuJoCo refuses it"}, "refused"),
     ],
 )
-def test_verdicts_depend_on_where_the_intervals_lie(found: dict[str, Any], wanted: str) -> None:
+def test_verdict_depends_on_the_intervals_of_the_returns(found: dict[str, Any], wanted: str) -> None:
     assert verdict(found, "strict") == wanted
 
 
-def test_a_looser_tolerance_accepts_more() -> None:
+def test_looser_tolerance_accepts_larger_differences() -> None:
     found = row((-0.04, 0.01))
     assert verdict(found, "strict") == "not shown"
     assert verdict(found, "loose") == verdict(row((1.0, 2.0)), "any") == "same"

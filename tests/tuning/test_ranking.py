@@ -1,4 +1,4 @@
-"""Rank correlations of samples between a planner's physics and the plant's."""
+"""Test rank correlations of samples between the physics of planner and plant."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ from lyceum_warp.tuning.ranking import Rankings, rank_correlations
 FAILED = float("-inf")
 
 
-def test_rank_correlations_are_spearmans_with_mean_ranks_of_equal_numbers() -> None:
+def test_rank_correlations_are_spearman_correlations_with_mean_ranks_for_ties() -> None:
     order = [1.0, 2.0, 3.0, 4.0]
     first = torch.tensor([order, [1.0, 2.0, 2.0, 3.0], [0.0, 1.0, 5.0, FAILED], [7.0] * 4, order])
     second = torch.tensor([[1.0, 3.0, 2.0, 4.0], order, [9.0, 4.0, 1.0, 90.0], order, [2.0] * 4])
@@ -24,14 +24,14 @@ def rankings() -> Rankings:
     return Rankings(find_task("half_cheetah"), states=3, repeats=1, samples=24, horizon=16, nthread=1)
 
 
-def test_the_plants_own_physics_ranks_its_samples_perfectly(rankings: Rankings) -> None:
+def test_rank_correlation_of_unchanged_physics_is_one(rankings: Rankings) -> None:
     row = rankings.measure(Setting("", "", {}))
     assert list(row["ranks"]) == ["standing", "moving", "fallen"]
     assert [found["mean"] for found in row["ranks"].values()] == pytest.approx([1.0, 1.0, 1.0], abs=1e-12)
     assert row["plan_ms"] > 0.0
 
 
-def test_the_form_of_the_jacobian_keeps_ranks_and_a_crude_model_loses_them(rankings: Rankings) -> None:
+def test_sparse_jacobian_keeps_the_ranks_and_coarse_physics_change_them(rankings: Rankings) -> None:
     sparse = rankings.measure(Setting("", "", {"jacobian": "sparse"}))
     assert all(found["low"] > 0.999 for found in sparse["ranks"].values())
     crude = rankings.measure(Setting("", "", {"frame_skip": 1, "timestep": 0.05, "solver": {"iterations": 1}}))
@@ -39,12 +39,12 @@ def test_the_form_of_the_jacobian_keeps_ranks_and_a_crude_model_loses_them(ranki
     assert verdict(crude, "strict") in ("ranks badly", "not shown") and verdict(crude, "any") in ("same", "no gain")
 
 
-def test_states_of_the_three_kinds_differ(rankings: Rankings) -> None:
+def test_standing_moving_and_fallen_states_are_from_different_steps(rankings: Rankings) -> None:
     columns = rankings.reference.state_space.parts["step"]
     steps = {kind: start[:, columns] for kind, start in rankings.starts.items()}
     assert (steps["standing"] == 0).all() and (steps["moving"] == 30).all() and (steps["fallen"] > 100).all()
 
 
-def test_a_setting_that_mujoco_refuses_has_its_reason() -> None:
+def test_ranking_of_an_invalid_setting_gives_the_error_of_mujoco() -> None:
     own = Rankings(find_task("soft_ball"), states=1, repeats=1, samples=2, horizon=2, nthread=1)
     assert "flex elasticity" in own.measure(Setting("", "", {"integrator": "implicitfast"}))["refused"]

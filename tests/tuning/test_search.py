@@ -1,4 +1,4 @@
-"""Test lw.tune: results, resuming from their file, and wrong arguments."""
+"""Test the results of lw.tune, its resumption from their file, and its errors."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ QUICK = {"short": True, "episodes": 8, "nworld": 8, "nthread": 1}
 
 @pytest.fixture
 def no_measuring(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make every further measurement an error."""
+    """Make every further measurement raise an error."""
 
     def measure(own: Trials, setting: Any) -> Any:
         raise AssertionError(f"{setting.name} was measured")
@@ -27,7 +27,7 @@ def no_measuring(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def brief() -> Iterator[None]:
-    """Measure speeds for milliseconds."""
+    """Limit speed measurements to milliseconds."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(search, "SHORT", dataclasses.replace(SHORT, repeats=2, block_seconds=0.005, steps=40))
         yield
@@ -38,7 +38,7 @@ def tuned(brief: None, tmp_path_factory: pytest.TempPathFactory) -> lw.Tuning:
     return lw.tune("half_cheetah", out=tmp_path_factory.mktemp("tune") / "rows.jsonl", tolerance="loose", **QUICK)
 
 
-def test_rows_are_sorted_by_speed_and_the_best_is_the_fastest_with_equal_returns(tuned: lw.Tuning) -> None:
+def test_rows_are_sorted_by_speed_and_the_best_is_the_fastest_with_unchanged_returns(tuned: lw.Tuning) -> None:
     speeds = [row["speedup"] for row in tuned.rows]
     assert speeds == sorted(speeds, reverse=True)
     assert tuned.reference["divergence"] == [0.0, 0.0, 0.0]
@@ -53,20 +53,20 @@ def test_a_stopped_search_resumes_from_its_file(tuned: lw.Tuning, no_measuring: 
         file.write('{"name": "cut off by a ki')
     again = lw.tune("half_cheetah", out=tuned.path, tolerance="loose", **QUICK)
     assert again == tuned
-    # results are judged again, not measured
+    # results are only judged again, but not measured again
     rows = lw.tune("half_cheetah", out=tuned.path, tolerance="strict", **QUICK).rows
     assert len(rows) <= len(tuned.rows)
 
 
 @pytest.mark.parametrize("change", [{"nworld": 4}, {"seed": 1}, {"ctrl_cost_weight": 0.2}, {"integrator": "rk4"}])
-def test_results_of_another_task_or_number_of_worlds_do_not_count(
+def test_results_of_another_task_or_number_of_worlds_are_not_reused(
     change: dict[str, Any], tuned: lw.Tuning, no_measuring: None
 ) -> None:
     with pytest.raises(AssertionError, match="was measured"):
         lw.tune("half_cheetah", out=tuned.path, **{**QUICK, **change})
 
 
-def test_a_new_row_follows_a_line_that_was_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_row_starts_on_a_new_line_after_an_incomplete_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "rows.jsonl"
     out.write_text('{"name": "cut off by a ki')
     rows: list[dict[str, Any]] = []
@@ -81,7 +81,7 @@ def test_a_new_row_follows_a_line_that_was_cut_off(tmp_path: Path, monkeypatch: 
     lw.tune("point_mass", out=out, **QUICK)
     assert len(out.read_text().splitlines()) > 1
     monkeypatch.undo()
-    lw.tune("point_mass", out=out, **QUICK)  # getting a row reads every line
+    lw.tune("point_mass", out=out, **QUICK)  # every line is read to get a row
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_runs_policy_plays_with_the_runs_parameters(run: Path, tmp_path: Path) -> None:
+def test_policy_of_a_run_plays_with_the_parameters_of_the_run(run: Path, tmp_path: Path) -> None:
     rows: list[dict[str, Any]] = []
 
     def stop(row: dict[str, Any]) -> None:
@@ -104,7 +104,7 @@ def test_a_runs_policy_plays_with_the_runs_parameters(run: Path, tmp_path: Path)
     assert set(rows[0]["returns"]) == {"random", "policy"}
 
 
-def test_each_wrong_argument_raises_an_error(run: Path, tmp_path: Path) -> None:
+def test_each_invalid_argument_of_tune_raises_an_error(run: Path, tmp_path: Path) -> None:
     other = tmp_path / "notes.txt"
     other.write_text("bread\nmilk\n")
     wrong: list[tuple[str, dict[str, Any], str]] = [

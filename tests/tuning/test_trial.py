@@ -1,4 +1,4 @@
-"""Measure settings on real tasks."""
+"""Test measurements of physics settings on real tasks."""
 
 import pytest
 import torch
@@ -21,7 +21,7 @@ def judge_all(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def lean(obs: torch.Tensor) -> torch.Tensor:
-    """A policy of half_cheetah."""
+    """A fixed policy for half_cheetah."""
     return torch.sin(3.0 * obs[:, :6])
 
 
@@ -30,7 +30,7 @@ def trials(task: str = "half_cheetah", *, policy: bool = False, episodes: int | 
     return Trials(env, lean if policy else None, effort=BRIEF, episodes=episodes)
 
 
-def test_the_unchanged_task_differs_from_itself_by_exactly_zero() -> None:
+def test_returns_of_the_unchanged_task_differ_by_exactly_zero() -> None:
     row = trials(policy=True).measure(SAME)
     assert row["divergence"] == [0.0, 0.0, 0.0] and row["memory"] == 1.0
     assert set(row["returns"]) == {"random", "policy"}
@@ -39,35 +39,35 @@ def test_the_unchanged_task_differs_from_itself_by_exactly_zero() -> None:
     assert row["faults_per_million"] == row["reference_faults_per_million"] == 0.0
 
 
-def test_a_crude_setting_changes_returns_and_diverges_faster_than_chaos() -> None:
+def test_coarse_physics_change_returns_and_diverge_faster_than_chaos() -> None:
     own = trials(policy=True)
     row = own.measure(CRUDE)
     assert verdict({**row, "speedup_low": 2.0}, "loose") in ("different", "faults")
     assert all(1e-8 < small < 1e-3 < found for small, found in zip(own.nudged, row["divergence"], strict=True))
 
 
-def test_a_form_of_the_jacobian_changes_results_only_by_rounding() -> None:
+def test_sparse_jacobian_changes_results_only_by_rounding() -> None:
     own = trials("hopper", nworld=8)
     row = own.measure(Setting("", "", {"jacobian": "sparse"}))
     assert row["divergence"][0] < 1e-9 < own.nudged[0]
-    assert 0.0 < own.in_contact < 1.0  # some are in the air
+    assert 0.0 < own.in_contact < 1.0  # some robots are in the air
 
 
 @pytest.mark.long
-def test_the_spread_determines_the_number_of_episodes_within_the_time_limit() -> None:
+def test_number_of_episodes_depends_on_the_spread_of_returns_and_the_time_limit() -> None:
     own = trials("hopper", episodes=None, nworld=8)
     coarse = Setting("", "", {"integrator": "implicitfast", "frame_skip": 2, "timestep": 0.004})
     assert own.measure(coarse)["returns"]["random"]["episodes"] > 8
     assert own.measure(SAME)["returns"]["random"]["episodes"] == 8  # if the returns do not vary, one batch suffices
 
 
-def test_a_setting_that_mujoco_refuses_has_its_reason() -> None:
+def test_trial_of_an_invalid_setting_gives_the_error_of_mujoco() -> None:
     refused = trials("soft_ball", nworld=2).measure(Setting("", "", {"integrator": "implicitfast"}))
     assert "flex elasticity" in refused["refused"] and verdict(refused, "strict") == "refused"
 
 
 @pytest.mark.long
-def test_too_little_room_on_the_warp_engine_shows_as_faults() -> None:
+def test_too_small_buffers_of_the_warp_engine_are_reported_as_faults() -> None:
     own = trials("hopper", engine="warp", nworld=8, nconmax=16, njmax=64)
     assert own.measure(SAME)["divergence"] == [0.0, 0.0, 0.0]
     row = own.measure(Setting("", "", {"nconmax": 1, "njmax": 2}))
@@ -76,6 +76,6 @@ def test_too_little_room_on_the_warp_engine_shows_as_faults() -> None:
 
 
 @pytest.mark.gpu
-def test_a_gpu_reports_the_memory_of_the_device() -> None:
+def test_trial_on_a_gpu_reports_the_memory_of_the_device() -> None:
     row = trials("hopper", nworld=1024, device="cuda").measure(SAME)
     assert row["device_bytes"] > 0

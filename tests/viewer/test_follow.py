@@ -1,4 +1,4 @@
-"""View a run while it trains."""
+"""Test the viewer of a run that is training."""
 
 import contextlib
 import importlib
@@ -21,7 +21,7 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.viewer.follow import Follower, wait_for_run
 
 
-def test_a_follower_takes_the_newest_policy(tmp_path: Path) -> None:
+def test_follower_loads_the_newest_policy(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     npg = lw.NPG(lw.make("point_mass", nworld=2), config=lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,)))
     followers: list[Follower] = []
@@ -30,7 +30,7 @@ def test_a_follower_takes_the_newest_policy(tmp_path: Path) -> None:
     def callback(iteration: lw.Iteration) -> None:
         if not followers:
             followers.append(Follower(Run.open(folder)))
-        # short iterations are not saved at once
+        # the run does not save every short iteration
         write_content(folder / "policy.pt", policy_content(npg.iteration, npg.policy, npg.value))
         messages.extend(followers[0].update())
 
@@ -42,7 +42,7 @@ def test_a_follower_takes_the_newest_policy(tmp_path: Path) -> None:
         assert torch.equal(followers[0](obs), npg.policy(obs))
 
 
-def test_a_file_that_cannot_be_read_is_a_message(tmp_path: Path) -> None:
+def test_follower_reports_an_unreadable_policy_as_a_message(tmp_path: Path) -> None:
     assert train(tmp_path / "run", "--iterations", "1") == 0
     follower = Follower(Run.open(tmp_path / "run"))
     (tmp_path / "run" / "policy.pt").write_bytes(b"half a file")
@@ -68,7 +68,7 @@ def trained(folder: Path, callback: Callable[[lw.Iteration], object] | None = No
 
 
 @pytest.mark.long
-def test_a_viewer_does_not_change_a_runs_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_viewer_does_not_change_the_results_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     alone = trained(tmp_path / "alone")
     begun, printed = time.monotonic(), ""
     with lw.RunViewer(tmp_path / "shown", nworld=2) as viewer:
@@ -78,7 +78,7 @@ def test_a_viewer_does_not_change_a_runs_numbers(tmp_path: Path, capsys: pytest.
             while not re.search(r"http://127\.0\.0\.1:\d+/", printed):  # the first iteration waits for the viewer
                 assert viewer.is_open and time.monotonic() < begun + 60, printed
                 time.sleep(0.1)
-                printed += capsys.readouterr().out  # printed by this process, above a live line
+                printed += capsys.readouterr().out  # this process prints the address above a live line
 
         shown = trained(tmp_path / "shown", callback)
         assert viewer.is_open
@@ -105,7 +105,7 @@ def runs(process: int) -> bool:
 
 
 @pytest.mark.long
-def test_a_viewer_ends_with_its_program_also_while_it_waits_for_the_run(tmp_path: Path) -> None:
+def test_viewer_that_waits_for_a_run_ends_with_its_program(tmp_path: Path) -> None:
     command = [sys.executable, "-c", PROGRAM, str(tmp_path / "run")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None
@@ -117,15 +117,16 @@ def test_a_viewer_ends_with_its_program_also_while_it_waits_for_the_run(tmp_path
     assert not runs(viewer)
 
 
-def test_a_viewer_that_is_closed_at_once_ends(tmp_path: Path) -> None:
+def test_viewer_that_is_closed_immediately_ends(tmp_path: Path) -> None:
     with lw.RunViewer(tmp_path / "run") as viewer:
         assert viewer.is_open and runs(viewer._process.pid)
     assert not viewer.is_open and not runs(viewer._process.pid)
 
 
-def test_train_shows_its_run_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_train_with_view_opens_a_viewer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Any] = []
-    training = importlib.import_module("lyceum_warp.cli.train")  # the package also has a function of this name
+    # import_module is necessary because the package also has a function with this name
+    training = importlib.import_module("lyceum_warp.cli.train")
     monkeypatch.setattr(
         training, "RunViewer", lambda *given, **words: made.append((given, words)) or contextlib.nullcontext()
     )
@@ -134,9 +135,7 @@ def test_train_shows_its_run_on_request(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.long
-def test_a_viewer_of_a_task_that_is_not_found_ends_with_one_line(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_viewer_of_a_missing_task_ends_with_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert train(tmp_path / "run", "--iterations", "1") == 0
     run = Run.open(tmp_path / "run")
     run.amend(task="missing_task")

@@ -1,4 +1,4 @@
-"""Show a view from a notebook."""
+"""Test the view in a notebook."""
 
 import re
 import sys
@@ -11,7 +11,7 @@ from conftest import SharedEnv
 import lyceum_warp as lw
 
 
-def test_a_notebook_shows_the_page_and_a_link_while_the_worlds_run(
+def test_show_displays_the_page_and_a_link_in_a_notebook_while_the_worlds_run(
     shared_env: SharedEnv, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shell = SimpleNamespace(kernel=object())

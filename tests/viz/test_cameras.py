@@ -23,12 +23,12 @@ def model() -> mujoco.MjModel:
 
 
 @pytest.mark.parametrize("task", ["half_cheetah", "hopper", "reach", "point_mass"])
-def test_the_models_own_camera_is_the_default(task: str) -> None:
+def test_default_camera_is_the_first_camera_of_the_model(task: str) -> None:
     found = find_camera(lw.make(task).model)
     assert (found.type, found.fixedcamid) == (mujoco.mjtCamera.mjCAMERA_FIXED, 0)
 
 
-def test_without_a_camera_the_default_follows_the_first_body() -> None:
+def test_default_camera_of_a_model_without_cameras_follows_the_first_body() -> None:
     text = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
     found = find_camera(mujoco.MjModel.from_xml_string(text))
     assert (found.type, found.trackbodyid) == (mujoco.mjtCamera.mjCAMERA_TRACKING, 1)
@@ -43,14 +43,14 @@ def test_a_camera_is_found_by_name_and_by_index(model: mujoco.MjModel, camera: o
 
 
 @pytest.mark.parametrize("camera", ["side", "", 3, -2, True, 0.0, "7"])
-def test_an_unknown_camera_is_refused_with_the_models_cameras(model: mujoco.MjModel, camera: object) -> None:
+def test_error_of_an_unknown_camera_lists_the_cameras_of_the_model(model: mujoco.MjModel, camera: object) -> None:
     with pytest.raises(ValueError, match=r"no camera .*: the model has 'corner' \(0\), 1, '1' \(2\), or 'free'"):
         find_camera(model, camera)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="the model has none, or 'free'"):
         find_camera(mujoco.MjModel.from_xml_string("<mujoco/>"), 0)
 
 
-def test_a_free_camera_has_the_given_pose_or_mujocos_default(model: mujoco.MjModel) -> None:
+def test_free_camera_has_the_given_pose_or_the_default_of_mujoco(model: mujoco.MjModel) -> None:
     default = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, default)
     for choice in ("free", FreeCamera()):
@@ -71,7 +71,7 @@ def test_a_free_camera_has_the_given_pose_or_mujocos_default(model: mujoco.MjMod
     (dict(azimuth=float("nan")), "azimuth must be a number of degrees, not nan"),
     (dict(lookat=(1, 2)), r"lookat must be three finite numbers, not \(1, 2\)"),
 ])  # fmt: skip
-def test_a_wrong_pose_is_refused(model: mujoco.MjModel, pose: dict[str, object], message: str) -> None:
+def test_invalid_camera_pose_raises_an_error(model: mujoco.MjModel, pose: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         find_camera(model, FreeCamera(**pose))  # type: ignore[arg-type]
 
@@ -90,6 +90,6 @@ def test_command_line_arguments_describe_a_camera() -> None:
     (["azimuth=left"], "azimuth must be a number, not 'left'"),
     (["lookat=1,2"], "lookat must be X,Y,Z, not '1,2'"),
 ])  # fmt: skip
-def test_other_command_line_arguments_are_refused(words: list[str], message: str) -> None:
+def test_invalid_camera_arguments_raise_an_error(words: list[str], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parsed_camera(words)

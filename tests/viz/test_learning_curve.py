@@ -24,13 +24,13 @@ def is_png(path: Path) -> bool:
     return path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 10_000
 
 
-def test_a_run_is_drawn_into_its_folder(run: Run) -> None:
+def test_learning_curve_is_written_to_the_run_folder(run: Run) -> None:
     pytest.importorskip("matplotlib")
     assert learning_curve(run) == run.folder / "curve.png"
     assert is_png(run.folder / "curve.png")
 
 
-def test_a_run_with_metrics_gets_a_panel_for_them(tmp_path: Path) -> None:
+def test_learning_curve_of_a_task_with_metrics_has_a_panel_for_them(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     sizes = []
     for number, metrics in enumerate(({}, {"metrics/forward": 1.0, "metrics/effort": float("nan")})):
@@ -42,7 +42,7 @@ def test_a_run_with_metrics_gets_a_panel_for_them(tmp_path: Path) -> None:
     assert sizes[1] > sizes[0]
 
 
-def test_a_run_without_rows_is_refused(run: Run) -> None:
+def test_learning_curve_of_a_run_without_rows_raises_an_error(run: Run) -> None:
     pytest.importorskip("matplotlib")
     cut_rows(run.metrics, 0)
     with pytest.raises(ValueError, match="has no complete iteration to draw: train it first"):

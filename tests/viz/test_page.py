@@ -1,4 +1,4 @@
-"""Write episodes as pages."""
+"""Test pages that contain episodes."""
 
 import base64
 import json
@@ -41,7 +41,7 @@ def content(file: Path) -> dict[str, Any]:
     return data | {n: np.frombuffer(zlib.decompress(base64.b64decode(data[n])), kind) for n, kind in kinds.items()}
 
 
-def test_a_page_has_the_poses_of_the_states(shared_env: SharedEnv, tmp_path: Path) -> None:
+def test_page_contains_the_poses_of_the_states(shared_env: SharedEnv, tmp_path: Path) -> None:
     env = shared_env("hopper")
     env.reset()
     states = env.get_state().repeat(5, 1)

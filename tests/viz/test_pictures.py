@@ -29,7 +29,7 @@ def pictures(env: lw.Env) -> Iterator[WorldPictures]:
     pictures.close()
 
 
-def test_worlds_in_one_state_look_the_same_and_others_differ(env: lw.Env, pictures: WorldPictures) -> None:
+def test_worlds_in_equal_states_give_equal_pictures_and_others_differ(env: lw.Env, pictures: WorldPictures) -> None:
     env.reset()
     first, second = pictures()
     assert first.shape == (64, 96, 3) and first.dtype == np.uint8 and first.std() > 10
@@ -50,14 +50,14 @@ def test_a_picture_shows_the_model_of_its_world(env: lw.Env, pictures: WorldPict
     env.set_dynamics(geom_size=sizes[0])
 
 
-def test_a_closed_process_is_restarted(pictures: WorldPictures) -> None:
+def test_render_process_is_restarted_after_close(pictures: WorldPictures) -> None:
     before = pictures()
     pictures.close()
     for picture, again in zip(before, pictures(), strict=True):
         np.testing.assert_array_equal(picture, again)
 
 
-def test_arguments_that_do_not_fit_are_refused(env: lw.Env) -> None:
+def test_invalid_size_or_camera_raises_an_error(env: lw.Env) -> None:
     with pytest.raises(ValueError, match="size must be two even numbers"):
         WorldPictures(env, size=(3, 4))
     with pytest.raises(ValueError, match="there is no camera 'front'"):

@@ -26,7 +26,7 @@ def test_videos_are_written_every_few_iterations(npg: lw.NPG, tmp_path: Path) ->
     assert shown[:7] == shown[7:] == [("drawing the video", "frames", i, 7) for i in range(1, 8)]
 
 
-def test_python_gets_the_videos_of_the_command_line(npg: lw.NPG, tmp_path: Path) -> None:
+def test_training_in_python_writes_the_same_videos_as_the_command_line(npg: lw.NPG, tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     with pytest.raises(ValueError, match="there is no camera 'side': the model has"):
         lw.train(npg, tmp_path / "run", iterations=2, video_every=1, camera="side")

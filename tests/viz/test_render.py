@@ -5,7 +5,7 @@ from varied_task import ball
 from lyceum_warp.viz.render import change_model
 
 
-def test_a_changed_model_has_the_poses_of_a_compiled_one() -> None:
+def test_changed_model_has_the_poses_of_a_compiled_model() -> None:
     spec = ball()
     spec.body("ball").add_camera(name="tracking", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, pos=[0, -2, 0])
     model = spec.compile()

@@ -1,4 +1,4 @@
-"""Write curves for TensorBoard, and read them with TensorBoard's own reader."""
+"""Test the curves for TensorBoard by reading them with TensorBoard's own reader."""
 
 import dataclasses
 import inspect
@@ -21,7 +21,7 @@ pytest.importorskip("tensorboard")
 
 @pytest.fixture(scope="module")
 def first() -> lw.Iteration:
-    """An iteration of a real run, with an evaluation of the mean policy."""
+    """Return an iteration of a real run, with an evaluation of the mean policy."""
     config = lw.NPGConfig(samples=96, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2)
     return next(lw.NPG(lw.make("point_mass", nworld=4, horizon=12), config=config))
 
@@ -40,7 +40,7 @@ def curve(folder: Path, name: str) -> list[tuple[int, float]]:
     return [(point.step, pytest.approx(point.value)) for point in read(folder).Scalars(name)]
 
 
-def test_every_number_of_an_iteration_is_a_curve_in_its_group(first: lw.Iteration, tmp_path: Path) -> None:
+def test_every_number_of_an_iteration_is_written_as_a_curve_in_its_group(first: lw.Iteration, tmp_path: Path) -> None:
     iteration = numbered(first, 1, metrics={"forward": 2.5}, step_metrics={"forward": 0.5})
     with TensorBoard(tmp_path / "new" / "run") as board:
         board(iteration)
@@ -61,7 +61,7 @@ def test_every_number_of_an_iteration_is_a_curve_in_its_group(first: lw.Iteratio
     }  # fmt: skip
 
 
-def test_curves_that_rsl_rl_writes_have_its_names() -> None:
+def test_curves_have_the_names_that_rsl_rl_uses() -> None:
     logger = inspect.getsource(pytest.importorskip("rsl_rl.utils.logger"))
     losses = inspect.getsource(pytest.importorskip("rsl_rl.algorithms.ppo").PPO.update)
     for column in (*inspect.signature(PPOIteration).parameters, "total_fps"):
@@ -72,7 +72,7 @@ def test_curves_that_rsl_rl_writes_have_its_names() -> None:
             assert f'"{name}": mean_' in losses or f'"Loss/{name}"' in logger
 
 
-def test_terms_of_a_walking_robot_have_mjlabs_names_and_units(first: lw.Iteration, tmp_path: Path) -> None:
+def test_terms_of_a_walking_robot_have_the_names_and_units_of_mjlab(first: lw.Iteration, tmp_path: Path) -> None:
     env = lw.make("go1_velocity", nworld=3, horizon=100)
     metrics = {"upright": 1.5, "fell_over": 0.25}
     with TensorBoard(tmp_path, env) as board:
@@ -83,7 +83,7 @@ def test_terms_of_a_walking_robot_have_mjlabs_names_and_units(first: lw.Iteratio
         assert curve(tmp_path, name) == [(0, value)]
 
 
-def test_numbers_that_are_absent_or_not_finite_are_left_out(first: lw.Iteration, tmp_path: Path) -> None:
+def test_missing_and_non_finite_numbers_are_omitted(first: lw.Iteration, tmp_path: Path) -> None:
     with TensorBoard(tmp_path) as board:
         board(numbered(first, 1, return_mean=math.nan, mean_return=None))
         board(numbered(first, 2, return_mean=-3.0))
@@ -91,25 +91,25 @@ def test_numbers_that_are_absent_or_not_finite_are_left_out(first: lw.Iteration,
     assert curve(tmp_path, "mean_policy/return") == [(1, first.mean_return)]
 
 
-def test_a_resumed_run_replaces_later_points_and_repeats_none(first: lw.Iteration, tmp_path: Path) -> None:
+def test_resumed_run_replaces_points_after_its_checkpoint(first: lw.Iteration, tmp_path: Path) -> None:
     with TensorBoard(tmp_path) as board:
         for i in (1, 2, 3, 4):
             board(numbered(first, i))
-    with TensorBoard(tmp_path) as board:  # the checkpoint was of iteration 2
+    with TensorBoard(tmp_path) as board:  # the checkpoint is from iteration 2
         for i in (3, 4, 5):
             board(numbered(first, i, return_mean=100.0))
     assert curve(tmp_path, "policy/kl") == [(i - 1, 0.01 * i) for i in (1, 2, 3, 4, 5)]
     assert [value for _, value in curve(tmp_path, "Train/mean_reward")] == [first.return_mean] * 2 + [100.0] * 3
 
 
-def test_points_are_in_the_file_before_it_is_closed(first: lw.Iteration, tmp_path: Path) -> None:
+def test_points_are_written_before_the_file_is_closed(first: lw.Iteration, tmp_path: Path) -> None:
     board = TensorBoard(tmp_path)
     board(numbered(first, 1))
     assert curve(tmp_path, "policy/kl") == [(0, 0.01)]
     board.close()
 
 
-def test_a_full_disk_is_an_error_of_the_call(first: lw.Iteration, tmp_path: Path) -> None:
+def test_full_disk_raises_an_error(first: lw.Iteration, tmp_path: Path) -> None:
     resource = pytest.importorskip("resource")
     before, limits = signal.signal(signal.SIGXFSZ, signal.SIG_IGN), resource.getrlimit(resource.RLIMIT_FSIZE)
     board = TensorBoard(tmp_path)
@@ -125,14 +125,14 @@ def test_a_full_disk_is_an_error_of_the_call(first: lw.Iteration, tmp_path: Path
     assert [step for step, _ in curve(tmp_path, "policy/kl")] == list(range(i))
 
 
-def test_a_missing_package_raises_one_line_with_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_of_a_missing_package_names_the_install_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"need the package tensorboard: pip install 'lyceum-warp\[tensorboard\]'$"):
         TensorBoard(tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
-def test_train_writes_the_numbers_of_metrics_csv_also_after_it_resumes(tmp_path: Path) -> None:
+def test_train_writes_the_numbers_of_metrics_csv_before_and_after_resuming(tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert train(run, "--tensorboard", "--iterations", "2") == 0
     assert main(["train", "--resume", str(run), "--tensorboard", "--iterations", "3", *QUIET]) == 0

@@ -1,4 +1,4 @@
-"""Write videos of states, and draw single shots."""
+"""Test videos of states and of single shots."""
 
 import os
 import signal
@@ -17,9 +17,10 @@ import video_frames
 from varied_task import Varied, ball
 
 import lyceum_warp as lw
+from lyceum_warp.algos.evaluation import evaluation_worlds
+from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.viz import drawing, video
 from lyceum_warp.viz.cameras import FreeCamera
-from lyceum_warp.viz.policy_videos import policy_states
 from lyceum_warp.viz.render import Shot
 
 SMALL = (96, 64)
@@ -52,7 +53,9 @@ def still(obs: torch.Tensor) -> torch.Tensor:
 
 
 def episode(env: lw.Env, policy: Callable[[torch.Tensor], torch.Tensor], **words: Any) -> torch.Tensor:
-    return policy_states(env, policy, **words)[1]  # type: ignore[arg-type]
+    one = evaluation_worlds(env, 1, autoreset=False)
+    (found,) = policy_episodes(one, policy, 1, **words)
+    return found.states
 
 
 def test_episode_returns_all_states(env: lw.Env) -> None:
@@ -78,7 +81,7 @@ def test_write_video_writes_a_frame_for_each_state(env: lw.Env, tmp_path: Path) 
     assert min(result["brightest"]) > 100  # the scene has light
 
 
-def test_a_video_has_the_model_fields_of_its_states(tmp_path: Path) -> None:
+def test_video_shows_the_model_fields_of_its_states(tmp_path: Path) -> None:
     env = lw.make(Varied, autoreset=False)
     first, second = (episode(env, lambda obs: torch.zeros(1, 1), seed=seed) for seed in (1, 2))
     states, parts = torch.cat([first, second]), env.state_space.parts
@@ -86,13 +89,13 @@ def test_a_video_has_the_model_fields_of_its_states(tmp_path: Path) -> None:
     assert sizes.unique().numel() == 2
     out = tmp_path / "video.mp4"
     path = drawable(lambda: video.write_video(env, states, out, size=(160, 120), speed=0.01))
-    areas = np.array(video_frames.read(path)["red"], dtype=float)  # the red ball, seen by a fixed camera
+    areas = np.array(video_frames.read(path)["red"], dtype=float)  # a fixed camera shows the red ball
     assert len(areas) == len(states) and areas.min() > 0
     ratio = areas[len(first) :].mean() / areas[: len(first)].mean()
     assert ratio == pytest.approx((sizes[-1] / sizes[0]).item() ** 2, rel=0.25)
 
 
-def test_a_video_is_seen_from_the_given_camera(env: lw.Env, tmp_path: Path) -> None:
+def test_video_is_rendered_from_the_given_camera(env: lw.Env, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="there is no camera 'side': the model has "):
         video.write_video(env, env.get_state(), tmp_path / "video.mp4", camera="side")
     assert not list(tmp_path.iterdir())
@@ -105,7 +108,7 @@ def test_a_video_is_seen_from_the_given_camera(env: lw.Env, tmp_path: Path) -> N
     assert pictures[0] != pictures[1]
 
 
-def test_a_machine_that_cannot_draw_is_reported_with_a_fix(
+def test_error_on_a_machine_that_cannot_render_names_a_fix(
     env: lw.Env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("imageio_ffmpeg")
@@ -127,14 +130,16 @@ def test_a_machine_that_cannot_draw_is_reported_with_a_fix(
     ({"speed": 0.0}, r"speed must be a positive number of simulated seconds per second, not 0.0"),
     ({"out": "video.avi"}, r"give a file's name that ends in .mp4, not '.*video.avi'"),
 ])  # fmt: skip
-def test_a_wrong_argument_is_refused(env: lw.Env, tmp_path: Path, options: dict[str, Any], message: str) -> None:
+def test_invalid_video_argument_raises_an_error(
+    env: lw.Env, tmp_path: Path, options: dict[str, Any], message: str
+) -> None:
     out = tmp_path / options.pop("out", "video.mp4")
     with pytest.raises(ValueError, match=message):
         video.write_video(env, env.get_state(), out, **options)
     assert not list(tmp_path.iterdir())
 
 
-# shots one by one
+# tests of videos from single shots
 
 
 def shot(x: float, **changes: Any) -> Shot:
@@ -148,7 +153,7 @@ def video_of(model: mujoco.MjModel, out: Path, *, fps: float = 30.0, most_waitin
     return video.Recorder(model, out, size=SMALL, fps=fps, most_waiting=most_waiting)
 
 
-def test_shots_are_drawn_one_by_one_with_their_model_ghosts_and_lines(model: mujoco.MjModel, tmp_path: Path) -> None:
+def test_single_shots_show_their_model_ghosts_and_lines(model: mujoco.MjModel, tmp_path: Path) -> None:
     small, red = {"geom_size": np.array([[0.1, 0, 0], [0.1, 0, 0]])}, (1.0, 0.0, 0.0, 1.0)
 
     def write() -> Path:
@@ -170,14 +175,14 @@ def test_shots_are_drawn_one_by_one_with_their_model_ghosts_and_lines(model: muj
     assert result["columns"][3] > result["columns"][2] + 0.5  # the ball has moved to the right
 
 
-def test_shots_that_come_too_fast_are_dropped_and_the_video_keeps_its_length(
+def test_shots_are_dropped_if_rendering_is_too_slow_and_the_video_keeps_its_length(
     model: mujoco.MjModel, tmp_path: Path
 ) -> None:
     def write() -> Path:
         mp4 = video_of(model, tmp_path / "video.mp4", most_waiting=2)
         for i in range(10):
             mp4.add(shot(0.1 * i))
-        assert mp4.added == 10 and mp4.dropped in (7, 8)  # the process may have taken one
+        assert mp4.added == 10 and mp4.dropped in (7, 8)  # the process may have taken one shot
         return mp4.close()
 
     result = video_frames.read(drawable(write))
@@ -208,7 +213,7 @@ def test_cancel_kills_a_process_that_hangs(
     assert len(started) == 1 and started[0].poll() is not None and not list(tmp_path.iterdir())
 
 
-def test_a_cancelled_or_empty_video_leaves_the_old_file(model: mujoco.MjModel, tmp_path: Path) -> None:
+def test_cancelled_or_empty_video_does_not_replace_the_old_file(model: mujoco.MjModel, tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     out = tmp_path / "video.mp4"
     out.write_text("old")
@@ -223,7 +228,7 @@ def test_a_cancelled_or_empty_video_leaves_the_old_file(model: mujoco.MjModel, t
 
 
 @pytest.mark.long
-def test_a_killed_program_leaves_no_file(tmp_path: Path) -> None:
+def test_killed_program_leaves_no_video_file(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     program = f"""
 import time

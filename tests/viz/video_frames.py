@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-# in a small process: imageio forks, and this process may be too large to fork after all other tests
+# runs in a small subprocess, because imageio forks, and this process may be too large for a fork after all other tests
 PROGRAM = """
 import json, sys
 import imageio.v2 as imageio
@@ -24,7 +24,7 @@ with imageio.get_reader(sys.argv[1]) as reader:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Return rate, shape and number of frames; per frame the brightest pixel, and the red pixels' count and mean
-    column."""
+    """Return the rate, shape and number of frames, and for each frame the brightest pixel and the red pixels' count and
+    mean column."""
     done = subprocess.run([sys.executable, "-c", PROGRAM, str(path)], capture_output=True, text=True, check=True)
     return dict(json.loads(done.stdout))

@@ -1,8 +1,8 @@
 """Define tasks for Gymnasium and dm_control with the formulas and models of lyceum_warp's tasks.
 
-Gymnasium has all tasks except cartpole and herb_reach, and dm_control has cartpole and its suite. This file defines the
-other tasks in NumPy, as a user of the libraries would. This file runs in peers' virtual environments and does not
-import lyceum_warp.
+Gymnasium contains all tasks of the comparison except cartpole and herb_reach, and dm_control contains cartpole and its
+own suite. This file defines the missing tasks in NumPy, as a user of these libraries would. This file runs in the other
+libraries' virtual environments, and does not import lyceum_warp.
 """
 
 from pathlib import Path
@@ -34,7 +34,7 @@ GYMNASIUM = {
 """Gymnasium's names of the tasks."""
 
 JUDGE_NEW_STATE = {"humanoid_standup", "reacher", "pusher", "inverted_pendulum", "inverted_double_pendulum"}
-"""Tasks whose step in Gymnasium reads only the state after the physics."""
+"""Tasks for which Gymnasium's step reads only the state after the physics."""
 
 
 class CartpoleEnv(MujocoEnv):
@@ -94,7 +94,7 @@ class HerbReachEnv(MujocoEnv):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         self.do_simulation(action, self.frame_skip)
-        mujoco.mj_kinematics(self.model, self.data)  # mj_step leaves site positions one step behind
+        mujoco.mj_kinematics(self.model, self.data)  # mj_step leaves site positions at the previous state
         return self._get_obs(), self._get_rew(0.0, action)[0], False, False, {}
 
     def reset_model(self) -> np.ndarray:
@@ -113,7 +113,7 @@ POSITIONS = {
     "humanoid": lambda env: mass_center(env.model, env.data)[0],
     "ant": lambda env: env.data.body("torso").xpos[0],
 }
-"""The coordinate whose change is rewarded; by default the first."""
+"""Index of the coordinate whose velocity is rewarded; by default the first."""
 
 
 def dm_control_env(task: str, seed: int) -> Any:
@@ -128,8 +128,8 @@ def dm_control_env(task: str, seed: int) -> Any:
             return suite.load(domain, name, task_kwargs={"random": seed})
 
     class FromGymnasium(control.Task):
-        """A dm_control task with the observation, reward and end of a Gymnasium environment, on dm_control's model and
-        data."""
+        """A dm_control task with the observations, rewards and terminations of a Gymnasium environment, on dm_control's
+        model and data."""
 
         def __init__(self, env: Any, physics: Any) -> None:
             self.env, self.position = env, POSITIONS.get(task, lambda env: env.data.qpos[0])
@@ -161,7 +161,8 @@ def dm_control_env(task: str, seed: int) -> Any:
             return 0.0 if ends and not self.env.is_healthy else None
 
     class FromStep(FromGymnasium):
-        """A task that evaluates only the new state, with Gymnasium's step function without its physics."""
+        """A task that computes observation and reward from the new state by Gymnasium's step function, without its
+        physics."""
 
         def __init__(self, env: Any, physics: Any) -> None:
             super().__init__(env, physics)

@@ -1,8 +1,8 @@
 """Measure environment steps per second of other libraries, as a worker of bench/venvs.py.
 
-The program reads a JSON object (contestant, task, envs, threads, seconds, warm, seed) and prints another. Actions are
-uniform within their bounds and drawn before the clock starts. An episode restarts within its last step if the library
-supports it.
+The program reads a JSON object (contestant, task, envs, threads, seconds, warm, seed) and prints a JSON object. Actions
+are uniform within their bounds and drawn before the clock starts. An episode restarts within its last step if the
+library supports it.
 """
 
 import json
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 KEPT_ACTIONS = 4096
-"""Total number of actions that are drawn before the clock starts; they cover at least 16 steps."""
+"""Total number of actions to draw before the clock starts; at least 16 steps are drawn."""
 
 ENVPOOL = {
     "hopper": "Hopper-v5",
@@ -41,7 +41,7 @@ ENVPOOL = {
 
 
 def draw(low: np.ndarray, high: np.ndarray, envs: int, seed: int) -> np.ndarray:
-    """Draw actions for several steps, (steps, envs, nact), which are then repeated."""
+    """Draw actions, (steps, envs, nact), for several steps; the caller repeats them."""
     return np.random.default_rng(seed).uniform(low, high, (max(16, KEPT_ACTIONS // envs), envs, *low.shape))
 
 
@@ -159,7 +159,7 @@ class Share:
 
 
 class EnvPool:
-    """EnvPool, whose environments all step together."""
+    """EnvPool's environments, which all step together."""
 
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
         import envpool
@@ -174,7 +174,7 @@ class EnvPool:
         return self.env.step(self.actions[t])[-1]["elapsed_step"]
 
     def transition_share(self) -> float:
-        """Return the share of environment steps that are transitions, measured over 200 additional steps.
+        """Return the fraction of environment steps that are transitions, measured over 200 additional steps.
 
         The step after the end of an episode ignores its action and returns the first observation of the next episode.
         """
@@ -194,7 +194,7 @@ CONTESTANTS: dict[str, Callable[..., Any]] = {
 }
 
 PACKAGES = {Gymnasium: ("gymnasium", "mujoco"), DmControl: ("dm_control", "mujoco"), EnvPool: ("envpool",)}
-"""Packages whose versions matter to the result; EnvPool contains its MuJoCo."""
+"""Packages that affect the result; EnvPool includes its own MuJoCo."""
 
 
 def timed(
@@ -203,11 +203,11 @@ def timed(
     """Return the number of steps and the seconds that they took.
 
     Args:
-        step: Takes a step with the actions of an index below ``period``.
+        step: Function that takes a step with the actions of an index below ``period``.
         period: Number of steps after which the actions repeat.
         warm: Number of steps before the clock starts.
         seconds: Duration of the measurement.
-        wait: Waits for the end of asynchronous steps.
+        wait: Function that waits for the end of asynchronous steps.
     """
     for t in range(warm):
         step(t % period)
@@ -221,7 +221,7 @@ def timed(
             count += 1
         wait()
         now = time.perf_counter()
-        if now - began < 0.01:  # otherwise reading the clock would take a noticeable time
+        if now - began < 0.01:  # read the clock only every few steps, because reading it takes time
             block *= 2
     return count, now - start
 

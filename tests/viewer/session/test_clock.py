@@ -18,7 +18,7 @@ from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viz.video import Recorder
 
 
-def test_speed_and_pause_are_kept(shared_env: SharedEnv) -> None:
+def test_session_obeys_set_speed_and_set_paused(shared_env: SharedEnv) -> None:
     window = run(
         Session(shared_env("point_mass")),
         [protocol.SetSpeed(8.0)],
@@ -31,7 +31,7 @@ def test_speed_and_pause_are_kept(shared_env: SharedEnv) -> None:
 
 
 @pytest.mark.parametrize("call", ["__init__", "add"])
-def test_a_video_that_cannot_be_written_is_a_message(
+def test_failed_video_is_reported_as_a_message(
     shared_env: SharedEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
 ) -> None:
     def full(*_: object, **__: object) -> None:
@@ -44,7 +44,7 @@ def test_a_video_that_cannot_be_written_is_a_message(
     assert "No space left on device" in window.messages[0] and window.frames[-1].status.video is None
 
 
-def test_a_refused_port_leaves_no_thread(shared_env: SharedEnv) -> None:
+def test_view_on_a_busy_port_leaves_no_thread(shared_env: SharedEnv) -> None:
     env, mppi = shared_env("point_mass", nworld=3), lw.MPPI("point_mass", horizon=4, samples=4)
     with socket.create_server(("127.0.0.1", 0)) as busy:
         before = threading.enumerate()
@@ -53,7 +53,7 @@ def test_a_refused_port_leaves_no_thread(shared_env: SharedEnv) -> None:
     assert [thread.name for thread in threading.enumerate() if thread not in before] == []
 
 
-def test_a_window_that_fails_is_closed(shared_env: SharedEnv) -> None:
+def test_window_is_closed_after_an_exception(shared_env: SharedEnv) -> None:
     class Broken(MemoryWindow):
         def show(self, frame: Frame) -> None:
             raise KeyboardInterrupt
@@ -65,7 +65,7 @@ def test_a_window_that_fails_is_closed(shared_env: SharedEnv) -> None:
 
 
 @pytest.mark.parametrize("controllers", [{}, {"own": towards}])
-def test_a_session_without_an_open_page_takes_little_time(
+def test_session_without_an_open_page_uses_little_cpu_time(
     shared_env: SharedEnv, controllers: dict[str, object]
 ) -> None:
     class Unwatched(MemoryWindow):
@@ -83,13 +83,13 @@ def test_a_session_without_an_open_page_takes_little_time(
     assert time.thread_time() - begun < 0.5
 
 
-def test_watchers_are_called_and_their_messages_shown(shared_env: SharedEnv) -> None:
+def test_session_calls_watchers_and_shows_their_messages(shared_env: SharedEnv) -> None:
     session = Session(shared_env("point_mass"), watchers=[lambda: ["news"]])
     window = run(session, lambda frame: "news" in frame.messages)
     assert window.messages == ["news"]
 
 
-def test_wrong_arguments_are_refused(shared_env: SharedEnv) -> None:
+def test_invalid_session_arguments_raise_an_error(shared_env: SharedEnv) -> None:
     env, small = shared_env("hopper", nworld=2), dict(horizon=2, samples=2)
     wrong: list[tuple[dict[str, Any], str]] = [
         (dict(env="hopper"), "env must be of type Env"),

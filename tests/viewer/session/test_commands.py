@@ -43,7 +43,7 @@ def test_a_restored_push_ends_when_the_world_continues(shared_env: SharedEnv, br
     assert not pushed(env, 0)
 
 
-def test_a_push_that_ended_in_the_past_is_absent_in_the_present(shared_env: SharedEnv) -> None:
+def test_push_that_ended_in_a_past_step_does_not_act_in_the_present(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True)
     for command in (StepBy(2), PUSH, StepBy(2), StepBy(-4), RELEASE, StepBy(2)):
@@ -53,7 +53,7 @@ def test_a_push_that_ended_in_the_past_is_absent_in_the_present(shared_env: Shar
     assert not pushed(env, 0) and session.stage.live.past.ahead == 0
 
 
-def test_a_planner_does_not_see_a_push_and_the_push_continues() -> None:
+def test_state_for_a_planner_excludes_a_push_and_the_push_continues() -> None:
     env = lw.make("hopper", nworld=2)
     seen = []
 
@@ -74,7 +74,7 @@ def test_a_planner_does_not_see_a_push_and_the_push_continues() -> None:
     assert not pushed(plant, 0)
 
 
-def test_a_body_is_placed_while_paused(shared_env: SharedEnv) -> None:
+def test_body_can_be_placed_while_paused(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True)
     session.obey(protocol.SetWorld(1))
@@ -100,7 +100,7 @@ def test_worlds_are_chosen_by_number_and_by_return(shared_env: SharedEnv) -> Non
     env = shared_env("hopper", nworld=4)
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=0)
     total = torch.zeros(4, dtype=torch.float64)
-    for _ in range(60):  # some episodes end on the way
+    for _ in range(60):  # some episodes end during these steps
         session.stage.advance()
         total += env.reward
         total[env.done] = 0.0

@@ -1,4 +1,4 @@
-"""Drive a walking robot: a command of the user replaces the drawn one."""
+"""Test that a user's velocity command replaces the command that the task draws."""
 
 import numpy as np
 import torch
@@ -8,7 +8,7 @@ from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.session.clock import Session
 
 
-def test_a_user_command_is_observed_until_it_is_given_back(shared_env: SharedEnv) -> None:
+def test_command_of_the_user_is_observed_until_it_is_released(shared_env: SharedEnv) -> None:
     env = shared_env("go1_velocity", nworld=2)
     session = Session(env, paused=True, seed=0)
     stage, command = session.stage, (0.5, -0.25, 0.125)
@@ -41,11 +41,11 @@ def test_arrows_show_the_commanded_and_the_measured_velocity(shared_env: SharedE
     stage.live.set_row(state)
     stage.frame()
     ways = [arrow.end - arrow.start for arrow in stage.frame().arrows]
-    expected = [[0, 0.4, 0], [0, 0.2, 0], [0, 0, 0.2], [0, 0, -0.4]]  # the robot looks along y
+    expected = [[0, 0.4, 0], [0, 0.2, 0], [0, 0, 0.2], [0, 0, -0.4]]  # the robot faces along y
     np.testing.assert_allclose(ways, expected, atol=1e-6)
 
 
-def test_other_tasks_cannot_be_driven(shared_env: SharedEnv) -> None:
+def test_task_without_velocity_commands_cannot_be_driven(shared_env: SharedEnv) -> None:
     session = Session(shared_env("hopper", nworld=2), paused=True)
     session.obey(protocol.Drive((1.0, 0.0, 0.0)))
     frame = session.stage.frame()

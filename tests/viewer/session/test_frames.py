@@ -32,7 +32,7 @@ def test_other_worlds_and_past_states_are_shown_as_ghosts(shared_env: SharedEnv)
     assert len(session.stage.frame().ghosts) == 3
 
 
-def test_ends_of_episodes_and_faults_become_messages(shared_env: SharedEnv) -> None:
+def test_ends_of_episodes_and_faults_are_shown_as_messages(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
 
     def bad(obs: torch.Tensor) -> torch.Tensor:
@@ -52,7 +52,7 @@ def test_ends_of_episodes_and_faults_become_messages(shared_env: SharedEnv) -> N
     assert "fault in world 1: action (1 so far)" in session.stage.frame().messages
 
 
-def test_frames_hold_every_point_of_the_curves(shared_env: SharedEnv) -> None:
+def test_frames_contain_every_point_of_the_curves(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True, seed=0)
     assert session.stage.scene.curves == ("reward", "eval", *env.metrics)
@@ -65,11 +65,11 @@ def test_frames_hold_every_point_of_the_curves(shared_env: SharedEnv) -> None:
     np.testing.assert_array_equal(points[:, 2], rewards)
     np.testing.assert_allclose(points[:, 0], env.timestep * np.arange(1, 21))
     session.obey(protocol.StepBy(-5))
-    session.obey(protocol.StepBy(6))  # one step after five restored ones
+    session.obey(protocol.StepBy(6))  # one new step after five restored steps
     np.testing.assert_allclose(session.stage.frame().samples[:, 0], [env.timestep * 21])
 
 
-def test_model_fields_that_differ_are_in_the_frame() -> None:
+def test_frame_contains_model_fields_that_differ_between_worlds() -> None:
     env = lw.make("hopper", nworld=2, dynamics=["body_mass"])
     session = Session(env, paused=True)
     assert session.stage.frame().model_fields == {}

@@ -18,7 +18,7 @@ def test_steps_back_and_forth_restore_the_states_bit_for_bit(shared_env: SharedE
     env = shared_env("hopper", engine=engine, nworld=3)
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=1)
     states = [env.get_state()]
-    for k in range(40):  # some episodes end on the way
+    for k in range(40):  # some episodes end during these steps
         if k == 20:
             session.obey(protocol.Reset(random=True))
             states[-1] = env.get_state()
@@ -34,7 +34,7 @@ def test_steps_back_and_forth_restore_the_states_bit_for_bit(shared_env: SharedE
     assert session.stage.live.past.behind == 41
     session.obey(StepBy(-5))
     restored = env.get_state()
-    session.obey(protocol.SetMode("passive"))  # drops the steps ahead
+    session.obey(protocol.SetMode("passive"))  # a new step removes the later steps from the history
     session.obey(StepBy(1))
     assert session.stage.live.past.ahead == 0 and not torch.equal(env.get_state(), restored)
 
@@ -56,7 +56,7 @@ def test_the_history_is_bounded_and_its_end_is_reported(shared_env: SharedEnv) -
     assert plant.env is not worlds and plant.past.states.nbytes <= PLANT_HISTORY_BYTES
 
 
-def test_the_return_ends_with_the_episode_without_autoreset() -> None:
+def test_return_stops_at_the_end_of_the_episode_without_autoreset() -> None:
     env = lw.make("hopper", nworld=3, autoreset=False)
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=0)
     total, over = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.bool)

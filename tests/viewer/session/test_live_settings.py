@@ -7,7 +7,7 @@ from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.session.clock import Session
 
 
-def test_a_planner_gets_other_settings_and_plans_go_on() -> None:
+def test_planner_continues_with_changed_settings() -> None:
     env = lw.make("reach", autoreset=False, nthread=1)
     session = Session(env, controllers={"mppi": lw.MPPI("reach", samples=8)}, seed=0, paused=True)
     stage = session.stage
@@ -24,7 +24,7 @@ def test_a_planner_gets_other_settings_and_plans_go_on() -> None:
     stage.close()
 
 
-def test_a_weight_of_the_reward_changes_in_all_worlds() -> None:
+def test_changed_reward_weight_applies_to_all_worlds() -> None:
     env = lw.make("hopper", nworld=2)
     session = Session(env, seed=0, paused=True)
     state = env.get_state()

@@ -1,4 +1,4 @@
-"""Control one world in real time, also with controllers that are slow or fail."""
+"""Test the real-time control of one world, even with controllers that are slow or fail."""
 
 import threading
 import time
@@ -18,7 +18,7 @@ from lyceum_warp.viewer.session.clock import Session
 PLANNER = dict(horizon=8, samples=6, temperature=0.01, noise=0.3)
 
 
-def test_a_planner_keeps_its_rate_and_shows_its_plan() -> None:
+def test_plant_keeps_its_rate_and_the_plan_is_shown() -> None:
     env = lw.make("point_mass", autoreset=False, horizon=0)
     session = Session(env, controllers={"mppi": lw.MPPI("point_mass", **PLANNER)}, seed=0)
     begun = time.monotonic()
@@ -50,7 +50,7 @@ def test_a_planner_controls_a_copy_of_the_shown_world(shared_env: SharedEnv) -> 
     assert not torch.equal(moved, before[1])
     session.obey(protocol.SetGhosts(worlds=1))
     np.testing.assert_array_equal(session.stage.frame().ghosts[0].pose.qpos, before[2, qpos].numpy())
-    session.obey(protocol.SetWorld(2))  # world 1 takes over the state of the copy
+    session.obey(protocol.SetWorld(2))  # world 1 gets the state of the copy
     assert torch.equal(env.get_state()[1, qpos], moved[qpos])
     assert torch.equal(session.stage.live.env.get_state()[0, qpos], before[2, qpos])
     session.obey(SetMode("controller", "own"))
@@ -61,7 +61,7 @@ def test_a_planner_controls_a_copy_of_the_shown_world(shared_env: SharedEnv) -> 
     assert session.stage.frame().status.world == 2
 
 
-def test_an_episode_of_a_plant_that_ends_is_followed_by_another() -> None:
+def test_plant_starts_another_episode_after_the_end_of_an_episode() -> None:
     env = lw.make("point_mass", autoreset=False, horizon=12)
     session = Session(env, controllers={"own": towards}, seed=0)
     session.obey(protocol.SetSpeed(8.0))
@@ -104,12 +104,12 @@ def test_a_slow_plan_does_not_delay_commands(shared_env: SharedEnv) -> None:
         lambda frame: frame.status.speed == 2.0,
     )
     calls = len(slow.log)
-    assert slow.inside == 1  # still the same call
+    assert slow.inside == 1  # the controller is still in the same call
     slow.release.set()
     while slow.inside:
         time.sleep(0.01)
     time.sleep(0.1)
-    assert len(slow.log) == calls  # calls of earlier runs fail
+    assert len(slow.log) == calls  # a session that has ended makes no further calls
     assert "reset within a call" not in slow.log
 
 
@@ -119,7 +119,7 @@ def test_a_slow_plan_does_not_delay_commands(shared_env: SharedEnv) -> None:
      ("unfit", "ValueError: a controller must return an action of shape (2,)")],
 )  # fmt: skip
 @pytest.mark.parametrize("paused", [False, True])
-def test_a_controller_that_fails_is_reported_and_loses_control(
+def test_failing_controller_is_reported_and_stopped(
     shared_env: SharedEnv, capsys: pytest.CaptureFixture[str], kind: str, text: str, paused: bool
 ) -> None:
     calls = []
@@ -147,7 +147,7 @@ def test_a_controller_that_fails_is_reported_and_loses_control(
 
 
 @pytest.mark.parametrize("speed", [4.0, 16.0])
-def test_frames_come_from_a_plant_that_never_waits(shared_env: SharedEnv, speed: float) -> None:
+def test_frames_of_a_plant_without_waiting_times_are_shown(shared_env: SharedEnv, speed: float) -> None:
     env = shared_env("point_mass", autoreset=False, horizon=0)
     session = Session(env, controllers={"none": lambda state, obs: torch.zeros(2)}, seed=0)
     session.obey(protocol.SetSpeed(speed))

@@ -18,7 +18,7 @@ def trajectories() -> list[lw.Trajectory]:
     return [lw.control(env, towards, seed=seed, steps=20 - 5 * seed) for seed in (0, 1)]
 
 
-def test_a_playback_is_sought_reversed_and_looped(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:
+def test_playback_can_seek_reverse_and_loop(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:
     env = shared_env("point_mass")
     session = Session(env, episodes=trajectories, paused=True)
     scene = session.stage.scene
@@ -34,7 +34,7 @@ def test_a_playback_is_sought_reversed_and_looped(shared_env: SharedEnv, traject
     assert session.stage.frame().status.step == 5
     session.obey(protocol.SetBackwards(True))
     session.stage.advance(6)
-    assert session.stage.frame().status.step == 20  # played backwards, the last step follows the first
+    assert session.stage.frame().status.step == 20  # during reverse playback, the last step follows the first
     session.obey(protocol.SetMode("playback", episode=1))
     frame = session.stage.frame()
     assert frame.status.step == 15 and frame.status.steps == 15 and frame.status.episode == 1
@@ -70,7 +70,9 @@ def test_states_are_played_back_without_rewards(shared_env: SharedEnv) -> None:
     assert frame.status.steps == 3 and np.isnan(frame.samples[:, 2:]).all()
 
 
-def test_an_episode_that_does_not_fit_is_refused(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:
+def test_episode_of_another_task_or_model_raises_an_error(
+    shared_env: SharedEnv, trajectories: list[lw.Trajectory]
+) -> None:
     env = lw.make("point_mass", dynamics=["body_mass"])
     for worlds, episodes, message in (
         (

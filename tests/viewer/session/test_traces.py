@@ -1,4 +1,4 @@
-"""Trace the paths of a planner's samples."""
+"""Test the traces of a planner's samples."""
 
 import mujoco
 import numpy as np
@@ -23,7 +23,7 @@ ARM = """<mujoco><worldbody><body name="base"><body name="upper"><joint name="a"
         ("cartpole", "xipos", "pole"),
     ],
 )  # fmt: skip
-def test_the_centre_of_mass_or_the_end_of_an_arm_is_traced(
+def test_default_trace_point_is_the_centre_of_mass_or_the_end_of_an_arm(
     shared_env: SharedEnv, task: str, field: str, name: str
 ) -> None:
     model = shared_env(task).model
@@ -31,7 +31,7 @@ def test_the_centre_of_mass_or_the_end_of_an_arm_is_traced(
     assert trace_point(model) == TracePoint(field, index)
 
 
-def test_a_site_a_body_or_the_tasks_choice_is_traced() -> None:
+def test_trace_point_may_be_a_site_a_body_or_the_choice_of_the_task() -> None:
     model = mujoco.MjModel.from_xml_string(ARM.format(site='<site name="tip" pos="0 0 1"/>'))
     assert trace_point(model) == TracePoint("site_xpos", 0)
     bare = mujoco.MjModel.from_xml_string(ARM.format(site=""))

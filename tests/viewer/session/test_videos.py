@@ -1,4 +1,4 @@
-"""Write videos in the viewer."""
+"""Test the videos that the viewer writes."""
 
 import os
 import signal
@@ -73,7 +73,7 @@ def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> No
         time.sleep(0.5)
 
     monkeypatch.setattr(drawing.Drawing, "draw", slow)
-    monkeypatch.setattr(videos, "FPS", 5)  # few poses, which are drawn without a GPU
+    monkeypatch.setattr(videos, "FPS", 5)  # the video has few poses, because they are drawn without a GPU
     try:
         taker.begin(CAMERA)
         while not drawn.is_set():

@@ -1,4 +1,4 @@
-"""Test the window process: what it serves, and how it ends."""
+"""Test the files that the window process serves, and how the process ends."""
 
 import contextlib
 import os
@@ -86,7 +86,7 @@ def test_process_listens_on_the_loopback_address_only(shared_window: Window) -> 
     assert listening == {"0100007F", "00000000000000000000000001000000"}  # 127.0.0.1, ::1
 
 
-def test_frames_are_taken_without_a_browser(shared_window: Window) -> None:
+def test_window_accepts_frames_without_a_browser(shared_window: Window) -> None:
     assert shared_window.commands() == []
     assert wait_until(lambda: shared_window.wants_frame)
     shared_window.show(frame_of(MODEL, DATA))
@@ -98,7 +98,7 @@ def test_ctrl_c_does_not_end_the_window(shared_window: Window) -> None:
     os.kill(process_of(shared_window), signal.SIGINT)
     time.sleep(0.3)
     assert shared_window.is_open() and page(shared_window)
-    assert os.getpgid(process_of(shared_window)) != os.getpgid(0)  # the terminal's Ctrl-C does not reach it
+    assert os.getpgid(process_of(shared_window)) != os.getpgid(0)  # Ctrl-C in the terminal does not reach the process
 
 
 # frames
@@ -111,7 +111,7 @@ def test_show_does_not_wait_for_a_window_that_hangs(shared_window: Window) -> No
         began = time.monotonic()
         for _ in range(2000):
             shared_window.show(frame)
-        assert time.monotonic() - began < 20  # the pipe is full and stays full
+        assert time.monotonic() - began < 20  # the pipe stays full
     finally:
         os.kill(process_of(shared_window), signal.SIGCONT)
 
@@ -135,7 +135,7 @@ def test_skipped_frames_keep_their_points_and_messages_up_to_a_limit() -> None:
 # ends
 
 
-def test_close_ends_the_process_and_leaves_nothing_open(capfd: pytest.CaptureFixture[str]) -> None:
+def test_close_ends_the_process_and_closes_all_file_descriptors(capfd: pytest.CaptureFixture[str]) -> None:
     threads, descriptors = threading.active_count(), None
     for _ in range(2):
         with Window(scene_of(MODEL)) as window:
@@ -151,8 +151,8 @@ def test_close_ends_the_process_and_leaves_nothing_open(capfd: pytest.CaptureFix
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
-def test_process_that_ends_while_it_is_sent_frames_is_an_error(number: signal.Signals) -> None:
-    """The sending thread notices it first."""
+def test_sending_frames_to_a_process_that_ends_raises_an_error(number: signal.Signals) -> None:
+    """The sending thread is the first to notice that the process has ended."""
     with Window(scene_of(MODEL)) as window:
         os.kill(process_of(window), signal.SIGSTOP)
         frame = frame_of(MODEL, DATA, samples=np.zeros((20_000, 3)))

@@ -16,7 +16,7 @@ def bench() -> Bench:
 
 
 def drag(bench: Bench, body: str, *, paused: bool) -> list[Perturb]:
-    """Imitate studio's report of a drag by half a metre; return the messages that are sent to the session."""
+    """Simulate a drag by half a metre in MuJoCo Studio; return the messages that are sent to the session."""
     perturb, data = bench.viewer.perturb, bench.viewer.data
     perturb.select = bench.model.body(body).id
     perturb.flexselect = perturb.skinselect = -1
@@ -42,7 +42,7 @@ def test_dragged_body_is_pushed_until_the_release(bench: Bench) -> None:
     assert not end.forces.any()
 
 
-def test_dragged_body_is_placed_while_paused_and_only_when_it_moves(bench: Bench) -> None:
+def test_dragged_body_is_placed_only_while_paused_and_only_when_it_moves(bench: Bench) -> None:
     (place,) = drag(bench, "ball", paused=True)
     np.testing.assert_allclose(place.qpos[0], 0.5)
     assert not place.forces.any()
@@ -60,7 +60,7 @@ def test_push_ends_when_its_browser_disconnects(bench: Bench, paused: bool) -> N
     """A browser that is closed during a drag never releases the button."""
     drag(bench, "ball", paused=paused)
     bench.sent.clear()
-    bench.panel.mouse.let_go()  # called by another thread; no frame is drawn after this
+    bench.panel.mouse.let_go()  # another thread makes this call, and no frame is drawn afterwards
     bench.panel.mouse.let_go()
     (end,) = bench.sent
     assert isinstance(end, Perturb) and not end.forces.any() and end.qpos is None

@@ -44,13 +44,13 @@ def test_panel_draws_every_mode_with_all_windows_open(mode: str, monkeypatch: py
         samples=np.array([[0.0, 0.0, 1.0, np.nan], [0.1, 1.0, 2.0, 3.0]]), messages=("world 3: terminated",),
     )  # fmt: skip
     assert bench.sent == [Opened("http://here")]
-    assert bench.draw() == bench.draw(frame) == bench.draw() == []  # draw before, with and after the first frame
+    assert bench.draw() == bench.draw(frame) == bench.draw() == []  # draw before, during and after the first frame
     small = Bench(bench.model, scene_of(bench.model, nworld=1, controllers=(), episodes=(), curves=()))
     small.panel.actions.windows |= set(WINDOWS)
     assert small.draw(frame_of(small.model, small.data, status_of(controller=None, world=0))) == []
 
 
-def test_state_of_the_frame_is_drawn_if_it_is_finite(bench: Bench) -> None:
+def test_panel_draws_only_finite_states(bench: Bench) -> None:
     bench.data.qpos[:3] = 1, 2, 3
     bench.show(status_of())
     bench.data.qpos[0] = np.nan
@@ -101,7 +101,7 @@ def test_keys_depend_on_the_mode_and_stay_within_limits(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("mode", ["passive", "controller", "playback"])
-def test_every_key_acts_in_every_mode(bench: Bench, mode: str) -> None:
+def test_every_key_is_accepted_in_every_mode(bench: Bench, mode: str) -> None:
     for name in KEYS:
         pressed(bench, name, mode=mode)
         bench.draw()
@@ -110,7 +110,7 @@ def test_every_key_acts_in_every_mode(bench: Bench, mode: str) -> None:
 # cameras and videos
 
 
-def test_the_first_camera_tracks_the_body_of_a_tracking_camera_and_takes_videos(bench: Bench) -> None:
+def test_default_camera_tracks_the_body_of_a_tracking_camera_also_in_videos(bench: Bench) -> None:
     ball = bench.model.body("ball").id
     (command,) = pressed(bench, "Ctrl+V")
     assert isinstance(command, SetVideo) and command.camera is not None
@@ -118,7 +118,7 @@ def test_the_first_camera_tracks_the_body_of_a_tracking_camera_and_takes_videos(
     assert pressed(bench, "Ctrl+V", video="video.mp4") == [SetVideo(None)]
 
 
-def test_fixed_camera_of_the_model_can_be_chosen(bench: Bench) -> None:
+def test_user_can_choose_a_fixed_camera_of_the_model(bench: Bench) -> None:
     bench.show(status_of())
     bench.panel.actions.cameras.choose(0)
     bench.draw()
@@ -126,10 +126,10 @@ def test_fixed_camera_of_the_model_can_be_chosen(bench: Bench) -> None:
     assert bench.viewer.camera_index == 0
 
 
-# models that differ between worlds
+# these models differ between worlds
 
 
-def test_a_world_with_other_sizes_gets_a_separate_model(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_world_with_other_geom_sizes_gets_a_separate_model(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lyceum_warp.viewer.window.panel.SWAP_TIME", 0.0)
     sizes = np.array(bench.model.geom_size)
     sizes[1, 0] = 0.3

@@ -1,4 +1,4 @@
-"""Test the proxy: what it forwards, and the attacks that it refuses."""
+"""Test that the proxy forwards valid requests and rejects attacks."""
 
 import contextlib
 import http.client
@@ -108,7 +108,8 @@ def get(
     proxy: Proxy, path: str = "/PATH/", *headers: str, host: str = "HOST", cookie: str = "lyceum-warp=VALUE",
     method: str = "GET", rest: bytes = b"",
 ) -> bytes:  # fmt: skip
-    """Return the response to a request; words in capitals stand for the proxy's port, path, cookie and token."""
+    """Return the response to a request; words in capitals are placeholders for the proxy's port, path, cookie and
+    token."""
     own, below = entered(proxy)
     words = {"HOST": "127.0.0.1:PORT", "PORT": str(proxy.port), "PATH": below.strip("/"), "TOKEN": token(proxy),
              "VALUE": own.partition("=")[2]}  # fmt: skip
@@ -128,7 +129,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 # the secret
 
 
-def test_the_token_becomes_a_cookie_and_leaves_the_address(proxy: Proxy, upstream: Upstream) -> None:
+def test_token_is_exchanged_for_a_cookie_and_removed_from_the_address(proxy: Proxy, upstream: Upstream) -> None:
     answer = get(proxy, "/?token=TOKEN", host="localhost:PORT", cookie="").decode()
     assert answer.startswith("HTTP/1.1 303 ") and len(token(proxy)) == 43  # 32 bytes
     target = re.search(r"\r\nLocation: (/[\w-]{43}/)\r\n", answer)
@@ -146,7 +147,7 @@ def test_the_token_becomes_a_cookie_and_leaves_the_address(proxy: Proxy, upstrea
 
 
 class Jar(http.cookiejar.CookieJar):
-    """A cookie jar that behaves like a browser's: it sends a host's cookies to all ports, below their path."""
+    """A cookie jar that behaves like a browser: it sends a host's cookies to all its ports, below the cookies' path."""
 
     def sent_to(self, address: str) -> str | None:
         asked = urllib.request.Request(address)
@@ -154,8 +155,8 @@ class Jar(http.cookiejar.CookieJar):
         return asked.get_header("Cookie")
 
 
-def test_another_port_of_the_host_is_not_sent_the_cookie(proxy: Proxy) -> None:
-    """Other users of the machine may listen there."""
+def test_browser_does_not_send_the_cookie_to_another_port(proxy: Proxy) -> None:
+    """Other users of the machine may listen on other ports."""
     jar = Jar()
     browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(jar))
     cookie, path = entered(proxy)
@@ -166,7 +167,7 @@ def test_another_port_of_the_host_is_not_sent_the_cookie(proxy: Proxy) -> None:
         assert jar.sent_to(f"http://127.0.0.1:{proxy.port + 1}{other}") is None
 
 
-# attacks: none of them may reach the private server
+# none of these attacks may reach the private server
 
 ORIGINS = ("http://evil.example", "null", "https://127.0.0.1", "http://127.0.0.1:1", "file://",
            "http://localhost:PORT", "http://127.0.0.1:PORT.evil.example", "http://127.0.0.1:PORT/", "")  # fmt: skip
@@ -212,7 +213,7 @@ ATTACKS: list[tuple[set[int], str, tuple[str, ...], dict[str, str]]] = [
 
 
 @pytest.mark.parametrize(("codes", "path", "headers", "options"), ATTACKS)
-def test_an_attack_is_refused(
+def test_proxy_rejects_an_attack(
     proxy: Proxy, upstream: Upstream, codes: set[int], path: str, headers: tuple[str, ...], options: dict[str, str]
 ) -> None:
     smuggled = b"0\r\n\r\nGET /drop HTTP/1.1\r\n\r\n" if headers and headers[0] in BODIES else b""
@@ -221,7 +222,7 @@ def test_an_attack_is_refused(
     assert not upstream.received
 
 
-# what studio's responses may contain
+# contents of Studio's responses that the proxy allows
 
 
 def test_other_sites_cannot_read_or_embed_the_page_and_studio_sets_no_cookies(proxy: Proxy) -> None:
@@ -234,7 +235,7 @@ def test_other_sites_cannot_read_or_embed_the_page_and_studio_sets_no_cookies(pr
     assert b"\r\nCache-Control: no-cache\r\n" in get(proxy, "/PATH/model")
 
 
-def test_a_page_of_this_host_embeds_the_viewer_by_its_token(proxy: Proxy, upstream: Upstream) -> None:
+def test_page_of_this_host_can_embed_the_viewer_with_its_token(proxy: Proxy, upstream: Upstream) -> None:
     frame = ("Sec-Fetch-Site: same-site", "Sec-Fetch-Mode: navigate", "Sec-Fetch-Dest: iframe")
     assert re.search(rb'<meta http-equiv="refresh" content="0; url=/[\w-]{43}/">', get(proxy, "/?token=TOKEN", *frame))
     assert status(get(proxy, "/?token=WRONG", *frame)) == status(get(proxy, "/PATH/", *frame, cookie="")) == 403
@@ -245,7 +246,7 @@ def test_a_page_of_this_host_embeds_the_viewer_by_its_token(proxy: Proxy, upstre
     b"nonsense\r\n\r\n", b"HTTP/1.1 200 OK\r\n",
     b"HTTP/1.1 200 OK\r\nContent-Type: text/html\r\nContent-Length: 26\r\n\r\n<title>robot</title>      ", None,
 ])  # fmt: skip
-def test_a_broken_or_missing_response_is_reported(answer: bytes | None) -> None:
+def test_invalid_or_missing_response_gives_status_502(answer: bytes | None) -> None:
     upstream = Upstream(answer)
     if answer is None:
         upstream.listener.shutdown(socket.SHUT_RDWR)
@@ -256,7 +257,7 @@ def test_a_broken_or_missing_response_is_reported(answer: bytes | None) -> None:
 # requests
 
 
-def test_a_link_on_another_page_leads_to_the_viewer_if_it_has_the_token(proxy: Proxy, upstream: Upstream) -> None:
+def test_link_with_the_token_on_another_page_opens_the_viewer(proxy: Proxy, upstream: Upstream) -> None:
     answer = get(proxy, "/?token=TOKEN", *LINK, cookie="").decode()
     assert answer.startswith("HTTP/1.1 200 ") and "Set-Cookie: " in answer and not upstream.received
     assert f'content="0; url={entered(proxy)[1]}/"' in answer
@@ -266,11 +267,11 @@ def test_a_link_on_another_page_leads_to_the_viewer_if_it_has_the_token(proxy: P
     "host", ["127.0.0.1", "127.0.0.1:9000", "localhost:9000", "Localhost:80", "[::1]:9000", "192.168.0.7:8080"]
 )
 def test_addresses_of_this_machine_are_accepted_at_any_port(proxy: Proxy, host: str) -> None:
-    """The port may be forwarded."""
+    """The port in a request may differ, because ports may be forwarded."""
     assert status(get(proxy, "/PATH/", f"Origin: http://{host.lower()}", host=host)) == 200
 
 
-def test_pages_are_forwarded_without_the_clients_headers(proxy: Proxy, upstream: Upstream) -> None:
+def test_requests_are_forwarded_without_the_headers_of_the_client(proxy: Proxy, upstream: Upstream) -> None:
     for path in ("/index.html", "/model?crc32=1&total_bytes", "/assets/AtkinsonHyperlegibleNext[wght].ttf"):
         upstream.received.clear()
         assert get(proxy, f"/PATH{path}", "X-Forwarded-For: 1").endswith(b"\r\n\r\nrobot")
@@ -279,7 +280,7 @@ def test_pages_are_forwarded_without_the_clients_headers(proxy: Proxy, upstream:
         assert b"Cookie" not in received and b"X-Forwarded-For" not in received
 
 
-def test_only_offered_files_are_sent_and_only_to_those_with_the_secret(proxy: Proxy, tmp_path: Path) -> None:
+def test_only_offered_files_are_sent_and_only_with_the_cookie(proxy: Proxy, tmp_path: Path) -> None:
     (tmp_path / "video.mp4").write_bytes(b"offered")
     (tmp_path / "secret.txt").write_bytes(b"not offered")
     proxy.offer(str(tmp_path / "video.mp4"))
@@ -291,7 +292,7 @@ def test_only_offered_files_are_sent_and_only_to_those_with_the_secret(proxy: Pr
         assert status(get(proxy, f"/PATH/saved/{name}")) == 404
 
 
-def test_an_endless_head_is_refused_without_being_buffered(proxy: Proxy) -> None:
+def test_endless_request_head_is_rejected_without_being_buffered(proxy: Proxy) -> None:
     with socket.create_connection(("127.0.0.1", proxy.port), timeout=10) as client:
         sent = 0
         with contextlib.suppress(OSError):
@@ -300,17 +301,17 @@ def test_an_endless_head_is_refused_without_being_buffered(proxy: Proxy) -> None
         assert sent < 64 * 2**20
 
 
-def test_a_second_request_on_a_connection_is_checked_again(proxy: Proxy, upstream: Upstream) -> None:
+def test_second_request_on_a_connection_is_also_checked(proxy: Proxy, upstream: Upstream) -> None:
     second = b"GET /model HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
     answer = get(proxy, "/PATH/", "Connection: keep-alive", rest=second)
     assert [int(code) for code in re.findall(rb"HTTP/1.1 (\d+)", answer)] == [200, 403]
     assert len(upstream.received) == 1
 
 
-# slow clients, and many
+# slow clients, and many clients
 
 
-def test_a_slow_head_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_request_head_closes_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "HEAD_SECONDS", 0.3)
     with (
         proxy_of(Upstream()) as proxy,
@@ -322,16 +323,16 @@ def test_a_slow_head_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
             time.sleep(0.02)
 
 
-def test_silent_connections_leave_room_for_others(proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silent_connections_do_not_block_other_connections(proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "UNCHECKED", 8)
     with contextlib.ExitStack() as stack:
         silent = [stack.enter_context(socket.create_connection(("127.0.0.1", proxy.port))) for _ in range(40)]
         assert status(get(proxy)) == 200
         silent[0].settimeout(5)
-        assert silent[0].recv(1) == b""  # the oldest ones were closed
+        assert silent[0].recv(1) == b""  # the oldest connections were closed
 
 
-def test_a_client_that_does_not_read_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_connection_of_a_client_that_does_not_read_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "WRITE_SECONDS", 0.3)
     size = 64 * 2**20
     upstream = Upstream(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n" % size + bytes(size))
@@ -353,7 +354,8 @@ def test_a_client_that_does_not_read_is_dropped(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.fixture
 def echo() -> Iterator[tuple[Proxy, list[ServerConnection], list[float]]]:
-    """Run a proxy before a WebSocket server of studio's library; yield it, open connections and times of silence."""
+    """Run a proxy in front of a WebSocket server of Studio's library; yield the proxy, open connections and times of
+    silence."""
     opened: list[ServerConnection] = []
     quiet: list[float] = []
 
@@ -383,7 +385,7 @@ def open_tab(proxy: Proxy, path: str = "/ui") -> ClientConnection:
                    additional_headers={"Cookie": cookie})  # fmt: skip
 
 
-def test_two_tabs_talk_at_once_and_one_may_close(echo: Echo) -> None:
+def test_two_tabs_communicate_at_the_same_time_and_one_may_close(echo: Echo) -> None:
     proxy, opened, _ = echo
     with open_tab(proxy) as one:
         with open_tab(proxy, "/state?sid=b") as two:
@@ -398,10 +400,10 @@ def test_two_tabs_talk_at_once_and_one_may_close(echo: Echo) -> None:
     wait_until(lambda: not opened)
 
 
-def test_the_page_gets_the_reason_of_a_closed_websocket(echo: Echo) -> None:
+def test_page_receives_the_reason_for_a_closed_websocket(echo: Echo) -> None:
     with open_tab(echo[0]) as tab:
         tab.send("close")
-        with pytest.raises(ConnectionClosed, match="4001.*control taken"):  # a code of studio's own
+        with pytest.raises(ConnectionClosed, match="4001.*control taken"):  # a close code that Studio defines
             tab.recv(timeout=10)
     with open_tab(echo[0]) as tab, pytest.raises(ConnectionClosed):
         tab.send(bytes(2**20 + 1))  # too large
@@ -409,11 +411,11 @@ def test_the_page_gets_the_reason_of_a_closed_websocket(echo: Echo) -> None:
     wait_until(lambda: not echo[1])
 
 
-def test_a_tab_that_disappears_is_noticed_by_the_private_server(echo: Echo) -> None:
+def test_private_server_notices_a_tab_that_disappears(echo: Echo) -> None:
     proxy, opened, _ = echo
     tab = open_tab(proxy)
     wait_until(lambda: len(opened) == 1)
-    tab.socket.shutdown(socket.SHUT_RDWR)  # as the system does for a killed browser
+    tab.socket.shutdown(socket.SHUT_RDWR)  # the system closes the connection of a killed browser in the same way
     wait_until(lambda: not opened)
 
 
@@ -422,7 +424,7 @@ def test_a_silent_controlling_browser_is_reported(monkeypatch: pytest.MonkeyPatc
     proxy, _, quiet = echo
     with open_tab(proxy) as tab:
         tab.send(b"input")
-        wait_until(lambda: len(quiet) == 1)  # hidden, or cut off
+        wait_until(lambda: len(quiet) == 1)  # the browser's tab may be hidden, or its connection lost
         tab.send(b"input")
     wait_until(lambda: len(quiet) == 2)  # closed
     time.sleep(1.0)
@@ -433,7 +435,7 @@ def test_a_silent_controlling_browser_is_reported(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
-def test_a_remote_viewer_prints_an_address_and_the_ssh_line(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_remote_viewer_prints_an_address_and_an_ssh_command(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for connection, shown in (("198.51.100.7 50000 203.0.113.9 22", "203.0.113.9"), ("", socket.gethostname())):
         monkeypatch.setenv("SSH_CONNECTION", connection)
         with Proxy(host=host) as proxy:
@@ -443,7 +445,7 @@ def test_a_remote_viewer_prints_an_address_and_the_ssh_line(host: str, monkeypat
             assert f"http://127.0.0.1:{proxy.port}/?token={token(proxy)}" in proxy.instructions[3]
 
 
-def test_a_port_is_found_or_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_free_port_is_found_and_busy_port_raises_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sockets_module, "PORTS", 1)
     with Proxy() as one, Proxy() as other:
         assert one.port != other.port
@@ -471,7 +473,7 @@ def test_close_ends_connections_and_frees_the_port(proxy: Proxy) -> None:
             assert again.port == proxy.port
 
 
-def test_the_ssh_line_forwards_the_port(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_printed_ssh_command_forwards_the_port(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("getpass.getuser", lambda: "ada")
     for connection, target in (
         (None, f"ada@{socket.gethostname()}"), ("198.51.100.7 50000 203.0.113.9 2222", "-p 2222 ada@203.0.113.9"),

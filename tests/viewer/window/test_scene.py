@@ -20,7 +20,7 @@ def ghost(x: float, opacity: float = 0.3) -> Ghost:
     return Ghost(pose(x), (0.2, 0.4, 0.6, opacity))
 
 
-def test_ghost_has_the_models_moving_geoms_in_its_colour() -> None:
+def test_ghost_has_the_moving_geoms_of_the_model_in_its_colour() -> None:
     geoms = ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(2.0)])
     assert [geom.type for geom in geoms] == [int(mujoco.mjtGeom.mjGEOM_SPHERE)]  # no static plane
     np.testing.assert_allclose(geoms[0].pos, [2, 0, 1])
@@ -33,26 +33,26 @@ def test_hidden_groups_have_no_ghosts() -> None:
     assert ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(2.0)], groups=groups) == []
 
 
-def test_a_ghost_omits_geoms_that_coincide_with_the_worlds() -> None:
+def test_ghost_omits_geoms_that_coincide_with_those_of_the_shown_world() -> None:
     geoms = ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(0.0), ghost(0.5)])
     np.testing.assert_allclose([geom.pos[0] for geom in geoms], [0.5])
 
 
 @pytest.mark.parametrize(("limit", "number"), [(1024, 10), (100, 10), (10, 10), (1024, 100), (3, 7), (1, 7)])
 @pytest.mark.parametrize("best", [None, 2])
-def test_traces_get_fewer_points_before_some_are_dropped(limit: int, number: int, best: int | None) -> None:
+def test_traces_are_thinned_before_some_are_omitted(limit: int, number: int, best: int | None) -> None:
     traces = np.random.default_rng(0).normal(size=(number, 33, 3))
     scene = ExtraGeoms(MODEL, limit)
     geoms = scene.draw(pose(0), traces=traces, best=best)
-    assert len(geoms) <= min(limit, 160)  # most geoms are left for the ghosts
+    assert len(geoms) <= min(limit, 160)  # most geoms remain for the ghosts
     assert (len(geoms) >= 4 * number) == (limit >= 100 and number == 10)  # a trace has at least 4 lines
     assert len(scene.draw(pose(0), [ghost(i) for i in range(20)], traces, best)) <= limit
 
 
-# the model of the world that is shown
+# the tests below check the model of the shown world
 
 
-def test_values_of_a_world_are_set_and_reset() -> None:
+def test_model_values_of_a_world_are_set_and_reset() -> None:
     values, gravity = ModelValues(MODEL), np.array([0.0, 0, -1])
     assert values.set({"gravity": gravity}) == (True, False)
     assert values.set({"gravity": gravity.copy()}) == (False, False)
@@ -65,11 +65,11 @@ def test_values_of_a_world_are_set_and_reset() -> None:
     ("name", "seen"),
     [("geom_size", True), ("geom_rgba", True), ("body_pos", True), ("geom_friction", False), ("dof_damping", False)],
 )
-def test_only_some_fields_change_the_picture(name: str, seen: bool) -> None:
+def test_only_visible_model_fields_change_the_picture(name: str, seen: bool) -> None:
     assert ModelValues(MODEL).set({name: np.array(getattr(MODEL, name)) + 0.1}) == (True, seen)
 
 
-def test_constants_follow_the_values() -> None:
+def test_derived_constants_are_updated_with_the_model_values() -> None:
     values = ModelValues(MODEL)
     values.set({"body_mass": np.array(MODEL.body_mass) * 2})
     assert values.model.body_subtreemass[0] == pytest.approx(2 * MODEL.body_subtreemass[0])

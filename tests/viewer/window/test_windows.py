@@ -15,7 +15,7 @@ def test_curves_keep_the_newest_points_in_order() -> None:
     np.testing.assert_array_equal(curves.rows, ramp(10_000, 30_000))
 
 
-def test_a_time_that_decreases_drops_later_points() -> None:
+def test_curve_drops_later_points_when_time_decreases() -> None:
     curves = Curves(1)
     curves.add(ramp(0, 10))
     curves.add(ramp(6, 7))
@@ -24,7 +24,7 @@ def test_a_time_that_decreases_drops_later_points() -> None:
     np.testing.assert_array_equal(curves.rows, ramp(0, 2))
 
 
-def test_thinned_curve_keeps_its_extremes_and_ends_of_episodes() -> None:
+def test_thinned_curve_keeps_its_extremes_and_the_ends_of_episodes() -> None:
     curves = Curves(1)
     rows = ramp(0, 1000)
     rows[:, 2] = 0

@@ -1,0 +1,102 @@
+"""Define the structs of a step's arrays, and collect the functions of a task that the kernels of a step call."""
+
+import dataclasses
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+import warp as wp
+
+
+@wp.struct
+class Counters:
+    """Counters and random streams of the worlds; every array is (nworld,) unless noted."""
+
+    step: wp.array[int]
+    """Steps since the reset."""
+    key: wp.array[wp.uint32]
+    """Key of the world's random streams."""
+    episode: wp.array[int]
+    """Index of the episode."""
+    rng: wp.array2d[wp.uint32]
+    """Stream that a task's function draws from, (observation groups * nworld, 1), with one row per drawing thread.
+    Every kernel resets it to its start."""
+
+
+@wp.struct
+class Outcome:
+    """The outcome of a step in each world; every array is (nworld,), metrics are (nworld, nmetrics)."""
+
+    reward: wp.array[float]
+    eval: wp.array[float]
+    terminated: wp.array[bool]
+    truncated: wp.array[bool]
+    success: wp.array[bool]
+    done: wp.array[bool]
+    done_reason: wp.array[int]
+    metrics: wp.array2d[float]
+    episode_metrics: wp.array2d[float]
+
+
+@wp.struct
+class Findings:
+    """Results of ``judge``, before it is known whether a world has a fault; every array is (nworld,)."""
+
+    reward: wp.array[float]
+    eval: wp.array[float]
+    terminated: wp.array[bool]
+    success: wp.array[bool]
+    fault: wp.array2d[int]
+    """Faults of each part, (parts, nworld)."""
+
+
+OUTCOMES = {
+    "reward": wp.float32,
+    "eval": wp.float32,
+    "terminated": wp.bool,
+    "truncated": wp.bool,
+    "success": wp.bool,
+    "done": wp.bool,
+    "done_reason": wp.int32,
+}
+"""Types of the fields of Outcome that are (nworld,)."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TaskCode:
+    """A task's structs and functions, and the functions that are generated from them.
+
+    Without ``control``, actions are scaled and shifted to controls. Without ``evaluate``, the evaluation is the reward.
+    Without ``advance``, the memory does not change.
+    """
+
+    module: str  # name of the task's Warp module
+    functions: Mapping[str, wp.Function]  # functions by name, including defaults
+    written: Collection[str]  # names of the functions that the task defines
+    World: Any
+    Params: Any
+    Batch: Any  # struct of the task's fields in all worlds
+    Observations: Any  # struct of the observation groups
+    Shared: Any  # struct of the memory that worlds share, or None
+    Sums: Any  # struct of the sums over worlds, or None
+    view: wp.Function  # (batch, world) -> World
+    views: Mapping[Any, wp.Function]  # ``Kernels.views``
+    copy_state: wp.Function  # copies the fields that steps change
+    observe_group: wp.Function
+    finite_group: wp.Function
+    copy_observations: wp.Function
+    finite_memory: wp.Function
+    valid_model: wp.Function  # whether the model fields that the task writes are valid
+    terms: Mapping[
+        str, wp.Function
+    ]  # ``reward``, ``score`` and ``terminated`` of a task with terms; see ``binding.task_terms``
+    has_state: bool  # whether ``copy_state`` is needed
+    has_memory: bool  # whether ``finite_memory`` is needed
+    checks_model: bool  # whether ``valid_model`` is needed
+
+    def kernel(self, needed: bool = True) -> Callable[[Any], Any]:
+        """Decorator: make a kernel in the task's module, or None if it is not needed."""
+        return wp.kernel(module=self.module, enable_backward=False) if needed else lambda body: None
+
+    def kernel_for(self, function: str) -> Callable[[Any], Any]:
+        """Decorator: make a kernel if the task has a function, else None."""
+        return self.kernel(function in self.written)
