@@ -1,4 +1,4 @@
-"""Make and check the environment behind an adapter, its seeds and its pictures."""
+"""Make the environment, the seeds and the renderer that an adapter uses."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -12,19 +12,19 @@ from lyceum_warp.viz.cameras import CameraChoice
 from lyceum_warp.viz.pictures import WorldPictures
 
 _SEEDS = 2**31
-"""Upper bound (exclusive) of an environment's seeds."""
+"""Seeds of an environment are smaller than this number."""
 
 _OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode (in adapters that have it)"}
-"""Options that an adapter sets itself, each with the argument that replaces it."""
+"""Options of ``lw.make`` that an adapter sets, and the adapter's arguments that replace them."""
 
 
 def environment_of(
     task: str | type[Task] | Env, num_envs: int | None, words: Mapping[str, Any], *, autoreset: bool
 ) -> Env:
-    """Make the environment behind an adapter, or check a given one.
+    """Make an adapter's environment from a task, or check the given environment.
 
     Args:
-        task: A task, as in ``lw.make``, or an environment.
+        task: A task, as in ``lw.make``, or an ``Env``.
         num_envs: Number of worlds; by default one, or the number in the given environment.
         words: Options and parameters, for ``lw.make``.
         autoreset: Whether the environment resets worlds within a step.
@@ -34,11 +34,11 @@ def environment_of(
     """
     if not isinstance(task, Env):
         for word in _OTHER_WORDS.keys() & words.keys():
-            raise ValueError(f"{word}= does not belong to an adapter: {_OTHER_WORDS[word]} decides")
+            raise ValueError(f"{word}= is not an argument of an adapter: use {_OTHER_WORDS[word]}")
         return make(task, nworld=1 if num_envs is None else whole_number("num_envs", num_envs, low=1),
                     autoreset=autoreset, **words)  # fmt: skip
     if words:
-        raise ValueError(f"an environment has its options already: give {', '.join(words)} to lw.make")
+        raise ValueError(f"a given environment keeps its options: pass {', '.join(words)} to lw.make")
     if num_envs not in (None, task.nworld):
         raise ValueError(f"the environment has {task.nworld} worlds, not num_envs={num_envs}: omit num_envs")
     if task.autoreset is not autoreset:
@@ -49,7 +49,7 @@ def environment_of(
 def pictures_of(
     env: Env, render_mode: str | None, camera: CameraChoice, size: tuple[int, int]
 ) -> tuple[WorldPictures, dict[str, Any]]:
-    """The renderer of an environment's worlds, and the entries of a library's ``metadata`` that describe it.
+    """Make an environment's renderer, and the ``metadata`` that describes it to Gymnasium and Stable-Baselines3.
 
     Raises:
         ValueError: There is no such render mode or camera, or the size is odd.
@@ -61,7 +61,7 @@ def pictures_of(
 
 
 class ResetSeeds:
-    """Chooses the seed of each reset. If the first reset has no seed, one is drawn at random, as libraries expect.
+    """Chooses the seed of each reset. The first reset draws a random seed if it gets none, as libraries expect.
 
     Args:
         seeded: Whether the user has seeded the environment.
@@ -71,11 +71,11 @@ class ResetSeeds:
         self._seeded = seeded
 
     def __call__(self, given: Any, drawn: Callable[[], Any]) -> int | None:
-        """The seed of this reset; None continues the random streams.
+        """Return the seed of a reset, or None to continue the random streams.
 
         Args:
-            given: The seed passed to reset, of any size, or None.
-            drawn: Returns a random seed, for worlds that were never seeded.
+            given: The seed passed to ``reset``, or None.
+            drawn: A function that returns a random seed; called if the worlds were never seeded.
         """
         if given is None and self._seeded:
             return None
@@ -84,7 +84,7 @@ class ResetSeeds:
 
 
 def per_world(value: Any, nworld: int) -> list[Any]:
-    """A list with one value per world: the tensor's rows if there is one per world, else the value repeated."""
+    """Return a list with one value per world: the rows of a tensor with ``nworld`` rows, else copies of the value."""
     if isinstance(value, torch.Tensor) and value.ndim and len(value) == nworld:
         return list(value)
     return [value] * nworld

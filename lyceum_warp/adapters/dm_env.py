@@ -20,12 +20,12 @@ from dm_env import specs  # noqa: E402
 class DmEnvironment(dm_env.Environment):  # type: ignore[misc]
     """One world as a ``dm_env.Environment``, for code that expects the interface of dm_control's suite.
 
-    An observation is a dict with the parts of the observation group ``policy``, float32; a part of one number has the
-    shape (1,). The step after the last of an episode starts the next one, and ignores its action. The discount is 0
-    after a termination, and 1 if the time limit or a fault ends the episode.
+    An observation is a dict with the parts of the observation group ``policy``, float32; a part with a single number
+    has the shape (1,). A step after the end of an episode ignores its action and starts a new episode. The discount is
+    0 after a termination, and 1 if the time limit or a fault ends the episode.
 
     Args:
-        task: A task, as in ``lw.make``, or an environment of one world, made with ``autoreset=False``.
+        task: A task, as in ``lw.make``, or an environment with one world, made with ``autoreset=False``.
         flat_observation: Whether an observation is a dict with one array, "observations".
         **words: Options and parameters for ``lw.make``; ``seed=0`` gives the same episodes in every run.
 

@@ -20,9 +20,9 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
     ``episode_metrics``. ``GymnasiumVectorEnv`` steps many worlds much faster.
 
     Args:
-        task: A task, as in ``lw.make``, or an environment of one world, made with ``autoreset=False``.
-        dict_obs: Whether observations are dicts of all observation groups; otherwise they are the group ``policy``. The
-            default is True if the task has several groups.
+        task: A task, as in ``lw.make``, or an environment with one world, made with ``autoreset=False``.
+        dict_obs: Whether observations are dicts of all observation groups; otherwise they are the group ``policy``. By
+            default True if the task has several groups.
         render_mode: "rgb_array" for pictures, or None.
         camera: The camera for pictures, as in ``lyceum_warp.viz.video.write_video``.
         render_size: Width and height of pictures in pixels, even numbers.
@@ -61,13 +61,13 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
 
         Args:
             seed: Seed of the random stream; None continues it.
-            options: None or empty.
+            options: Must be None or empty.
 
         Raises:
-            ValueError: The seed is not a whole number, or there is an option.
+            ValueError: The seed is not a whole number, or ``options`` is not empty.
         """
         if options:
-            raise ValueError(f"reset has no option {next(iter(options))!r}: omit options")
+            raise ValueError(f"reset has no option {next(iter(options))!r}: call it without options")
         own_seed = self._seeds(seed, lambda: self.np_random_seed)
         super().reset(seed=seed)
         self.env.rand_reset(own_seed)
@@ -105,7 +105,7 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         self._pictures.close()
 
     def _rows(self, *buffers: torch.Tensor) -> list[Any]:
-        """The row of the single world in each buffer."""
+        """The first row of each buffer, which belongs to the single world."""
         return [array[0] for array in self._host.of(*buffers)]
 
 

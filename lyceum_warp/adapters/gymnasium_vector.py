@@ -20,36 +20,36 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     """Many worlds as a ``gymnasium.vector.VectorEnv``.
 
     ``infos`` holds ``eval``, ``done_reason`` and, if the task has them, ``success``, ``metrics`` and
-    ``episode_metrics``: arrays with one value per world.
+    ``episode_metrics``, as arrays with one value per world.
 
     ``autoreset_mode`` determines when a world is reset after its episode ends:
 
-    - SAME_STEP: within the same step. The world returns the first observation of its next episode;
+    - SAME_STEP resets it within the same step. The world returns the first observation of its next episode;
       ``infos["final_obs"]`` and ``infos["final_info"]`` hold the last observations and infos of ended episodes, and the
       masks ``_final_obs`` and ``_final_info`` select their worlds. With NumPy these entries exist only if an episode
       ended, and ``final_obs`` is an object array with None for the other worlds, as Gymnasium's wrappers expect. With
       ``torch=True`` the entries always exist, as tensors over all worlds: a step does not wait to learn whether an
       episode ended.
-    - DISABLED: only by ``reset(options={"reset_mask": mask})``. Until then the world keeps stepping, and its
-      termination or truncation stays set. A world with a fault is reset at once, but returns its last valid
+    - DISABLED leaves resets to ``reset(options={"reset_mask": mask})``. An ended world keeps stepping until its reset,
+      and its termination or truncation stays set. A world with a fault is reset at once, but returns its last valid
       observation.
-    - NEXT_STEP: in the next step, which ignores the world's action. Every step then has a second reset phase. Some
-      wrappers, such as ``NormalizeObservation``, require NEXT_STEP.
+    - NEXT_STEP resets it in the next step, which ignores the world's action. With NEXT_STEP, every step has a second
+      reset phase. Some wrappers, such as ``NormalizeObservation``, require NEXT_STEP.
 
-    As in Gymnasium's own environments, a first reset without a seed draws one at random, unless ``seed=`` is given
-    here. With a given seed, the worlds differ from each other, but are the same in every run.
+    As in Gymnasium's own environments, a first reset without a seed draws one at random, unless the constructor gets
+    ``seed=``. A seed determines the random numbers of all worlds, which differ between worlds.
 
     Args:
         task: A task, as in ``lw.make``, or an environment.
         num_envs: Number of worlds.
         autoreset_mode: A ``gymnasium.vector.AutoresetMode`` or its value; by default SAME_STEP, or DISABLED for an
             environment with ``autoreset=False``.
-        torch: Whether actions and results are tensors on the environment's device. A step then never waits for the
-            device.
-        copy: Whether results are copied. Otherwise most tensors, and most arrays on the CPU, are live buffers that the
+        torch: Whether actions and results are tensors on the environment's device instead of NumPy arrays. With
+            tensors, a step never waits for the device.
+        copy: Whether to copy results. Without copies, most tensors and most arrays on the CPU are live buffers that the
             next step overwrites.
-        dict_obs: Whether observations are dicts of all observation groups; otherwise they are the group ``policy``. The
-            default is True if the task has several groups.
+        dict_obs: Whether observations are dicts of all observation groups; otherwise they are the group ``policy``. By
+            default True if the task has several groups.
         render_mode: "rgb_array" for pictures, or None.
         camera: The camera for pictures, as in ``lyceum_warp.viz.video.write_video``.
         render_size: Width and height of pictures in pixels, even numbers.
@@ -153,7 +153,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         else:
             self._host.set_action(actions)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
-            env.action.masked_fill_(self._ended[:, None], 0.0)  # an ignored action must not be a fault
+            env.action.masked_fill_(self._ended[:, None], 0.0)  # NaN in an ignored action must not be a fault
         env.step()
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             env.rand_reset(mask=self._ended)
@@ -192,13 +192,13 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             self._pictures.close()
 
     def _given(self, *buffers: torch.Tensor) -> list[Any]:
-        """Copy or convert buffers for the caller."""
+        """Convert buffers to the arrays or tensors that the caller gets."""
         if self._host is not None:
             return list(self._host.of(*buffers))
         return [buffer.clone() for buffer in buffers] if self._copy else list(buffers)
 
     def _add_final(self, infos: dict[str, Any], ended: Any) -> None:
-        """Add the last observations and infos of episodes that ended in this step."""
+        """Add the final observations and infos of the episodes that ended in this step."""
         final_info = dict(infos)
         if self._host is None:
             final_obs = self._observations.formed(self._given(*self._observations.final))
@@ -209,7 +209,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         infos |= {"final_obs": final_obs, "_final_obs": ended, "final_info": final_info, "_final_info": ended}
 
     def _rows_of_ended(self, ended: np.ndarray) -> np.ndarray:
-        """The last observations of ended episodes as an object array; None for the other worlds."""
+        """Return an object array with the final observation of each ended world, and None for each other world."""
         (worlds,) = ended.nonzero()
         index = torch.from_numpy(worlds).to(self.device)
         values = self._given(*(final[index] for final in self._observations.final))
@@ -219,7 +219,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return rows
 
     def _mask(self, options: dict[str, Any] | None) -> torch.Tensor | None:
-        """The mask of a partial reset, on the device; None for all worlds."""
+        """Return the mask of a partial reset as a tensor, or None to reset all worlds."""
         if unknown := [name for name in options or {} if name != "reset_mask"]:
             raise ValueError(f'reset has no option {unknown[0]!r}: it takes options={{"reset_mask": mask}}')
         mask = (options or {}).get("reset_mask")
@@ -229,12 +229,12 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             mask = torch.from_numpy(mask).to(self.device)
         check_tensor(mask, "the reset_mask", self.env.done)
         if not self._reset_once:
-            raise gymnasium.error.ResetNeeded("no reset came before this reset_mask: call reset() without it first")
+            raise gymnasium.error.ResetNeeded("the first reset cannot have a reset_mask: call reset() first")
         return mask
 
 
 def _tensor(actions: Any, like: torch.Tensor) -> torch.Tensor:
     if not isinstance(actions, torch.Tensor):
-        raise ValueError(f"actions must be {described(like)}, not {described(actions)}: torch=True takes tensors")
+        raise ValueError(f"actions must be {described(like)}, not {described(actions)}, because of torch=True")
     check_tensor(actions, "actions", like)
     return actions

@@ -8,7 +8,7 @@ from lyceum_warp.algos.value import value_group
 from lyceum_warp.env import Env
 
 _ACTIVATIONS = {"leaky_relu": "lrelu", "silu": "swish"}
-"""Activations whose names differ: the name here and in rsl_rl."""
+"""rsl_rl's names of activations, if they differ from torch's."""
 
 _PPO = {
     "epochs": "num_learning_epochs", "minibatches": "num_mini_batches", "clip": "clip_param", "gamma": "gamma",
@@ -16,7 +16,7 @@ _PPO = {
     "max_grad_norm": "max_grad_norm", "clip_value_loss": "use_clipped_value_loss", "schedule": "schedule",
     "desired_kl": "desired_kl", "whiten_minibatches": "normalize_advantage_per_mini_batch",
 }  # fmt: skip
-"""Names of hyperparameters here and in rsl_rl."""
+"""rsl_rl's name of each hyperparameter of PPOConfig."""
 
 
 def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
@@ -47,7 +47,7 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
     return {
         "num_steps_per_env": config.num_steps,
         "save_interval": 50,
-        "check_for_nan": False,  # this check waits for the device, and non-finite values are faults
+        "check_for_nan": False,  # the check waits for the device, and the environment already ends episodes at NaN
         "obs_groups": {"actor": ["policy"], "critic": [value_group(env, config.value_group)]},
         "actor": network | _layers(config.hidden, config.activation) | {"distribution_cfg": distribution},
         "critic": network | _layers(config.value_hidden, config.value_activation),

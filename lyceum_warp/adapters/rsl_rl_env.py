@@ -17,15 +17,14 @@ from rsl_rl.env import VecEnv  # noqa: E402 (after the check)
 from tensordict import TensorDict  # noqa: E402
 
 RECENT = 100
-"""Logged means cover about this number of recent episodes."""
+"""The approximate number of recent episodes over which logged metrics are averaged."""
 
 
 class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     """An environment for rsl_rl's runners: ``OnPolicyRunner(RslRlVecEnv("hopper", 4096, device="cuda"), config)``.
 
     ``step`` never waits for the device. ``step`` returns copies of the observations, because rsl_rl stores observations
-    only after the next step. All other results are buffers that the next step overwrites; rsl_rl copies them before
-    that.
+    only after the next step. All other results are buffers, which rsl_rl copies before the next step overwrites them.
 
     Args:
         task: A task, as in ``lw.make``, or an environment with automatic resets.
@@ -40,9 +39,9 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     num_envs: int
     """Number of worlds."""
     num_actions: int
-    """Length of an action."""
+    """The number of elements of an action."""
     max_episode_length: int
-    """Steps after which an episode is truncated; 2147483647 without a horizon."""
+    """Steps after which an episode is truncated; 2147483647 if the task has no horizon."""
     device: torch.device
     """Device of all tensors."""
     cfg: dict[str, Any]
@@ -62,7 +61,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             for groups in (env.obs_groups, env.final_obs_groups)
         )
         self._metrics = torch.zeros(len(env.metrics), device=self.device)
-        self._episodes = torch.zeros((), device=self.device)  # episodes in the means
+        self._episodes = torch.zeros((), device=self.device)  # number of episodes that the means cover
 
     @property
     def unwrapped(self) -> Env:
@@ -73,7 +72,8 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     def episode_length_buf(self) -> torch.Tensor:
         """Steps since the reset, (nworld,) int32, a live view. Assign to it to change the worlds' step counters.
 
-        This also moves the time limits: the next step truncates a world at step ``max_episode_length - 1``.
+        An assignment also moves the time limits: a world at step ``max_episode_length - 1`` is truncated by the next
+        step.
         """
         return self.env.episode_step
 
@@ -98,7 +98,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         env.set_state(state)
 
     def get_observations(self) -> TensorDict:
-        """The current observations, a dict of groups, each (nworld, size of the group)."""
+        """Return a copy of the current observations: a dict of groups, each (nworld, group size)."""
         return self._obs.clone()
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
@@ -133,7 +133,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         return self._obs.clone(), env.reward, env.done, extras
 
     def _log(self) -> dict[str, torch.Tensor]:
-        """Means of the metrics over recent episodes, computed on the device.
+        """Average the metrics over recent episodes, on the device.
 
         rsl_rl averages the log over the steps of an iteration. If each log held only the last step, a step with one
         finished episode would weigh as much as a step with a thousand.

@@ -32,8 +32,8 @@ class StableBaselines3VecEnv(VecEnv):
     By default observations are only the group ``policy``, because Stable-Baselines3 feeds all groups to the policy.
 
     Args:
-        task: A task, as in ``lw.make``, or an environment.
-        num_envs: Number of worlds.
+        task: A task, as in ``lw.make``, or an ``Env``.
+        num_envs: Number of worlds; by default one, or the number in the given environment.
         dict_obs: Whether observations are dicts of all observation groups.
         render_mode: "rgb_array" for pictures, or None.
         camera: The camera for pictures, as in ``lyceum_warp.viz.video.write_video``.
@@ -56,7 +56,7 @@ class StableBaselines3VecEnv(VecEnv):
         render_size: tuple[int, int] = (480, 480),
         **words: Any,
     ) -> None:
-        self.render_mode = render_mode  # the base class reads it
+        self.render_mode = render_mode  # the constructor of VecEnv reads render_mode
         self.env = env = environment_of(task, num_envs, words, autoreset=True)
         self._pictures, metadata = pictures_of(env, render_mode, camera, render_size)
         self._observations = Observations(env, dict_obs=dict_obs)
@@ -73,10 +73,10 @@ class StableBaselines3VecEnv(VecEnv):
         """Start new random episodes in all worlds, and return their first observations.
 
         Raises:
-            ValueError: ``set_options`` set an option, but ``reset`` has none.
+            ValueError: Options were set by ``set_options``; ``reset`` supports no options.
         """
         if options := next(filter(None, self._options), None):
-            raise ValueError(f"reset has no option {next(iter(options))!r}: omit set_options")
+            raise ValueError(f"reset has no option {next(iter(options))!r}: do not call set_options")
         seed = self._own_seeds(self._seeds[0], lambda: int(np.random.randint(2**31 - 1)))
         self.env.rand_reset(seed)
         self._reset_seeds()
@@ -116,7 +116,7 @@ class StableBaselines3VecEnv(VecEnv):
         self._pictures.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Render a picture of each world, (height, width, 3) uint8; None per world without a ``render_mode``.
+        """Render a picture of each world, (height, width, 3) uint8; a list of None without a ``render_mode``.
 
         Raises:
             NoVideoError: This machine cannot render.
@@ -139,13 +139,13 @@ class StableBaselines3VecEnv(VecEnv):
         """Set a parameter of the task in all worlds, or an attribute of this adapter.
 
         Raises:
-            ValueError: There is no such parameter or attribute, or ``indices`` does not include all worlds.
+            ValueError: There is no such parameter or attribute, or ``indices`` selects only some worlds.
         """
         if len(set(self._get_indices(indices))) != self.num_envs:
-            raise ValueError(f"{attr_name!r} belongs to all worlds together: omit indices")
+            raise ValueError(f"{attr_name!r} is shared by all worlds: call set_attr without indices")
         if attr_name not in self.env.task.parameters.values and hasattr(self, attr_name):
             setattr(self, attr_name, value)
-        else:  # the error of set_params suggests the closest names
+        else:  # for an unknown name, the error of set_params suggests the closest ones
             self.env.set_params(**{attr_name: value})
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
@@ -153,7 +153,7 @@ class StableBaselines3VecEnv(VecEnv):
         return self._chosen(getattr(self.env, method_name)(*method_args, **method_kwargs), indices)
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """Whether each world is wrapped. True for Monitor, whose statistics this adapter provides."""
+        """Return True for Monitor, whose statistics this adapter provides, and False for any other wrapper."""
         return self._chosen(wrapper_class is Monitor, indices)
 
     def _chosen(self, value: Any, indices: Any) -> list[Any]:
@@ -161,7 +161,7 @@ class StableBaselines3VecEnv(VecEnv):
         return [rows[i] for i in self._get_indices(indices)]
 
     def _add_ends(self, infos: list[dict[str, Any]], worlds: np.ndarray) -> None:
-        """Fill in the infos of ended episodes, and reset their worlds' sums."""
+        """Write the info dicts of ended episodes, and set the sums of their worlds to 0."""
         env, count = self.env, self._observations.count
         index = torch.from_numpy(worlds).to(env.obs.device)
         buffers = [*self._observations.final, env.terminated, *self._infos.tensors]
@@ -181,7 +181,7 @@ class StableBaselines3VecEnv(VecEnv):
 
 
 def _of_world(infos: dict[str, Any], i: int) -> dict[str, Any]:
-    """The infos of one world, under Stable-Baselines3's names."""
+    """Convert one world's infos to Stable-Baselines3's names."""
     return {
         "is_success" if name == "success" else name: _of_world(value, i) if isinstance(value, dict) else value[i].item()
         for name, value in infos.items()

@@ -13,11 +13,11 @@ from lyceum_warp.support.validate import described
 
 
 class Observations:
-    """The observations that an adapter returns: the group ``policy``, or a dict of all groups.
+    """Returns an environment's observations in an adapter's format: the group ``policy``, or a dict of all groups.
 
     Args:
         env: The environment.
-        dict_obs: Whether to return all groups. The default is True if there are several.
+        dict_obs: Whether to return a dict of all groups. By default True if the task has several groups.
     """
 
     def __init__(self, env: Env, *, dict_obs: bool | None) -> None:
@@ -34,13 +34,14 @@ class Observations:
         env = self._env
         if env.autoreset:
             return [env.obs_groups[group] for group in self._groups]
-        # a world with a fault is always reset, so its buffer already holds the next episode's observation
+        # worlds with a fault are reset in any case, so their rows already hold the first observation of the next
+        # episode
         done = env.done[:, None]
         return [torch.where(done, env.final_obs_groups[group], env.obs_groups[group]) for group in self._groups]
 
     @property
     def final(self) -> list[torch.Tensor]:
-        """The observations of each group after the last step, before any reset."""
+        """The final observations by group: their values after the last step, before any reset."""
         return [self._env.final_obs_groups[group] for group in self._groups]
 
     @property
@@ -62,14 +63,15 @@ class HostArrays:
 
     Args:
         env: The environment.
-        copy: Whether results are copied. Otherwise, on the CPU, results are the environment's live buffers, which the
+        copy: Whether to copy results. Without copies, results on the CPU are the environment's live buffers, which the
             next step overwrites.
-        one_world: Whether actions have no axis for worlds, because there is only one.
+        one_world: Whether an action has the shape (nact,), because the environment has a single world.
     """
 
     def __init__(self, env: Env, *, copy: bool = True, one_world: bool = False) -> None:
         self._env, self._copy = env, copy
-        # on the CPU the array shares the buffer's memory; for a GPU, actions are staged in pinned memory
+        # on the CPU the array shares the action buffer's memory; on a GPU, pinned memory holds the actions before the
+        # copy
         pinned = torch.empty(env.action.shape, pin_memory=True) if env.action.is_cuda else None
         self._pinned = pinned
         actions = (env.action if pinned is None else pinned).numpy()
@@ -79,7 +81,7 @@ class HostArrays:
         """Copy actions into the environment, (nworld, nact) or (nact,), float32 or float64.
 
         Raises:
-            ValueError: They are not a NumPy array, or have the wrong shape or type.
+            ValueError: The actions are not a NumPy array, or have the wrong shape or type.
         """
         if not isinstance(action, np.ndarray) or action.shape != self._action.shape or action.dtype.kind != "f":
             numpy = isinstance(action, np.ndarray)
@@ -90,7 +92,7 @@ class HostArrays:
             self._env.action.copy_(self._pinned, non_blocking=True)
 
     def of(self, *tensors: torch.Tensor) -> list[np.ndarray]:
-        """Copy tensors to NumPy arrays, with at most one wait for the device."""
+        """Convert tensors to NumPy arrays, waiting for the device at most once."""
         if self._pinned is None:
             return [tensor.numpy().copy() if self._copy else tensor.numpy() for tensor in tensors]
         copies = [tensor.to("cpu", non_blocking=True) for tensor in tensors]
@@ -99,10 +101,11 @@ class HostArrays:
 
 
 class Infos:
-    """The infos of a step, by name.
+    """Collects the infos of a step in a dict.
 
     ``eval`` is the evaluation metric after the step, and ``done_reason`` has the bits of ``lw.Done``. A task with a
-    goal adds ``success``; a task with metrics adds ``metrics`` and ``episode_metrics``, their sums over the episode.
+    goal adds ``success``; a task with metrics adds ``metrics`` and ``episode_metrics``, the sums of the metrics over
+    the episode.
 
     Args:
         env: The environment.
@@ -123,7 +126,7 @@ class Infos:
         return [*self._plain.values(), *self._metrics.values()]
 
     def named(self, values: list[Any]) -> dict[str, Any]:
-        """Convert values, tensors or arrays in the order of ``tensors``, to a dict."""
+        """Return a dict of the given values, which have the order of ``tensors``."""
         infos = dict(zip(self._plain, values, strict=False))
         for name, table in zip(self._metrics, values[len(self._plain) :], strict=True):
             infos[name] = dict(zip(self._names, table.T, strict=True))
@@ -131,12 +134,12 @@ class Infos:
 
 
 class StepResults:
-    """The results of a step in Gymnasium's format.
+    """Returns the results of a step in Gymnasium's format.
 
     Args:
         env: The environment.
-        observations: The observations to return.
-        given: Converts all buffers for the caller in one call.
+        observations: The format of the observations.
+        given: A function that converts all buffers to the caller's arrays or tensors in one call.
     """
 
     def __init__(self, env: Env, observations: Observations, given: Callable[..., list[Any]]) -> None:

@@ -31,23 +31,23 @@ _SPELLED = {
 }  # fmt: skip
 
 _MOST_SUCCESS_STEPS = 2**24
-"""Steps are counted in float32, which holds every whole number up to this one."""
+"""The largest number of success steps: the count is a float32, which is exact up to 2**24."""
 
 _PARTS = 'the parts of its observation, as obs = {"position": 5}'
 
 
 def task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSpec:
-    """Load a task's own model, or another one, as an MjSpec, and apply the task's ``edit_model``."""
+    """Load a task's model, or the model given instead, as an MjSpec, and apply the task's ``edit_model``."""
     return _edited(task, _read_spec(task, model))
 
 
 def _read_spec(task: type[Task], model: ModelSource | None) -> mujoco.MjSpec:
-    """Load the model that the task's ``edit_model`` will change."""
+    """Load a task's model before its ``edit_model``."""
     if model is not None:
         return models.load_spec(model)
     if not hasattr(task, "model"):
         name = task_name(task)
-        raise ValueError(f'the task {name!r} has no model: add a model, as model = "robot.xml" to its class')
+        raise ValueError(f'the task {name!r} has no model: add one to its class, such as model = "robot.xml"')
     return models.load_spec(task.model() if callable(task.model) else task.model, task)
 
 
@@ -83,7 +83,7 @@ def check_field_name(name: str) -> None:
 
 
 def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict[str, int]]:
-    """The parts of each group of a task's observations and their sizes, for given values of its parameters.
+    """Lay out the parts of each observation group, for given values of the task's parameters.
 
     Raises:
         ValueError: The task's ``obs`` is neither a dict of sizes nor a dict of groups of sizes, or a struct has no
@@ -113,7 +113,7 @@ def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict
 
 
 def obs_slices(source: TaskSource, params: Mapping[str, Any]) -> dict[str, parts.Layout]:
-    """The layouts of the observation groups that a task writes into structs; empty if the task has ``obs``.
+    """Lay out the observation groups that a task writes into structs; empty if the task has ``obs``.
 
     Raises:
         ValueError: ``observe`` takes no struct, or a struct has no parts, or has fields that are not parts.
@@ -148,7 +148,7 @@ class BoundTask:
 
     Args:
         task: The task's class.
-        nworld: Number of worlds, for parameters that differ between them.
+        nworld: Number of worlds, which is the length of parameters that differ between worlds.
         model: A model to use instead of the task's own.
         fields: Fields that the engine keeps in addition to those in ``World``.
         dynamics: Model fields that may differ between worlds in addition to those that the task writes.
@@ -185,14 +185,14 @@ class BoundTask:
         for name in named:
             check_field_name(name)
         self.types = {name: v.type for name, v in self.source.world.vars.items() if name not in own_names}
-        """The types, in a batch of worlds, of the fields and of the rows of memory."""
+        """The Warp types of one world's fields and rows of memory, by name."""
         self.types |= {name: Row[float] for name in MEMORIES if any(part.kind == name for part in memory.values())}
         self.writes = self._checked_writes()
-        """For each function by name, the fields of World and the rows of memory that it writes."""
+        """The fields of World and the rows of memory that each function writes, by the function's name."""
         own = [name for name in named if is_data_field(name)]
         of_model = [name for name in named if name not in own]
         self.spec = _read_spec(task, model)
-        """The model before ``edit_model``. Replicas use this model, because the file may have changed."""
+        """The model before ``edit_model``. Replicas copy this spec, because the file may have changed."""
         self.model = models.compile_model(_edited(task, self.spec), own, physics, varied={*of_model, *dynamics})
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.frame_skip = whole_number(f"frame_skip of the task {self.name!r}", skip, low=1)
@@ -202,7 +202,7 @@ class BoundTask:
             describe(self.model, name, lagged=name in task.lagged, cleared=name in task.cleared, written=name in inputs)
             for name in dict.fromkeys([*own, "time", "ctrl"])
         ]
-        """The fields that the engine keeps: those in World, the requested ones, time and controls."""
+        """The fields that the engine keeps: the fields of World and of ``fields=``, time and controls."""
         self._sort_model_fields(of_model, dynamics)
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)
         """The integration state at which a reset starts, (integration_size,) float64; None for the model's default."""
@@ -213,7 +213,7 @@ class BoundTask:
         self.actions = self._checked_actions()
         """Sizes of an action's parts, by name; None if actions are controls."""
         self.memory = self._memory_layouts()
-        """Layouts of the rows ``memory`` and ``lasting_memory``."""
+        """The layouts of the rows ``memory`` and ``lasting_memory``."""
         self.obs_layouts = obs_layouts(self.source, self.params)
         """The parts of each group of observations and their sizes."""
         self.observers = self.source.group_functions(self.obs_layouts)
@@ -221,18 +221,18 @@ class BoundTask:
         observers = {observer_name(group): function for group, function in self.observers.items()}
         check_writes(self.name, observers, dict.fromkeys(observers, self._rights(FUNCTIONS["observe"])))
         self.shared = self._shared_layouts()
-        """Layouts of Shared and Sums; empty if worlds share no memory."""
+        """The layouts of the structs Shared and Sums; empty if worlds share no memory."""
         structs = obs_slices(self.source, self.params) | self.shared
         self.kernels = kernels_of(self.source, self.observers, self.memory, structs)
 
     @property
     def params(self) -> dict[str, Any]:
-        """The parameters' values by name; an array for a parameter that differs between worlds."""
+        """The values of the parameters by name; a parameter that differs between worlds has an array."""
         return self.parameters.values
 
     @property
     def reward_text(self) -> str:
-        """The generated source of the reward, metrics and terminations of a task with terms; otherwise empty."""
+        """The generated source of the reward, the metrics and the terminations; empty if the task has no terms."""
         return self.source.terms.text
 
     @property
@@ -245,7 +245,7 @@ class BoundTask:
         rights: dict[str, Rights] = {name: self._rights(function) for name, function in FUNCTIONS.items()}
         check_writes(self.name, written, rights)
         for name, function in self.source.terms.functions.items():
-            for overload in overloads(function):  # terms must not write
+            for overload in overloads(function):  # terms may not write fields
                 check_writes(self.name, {name: overload}, rights | {name: dict.fromkeys(overload.input_types, ())})
         memory = self.source.memory
         return {
@@ -265,7 +265,7 @@ class BoundTask:
         }
 
     def _rights(self, function: TaskFunction) -> Rights:
-        """The fields that a function may write, by argument name."""
+        """Return the fields that a function may write through each argument, by the argument's name."""
         model = [name for name in self.types if is_model_field(name)]
         memory = tuple(self.source.memory)
         lasting = (*(name for name, part in self.source.memory.items() if part.kind == "lasting_memory"), *model)
@@ -276,7 +276,7 @@ class BoundTask:
         }
 
     def _sort_model_fields(self, named: list[str], dynamics: Collection[str]) -> None:
-        """Divide the model fields into varied fields and constants."""
+        """Separate the model fields that differ between worlds from those that do not."""
         drawn = {name: self.writes.get(name, frozenset()) for name in ("startup", "initialize", "randomize", "event")}
         between = drawn["initialize"] | drawn["randomize"] | drawn["event"]
         self.reset_dynamics = [name for name in named if name in between]
@@ -291,7 +291,7 @@ class BoundTask:
         self.dynamics = [describe_model_field(self.model, name) for name in varied]
         """The model fields that differ between worlds."""
         self.constants = [describe_model_field(self.model, name, varies=False) for name in named if name not in varied]
-        """The model fields that functions read and that do not differ between worlds."""
+        """The model fields that functions read and all worlds share."""
         drawn_constants = [field.name for field in self.dynamics if field.constants]
         if drawn_constants and (stale := [field.name for field in self.constants if field.follows]):
             raise ValueError(
@@ -303,12 +303,12 @@ class BoundTask:
         """Change parameters.
 
         Raises:
-            ValueError: There is no such parameter, or the observation's size would change.
+            ValueError: A name is unknown, or the size of the observation or of the memory would change.
         """
         previous, self.parameters = self.parameters, self.parameters.changed(params)
         try:
             changed = "the observation's" if obs_layouts(self.source, self.params) != self.obs_layouts else ""
-        except ValueError:  # a size must not differ between worlds
+        except ValueError:  # obs_layouts refuses a size that differs between worlds
             changed = "the observation's"
         layouts = (self._memory_layouts(), self._shared_layouts())
         changed = changed or ("the memory's" if layouts != (self.memory, self.shared) else "")
@@ -372,8 +372,8 @@ class BoundTask:
             raise ValueError(f"the task {self.name!r} names the metric {twice[0]!r} twice: give each one name")
         if self.functions["measure"] is not None and not self.task.metrics:
             raise ValueError(
-                f"the task {self.name!r} has {FUNCTIONS['measure'].signature}, but its class does not name what it "
-                "writes: add metrics = (...)"
+                f"the task {self.name!r} has {FUNCTIONS['measure'].signature}, but its class does not name its "
+                "metrics: add metrics = (...)"
             )
 
     def _checked_actions(self) -> dict[str, int] | None:
@@ -381,8 +381,8 @@ class BoundTask:
         if actions is None:
             if self.model.nu == 0:
                 raise ValueError(
-                    f"the model of the task {self.name!r} has no actuators: add some, or give the task "
-                    "actions = {...} and a control that writes inputs"
+                    f"the model of the task {self.name!r} has no actuators: add actuators, or give the task "
+                    "actions = {...} and a control function that writes inputs"
                 )
             return None
         if not isinstance(actions, Mapping) or not actions:
@@ -400,7 +400,7 @@ class BoundTask:
         }
 
     def check_field(self, name: str, array: wp.array) -> None:
-        """Compare the type of a field in World with its array, (nworld, ...).
+        """Check that a field's type in World fits the engine's array, (nworld, ...).
 
         Raises:
             ValueError: The element types or the numbers of axes differ.

@@ -1,7 +1,7 @@
 """Generate the source that turns a task's functions of one world into kernels over a batch of worlds.
 
 The generated source defines a struct of the fields with an additional axis for the worlds, a function that returns a
-view of world w, and default functions. Warp compiles source, so the result is text.
+view of one world, and default functions. The generator writes text, because Warp compiles functions from their source.
 """
 
 import dataclasses
@@ -92,7 +92,7 @@ _MEMORY_CHECKS = {
         "    if not restored_row(before.lasting_memory[w], after.lasting_memory[w], lane, lanes):\n"
         "        finite = False",
 }  # fmt: skip
-"""Lines that detect non-finite memory, and restore lasting memory to its value before the step."""
+"""Lines of Warp source that detect non-finite memory, and restore lasting memory to its value before the step."""
 
 _kernels: dict[Any, steps.Kernels] = {}
 _MAKING = threading.RLock()
@@ -104,7 +104,7 @@ def kernels_of(
     memory: Mapping[str, Layout],
     structs: Mapping[str, Layout],
 ) -> steps.Kernels:
-    """The kernels of a task, made once for the same functions, structs and sizes; see ``kernels.steps.make_kernels``.
+    """Return a task's kernels, which tasks with equal functions, structs and sizes share; see ``make_kernels``.
 
     Args:
         source: The task.
@@ -139,7 +139,7 @@ def _generated(
     memory: Mapping[str, Layout],
     structs: Mapping[str, Layout],
 ) -> dict[str, Any]:
-    """The names that the generated source defines: structs, wrappers of the task's functions, and default functions."""
+    """Run the generated source, and return the structs, wrappers and default functions that it defines, by name."""
     scope: dict[str, Any] = {"wp": wp, "Row": Row, "World": source.world, "Params": source.params}
     scope |= {"Shared": source.shared, "Sums": source.sums}
     batch, rows, state, views = [], [], [], []
@@ -166,7 +166,7 @@ def _generated(
             rows += [f"{name} = batch.{name}[w]", *view_lines(memory[name], "s", name, scope)]
         else:
             rows.append(f"s.{name} = batch.{name}[w]")
-        if name in memory or is_data_field(name):  # no step changes the model
+        if name in memory or is_data_field(name):  # a step does not change model fields, so it need not copy them
             state += _copy(name, ndim)
     scope |= {"substream": random.substream, "finite_row": kernel_rows.finite_row, "copy_row": kernel_rows.copy_row}
     scope["restored_row"] = kernel_rows.restored_row
@@ -175,7 +175,7 @@ def _generated(
         scope[f"observe_{number}"] = function
         noisy = draws_noise(function)
         observe.append(f"if group == {number}:")
-        if noisy:  # a separate stream for each group, so that its draws do not depend on other groups
+        if noisy:  # each group has its own random stream, so its draws do not depend on other groups
             observe.append(f"    rng[0] = substream(base, {number})")
         row = f"out.{group}[w]"
         if group in structs:
@@ -208,7 +208,7 @@ def _generated(
 
 
 def _copy(name: str, ndim: int) -> list[str]:
-    """Lines that copy one world's values of a field with ``ndim`` axes, (nworld, ...); the lanes share a row."""
+    """Generate lines that copy one world's row of a field with ``ndim`` axes, (nworld, ...), in parallel lanes."""
     if ndim == 1:
         return ["    if lane == 0:", f"        target.{name}[w] = source.{name}[w]"]
     lines = [f"    for i1 in range(lane, source.{name}.shape[1], lanes):"]
@@ -219,7 +219,7 @@ def _copy(name: str, ndim: int) -> list[str]:
 
 
 def _model_checks(source: TaskSource) -> list[str]:
-    """Lines that detect NaN and invalid negative numbers in the model fields that the task writes."""
+    """Generate lines that detect NaN and invalid negative numbers in the model fields that the task writes."""
     written = frozenset[str]().union(*(written_fields(function) for function in source.functions.values() if function))
     lines = []
     for name, variable in source.world.vars.items():

@@ -10,10 +10,10 @@ def explained(error: Exception, task: str) -> Exception:
     text = str(error)
     if "while parsing function" not in text and not type(error).__module__.startswith("warp"):
         return error
-    # the message names the kernel that Warp happened to compile first
+    # Warp's message names whichever kernel it compiled first, which may be of another task
     flat = " ".join(text.split())
-    # the last function in the message contains the error: if it is a kernel that calls a function of the task, the
-    # type of the result is wrong
+    # the last function in Warp's message contains the error; if that is a kernel, a function of the task returns the
+    # wrong type
     innermost = flat.rpartition("while parsing function")[2]
     call = re.search(r"\b(reward|evaluate|terminated|success)\((?:s0|s1|view)\b", innermost)
     kind = re.search(r"value argument type \((.+?)\) must be|with different type \(<class '[\w.]*?(\w+)'>\)", flat)

@@ -18,15 +18,15 @@ from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, MEMORIES, Part, Task, Task
 
 
 class TaskSource:
-    """The structs and the functions of a task.
+    """Finds the structs and the functions of a task.
 
     Args:
         task: The task's class.
         name: The task's name, for messages.
 
     Raises:
-        ValueError: A struct or ``observe`` is missing, a function's signature differs from the table, or a name
-            resembles a name in the table.
+        ValueError: A struct or ``observe`` is missing, a function's signature is not the one in ``FUNCTIONS``, or a
+            name resembles a name in ``FUNCTIONS``.
     """
 
     def __init__(self, task: type[Task], name: str) -> None:
@@ -38,28 +38,27 @@ class TaskSource:
         self.world: Any = self._struct("World")
         own: Any = self._struct("Params")
         self.defaults: type = own.cls
-        """The class whose attributes are the defaults of the parameters."""
+        """The class whose attributes are the parameters' defaults."""
         self.params: Any = self._with_functions(own)
         self._variant = variant_of(name, self._owners, self.world, self.params, own)
         self.memory: dict[str, Part] = self._memory()
         """The fields of World that are the task's memory, by name."""
         self.shared, self.sums = self._shared_structs()
-        """The structs of the memory that worlds share, and of the sums over worlds; None if the task has no shared
-        memory."""
+        """The structs ``Shared`` and ``Sums``; None if the worlds of the task share no memory."""
         self.functions: dict[str, wp.Function | None] = {
             name: self._function(wanted) for name, wanted in FUNCTIONS.items()
         }
-        """The task's functions by their names in the table; None for missing functions."""
+        """The task's functions by their names in ``FUNCTIONS``; None for missing functions."""
         self.terms = Terms(task, name, self._term, self.functions, self.world, self.params)
         if self.functions["observe"] is None:
             raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), which every task needs")
         self._check_names()
 
     def group_functions(self, groups: Collection[str]) -> dict[str, wp.Function]:
-        """The functions that write observation groups, by group name.
+        """Return the functions that write observation groups, by group name.
 
         Raises:
-            ValueError: No function writes a group, or a function writes a group that is not listed.
+            ValueError: No function writes a group, or a function writes a group that ``obs`` does not list.
         """
         found = {}
         for group in groups:
@@ -77,14 +76,14 @@ class TaskSource:
         return found
 
     def group_structs(self) -> dict[str, Any]:
-        """The structs of the observation groups that functions write, by group name."""
+        """Return the structs into which functions write observation groups, by group name."""
         names = [name for owner in reversed(self._owners) for name in self._observers(owner)]
         groups = dict.fromkeys(["policy", *(name.removeprefix(GROUP_PREFIX) for name in names)])
         functions = self.group_functions(groups)
         return {group: list(function.input_types.values())[2] for group, function in functions.items()}
 
     def _observers(self, owner: type[Task]) -> list[str]:
-        """Names of the functions of a class that write groups, or of its module if no other code there uses them."""
+        """Return the names of a class's functions that write groups, and of its module's if no other code uses them."""
         module = vars(sys.modules[owner.__module__])
         functions = {name: self._seen(value) for name, value in module.items() if isinstance(value, wp.Function)}
         tasks = [kind for kind in (owner, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
@@ -96,7 +95,7 @@ class TaskSource:
             name
             for name, function in functions.items()
             if name not in called and id(function) not in used
-            and tuple(map(self._kind, function.input_types.values())) in forms  # unless they belong to another task
+            and tuple(map(self._kind, function.input_types.values())) in forms  # other tasks' functions differ here
             and (self._has_structs or not any(_may_list(task, name.removeprefix(GROUP_PREFIX)) for task in tasks))
         ]  # fmt: skip
         return [name for name in (*own, *unused) if name.startswith(GROUP_PREFIX)]
@@ -110,12 +109,12 @@ class TaskSource:
         return None
 
     def _seen(self, value: Any) -> Any:
-        """A value of the task's family, converted to the task's own structs; see ``variants``."""
+        """Convert a struct or function of the task's family to the task's own structs; see ``variants``."""
         return value if self._variant is None else self._variant.seen(value)
 
     @property
     def _has_structs(self) -> bool:
-        """Whether structs define the layout of the observations, instead of the task's ``obs``."""
+        """Whether structs, instead of the task's ``obs``, define the layout of the observations."""
         return not hasattr(self.task, "obs")
 
     def _term(self, name: str) -> wp.Function | None:
@@ -138,7 +137,7 @@ class TaskSource:
         return struct
 
     def _with_functions(self, own: Any) -> Any:
-        """The parameter struct that functions take: a base task's struct if the task's own differs only in defaults.
+        """Return the parameter struct that functions take: a base task's if the task's own differs only in defaults.
 
         Tasks that differ only in defaults then share functions and kernels.
         """
@@ -151,20 +150,22 @@ class TaskSource:
         return own
 
     def _memory(self) -> dict[str, Part]:
-        """The parts of memory in World. A task that declares only the number of elements is refused."""
+        """Return the fields of World that are memory, by name; refuse memory that is declared as a number."""
         counted = [name for name in MEMORIES if hasattr(self.task, name)]
         parts = parts_of(self.world, "World")
         if old := [*counted, *(name for name in MEMORIES if name in self.world.vars and name not in parts)]:
             raise ValueError(
-                f"{old[0]} of the task {self.name!r} has no names: name its parts in World in place of {old[0]}, as "
+                f"{old[0]} of the task {self.name!r} has no names: declare its parts in World instead of {old[0]}, as "
                 f"air_time: Row[float] = lw.{old[0]}(4), and use them as s.air_time[0]"
             )
         if wrong := [name for name, part in parts.items() if part.kind not in MEMORIES]:
-            raise ValueError(f"World.{wrong[0]} of the task {self.name!r} is lw.part(...): write lw.memory(...)")
+            raise ValueError(
+                f"World.{wrong[0]} of the task {self.name!r} is declared by lw.part(...): use lw.memory(...)"
+            )
         return parts
 
     def _shared_structs(self) -> tuple[Any, Any]:
-        """The structs of the memory that worlds share, and of the sums over worlds.
+        """Return the structs Shared and Sums, or None if the worlds share no memory.
 
         Raises:
             ValueError: ``World.shared``, ``tally`` or ``share`` is missing or malformed.
@@ -193,7 +194,7 @@ class TaskSource:
         structs = [kind for kind in types if is_struct(kind)]
         foreign = structs and self.world not in structs and self.params not in structs
         if foreign and function.func.__module__ in {owner.__module__ for owner in self.task.__mro__}:
-            return None  # the function belongs to another task of the module
+            return None  # a function with another World belongs to another task in the module
         annotations = function.func.__annotations__
         if any(isinstance(annotation, str) for annotation in annotations.values()):
             raise ValueError(
@@ -218,7 +219,7 @@ class TaskSource:
         return function
 
     def _check_structs(self, name: str, structs: list[Any]) -> None:
-        """Refuse a function that takes the World or Params of another file."""
+        """Refuse a function that takes another file's World or Params."""
         for kind in structs:
             for own_name, own in (("World", self.world), ("Params", self.params)):
                 if kind is not own and kind.key.rpartition(".")[2] == own_name:
@@ -229,7 +230,7 @@ class TaskSource:
                     )
 
     def _kind(self, argument: Any) -> str:
-        """The table's annotation for the type of an argument."""
+        """Return an argument's type as the annotation that ``FUNCTIONS`` uses."""
         if argument is self.world:
             return "World"
         if argument is self.params:
@@ -243,7 +244,7 @@ class TaskSource:
         return "bool" if argument in (bool, wp.bool) else kinds.get(element, "?")
 
     def _check_names(self) -> None:
-        """Refuse names that resemble a name in the table, because such a function would never be called."""
+        """Refuse a name that resembles a name in ``FUNCTIONS``, because such a function would never be called."""
         attributes = [name for name in vars(Task) if not name.startswith("_")]
         for name in vars(self.task):
             if name.startswith(("_", GROUP_PREFIX)) or name in (*attributes, "World", "Params", *FUNCTIONS):
@@ -260,23 +261,23 @@ class TaskSource:
 
 
 def draws_noise(observer: wp.Function) -> bool:
-    """Whether an observation group's function takes a random stream."""
+    """Whether the function of an observation group takes a random stream."""
     return len(observer.input_types) > len(FUNCTIONS["observe"].kinds)
 
 
 def _may_list(task: type[Task], group: str) -> bool:
-    """Whether a class lists an observation group, or may do so because its ``obs`` is a method."""
+    """Whether the ``obs`` of a class may have an observation group; an ``obs`` that is a method may have any."""
     obs = getattr(task, "obs", None)
     return callable(obs) or (isinstance(obs, Mapping) and isinstance(obs.get(group), Mapping))
 
 
 def _origin(struct: Any) -> str:
-    """The file that defines a struct, or its module if it has no file."""
+    """Return the file that defines a struct, or the name of its module if there is no file."""
     module = struct.cls.__module__
     return str(getattr(sys.modules.get(module), "__file__", None) or module)
 
 
 def _return_values(function: wp.Function) -> list[ast.expr]:
-    """The expressions that a function returns."""
+    """Return the expressions in a function's return statements."""
     nodes = ast.walk(FunctionSource(function).tree)
     return [node.value for node in nodes if isinstance(node, ast.Return) and node.value is not None]

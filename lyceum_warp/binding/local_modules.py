@@ -10,17 +10,17 @@ from types import ModuleType
 from typing import TypeAlias
 
 Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
-"""Modification times and sizes of files; None for a file that does not exist."""
+"""The modification time and size of each file; None if the file does not exist."""
 
 _taken: dict[str, Stamps] = {}
 """The modules in ``sys.modules`` that task files imported from their folders, with their stamps."""
 
 
 def local_modules(file: Path) -> dict[str, Path]:
-    """The modules beside a Python file that it imports, directly or indirectly. They are not run.
+    """Find the modules beside a Python file that the file imports, directly or indirectly. The modules are not run.
 
     Returns:
-        The modules' files by name; for a package without ``__init__.py``, its folder.
+        The file of each module by the module's name; a package without ``__init__.py`` has its folder.
     """
     folder = file.resolve().parent
     found: dict[str, Path] = {}
@@ -34,7 +34,7 @@ def local_modules(file: Path) -> dict[str, Path]:
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
         for wanted in _imported_names(tree, package):
             if _module_file(folder, wanted) is None:
-                wanted = wanted.rpartition(".")[0]  # the name may be an attribute of a module
+                wanted = wanted.rpartition(".")[0]  # an imported name may be an attribute instead of a module
             for part in _prefixes(wanted):
                 if part not in found and (module := _module_file(folder, part)) not in (None, file.resolve()):
                     found[part] = module
@@ -44,12 +44,12 @@ def local_modules(file: Path) -> dict[str, Path]:
 
 
 def _imported_names(tree: ast.AST, package: str) -> Iterator[str]:
-    """Full names of the modules that a module of this package imports, and of names imported from modules."""
+    """Return the full names of all modules and of all names that a module imports."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            with contextlib.suppress(ImportError):  # the relative import has too many dots
+            with contextlib.suppress(ImportError):  # a relative import with too many dots would leave the package
                 owner = importlib.util.resolve_name("." * node.level + (node.module or ""), package or None)
                 yield from (owner, *(f"{owner}.{alias.name}" for alias in node.names))
 
@@ -60,7 +60,7 @@ def _prefixes(name: str) -> list[str]:
 
 
 def _module_file(folder: Path, name: str) -> Path | None:
-    """The file of a module in a folder; for a package without ``__init__.py``, its folder."""
+    """Return a module's file in a folder; for a package without ``__init__.py``, return the package's folder."""
     if not name:
         return None
     base = folder.joinpath(*name.split("."))
@@ -71,7 +71,7 @@ def _module_file(folder: Path, name: str) -> Path | None:
 
 
 def stamps(files: Iterable[Path]) -> Stamps:
-    """The current stamps of files, to detect changed files."""
+    """Read the stamps of files, which change when a file is edited."""
     found: Stamps = dict.fromkeys(files)
     for file in found:
         with contextlib.suppress(OSError):
@@ -83,8 +83,8 @@ def stamps(files: Iterable[Path]) -> Stamps:
 def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
     """Context in which a task's file can import the modules beside it, as returned by ``local_modules``.
 
-    Loaded modules of the same names are replaced if they have changed or come from another folder. If the block raises
-    an error, ``sys.modules`` is restored.
+    A loaded module of the same name is replaced if it has changed or comes from another folder. If the block raises an
+    error, ``sys.modules`` is restored.
     """
     before = {name: sys.modules.get(name) for name in modules}
     if any(name in _taken and _taken[name] != stamps([path]) for name, path in modules.items()):
@@ -94,7 +94,7 @@ def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
     folder, bytecode = str(file.resolve().parent), sys.dont_write_bytecode
     sys.path.insert(0, folder)
     importlib.invalidate_caches()
-    sys.dont_write_bytecode = True  # the folder may be a run's; bytecode compares times in whole seconds
+    sys.dont_write_bytecode = True  # bytecode would land in run folders, and misses edits in the same second
     try:
         yield
     except BaseException:

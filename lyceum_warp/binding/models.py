@@ -24,19 +24,20 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
     """Load a model as an editable MjSpec that compiles from any current folder.
 
     Args:
-        source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec, which is copied. A path is
-            relative to the file of ``owner``, or of the base class that gives it, or else to the current folder.
+        source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec, which is copied. A relative
+            path starts at the folder of the class that declares it, ``owner`` or a base class, or without an owner at
+            the current folder.
         owner: The task class that declares the model.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: MuJoCo can't read the file, or the source is a compiled model or XML.
+        ValueError: MuJoCo can't read the file, or the source is a compiled model or a string of XML.
     """
     if isinstance(source, mujoco.MjModel):
         raise ValueError("a task's model must be a file or an MjSpec, not a compiled MjModel: give its MjSpec")
     if isinstance(source, mujoco.MjSpec):
         spec = source.copy()
-        spec.modelfiledir = str(Path(spec.modelfiledir).absolute())  # mesh paths are relative to this folder
+        spec.modelfiledir = str(Path(spec.modelfiledir).absolute())  # mesh paths are relative to modelfiledir
         return spec
     if isinstance(source, ModelFile):
         return source.spec()
@@ -49,13 +50,13 @@ def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFil
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The source is XML.
+        ValueError: The source is a string of XML.
     """
     if isinstance(source, str) and source.lstrip().startswith("<"):
         start = textwrap.shorten(source, 24, placeholder=" ...")
         raise ValueError(f"the model {start!r} is XML, not a file: pass mujoco.MjSpec.from_string(...)")
     folder = Path()
-    if owner is not None:  # a subclass in another folder inherits the path
+    if owner is not None:  # a subclass may inherit the path from a class in another folder
         owner = next((kind for kind in owner.__mro__ if "model" in vars(kind)), owner)
     if owner is not None and (file := getattr(sys.modules.get(owner.__module__), "__file__", None)):
         folder = Path(file).parent
@@ -70,12 +71,12 @@ def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFil
     except FileNotFoundError as error:
         close = difflib.get_close_matches(path.name, [file.name for file in path.parent.glob("*.xml")], 3)
         hint = f" (did you mean {' or '.join(close)}?)" if close else ""
-        raise FileNotFoundError(f"there is no model file {path}{hint}, and of Gymnasium's models: {error}") from None
+        raise FileNotFoundError(f"there is no model file {path}{hint}; among Gymnasium's models, {error}") from None
     return shipped
 
 
 def keyframe_state(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """The integration state of one of the model's keyframes at time 0, (integration_size,) float64.
+    """Return the integration state of a model's keyframe at time 0, (integration_size,) float64.
 
     Raises:
         ValueError: The model has no such keyframe.
@@ -97,12 +98,12 @@ def keyframe_state(model: mujoco.MjModel, name: str) -> np.ndarray:
 def compile_model(
     spec: mujoco.MjSpec, fields: Collection[str], physics: PhysicsOptions, *, varied: Collection[str] = ()
 ) -> mujoco.MjModel:
-    """Compile a model for either engine.
+    """Compile a model for both engines.
 
     - Newton replaces the PGS solver, which MuJoCo Warp lacks. Newton converges to the same accelerations.
     - Sleep is turned off, because a saved state does not say which bodies are asleep.
-    - Fields that MuJoCo computes only for a sensor get such a sensor, after the model's own; if no field needs sensors,
-      they are turned off. If a function reads the energy, its computation is enabled.
+    - A field that MuJoCo computes only for sensors gets a sensor after the model's own; if no field needs sensors,
+      sensors are turned off. The energy is computed if a function reads it.
     - If ``contact`` lists a pair of geoms twice, only the first entry is kept: MuJoCo would make the contact twice,
       MuJoCo Warp once.
 
@@ -110,7 +111,7 @@ def compile_model(
         spec: The model; changed in place.
         fields: Names of the fields that will be read.
         physics: Options of the solver and the integrator that replace the model's own.
-        varied: Names of the model fields that will differ between worlds.
+        varied: Names of the model fields that may differ between worlds.
 
     Raises:
         ValueError: MuJoCo refuses the model.
@@ -153,13 +154,13 @@ def compile_model(
             model = spec.compile()
     except ValueError as error:
         raise ValueError(f"MuJoCo refuses the model {spec.modelname!r}: {error}") from error
-    for warning in caught:  # warnings are only logged: most concern Gymnasium's XML, which users cannot change
+    for warning in caught:  # most warnings concern Gymnasium's XML, which users cannot change
         log.info("%s: %s", spec.modelname, warning.message)
     return model
 
 
 def _remove_repeated_pairs(spec: mujoco.MjSpec) -> None:
-    """Remove all but the first contact pair of the same two geoms."""
+    """Remove all contact pairs of the same two geoms except the first."""
     known: set[frozenset[str]] = set()
     for pair in list(spec.pairs):
         geoms = frozenset((pair.geomname1, pair.geomname2))

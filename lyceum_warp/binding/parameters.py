@@ -15,32 +15,32 @@ from lyceum_warp.options import OPTIONS, suggestion
 from lyceum_warp.task import Element, FromModel
 
 _FILLED_IN = ("dt", "substep_dt")
-"""Fields of ``Params`` that are filled in: the durations of a step and of a substep, s."""
+"""Fields of ``Params`` that the package sets: the durations of a step and of a substep in seconds."""
 
 
 def defaults(struct: Any, owner: type) -> dict[str, Any]:
-    """The defaults of a task's parameters, by name, without fields that are filled in.
+    """Return the defaults of a task's parameters by name, without ``dt`` and ``substep_dt``.
 
-    The functions take ``struct``; the class ``owner`` has the defaults.
+    ``struct`` declares the parameters, and the class ``owner`` has the defaults as attributes.
     """
     names = [name for name in struct.vars if name not in _FILLED_IN and hasattr(owner, name)]
     return {name: getattr(owner, name) for name in names}
 
 
 class Parameters:
-    """Values for every field of a task's ``Params``: scalars and vectors, arrays with one value per world, or tables.
+    """The values of a task's parameters: scalars, vectors, arrays with one value per world, or tables.
 
-    A table is a field that is itself an array, such as ``motion: wp.array2d[float]``. All worlds share it.
+    A table is a field that is itself an array, such as ``motion: wp.array2d[float]``. All worlds share a table.
 
     Args:
         struct: The task's ``Params``, which the functions take.
         owner: The class with the defaults as attributes.
         task_name: The task's name, for messages.
-        model: The compiled model, which gives the indices of named elements.
+        model: The compiled model, which maps names of elements to indices.
         nworld: Number of worlds.
         timestep: Seconds in a step, the value of ``dt``.
         given: Values that replace defaults.
-        weights: The weights of the task's terms, by name; they are set like parameters.
+        weights: The weights of the task's terms, by name; weights are set like parameters.
 
     Raises:
         ValueError: A field has the name of an option, a name is unknown, or a value is missing or does not fit.
@@ -79,11 +79,11 @@ class Parameters:
 
     @property
     def per_world(self) -> dict[str, np.ndarray]:
-        """The values that differ between worlds, by name, (nworld, ...)."""
+        """The values of the parameters that differ between worlds, by name, (nworld, ...)."""
         return {name: v for name, v in self.values.items() if isinstance(v, np.ndarray) and name not in self.tables}
 
     def changed(self, given: Mapping[str, Any]) -> "Parameters":
-        """Copy with some values replaced, each converted to the type of its field. The copy shares the arrays.
+        """Return a copy with some values replaced, each converted to its field's type. The copy shares the arrays.
 
         Raises:
             ValueError: A name is unknown, or a value is missing or does not fit its field.
@@ -114,10 +114,10 @@ class Parameters:
         return other
 
     def _compute(self, name: str, values: Mapping[str, Any]) -> Any:
-        """Compute a default from the model; return the previous table if its contents are the same."""
+        """Compute a default from the model; return the previous table if the contents did not change."""
         try:
             found = getattr(self._owner, name).function(self._model, SimpleNamespace(**values))
-        except Exception as error:  # a function of the task may raise any error
+        except Exception as error:  # the task's function may raise any error
             message = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
             raise ValueError(
                 f"the parameter {name} of {self._task_name!r} can't be computed from the model: {message}"
@@ -126,10 +126,10 @@ class Parameters:
         return before if name in self.tables and np.array_equal(before, value) else value
 
     def array(self, device: wp.Device) -> wp.array:
-        """The values for the kernels: one entry for all worlds, or one per world if any value differs.
+        """Make the kernels' array of ``Params``: one entry for all worlds, or one per world if any value differs.
 
-        Entries point to the tables, which stay on the device as long as this object. A table that changed is copied
-        in place if its shape is the same.
+        The entries point to tables on the device, which this object keeps in memory. A changed table of the same shape
+        is copied in place.
         """
         for name, kind in self.tables.items():
             self._upload(name, kind.dtype, device)
@@ -138,7 +138,7 @@ class Parameters:
         return wp.array(instances, dtype=self._struct, device=device)
 
     def weights(self, device: wp.Device) -> wp.array:
-        """The weights of the task's terms: a row for all worlds, or one per world, (1 or nworld, terms)."""
+        """Make the array of the terms' weights, (1 or nworld, terms): one row for all worlds, or one per world."""
         count = self._nworld if any(name in self._weights for name in self.per_world) else 1
         rows = [np.broadcast_to(self.values[name], count) for name in self._weights]
         table: wp.array = wp.array(np.reshape(rows, (len(rows), count)).T, dtype=float, device=device)
@@ -173,15 +173,15 @@ class Parameters:
         if isinstance(value, Element):
             if not isinstance(default, Element) or default.field != value.field:
                 is_what = f"one of {default.field!r}" if isinstance(default, Element) else "a number"
-                raise ValueError(f"{what} can't be an element of {value.field!r}: it is {is_what}")
+                raise ValueError(f"{what} can't be an element of {value.field!r}: its default is {is_what}")
             if kind is not wp.int32:
-                raise ValueError(f"{what} must be declared as int: it is an index")
+                raise ValueError(f"{what} must be declared as int, because it holds an index")
             return elements(self._model, value.field, value.name).start
         if isinstance(default, Element) and isinstance(value, str):
             return elements(self._model, default.field, value).start
         shape = tuple(getattr(kind, "_shape_", ()))
         try:
-            array = np.asarray(value, dtype=np.float64)  # this also converts Warp's vectors, lists and tensors
+            array = np.asarray(value, dtype=np.float64)  # np.asarray also converts Warp's vectors, lists and tensors
         except (TypeError, ValueError) as error:
             raise ValueError(f"{given} is not a number: {error}") from error
         if np.isnan(array).any():
@@ -202,7 +202,7 @@ class Parameters:
         )
 
     def _table(self, name: str, value: Any) -> np.ndarray:
-        """Convert a table to a read-only array of float32 or int32, with the axes of its elements last."""
+        """Convert a table to a read-only array of float32 or int32, with the axes of a vector or matrix last."""
         if value is self.values.get(name) and isinstance(value, np.ndarray) and not value.flags.writeable:
             return value
         kind, what = self.tables[name], f"the parameter {name} of {self._task_name!r}"
@@ -223,7 +223,7 @@ class Parameters:
         axes = kind.ndim + len(element)
         if table.ndim != axes or table.shape[kind.ndim :] != element or not table.size:
             last = f", the last {element}" if element else ""
-            raise ValueError(f"{what} has shape {table.shape}: it takes {axes} axes{last}, none of length 0")
+            raise ValueError(f"{what} has shape {table.shape}: it takes {axes} axes{last}, with no axis of length 0")
         if field:
             self._check_index(what, given, field)
         bad = table != given if whole else ~np.isfinite(table)
@@ -235,12 +235,12 @@ class Parameters:
         return table
 
     def _indices(self, what: str, value: Any, field: str | None) -> Any:
-        """Replace the model's elements in a table by indices and, if ``field`` is given, names too."""
+        """Replace elements of the model in a table by indices; with ``field``, replace names too."""
         if isinstance(value, list | tuple):
             return [self._indices(what, entry, field) for entry in value]
         if isinstance(value, Element):
             if field and value.field != field:
-                raise ValueError(f"{what} can't have an element of {value.field!r}: it has elements of {field!r}")
+                raise ValueError(f"{what} can't have an element of {value.field!r}: its elements belong to {field!r}")
             return elements(self._model, value.field, value.name).start
         return elements(self._model, field, value).start if field and isinstance(value, str) else value
 
@@ -249,10 +249,7 @@ class Parameters:
             self._sizes[field] = rows(self._model, field)
         count = self._sizes[field]
         if ((array < 0) | (array >= count)).any():
-            raise ValueError(
-                f"{given} is an index of {field!r}, of which the model has {count}: give an index from 0 to "
-                f"{count - 1}, or a name"
-            )
+            raise ValueError(f"{given} is not an index of {field!r}: give an index from 0 to {count - 1}, or a name")
 
     def _instance(self, world: int) -> Any:
         instance = self._struct()
@@ -267,9 +264,9 @@ class Parameters:
 
 
 def _element_field(default: Any) -> str | None:
-    """The field, such as "site_xpos", of the model elements in a table's default.
+    """Return the field, such as "site_xpos", to which the elements in a table's default belong.
 
-    Returns None if the default has plain numbers.
+    The result is None if the default consists of numbers.
     """
     while isinstance(default, list | tuple) and default:
         default = default[0]
@@ -279,10 +276,10 @@ def _element_field(default: Any) -> str | None:
 def _loaded(what: str, path: str | Path) -> np.ndarray:
     """Load the array in a file written by ``numpy.save``."""
     try:
-        # memory-mapped, because a broken header may ask for any amount of memory
+        # map the file instead of reading it, because a broken header may request any amount of memory
         loaded: np.ndarray = np.load(path, allow_pickle=False, mmap_mode="r")
     except FileNotFoundError:
-        raise FileNotFoundError(f"{what}: there is no such file") from None
+        raise FileNotFoundError(f"{what} cannot be read, because there is no such file") from None
     except Exception as error:  # NumPy raises many types of errors
         raise ValueError(f"{what} cannot be read: {error}") from error
     if not isinstance(loaded, np.ndarray):

@@ -17,7 +17,7 @@ class Slice:
     """The slice of a row of floats that holds a part."""
 
     start: int
-    """Index of the first float."""
+    """The index of the first float."""
     count: int
     """Number of elements."""
     dtype: Any
@@ -30,11 +30,11 @@ class Slice:
 
 
 Layout = dict[str, Slice]
-"""The parts of one row of floats by name, in order."""
+"""The parts of a row of floats: their slices by name, in order."""
 
 
 def parts_of(struct: Any, owner: str) -> dict[str, Part]:
-    """The fields of a struct whose defaults are parts, by name; ``owner`` is the struct's name in error messages.
+    """Return the fields of a struct that have parts as defaults; ``owner`` is its name in error messages.
 
     Raises:
         ValueError: A part's type is not a row of numbers.
@@ -52,7 +52,7 @@ def parts_of(struct: Any, owner: str) -> dict[str, Part]:
 
 
 def layout(struct: Any, kind: str, params: Mapping[str, Any], owner: str) -> Layout:
-    """Lay out a struct's parts of one kind; ``params`` has the tables that determine sizes.
+    """Lay out a struct's parts of one kind; a size may be the name of a table in ``params``.
 
     Raises:
         ValueError: A size is neither a positive number nor the name of a table of Params.
@@ -72,7 +72,7 @@ def sizes(layout: Layout) -> dict[str, int]:
 
 
 def view_lines(layout: Layout, struct: str, row: str, scope: dict[str, Any]) -> list[str]:
-    """Lines of Warp source that set a struct's fields to slices of a row; adds the types they need to ``scope``."""
+    """Generate lines of Warp source that set a struct's fields to slices of a row; add their types to ``scope``."""
     lines = []
     for name, part in layout.items():
         scope[f"dtype_{struct}_{name}"] = part.dtype
@@ -87,7 +87,7 @@ def _floats(dtype: Any) -> int:
 
 
 def length(what: str, size: int | str, params: Mapping[str, Any]) -> int:
-    """Resolve a size: a number, or the name of a table in ``params``, whose rows are counted.
+    """Resolve a size: a number, or the name of a table in ``params`` with that number of rows.
 
     ``what`` names the size in error messages.
 
@@ -98,5 +98,5 @@ def length(what: str, size: int | str, params: Mapping[str, Any]) -> int:
         return whole_number(what, size, low=1)
     table = params.get(size)
     if not isinstance(table, list | tuple | np.ndarray):
-        raise ValueError(f"{what} is {size!r}, which is not a table of Params: give a number, or the name of a table")
+        raise ValueError(f"{what} is {size!r}, which is not a table in Params: give a number, or a table's name")
     return len(table)

@@ -16,7 +16,7 @@ def _refuse(self: Any, name: str, value: Any) -> None:
 
 
 class _Part:
-    """A read-only part of a model, such as ``model.opt`` or ``model.body("torso")``."""
+    """A part of a model that refuses edits, such as ``model.opt`` or ``model.body("torso")``."""
 
     def __init__(self, part: Any) -> None:
         object.__setattr__(self, "_part", part)
@@ -50,7 +50,7 @@ class ReadOnlyModel(mujoco.MjModel):  # type: ignore[misc]
 
 
 def read_only(model: mujoco.MjModel) -> ReadOnlyModel:
-    """A copy of a model that refuses edits."""
+    """Return a copy of a model that refuses edits."""
     copy = ReadOnlyModel.__new__(ReadOnlyModel)
     copy.__setstate__(model.__getstate__())
     return copy

@@ -25,7 +25,7 @@ from lyceum_warp.task import Task
 _tasks: dict[str, type[Task]] = {}
 
 _loaded: dict[str, Stamps] = {}
-"""For each task module, the stamps of its file and of the modules beside it when they were last run."""
+"""The stamps of each task module's file, and of the modules beside it, from when they were last run."""
 
 _LOADING = threading.RLock()
 """Held while a file is loaded, because imports and linecache are global to the process."""
@@ -42,7 +42,7 @@ def register(task: type[Task]) -> type[Task]:
     A class may replace an earlier one of the same file, for example if a notebook runs a cell again.
 
     Raises:
-        ValueError: Another task has the name, or the class is not a task.
+        ValueError: The name belongs to another task, or the class is not a task.
     """
     given: Any = task
     if not (isinstance(given, type) and issubclass(given, Task)):
@@ -61,7 +61,7 @@ def register(task: type[Task]) -> type[Task]:
 
 
 def _may_replace(task: type[Task], known: type[Task]) -> bool:
-    by_path = task.__module__.startswith(_FILE) and known.__module__.startswith(_FILE)  # files may share a name
+    by_path = task.__module__.startswith(_FILE) and known.__module__.startswith(_FILE)  # file names may be equal
     return by_path or known.__module__ == task.__module__ or _file(known) == _file(task)
 
 
@@ -72,7 +72,7 @@ def package_task_names() -> list[str]:
 
 @functools.cache
 def _package_modules() -> dict[str, str]:
-    """The modules of the package's tasks, by task name. They are not imported.
+    """The modules of the package's tasks, by task name. The modules are not imported.
 
     A module contains the task of the same name. A folder contains a family of tasks and declares their modules in
     ``TASKS``.
@@ -103,9 +103,9 @@ def _file(task: type[Task]) -> str | None:
 
 
 def spelled_task(task: type[Task]) -> str | None:
-    """The name or ``file:Class`` that finds a task in another process (``find_task``).
+    """Return the name or ``file:Class`` by which ``find_task`` finds a task in another process.
 
-    Returns None for a task without a file.
+    The result is None for a task without a file.
     """
     if task.__module__.startswith("lyceum_warp."):
         return task_name(task)
@@ -114,7 +114,7 @@ def spelled_task(task: type[Task]) -> str | None:
 
 
 def task_name(task: type[Task]) -> str:
-    """The name under which a task is registered: the class's name in snake_case.
+    """Return the name under which a task is registered: the class's name in snake_case.
 
     A family of the package may declare its names in a namespace: ``dm/walker_walk`` for WalkerWalk.
     """
@@ -124,7 +124,7 @@ def task_name(task: type[Task]) -> str:
 
 
 def file_name(name: str) -> str:
-    """The name of a task as part of a file's name: dm-walker_walk for dm/walker_walk."""
+    """Convert a task's name to a part of a file name: dm/walker_walk to dm-walker_walk."""
     return name.replace("/", "-")
 
 
@@ -141,8 +141,8 @@ def task_names() -> list[str]:
 def find_task(task: str | Path | type[Task]) -> type[Task]:
     """Find a task's class by name, by file (``path/to/file.py`` or ``path/to/file.py:Class``), or return a given class.
 
-    A file may import modules beside it. If one of these files has changed, the task's file is run again; existing
-    environments keep their task.
+    A file may import modules beside it. If the task's file or a module beside it has changed, the file is run again;
+    existing environments keep their task.
 
     Raises:
         ValueError: There is no such task, or its file can't be run.
@@ -169,7 +169,7 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
 
 
 def source_files(task: type[Task]) -> Mapping[Path, bytes]:
-    """The contents of a task's file and of the modules beside it that it imports, when the task was loaded.
+    """Return the contents of a task's file, and of the modules beside it that it imports, as they were loaded.
 
     A class that the program imports or defines counts as loaded when ``find_task`` first returns it. A class without a
     file, as in a notebook, has no sources.
@@ -186,14 +186,14 @@ def _read(file: Path, modules: Mapping[str, Path]) -> dict[Path, bytes]:
 
 
 def _run(path: Path, name: str, source: bytes) -> None:
-    """Run a file's source as a module, which replaces the previous module of this name."""
+    """Run a file's source as a module, and replace the previous module of the same name."""
     module = ModuleType(name)
     module.__file__ = file = str(path.resolve())
     before = sys.modules.get(name)
     sys.modules[name] = module
     try:
-        code = compile(source, file, "exec")  # a stale bytecode file may have the same time stamp, in whole seconds
-        # Warp reads the source of functions from the line cache, so later changes of the file do not matter
+        code = compile(source, file, "exec")  # stale bytecode may have the same time in whole seconds
+        # Warp reads the source of functions from linecache, where later changes of the file do not appear
         text = importlib.util.decode_source(source)
         linecache.cache[file] = (len(text), None, list(io.StringIO(text)), file)
         exec(code, vars(module))
@@ -207,14 +207,14 @@ def _run(path: Path, name: str, source: bytes) -> None:
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
         where = f"the task file {path}" if line is None else f"the task file {path}, line {line}"
         if isinstance(error, ImportError):
-            raise ImportError(f"{where}: {error}: install what it imports, or put it beside the file") from error
+            raise ImportError(f"{where}: {error}: install the missing module, or put it beside the file") from error
         raise ValueError(f"{where}: {_explained(error)}") from error
     finally:
         linecache.cache.pop(file, None)
 
 
 def _explained(error: Exception) -> str:
-    """The message for an error in a task file, with a fix for Warp's less clear errors."""
+    """Return the message for an error in a task file; add a fix if Warp's own message is unclear."""
     text = str(error).strip()
     if found := re.search(r"argument '(\w+)' of function (\w+): Unrecognized type '<class '[\w.]*?(\w+)'>'", text):
         argument, function, kind = found.groups()
@@ -245,7 +245,7 @@ def _task_of_file(path: Path, attribute: str) -> type[Task]:
 
 
 def kernel_name(task: type[Task]) -> str:
-    """The task's name in Warp's cache; it contains a hash of the file, so that copies share kernels."""
+    """Return the task's name in Warp's cache, with a hash of the file, so that copies of the file share kernels."""
     module = task.__module__
     if module.startswith(_FILE) and task in _sources:
         module = f"{module[:-8]}{zlib.crc32(b''.join(_sources[task].values())):08x}"
@@ -253,7 +253,10 @@ def kernel_name(task: type[Task]) -> str:
 
 
 def _module_of_file(path: Path) -> ModuleType:
-    """The module of a task's file. The file is run if it is new, or if it or a module beside it has changed."""
+    """Return the module of a task's file, and run the file if necessary.
+
+    A file is run when it is new, and when it or a module beside it has changed.
+    """
     if not path.is_file():
         raise FileNotFoundError(f"there is no task file {str(path)!r}")
     name = f"{_FILE}{path.stem}_{zlib.crc32(str(path.resolve()).encode()):08x}"

@@ -14,7 +14,7 @@ from lyceum_warp.support.upstream import builtin_functions
 
 
 class FunctionSource:
-    """The source of a ``wp.func`` as it was defined, even if its file has changed since then.
+    """Holds the source of a ``wp.func`` at its definition, even if the file has changed since then.
 
     Raises:
         ValueError: The source is not a single function definition.
@@ -31,18 +31,18 @@ class FunctionSource:
         self.file = Path(adj.filename).name
         self._first_line: int = adj.fun_lineno
         self.scope = _scope(function.func)
-        """The values of names from the module and from enclosing functions."""
+        """The values of the names that the module and the enclosing functions define."""
         self.locals = {argument.arg for argument in self.tree.args.args} | {
             node.id for node in ast.walk(self.tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
         }
         """The function's arguments, and the names that it assigns."""
 
     def place(self, node: ast.AST) -> str:
-        """The file and the line of a node, for messages."""
+        """Return the file and the line of a node, for messages."""
         return f"{self.file}, line {self._first_line + getattr(node, 'lineno', 1) - 1}"
 
     def value(self, node: ast.expr) -> Any:
-        """The value of a name, of a path such as ``module.helper`` or of ``wp.static(...)``; None if unknown."""
+        """Evaluate a name, a path such as ``module.helper`` or a ``wp.static(...)``; return None if that fails."""
         if isinstance(node, ast.Name):
             if node.id in self.locals:
                 return None
@@ -56,7 +56,7 @@ class FunctionSource:
             assert isinstance(node, ast.Call)
             try:
                 return eval(ast.unparse(node.args[0]), dict(self.scope))
-            except Exception:  # the argument may use other names, such as the counter of a loop that Warp unrolls
+            except Exception:  # the argument may use unknown names, such as the counter of a loop that Warp unrolls
                 return None
         return None
 
@@ -72,8 +72,8 @@ class FunctionSource:
     def call(self, node: ast.Call) -> tuple[Literal["static", "helper", "native", "builtin", "other"], Any]:
         """Classify a call, and return its kind and its callee.
 
-        The kinds are helpers (functions with Python source), native functions (``wp.func_native``), Warp's builtins,
-        and others: types, Python's functions, or None if the callee is unknown.
+        A callee is a helper (a function with Python source), a native function (``wp.func_native``), one of Warp's
+        builtins, or another object: a type, a Python function, or None if unknown.
         """
         callee = self.value(node.func)
         if self.is_static(node):
@@ -85,9 +85,9 @@ class FunctionSource:
         return "helper" if has_source(callee) else "native", callee
 
     def condition(self, node: ast.expr) -> bool | None:
-        """The value of a ``wp.static(...)`` condition, for which Warp compiles only one branch.
+        """Evaluate a ``wp.static(...)`` condition, of which Warp compiles only one branch.
 
-        Returns None for other conditions.
+        The result is None for other conditions.
         """
         found = self.value(node) if self.is_static(node) else None
         return None if found is None else bool(found)
@@ -109,22 +109,22 @@ def is_row(kind: Any) -> bool:
 
 
 def name_of(function: wp.Function) -> str:
-    """A function's name, as in its source."""
+    """Return a function's name in its source."""
     return function.func.__name__ if function.func is not None else function.key
 
 
 def builtin(name: str) -> Any:
     """Find a builtin function by name, first of Warp, then of Python.
 
-    Returns None if there is none. Warp's builtins need not be attributes of its module.
+    The result is None if there is no such builtin. Warp's builtins need not be attributes of its module.
     """
     return builtin_functions().get(name) or getattr(wp, name, None) or getattr(builtins, name, None)
 
 
 def overloads(function: wp.Function) -> list[wp.Function]:
-    """The overloads of a function with Python source: functions of the same name with other argument types."""
+    """Return the overloads of a function that have Python source."""
     found = [*function.user_overloads.values(), *function.user_templates.values()]
-    # omit the instances that Warp made from a generic function
+    # Warp adds its instances of a generic function to the overloads
     return [overload for overload in found if overload.generic_parent is None] or [function]
 
 
@@ -134,7 +134,7 @@ def _scope(function: Any) -> dict[str, Any]:
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         try:
             scope[name] = cell.cell_contents
-        except ValueError:  # the enclosing function has not assigned the variable yet
+        except ValueError:  # a variable of the enclosing function may not be assigned yet
             scope.pop(name, None)
     return scope
 
@@ -143,7 +143,7 @@ _module_names: set[str] = set()
 
 
 def free_module_name(name: str) -> str:
-    """A name for a Warp module, the same in every process so that Warp finds it in its cache; numbered if taken."""
+    """Return a free name for a Warp module, the same in every process, so that Warp finds it in its cache."""
     free = name = re.sub(r"[^\w.]", "_", name)
     number = 0
     while free in _module_names:
@@ -154,6 +154,6 @@ def free_module_name(name: str) -> str:
 
 
 def run_source(text: str, file: str, scope: dict[str, Any]) -> None:
-    """Run generated source in a scope, and keep it where Warp looks for the source of functions."""
+    """Run generated source in a scope, and add it to linecache, from which Warp reads the source of functions."""
     linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
     exec(compile(text, file, "exec"), scope)

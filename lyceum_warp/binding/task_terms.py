@@ -1,8 +1,8 @@
 """Find a task's terms and their arguments by name, and generate the functions that compute them.
 
-A term is a function of values, and its arguments are found by their names, as pytest finds fixtures: the state and the
-action, the result of another function of that name, a parameter, or a field. The generated text calls each function
-once, so that terms share its result.
+A term is a function, and its arguments are found by their names, as pytest finds fixtures. A name refers to the state,
+the action, the result of another function, a parameter, or a field. The generated text calls each function once, and
+terms share the results.
 """
 
 import difflib
@@ -16,13 +16,13 @@ from lyceum_warp.binding.sources import FunctionSource, is_struct, overloads, ru
 from lyceum_warp.task import Row, Task
 
 _STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
-"""The names that refer to the transition in reward terms and metrics, with their names in the generated text."""
+"""Names of a transition's parts in reward terms and metrics, with the names in the generated text."""
 
 _STATE = {"s": "s", "s1": "s", "p": "p"}
-"""The names that refer to the state in terminations, with their names in the generated text."""
+"""Names of the state and the parameters in terminations, with the names in the generated text."""
 
 _OWN = ("weights", "metrics", "total")
-"""Other names that the generated source uses."""
+"""Other names in the generated text."""
 
 _HEAD = "s0: World, action: Row[float], s1: World, p: Params, weights: Row[float]"
 
@@ -32,10 +32,9 @@ class Terms:
 
     Args:
         task: The task's class.
-        name: Its name, for messages.
-        lookup: Finds a function by its name in the task's class and its module, and in the base classes and their
-            modules.
-        written: The task's functions by their names in the table; None for missing functions.
+        name: The task's name, for messages.
+        lookup: A function that finds a function by name in the task's class, its base classes, and their modules.
+        written: The task's functions by their names in ``FUNCTIONS``; None for missing functions.
         world: The task's World.
         params: The task's Params.
 
@@ -54,15 +53,15 @@ class Terms:
     ) -> None:
         self._name, self.lookup, self._world, self._params = name, lookup, world, params
         self.weights = self._checked_weights(task.rewards)
-        """The weights of the terms of the reward, by name."""
+        """The weights of the reward's terms, by name."""
         self.terminations = self._names("terminations", task.terminations)
         self._reward, self._measure = written["reward"], written["measure"]
         functions = self._names("metrics", task.metrics, written=self._measure is not None)
         for attribute, kind in (("rewards", "reward"), ("rewards", "measure"), ("terminations", "terminated")):
             if getattr(task, attribute) and written[kind]:
-                raise ValueError(f"the task {name!r} has {attribute} and a function {kind}: leave one of them out")
+                raise ValueError(f"the task {name!r} has {attribute} and a function {kind}: remove one of them")
         self.functions: dict[str, wp.Function] = {}
-        """The functions that the text calls, by name."""
+        """The functions that the generated text calls, by name."""
         self.text = ""
         """The source of the generated functions; empty if the task has no terms."""
         self.metrics = (*self.weights, *task.metrics, *self.terminations)
@@ -99,13 +98,13 @@ class Terms:
             raise ValueError(f"rewards of the task {self._name!r} are per second: add dt: float to its Params")
         if taken := [term for term in rewards if term in self._params.vars]:
             raise ValueError(
-                f"the task {self._name!r} has a term and a parameter named {taken[0]!r}: set_params could not tell the "
-                "weight of the term from the parameter, so rename one"
+                f"the task {self._name!r} has a term and a parameter named {taken[0]!r}: set_params would not know "
+                "which one to set, so rename one"
             )
         return {term: float(weight) for term, weight in rewards.items()}
 
     def _names(self, attribute: str, names: Any, *, written: bool = False) -> tuple[str, ...]:
-        """The functions that an attribute of the task names; empty if the task defines the combined function."""
+        """Return the names in an attribute of the task; empty if the task defines the combined function."""
         if not isinstance(names, tuple | list) or not all(isinstance(name, str) and name for name in names):
             raise ValueError(
                 f"{attribute} of the task {self._name!r} must be names, such as ('forward', 'cost'), not {names!r}"
@@ -122,7 +121,7 @@ class Terms:
     # text
 
     def _written_text(self, metrics: tuple[str, ...], first: int) -> str:
-        """The generated text; ``first`` is the number of metrics that ``measure`` writes."""
+        """Generate the text; ``first`` is the number of metrics that ``measure`` writes."""
         parts = []
         if self.weights:
             body = _Body(self, _STEP)
@@ -156,15 +155,17 @@ class Terms:
     # names
 
     def choose(self, name: str, given: Mapping[str, str], within: tuple[str, ...] = ()) -> tuple[wp.Function, Any]:
-        """Select the overload of a function whose arguments can all be found; return it and its result type.
+        """Select the overload of a function for which all arguments can be found; also return its result type.
 
         Args:
             name: The function's name.
             given: The names that refer to states, the action and parameters.
-            within: The names of the functions that need this one.
+            within: The names of the functions that need this function.
         """
         if name in within:
-            raise ValueError(f"terms of the task {self._name!r} need each other: {' needs '.join((*within, name))}")
+            raise ValueError(
+                f"terms of the task {self._name!r} need each other in a circle: {' needs '.join((*within, name))}"
+            )
         function = self.lookup(name)
         assert function is not None
         refused = None
@@ -234,7 +235,7 @@ class Terms:
 
 
 class _Body:
-    """The lines of one generated function, which call each function once."""
+    """The body of a generated function, which calls each function once."""
 
     def __init__(self, terms: Terms, given: Mapping[str, str]) -> None:
         self._terms, self._given = terms, given
@@ -250,7 +251,7 @@ class _Body:
                 source, text = self._terms.source_of(function, argument, self._given, (name,))
                 text = self.value(text) if source == "function" else text
                 if source == "default":
-                    named = True  # the arguments after a default are passed by name
+                    named = True  # Warp requires names for the arguments after a default
                 else:
                     arguments.append(f"{argument}={text}" if named else text)
             self._lines.append(f"{name}_ = {name}({', '.join(arguments)})")
@@ -263,12 +264,12 @@ class _Body:
         return f"{name}_"
 
     def number(self, name: str) -> str:
-        """The value as a float; a bool counts as 0 or 1."""
+        """Convert a value to float; a bool becomes 0 or 1."""
         value = self.value(name, float, bool)
         return f"wp.where({value}, 1.0, 0.0)" if _fits(bool, self._values[name][1]) else value
 
     def function(self, signature: str, lines: list[str]) -> str:
-        """The text of the function; ``lines`` are its last lines."""
+        """Return the function's text, which ends with ``lines``."""
         return f"@wp.func\ndef {signature}:\n" + "\n".join(f"    {line}" for line in (*self._lines, *lines)) + "\n"
 
 

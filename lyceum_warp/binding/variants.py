@@ -1,8 +1,8 @@
 """Copy the functions of a task's family, so that a variant can run them with its own structs and functions.
 
-Warp compiles a function for the structs that it names. If a variant extends its parent's World, the parent's functions
-are copied: the copies take the variant's World, and call the variant's functions in place of those that it replaces. A
-copy keeps its original's source, so messages name the original's file and line.
+Warp compiles a function for the structs in its annotations. If a variant extends its parent's World, the parent's
+functions are copied. The copies take the variant's World, and call the variant's functions instead of the replaced
+ones. A copy keeps its original's source, so messages name the original's file and line.
 """
 
 import sys
@@ -17,7 +17,7 @@ from lyceum_warp.task import Task
 
 
 class Variant:
-    """The functions and structs of a family, as one task uses them.
+    """Copies of a family's functions that use one task's structs and functions.
 
     Args:
         modules: The modules of the family; the task's module comes first.
@@ -35,7 +35,7 @@ class Variant:
     ) -> None:
         self._modules, self._structs, self._replaced = {m.__name__: m for m in modules}, structs, replaced
         self._copies: dict[wp.Function, wp.Function] = {}
-        # Warp evaluates wp.static(...) when a function is defined, which needs the structs
+        # Warp evaluates wp.static(...) when it defines a function, so the structs must be in the scope
         scopes = {module.__name__: self._with_structs(vars(module)) for module in modules}
         homes = {name: wp.Module(name, None) for name in scopes}
         for function in functions:
@@ -45,7 +45,7 @@ class Variant:
             scope |= {key: self.seen(value, name) for key, value in scope.items()}
 
     def seen(self, value: Any, viewer: str = "") -> Any:
-        """The replacement of a function, a struct or a module of the family.
+        """Return the replacement of a function, a struct or a module of the family.
 
         ``viewer`` is the name of the module that uses the value. The module that defines a replacement still gets the
         original function, so that the replacement can call it.
@@ -86,9 +86,9 @@ _made: dict[Any, Variant] = {}
 
 
 def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any, own: Any) -> Variant | None:
-    """Make a task's variant of its family; None if the task uses its parents' structs and replaces no function.
+    """Make a task's variant of its family, or return None if the task has no struct or function of its own.
 
-    Tasks with the same structs and replacements share it, and with it their compiled kernels.
+    Tasks with the same structs and replacements share a variant and its compiled kernels.
 
     Args:
         task: The task's name, for messages.
@@ -117,7 +117,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
         if isinstance(value, wp.Function) and hasattr(value, "replaces")
     }
     named = {*structs, *structs.values(), world, params}
-    for module in modules:  # the loop body extends the list
+    for module in modules:  # the loop appends to modules
         for value in _values(module, owners):
             home = sys.modules.get(_home(value)) if isinstance(value, wp.Function) else value
             if isinstance(home, types.ModuleType) and home not in modules and _names(home, named):
@@ -127,7 +127,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
     taken = {kind for f in functions for overload in overloads(f) for kind in overload.input_types.values()
              if is_struct(kind)}  # fmt: skip
     structs = {struct: new for struct, new in structs.items() if struct in taken}
-    if not structs and not replaced:  # for example, a robot that only changes defaults
+    if not structs and not replaced:  # such a task may be a robot that only changes defaults
         return None
     key = (tuple(modules), tuple(functions), tuple(structs.items()), tuple(replaced.items()))
     if key not in _made:
@@ -138,12 +138,12 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
 
 
 def _home(function: wp.Function) -> str:
-    """The name of the module that defines a function."""
+    """Return the name of the module that defines a function."""
     return str(function.func.__module__) if function.func is not None else ""
 
 
 def _values(module: types.ModuleType, owners: Sequence[type[Task]]) -> Iterator[Any]:
-    """The values of a module, now and when its tasks were defined, and of these tasks' classes."""
+    """Yield the values in a module, now and when its tasks were defined, and the attributes of these tasks."""
     for owner in owners:
         if owner.__module__ == module.__name__:
             own = (value.__func__ if isinstance(value, staticmethod) else value for value in vars(owner).values())

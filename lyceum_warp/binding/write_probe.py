@@ -15,16 +15,18 @@ from lyceum_warp.support.arrays import launch_parts, launch_worlds
 from lyceum_warp.task import observer_name
 
 _ROOM = 2**18
-"""Bytes of guard memory before and after every row. Out-of-range writes land there harmlessly."""
+"""The bytes of guard memory before and after every row. Guard memory receives writes outside a row, so that they damage
+nothing."""
 
 _ALIGNED = 64
 
 _UNWRITTEN = 0x7FA5C3E1
-"""The sentinel, a signaling NaN. Arithmetic turns it into a quiet NaN, so that ``+=`` counts as a write."""
+"""The sentinel, a signaling NaN. Arithmetic turns a signaling NaN into a quiet NaN, so that ``+=`` counts as a
+write."""
 
 
 class GuardedRows:
-    """Rows, (n, ...), with guard memory around each row. Elements are sentinels, or the first n of ``values``."""
+    """Rows, (n, ...), with guard memory around each row. Rows contain sentinels, or the first n rows of ``values``."""
 
     def __init__(self, shape: Sequence[int], dtype: Any, device: wp.Device, values: wp.array | None = None) -> None:
         self.size = math.prod(shape[1:])
@@ -41,7 +43,7 @@ class GuardedRows:
             wp.copy(self.array, values[: shape[0]])
 
     def outside(self) -> np.ndarray:
-        """Ascending indices of written elements outside a row; elements before its start have negative indices."""
+        """Return the ascending indices of written elements outside a row; elements before it have negative indices."""
         words: np.ndarray = self._memory.numpy()
         changed = 4 * np.flatnonzero(words != _UNWRITTEN)[:, None] + np.arange(4)
         unwritten = np.array(_UNWRITTEN, dtype=np.uint32).reshape(1).view(np.uint8)
@@ -51,7 +53,7 @@ class GuardedRows:
         return np.unique(index[(index < 0) | (index >= self.size)])
 
     def written(self) -> np.ndarray:
-        """Mask of the written elements of a single row of 32-bit numbers."""
+        """Return the mask of the written elements in a single row of 32-bit numbers."""
         start = _ROOM // 4
         written: np.ndarray = self._memory.numpy()[start : start + self.size] != _UNWRITTEN
         return written
@@ -146,7 +148,7 @@ class Probe:
                 )
 
     def _named(self, group: str, chosen: np.ndarray) -> str:
-        """The names of the chosen elements of an observation."""
+        """Name the chosen elements of an observation, for messages."""
         columns = Space.of(self._layouts[group]).columns
         return ", ".join(columns[i] for i in np.flatnonzero(chosen))
 
@@ -163,10 +165,10 @@ class Probe:
             launch_worlds(kernel, 1, args, self._device)
 
     def _check_fields(self, function: str) -> None:
-        """Raise a ValueError if a function wrote beyond a field or beyond its random stream."""
+        """Raise a ValueError if a function wrote outside a field or outside its random stream."""
         for name in sorted(self._writes.get(function, ())):
             rows, parts = self._fields[name], self._memory.get(name)
-            if parts:  # a write within the row may still be a wrong element, which only check_task finds
+            if parts:  # check_task also finds writes to a wrong element within a row
                 self._check_memory(function, rows, parts)
             else:
                 self._check(function, rows, name, f"the model has {rows.size}")

@@ -1,6 +1,6 @@
 """Find all places where a Warp function, or a function that it calls, writes into its arguments.
 
-The analysis follows elements, components, calls, local names of a row, and rows in the fields of a local struct. A row
+The analysis follows elements, components, calls, local variables that hold rows, and local structs with rows. A row
 that is used in any other way (returned, put into a tuple, selected by ``wp.where``, passed to a native function) counts
 as written.
 """
@@ -24,27 +24,27 @@ _INQUIRIES = {"shape", "ndim", "size", "strides", "dtype", "device"}
 
 @dataclasses.dataclass(frozen=True)
 class Write:
-    """One write into an argument of a function."""
+    """A write into an argument of a function."""
 
     position: int
-    """Index of the argument."""
+    """The index of the argument."""
     field: str | None
-    """The field that is written, if the argument is a struct; None if it is a row."""
+    """The written field of an argument that is a struct; None for a row."""
     target: str
     """The argument with its field, such as "s.qpos"."""
     function: str
-    """Name of the function whose source contains the write."""
+    """The name of the function that contains the write."""
     place: str
     """The file and the line of the write."""
     replaced: bool = False
-    """Whether the field itself is assigned, as in ``s.time = 0.0``, instead of an element of its row."""
+    """Whether the write assigns the field, as ``s.time = 0.0`` does, instead of an element of its row."""
     use: str | None = None
-    """The expression that may write the row, if the analysis cannot follow it; None for a definite write."""
+    """An expression that may write the row but cannot be analysed; None for a definite write."""
 
 
 @functools.cache
 def find_writes(function: wp.Function) -> tuple[Write, ...]:
-    """The writes of a function and of its callees into its arguments, in source order."""
+    """Find the writes of a function and of its callees into the function's arguments, in source order."""
     kinds = enumerate(map(_kind, function.input_types.values()))
     places = tuple(None if kind is None else _Place(i, None, kind) for i, kind in kinds)
     arguments, writes = list(function.input_types), dict[Write, None]()
@@ -56,12 +56,12 @@ def find_writes(function: wp.Function) -> tuple[Write, ...]:
 
 
 def written_fields(function: wp.Function) -> frozenset[str]:
-    """The fields of its struct arguments that a function writes, or may write."""
+    """Return the fields of struct arguments that a function writes or may write."""
     return frozenset(write.field for write in find_writes(function) if write.field is not None)
 
 
 Rights = Mapping[str, Collection[str] | None]
-"""For each argument by name, in order, the fields that a function may write; None for a result row."""
+"""Fields that a function may write through each argument, by the argument's name; None for a row of results."""
 
 
 def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mapping[str, Rights]) -> None:
@@ -84,7 +84,7 @@ def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mappin
 
 
 def _advice(write: Write, name: str, rights: Mapping[str, Rights]) -> str:
-    """Say which fields the function may write, and which functions may write this field."""
+    """Say which fields the function may write, and which functions may write the given field."""
     may = [field for fields in rights[name].values() for field in fields or ()]
     results = [argument for argument, fields in rights[name].items() if fields is None and argument != "rng"]
     own = f"{name} may write {', '.join(dict.fromkeys([*results, *may])) or 'nothing'}"
@@ -108,12 +108,12 @@ def _advice(write: Write, name: str, rights: Mapping[str, Rights]) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class _Place:
-    """Memory of an argument of the analysed function: the argument, a field, a row of a table, or an element."""
+    """A part of an argument of the analysed function: the argument, a field, a row of a table, or an element."""
 
     position: int
     field: str | None
     kind: Any
-    """A struct; (axes, type of an element) of an array; or None for an element, whose value is copied when read."""
+    """A struct type, or (axes, element type) of an array, or None for an element, which is copied when it is read."""
 
     def attribute(self, name: str) -> "_Place | None":
         if is_struct(self.kind):
@@ -130,7 +130,7 @@ class _Place:
 
 
 def _kind(written: Any) -> Any:
-    """The ``_Place.kind`` of a type; None for numbers, vectors and matrices."""
+    """Return a type's ``_Place.kind``; None for numbers, vectors and matrices."""
     return written if is_struct(written) else (written.ndim, written.dtype) if is_row(written) else None
 
 
@@ -139,9 +139,9 @@ class _Reader:
 
     Args:
         function: The function.
-        places: For each argument, the memory to which it refers among the arguments of the analysed function, or None.
+        places: For each argument, the part of the analysed function's arguments to which it refers, or None.
         arguments: Names of the arguments of the analysed function.
-        writes: Collects the writes.
+        writes: The dict to which writes are added.
         seen: The functions that were read, with their places.
     """
 
@@ -155,9 +155,9 @@ class _Reader:
     ) -> None:
         self.arguments, self.writes, self.seen = arguments, writes, seen
         self.source = FunctionSource(function)
-        # keys: a name, or "name.field" for a row in a local struct
+        # a key is a name, or "name.field" for a row in a local struct
         self.places: dict[str, _Place | None] = dict(zip(function.input_types, places, strict=True))
-        # a loop may use a local struct in its first iteration, before a later line puts a row into it
+        # read twice, because a loop may use a local struct above the line that puts a row into it
         for _ in range(2):
             for statement in self.source.tree.body:
                 self._read(statement)
@@ -170,10 +170,10 @@ class _Reader:
         self.writes[Write(place.position, place.field, target, self.source.name, where, replaced, use)] = None
 
     def _read(self, node: ast.AST) -> _Place | None:
-        """The memory of an argument that an expression names; notes the writes within an expression or a statement."""
+        """Note the writes in an expression or a statement; return the part of an argument that it refers to."""
         if isinstance(node, ast.Name):
             for name, place in self.places.items():
-                if place is not None and name.startswith(f"{node.id}."):  # a local struct is used as a whole
+                if place is not None and name.startswith(f"{node.id}."):  # the expression uses a whole local struct
                     self._note(place, node, follows=False)
             return self.places.get(node.id)
         if isinstance(node, ast.Attribute):
@@ -195,7 +195,7 @@ class _Reader:
         return None
 
     def _read_all(self, parent: ast.AST, nodes: Any, *, elements: bool = False) -> None:
-        """Read parts of an expression or a statement in which the analysis cannot follow a whole row."""
+        """Read parts of an expression or a statement; note every row that they use as a whole."""
         for node in nodes:
             place = self._read(node)
             if place is not None and (elements or place.kind is not None):
@@ -216,7 +216,7 @@ class _Reader:
                     self._note(lost, node, follows=False)
 
     def _is_local(self, target: ast.expr) -> bool:
-        """Whether an assignment is to a local name, or to a field of a local struct."""
+        """Whether an assignment changes only a local variable, or a field of a local struct."""
         owner = target.value if isinstance(target, ast.Attribute) else None
         return isinstance(target, ast.Name) or (isinstance(owner, ast.Name) and owner.id not in self.places)
 

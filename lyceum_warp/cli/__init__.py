@@ -26,8 +26,8 @@ _COMMANDS = {
     "view": ("view", "View", "Show a task, a policy, a planner or saved episodes in a browser."),
     "bench": ("bench", "Bench", "Run an experiment or another program of bench/."),
 }
-"""Each command's module, class and help line. A module is imported only when its command is run, because most load
-torch, Warp and MuJoCo."""
+"""The module, the class and the help line of each command. A module is imported only when its command is run, because
+most modules import torch, Warp and MuJoCo."""
 
 _DESCRIPTION = """Batched MuJoCo worlds for robot learning.
 
@@ -66,10 +66,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     except Interrupted as signalled:
         return 128 + signalled.number
-    except BrokenPipeError:  # for example, lyceum-warp tasks | head
+    except BrokenPipeError:  # the reader of a pipe may end early, as in lyceum-warp tasks | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except OSError as error:  # for example, a full disk, or a folder that cannot be written
+    except OSError as error:  # the disk may be full, or a folder may be read-only
         text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
         print(f"lyceum-warp: {'; '.join([text, *getattr(error, '__notes__', [])])}", file=sys.stderr)
         return 2

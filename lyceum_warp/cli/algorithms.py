@@ -29,7 +29,7 @@ class Hyperparameters:
             algorithm: Name of the algorithm.
 
         Raises:
-            ValueError: There is no such algorithm, it has no such hyperparameter, or a value is not valid.
+            ValueError: The algorithm or a hyperparameter does not exist, or a value is not valid.
         """
         if algorithm not in ALGORITHMS:
             raise ValueError(f"there is no algorithm {algorithm!r}: use {' or '.join(ALGORITHMS)}")

@@ -14,37 +14,36 @@ from lyceum_warp.options import OPTIONS, EnvOptions, PhysicsOptions, given_value
 from lyceum_warp.support.docstrings import attribute_docs
 
 Repeated = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")]
-"""A repeatable flag with one NAME=VALUE each."""
+"""Declare a flag that takes one NAME=VALUE and may be repeated."""
 
 ParamWords = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
     tyro.conf.arg(
         metavar="NAME=VALUE",
-        help="A parameter of the task. A vector is written as NAME=0.7,inf, a table as NAME=file.npy. May be given "
-        "several times.",
+        help="A parameter of the task. A vector is written as NAME=0.7,inf, a table as NAME=file.npy. The flag "
+        "may be repeated.",
     ),
 ]
-"""The flag --param; ``parameters`` parses it."""
+"""Declare the flag --param, which ``parameters`` parses."""
 
 Trust = Annotated[
     bool,
     tyro.conf.arg(
-        help="Allow a run that you did not make on this machine to run its task and to read the files that it names, "
-        "now and later.",
+        help="Trust a run from elsewhere, now and later: allow it to run its task and to read the files that it names.",
     ),
 ]
-"""The flag --trust; see ``lyceum_warp.runs.trust``."""
+"""Declare the flag --trust; see ``lyceum_warp.runs.trust``."""
 
 CameraWords = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
     tyro.conf.arg(
         metavar="NAME|PART=VALUE",
         help='Camera of videos: a camera of the model by name or index, "free" for MuJoCo\'s default free camera, or a '
-        "part of a free camera's pose: azimuth=90, elevation=-20, distance=3, lookat=0,0,1 or track=BODY. May be given "
-        "several times.",
+        "part of a free camera's pose: azimuth=90, elevation=-20, distance=3, lookat=0,0,1 or track=BODY. The flag "
+        "may be repeated.",
     ),
 ]
-"""The flag --camera; ``viz.cameras.parsed_camera`` parses it."""
+"""Declare the flag --camera, which ``viz.cameras.parsed_camera`` parses."""
 
 TaskWord = Annotated[
     tyro.conf.Positional[str],
@@ -71,10 +70,11 @@ def optional_flags(
     box.
 
     Args:
-        options: The dataclasses. If several have the same field, the first determines its type and help text.
-        omit: Fields without a flag.
-        default: Text that describes the default in the help, for all flags or by field name; flags then default to
-            None. If it is None, flags have the dataclass's defaults.
+        options: The dataclasses. If several dataclasses have the same field, the first one determines its type and help
+            text.
+        omit: Names of fields that get no flag.
+        default: Text that describes the default in the help, for all flags or by field name. With a text, flags default
+            to None. Without a text, flags have the dataclass's defaults.
     """
 
     def decorated(cls: type[Class]) -> type[Class]:
@@ -90,7 +90,7 @@ def optional_flags(
                     setattr(cls, name, field.default if default is None else None)
                 value = getattr(cls, name)
                 flag = own.pop(name, None) or hints[name]
-                if value is None and flag is hints[name]:  # the docstring explains None; a flag cannot be None
+                if value is None and flag is hints[name]:  # the first sentence explains None, which a flag cannot have
                     (kind_of_flag,) = {*(typing.get_args(flag) if isinstance(flag, _UNIONS) else [flag])} - {type(None)}
                     flag = Annotated[kind_of_flag | None, tyro.conf.DisallowNone]
                 text = default[name] if isinstance(default, Mapping) else default or ""
@@ -103,7 +103,7 @@ def optional_flags(
 
 
 def given(flags: Any) -> dict[str, Any]:
-    """The flags that differ from their defaults, by name.
+    """Return the values of the flags that differ from their defaults, by name.
 
     Raises:
         ValueError: A limit of the solver is not of the form NAME=VALUE.
@@ -115,8 +115,8 @@ def given(flags: Any) -> dict[str, Any]:
 
 
 NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "model", "fields", "dynamics", "physics")
-"""Options of an environment without a generated flag. Commands define nworld, seed and the model themselves,
-``Physics`` has the flags of ``physics``, and the others are only for Python."""
+"""Options of an environment that have no generated flag. Commands declare flags for nworld, seed and the model, and
+``Physics`` declares the flags of ``physics``. The other options are only for Python."""
 
 
 @optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"))
@@ -142,14 +142,14 @@ class EnvFlags:
 
 @optional_flags(PhysicsOptions, omit=("base",), default="")
 class Physics:
-    """How the worlds are simulated. The defaults come from the run, the task or its model."""
+    """Physics options of the worlds. The defaults come from the run, the task or its model."""
 
     physics: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """One of the task's physics by name, as listed by lyceum-warp tasks, or exact for the task's own. The other options
-    change it."""
+    """One of the task's physics by name, as listed by lyceum-warp tasks, or exact for the task's own. The other physics
+    options are applied on top."""
     solver: Repeated = ()
     """A limit of the constraint solver, such as iterations=4, ls_iterations=10 or noslip_iterations=0; may be repeated.
-    By default the model's limits."""
+    The default limits come from the model."""
 
 
 def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str] | None = None) -> dict[str, Any]:
@@ -157,7 +157,7 @@ def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str]
 
     Args:
         texts: The strings, each NAME=VALUE.
-        command: The command's arguments; if a parameter is really an option, the error names its flag.
+        command: The command's arguments; if a parameter's name is an option, the error names the option's flag.
         instead: Flags of options that have a different name in this command.
 
     Raises:

@@ -14,7 +14,7 @@ import tyro
 from lyceum_warp.support.interrupts import Interrupted
 
 FOLDER = Path(__file__).resolve().parents[2] / "bench"
-"""The folder of the programs in a checkout; an installed package does not have it."""
+"""The folder bench/ of a checkout; an installed package does not contain bench/."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -46,15 +46,13 @@ class Bench:
             FileNotFoundError: The package is not in a checkout.
         """
         if not (FOLDER / "experiment.py").exists():
-            raise FileNotFoundError(
-                f"the experiments belong to a checkout of the repository, and {FOLDER} is not there"
-            )
+            raise FileNotFoundError(f"the experiments need a checkout of the repository, and {FOLDER} does not exist")
         programs = [path.stem for path in sorted(FOLDER.glob("*.py")) if "__main__" in path.read_text()]
         if self.name not in programs:
             close = difflib.get_close_matches(self.name, programs, 1)
             hint = f"did you mean {close[0]}?" if close else "lyceum-warp bench lists the experiments"
             raise ValueError(f"there is no program {self.name!r} in bench/: {hint}")
-        # the child imports this package, not an installed one
+        # the subprocess imports the package from this checkout, not an installed one
         path = os.pathsep.join([str(FOLDER.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
         command = [sys.executable, str(FOLDER / f"{self.name}.py"), *arguments]
         child = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": path})
@@ -62,7 +60,7 @@ class Bench:
             code = child.wait()
         except Interrupted:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                child.wait(3.0)  # Ctrl-C in a terminal also reaches the child
+                child.wait(3.0)  # in a terminal, Ctrl-C also reaches the subprocess
             child.terminate()
             child.wait()
             raise

@@ -36,7 +36,7 @@ def note(line: str) -> None:
 
 
 class Display(training.Display):
-    """Progress of a training run: a live bar of at most 80 columns on a terminal, otherwise one line per iteration.
+    """Shows the progress of training: a live bar of at most 80 columns on a terminal, otherwise one line per iteration.
 
     Args:
         console: The output.
@@ -74,7 +74,7 @@ class Display(training.Display):
             self.mean = it.mean_return
         shown = self.mean if self.console.is_terminal else math.nan if it.mean_return is None else self.mean
         row = _known(it.row())
-        # the return is unknown until an episode has ended
+        # before the first episode ends, the return is unknown
         reward = f"reward {row['reward_mean']:.3g} a step" if "reward_mean" in row else ""
         result = f"return {row['return_mean']:.4g}" if "return_mean" in row else reward
         mean = "" if math.isnan(shown) else f"(mean policy {shown:.4g})"
@@ -109,14 +109,15 @@ class Display(training.Display):
 
 
 _COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skipped update"}
-"""Columns that count problems, each with its label in messages. Not every algorithm has all columns."""
+"""Columns of metrics.csv that count problems, each with its label in messages. Some algorithms have only some of these
+columns."""
 
 _BAR_WIDTH = 36
-"""Width of the bar with the iteration number and the times, in characters."""
+"""The width of the bar, the iteration number and the times in characters."""
 
 
 def counted(number: int, what: str) -> str:
-    """A number with a noun, in the plural if necessary."""
+    """Format a number with a noun, in the plural if necessary."""
     return f"{number:,d} {what}{'s' if number > 1 else ''}"
 
 
@@ -126,16 +127,17 @@ _COLUMNS = [
     ("length", "length_mean", ".0f"), ("eval", "eval_mean", ".3g"), ("success", "success", ".0%"),
     ("KL", "kl", ".3f"), ("samples/s", "samples_per_second", ",.0f"),
 ]  # fmt: skip
-"""Columns of the table of iterations: heading, column in metrics.csv, format."""
+"""The columns of the table of iterations: heading, column in metrics.csv, format."""
 
 
 def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omit: Sequence[str] = ()) -> Table:
-    """A table that fits the console's width: words in the first column are wrapped, and then columns are omitted.
+    """Make a table that fits the console's width: wrap words in the first column, then omit columns.
 
     Args:
         console: The output.
-        columns: The cells of each column, by its heading. The first may hold words, the others hold numbers.
-        omit: Headings of the columns that may be omitted, in this order.
+        columns: The cells of each column, by its heading. The first column may hold words; all other columns hold
+            numbers.
+        omit: Headings of the columns that may be omitted, the first one first.
     """
     table = Table()
     for count in range(len(omit) + 1):
@@ -156,10 +158,9 @@ def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omi
 
 
 def curve_table(rows: list[dict[str, float | None]], console: Console) -> Table:
-    """A table of at most 15 of a run's iterations; it omits empty columns, and columns that do not fit the console.
+    """Make a table of at most 15 iterations of a run, without empty columns and columns that do not fit the console.
 
-    If the mean policy was evaluated in at least 4 iterations between the first and the last, other iterations are
-    omitted.
+    If the mean policy was evaluated in 4 iterations or more between the first and the last, only these are shown.
     """
     known = [_known(row) for row in rows]
     between = [row for row in known[1:-1] if "mean_return" in row]
@@ -173,7 +174,7 @@ def curve_table(rows: list[dict[str, float | None]], console: Console) -> Table:
             value = row.get(name, 0.0)
             cells.append(format(int(value) if form.endswith("d") else value, form) if name in row else "")
         if name == "reward_mean" and all("return_mean" in row for row in known):
-            continue  # shown only until an episode has ended
+            continue  # this column is shown only until an episode ends
         if any(cells):
             columns[heading] = cells
     table = fitting_table(console, columns, omit=("samples", "std", "KL", "samples/s", "length", "eval", "success"))
@@ -192,7 +193,7 @@ def _known(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
-    """Call a function that writes a file; return the path, or "none" with the reason of the failure.
+    """Call a function that writes a file; return the path, or "none" with the reason for a failure.
 
     Plots and videos are made from saved results, so the command succeeds even if one of them fails.
     """
@@ -206,10 +207,10 @@ def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
 
 
 class PlanDisplay:
-    """Progress of a planner's episode: a live line on a terminal, and a line at the end of the episode.
+    """Shows the progress of a planner's episode: a live line on a terminal, and a line at the end of the episode.
 
     With ``real_time`` the live line shows the rate of plans and the age of the action, otherwise the rate of the plant.
-    Rates are means over the episode so far.
+    Rates are averaged over the episode so far.
     """
 
     def __init__(
@@ -234,7 +235,7 @@ class PlanDisplay:
         """Show a step."""
         if self.console.is_terminal:
             time = max(now.time, 1e-9)
-            if self.real_time:  # the first plan is made before the clock starts
+            if self.real_time:  # the clock starts after the first plan
                 pace = f"{(now.plans - 1) / time:.0f} plans/s action {1000 * now.age:.3g} ms old"
             else:
                 pace = f"{now.step / time:.0f} Hz {now.step / time * self.timestep:.2f}x real time"
@@ -242,7 +243,7 @@ class PlanDisplay:
             self.progress.update(self.bar, completed=now.step, text=text)
 
     def done(self, trajectory: Trajectory) -> None:
-        """Print the result of the episode."""
+        """Print the episode's result."""
         factor = trajectory.steps * trajectory.timestep / trajectory.wall_seconds
         end = "success, " if trajectory.succeeded else "ended early, " if trajectory.terminated else ""
         self.console.print(
@@ -253,7 +254,7 @@ class PlanDisplay:
 
 
 def report_table(report: ControlReport, *, success: bool = True) -> Table:
-    """The table of a controller's report; without ``success``, the row of that name is omitted."""
+    """Make the table of a controller's report; a report without ``success`` has no such row."""
     table = Table(box=rich.box.SIMPLE, show_header=False)
     for row in report.rows():
         if success or row[0] != "success":

@@ -51,21 +51,21 @@ class Eval:
     )  # fmt: skip
 
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|TASK")]
-    """The run's folder; with --pretrained the name of a task."""
+    """The run's folder, or with --pretrained the name of a task."""
     pretrained: bool = False
-    """Whether to evaluate the pretrained policy of a task, which is part of the package."""
+    """Whether to evaluate the package's pretrained policy of a task."""
     which: str = "last"
-    """Which policy: last, best, or the number of a saved iteration."""
+    """The policy to evaluate: last, best, or the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """A task, by name or file, to use with its own physics and defaults instead of the run's task. The task may also be
-    the current version of the run's task. Observations and actions must have the same sizes."""
+    """A task, by name or file, that replaces the run's task and its physics and defaults. This may be the current
+    version of the run's task. The observations and actions of both tasks must have the same sizes."""
     param: ParamWords = ()
     episodes: int = 32
     """Number of episodes."""
     seed: int = 1
-    """Seed of the initial states; training with the same seed draws different ones."""
+    """Seed of the initial states; training with the same seed draws different initial states."""
     nworld: int = 32
-    """Maximum number of worlds; never more than episodes."""
+    """Maximum number of worlds; there are never more worlds than episodes."""
     video: bool = False
     """Whether to write a video of one episode: eval.mp4 in the run's folder, or with --pretrained TASK.mp4."""
     camera: CameraWords = ()
@@ -73,7 +73,8 @@ class Eval:
     """Whether to play the episodes on both engines, and under each of the task's physics, and to print the differences
     with a verdict. The Warp engine runs on --device, by default on a GPU if there is one."""
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """A new or empty folder for one file per episode, in the format of lyceum-warp plan: episode-000.npz and so on."""
+    """A new or empty folder for the episodes, one file each, in the format of lyceum-warp plan: episode-000.npz and so
+    on."""
     trust: Trust = False
     env: Annotated[EnvFlags, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
         default_factory=EnvFlags
@@ -85,12 +86,12 @@ class Eval:
         if self.episodes < 1 or self.nworld < 1:
             raise ValueError(f"eval needs at least 1 episode and 1 world, not {self.episodes} and {self.nworld}")
         if self.transfer and self.env.engine is not None:
-            raise ValueError("--transfer plays on both engines: omit --engine")
+            raise ValueError("--transfer plays episodes on both engines: omit --engine")
         camera = parsed_camera(self.camera)
         if self.video:
             check_video()
         elif camera is not None:
-            raise ValueError("--camera has no effect without --video: give both, or omit --camera")
+            raise ValueError("--camera has no effect without --video: add --video, or omit --camera")
         if self.episodes_to is not None:
             Run.check_free(self.episodes_to)
         run = Run.open(pretrained_run(str(self.folder)) if self.pretrained else self.folder)
@@ -169,7 +170,7 @@ def run_worlds(
 
     Args:
         run: The run.
-        words: Options that override the run's; without a device, the worlds run on the CPU if the engine is auto.
+        words: Options that override the run's; with the engine auto and no device, the worlds run on the CPU.
         params: Parameters that override the run's.
         nworld: Number of worlds.
         task: A different task, with its own options and parameters.
@@ -190,7 +191,7 @@ def run_worlds(
 
 
 def _save_episodes(env: Env, policy: Policy, options: Eval, run: Run, source: dict[str, Any]) -> str:
-    """Run the same episodes again, write one file per episode, and return a pattern that matches the files."""
+    """Run the same episodes again, write one file per episode, and return a glob pattern of the files."""
     assert options.episodes_to is not None
     whose = {"name": type(policy).__name__, "run": str(run.folder.resolve()), "which": options.which}
     with LongWork("running the episodes that are saved", "steps", make_console()) as work:
@@ -205,7 +206,7 @@ def _save_episodes(env: Env, policy: Policy, options: Eval, run: Run, source: di
 
 
 def _source(env: Env, run: Run) -> dict[str, Any]:
-    """The ``source`` of saved episodes, with the run's copy of the model if it was used."""
+    """Return the ``source`` of saved episodes, with the path of the run's copy of the model if that copy was used."""
     made, copy = source(env), run.config.get("kept", {}).get("model")
     if copy is not None and env.options.model is not None and "model" not in made["options"]:
         made["options"]["model"] = str((run.task_folder / copy).resolve())

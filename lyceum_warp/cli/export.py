@@ -21,8 +21,8 @@ class Export:
     """Write a run's policy, including its observation normaliser, to a file that runs without lyceum_warp.
 
     An .onnx file has the input "obs", (n, observations) float32 for any n, and the output "action", the mean actions.
-    The file's metadata describe the robot: parts of observations, joints, gains, control interval and more. Writing it
-    needs pip install 'lyceum-warp[export]'. torch loads a .pt2 file: torch.export.load(file).module()(obs).
+    The file's metadata describe the robot: parts of observations, joints, gains, control interval and more. ONNX needs
+    pip install 'lyceum-warp[export]'. torch loads a .pt2 file: torch.export.load(file).module()(obs).
 
     $ lyceum-warp export runs/hopper-20260101-120000
     $ lyceum-warp export runs/hopper-20260101-120000 --which best --to robot/policy.onnx
@@ -31,9 +31,9 @@ class Export:
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     to: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """The file, .onnx or .pt2; by default policy.onnx in the run's folder. An existing file is replaced."""
+    """The file to write, .onnx or .pt2; by default policy.onnx in the run's folder. An existing file is replaced."""
     which: str = "last"
-    """Which policy: last, best, or the number of a saved iteration."""
+    """The policy to export: last, best, or the number of a saved iteration."""
     trust: Trust = False
 
     def run(self) -> int:
@@ -48,7 +48,10 @@ class Export:
         return 0
 
     def _env(self, run: Run) -> Env | None:
-        """Make a world of the run's task for the metadata. If this fails, print a message and return None."""
+        """Make a world of the run's task for the metadata.
+
+        If the task cannot be loaded, print a message and return None.
+        """
         try:
             saved = Configuration.of(run)
             options = saved.options.changed({"nworld": 1} | options_on_cores())

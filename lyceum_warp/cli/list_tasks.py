@@ -54,12 +54,12 @@ class Tasks:
         entries = [entry for entry in map(_entry, task_names()) if entry.has(self.word)]
         if not entries:
             raise ValueError(
-                f"no task has {self.word!r} in its name, description or model: lyceum-warp tasks lists all"
+                f"no task has {self.word!r} in its name, description or model: list all tasks with lyceum-warp tasks"
             )
         console, table = make_console(), [_HEADINGS, *map(_cells, entries)]
         widths = [max(len(row[i]) for row in table) for i in range(len(_HEADINGS))]
         fits = sum(widths) + 2 * len(widths) - 2 <= console.width
-        shown = len(_HEADINGS) - (not fits)  # the model moves to the line below
+        shown = len(_HEADINGS) - (not fits)  # a long row shows the model in a line below
         heading, *lines = (
             "  ".join(f"{cell:{'>' if 1 <= i <= 5 else '<'}{widths[i]}}" for i, cell in enumerate(row[:shown]))
             for row in table
@@ -83,11 +83,11 @@ class _Entry:
 
     name: str
     task: type[Task] | None = None
-    """None if importing the task's file raises an error."""
+    """The task's class, or None if importing its file raises an error."""
     about: str = ""
     source: str = _UNKNOWN
     note: str = ""
-    """Reason why a value is unknown."""
+    """The reason why a value is unknown."""
 
     def has(self, word: str) -> bool:
         """Whether the entry contains a word, in any case."""
@@ -95,7 +95,7 @@ class _Entry:
 
 
 def _entry(name: str) -> _Entry:
-    """The entry of a task, without the sizes, which require the model."""
+    """Make the entry of a task, without its sizes, which require the model."""
     entry = _Entry(name)
     try:
         task = entry.task = find_task(name)
@@ -104,13 +104,13 @@ def _entry(name: str) -> _Entry:
         entry.about = (about.partition(": ")[2] or about).rstrip(".")
         entry.about += f" (physics: {', '.join(task.physics)})" * bool(task.physics)
         entry.source = _source(task)
-    except Exception as error:  # a broken task file may raise any error
+    except Exception as error:  # the import of a broken task file may raise any error
         entry.note = _reason(error)
     return entry
 
 
 def _cells(entry: _Entry) -> tuple[str, ...]:
-    """The cells of a task's row. If its model cannot be loaded, the entry's note says why."""
+    """Return the cells of a task's row. If the task's model cannot be loaded, the entry's note says why."""
     task = entry.task
     if task is None:
         return (entry.name, *[_UNKNOWN] * 5, entry.source)
@@ -124,20 +124,23 @@ def _cells(entry: _Entry) -> tuple[str, ...]:
         spec = task_spec(task)
         actions = str(_controls(spec)) if task.actions is None else actions
         timestep = f"{spec.option.timestep * task.frame_skip:g} s"
-    except Exception as error:  # a missing model package, or a mistake in the task
+    except Exception as error:  # the package with the model may be missing, or the task may be wrong
         entry.note = entry.note or _reason(error)
     return (entry.name, obs, actions, str(task.frame_skip), timestep, str(task.horizon or "none"), entry.source)
 
 
 def _controls(spec: mujoco.MjSpec) -> int:
-    """The number of a model's controls. Compiling a model takes up to a second, so this is avoided if possible."""
+    """Return the number of a model's controls.
+
+    The model is compiled only if necessary, because that takes up to a second.
+    """
     if all(actuator.gaintype in _ONE_CONTROL for actuator in spec.actuators):
         return len(spec.actuators)
     return compile_model(spec, (), PhysicsOptions()).nu
 
 
 def _source(task: type[Task]) -> str:
-    """The source of a task's model, with the extra that it needs, if any."""
+    """Describe the source of a task's model, and name the extra that the model needs, if any."""
     model: Any = task.model() if callable(task.model) else task.model
     if not isinstance(model, str | ModelFile):
         return f"made in {task.__module__.rpartition('.')[2]}.py"
@@ -149,7 +152,7 @@ def _source(task: type[Task]) -> str:
 
 
 def _reason(error: Exception) -> str:
-    """Shorten an error to one line, or to the pip command in it, if there is one."""
+    """Shorten an error to the pip command that it contains, or to one line."""
     text = " ".join(str(error).split())
     command = text.rpartition(": ")[2]
     if command.startswith("pip install"):

@@ -28,7 +28,7 @@ _SOURCES: dict[str, Callable[[str], ModelFile]] = {
 """Functions that locate a model, by the prefix before the colon in --model."""
 
 _TAKEN = ("World", "Params", "Row")
-"""Names that a generated file defines, so that a task cannot have them."""
+"""Names that a generated file defines, which a task's class therefore cannot have."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -46,41 +46,42 @@ class New:
     """
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
-    """The task's name in snake_case, to write TASK.py in the working directory; or a file, path/to/task.py."""
+    """The task's name in snake_case, for the file TASK.py in the working directory; or a path, path/to/task.py."""
     model: Annotated[str, tyro.conf.arg(metavar="FILE")]
     """An MJCF or URDF file; or menagerie:ROBOT/FILE.xml, of MuJoCo Menagerie (the extra "menagerie", the package
     mujoco-menagerie, or a checkout to which MENAGERIE_ROOT points); or gymnasium:FILE.xml or gymnasium_robotics:PATH,
-    of these packages. A relative path is written relative to the task file."""
+    from the package of that name. The task file stores a relative path relative to its own folder."""
 
     template: Literal["plain", "velocity"] = "plain"
-    """velocity: a task in which a walking robot follows velocity commands. The robot needs a floating
-    base, and legs made of hinges with one actuator each. The task's file is short, because the family defines
-    functions, rewards and most parameters."""
+    """With velocity, the task trains a walking robot to follow velocity commands. The robot needs a floating base, and
+    legs made of hinges with one actuator each. The file is short, because it inherits functions, rewards and most
+    parameters."""
     feet: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
-    """With --template velocity: sites, geoms or bodies that are feet. By default, the lowest ends of legs."""
+    """The names of the feet, for --template velocity: sites, geoms or bodies. By default, the lowest end of each leg is
+    a foot."""
     joints: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
-    """With --template velocity: names of the actuated joints, with one actuator each. By default, all leg joints with
-    an actuator; other joints keep their pose."""
+    """Names of the joints to control, for --template velocity; each must have one actuator. By default, all leg joints
+    with an actuator; other joints keep their pose."""
 
     def run(self) -> int:
-        """Run the command; returns the exit code."""
+        """Run the command, and return the exit code."""
         if self.template == "plain" and (self.feet or self.joints):
-            raise ValueError("--feet and --joints belong to --template velocity")
+            raise ValueError("--feet and --joints have no effect without --template velocity")
         path = Path(self.task if self.task.endswith(".py") else f"{self.task}.py").expanduser()
         class_name = _class_name(path)
         if path.exists():
             raise ValueError(f"{path} exists: choose another name, or remove it")
         if not path.absolute().parent.is_dir():
-            raise ValueError(f"there is no folder {path.parent} for the task file: make it first")
+            raise ValueError(f"there is no folder {path.parent} for the task file: create it first")
         source, title, spec = _model(self.model, path)
         try:
             model = compile_model(spec, ("sensordata",), PhysicsOptions())
         except ValueError as error:
             raise ValueError(f"{self.model}: {error}") from error
         if model.nu == 0:
-            raise ValueError(f"the model {self.model} has no actuators, so there is nothing to act on: add some to it")
+            raise ValueError(f"the model {self.model} has no actuators, so actions would have no effect: add actuators")
         if model.nv == 0:
-            raise ValueError(f"the model {self.model} has no joints, so nothing in it moves: add some to it")
+            raise ValueError(f"the model {self.model} has no joints, so its bodies cannot move: add joints")
         if self.template == "velocity":
             walker = self._walker(spec)
             _write(path, velocity_text(path.name, class_name, source, title, walker))
@@ -107,7 +108,7 @@ class New:
 
 
 def _class_name(path: Path) -> str:
-    """The name of the class for a task file.
+    """Return the name of the class for a task file.
 
     Raises:
         ValueError: The file's name cannot be the name of a task, or belongs to another task or module.
@@ -120,10 +121,12 @@ def _class_name(path: Path) -> str:
         or keyword.iskeyword(class_name)
     ):
         raise ValueError(f"a task can't be named {name!r}: use letters, digits and _, as in my_robot")
-    if snake_case(class_name) != name:  # the task's name is derived from the name of the class
+    if snake_case(class_name) != name:  # a task is named after its class
         raise ValueError(f"a task can't be named {name!r}: use {snake_case(class_name)!r}, for the class {class_name}")
     if class_name in _TAKEN:
-        raise ValueError(f"a task can't be named {name!r}: its file uses {class_name} for something else")
+        raise ValueError(
+            f"a task can't be named {name!r}: its class {class_name} would have the name of another object in the file"
+        )
     if name in package_task_names():
         raise ValueError(f"the task name {name!r} is taken by a task of the package: choose another")
     module = importlib.util.find_spec(name)
@@ -154,7 +157,7 @@ def _model(text: str, path: Path) -> tuple[str, str, mujoco.MjSpec]:
 
 
 def _title(file: str) -> str:
-    """The description of a model in the docstring of a task file."""
+    """Describe a model for the docstring of a task file."""
     plain = file.isprintable() and not set(file) & set('\\"') and len(file) <= 50
     return f"the model {file}" if plain else "a model"
 

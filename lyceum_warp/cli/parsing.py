@@ -10,20 +10,20 @@ from typing import Any
 
 import tyro
 
-_CONFIG = (tyro.conf.DisallowNone,)  # options with the default None do not accept the word None
+_CONFIG = (tyro.conf.DisallowNone,)  # tyro does not accept the word None for an option with the default None
 
 
 def parse(command: type, prog: str, words: Sequence[str]) -> Any:
     """Parse the options of a command.
 
     Args:
-        command: The command's class. Its attribute ``USUAL`` names the options that --help describes, by their fields;
-            --help-all describes all. Without the attribute, both do.
-        prog: The command, for messages.
+        command: The command's class. The class attribute ``USUAL`` names the fields whose options --help describes;
+            --help-all describes all options. Without ``USUAL``, --help also describes all options.
+        prog: The command's name, for messages.
         words: The arguments.
 
     Returns:
-        The command with its options.
+        An instance of the command, with its options.
 
     Raises:
         ValueError: There is no such option; the message suggests one.
@@ -42,7 +42,7 @@ def parse(command: type, prog: str, words: Sequence[str]) -> Any:
 
 
 def _print_help(command: type, prog: str) -> None:
-    """Print the help of the usual options, and the names of the others."""
+    """Print the help of the usual options, and the names of all other options."""
     usual = getattr(command, "USUAL", None)
     shown = command if usual is None else _with_only(command, usual)
     try:
@@ -59,7 +59,7 @@ def _print_help(command: type, prog: str) -> None:
 
 
 def _unknown(word: str, options: Sequence[str], prog: str) -> str:
-    """An error message for an argument that a command does not take."""
+    """Return the error message for an argument that a command does not accept."""
     flag = word.partition("=")[0].replace("_", "-")
     if not flag.startswith("-"):
         return f"{prog} does not take the argument {word!r}: see {prog} --help"
@@ -69,13 +69,13 @@ def _unknown(word: str, options: Sequence[str], prog: str) -> str:
 
 
 def _nested(hint: Any) -> Any:
-    """The dataclass of a group of options; None for a single option."""
+    """Return the dataclass of a group of options, or None for a single option."""
     inner = next(iter(typing.get_args(hint)), None)
     return inner if dataclasses.is_dataclass(inner) else None
 
 
 def _options(command: Any, group: str = "options") -> dict[str, dict[str, str]]:
-    """The flags of a command with the names of their fields, by group."""
+    """Return the flags of a command and their fields' names, by group."""
     found: dict[str, dict[str, str]] = {group: {}}
     for name, hint in typing.get_type_hints(command, include_extras=True).items():
         own = next(filter(None, (getattr(marker, "name", None) for marker in _markers(hint))), name)
@@ -91,7 +91,7 @@ def _markers(hint: Any) -> tuple[Any, ...]:
 
 
 def _with_only(command: Any, usual: Sequence[str]) -> type:
-    """A subclass of a command, or of a group of its options, that hides all but the usual options from the help."""
+    """Make a subclass of a command, or of a group of its options, that shows only the usual options in the help."""
     own = _options(command)["options"].values()
     body: dict[str, Any] = {"__annotations__": {}, "__doc__": command.__doc__}
     for name, hint in typing.get_type_hints(command, include_extras=True).items():

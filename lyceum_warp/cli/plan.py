@@ -89,7 +89,7 @@ class Plan:
 
     With --real-time the world keeps its rate. The command then measures planning times for a few seconds, and chooses
     the largest number of samples that meets the deadline on this machine, or if none does, a shorter horizon or other
-    physics of the task. Given values of --samples, --horizon and --physics do not change.
+    physics of the task. Values of --samples, --horizon and --physics that you give are never changed.
 
     The command writes config.json, versions.json, report.json, plan.png, a video of the first episode (video.mp4), and
     one file per episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy) into a
@@ -112,22 +112,24 @@ class Plan:
     episodes: int = 1
     """Number of episodes."""
     minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """Time limit: no episode begins after it."""
+    """The time limit in minutes, after which no episode begins."""
     steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of steps in an episode; by default the task's horizon."""
     replan_every: int = 1
-    """Steps from one plan to the next. The steps in between apply the plan's next actions."""
+    """The number of steps from one plan to the next. Steps without a new plan apply the next actions of the last
+    plan."""
     seed: int = 0
-    """Seed of the first episode's initial state and noise; it increases by one with each episode."""
+    """Seed of the first episode's initial state and noise; each further episode increases it by one."""
     real_time: bool = False
     """Step the world in real time while the planner plans, instead of waiting for each plan."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder; by default runs/plan-TASK-DATE."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """NPG or PPO run of this task. The run's value function gives the value of each sample's final state."""
+    """The folder of an NPG or PPO run of the same task. The planner adds the run's value function at each sample's
+    final state."""
     param: ParamWords = ()
     planner_param: Repeated = ()
-    """A parameter for the planner only, if it differs from the controlled world's; may be repeated."""
+    """A parameter of the planner's model that differs from the controlled world's; the flag may be repeated."""
     planner_model: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """The planner's model, if it differs from the controlled world's."""
     video: bool = True
@@ -136,7 +138,8 @@ class Plan:
     plot: bool = True
     """Whether to plot rewards, planning times and ages of actions."""
     planner: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
-    """Where the planner's worlds run. The controlled world runs in one thread of the mujoco engine."""
+    """The engine and the device of the planner's worlds. The controlled world runs in one thread of the mujoco
+    engine."""
     mppi: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
     planner_physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
@@ -195,18 +198,15 @@ def _check_value_task(run: Path, task: str) -> None:
     try:
         config = Run.open(run.parent if run.is_file() else run).config
     except FileNotFoundError:
-        return  # load_value reports what is missing; a policy file may be outside a run folder
+        return  # there may be no configuration: load_value reports missing files, and a policy file needs no run folder
     found = str(config.get("task"))
     names = {_stem(found), snake_case(found.partition(":")[2]), str(config.get("kept", {}).get("name"))}
     if not names & {_stem(task), task_name(find_task(task))}:
-        raise ValueError(
-            f"--value {run} is a run of the task {found!r}, not of {task!r}: a value function applies to the task that "
-            "it was trained on"
-        )
+        raise ValueError(f"--value {run} is a run of the task {found!r}, not of {task!r}: use a run of {task}")
 
 
 def _stem(task: str) -> str:
-    """The name of a task, or its file's name without suffix."""
+    """Return the name of a task, or its file's name without the suffix."""
     name = task.partition(":")[0]
     return Path(name).stem if name.endswith(".py") else name
 
@@ -218,7 +218,7 @@ def _worlds(
     steps: dict[str, Any] = {} if options.steps is None else {"horizon": whole_number("steps", options.steps, low=1)}
     plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
     if plant.horizon == 0:
-        raise ValueError(f"episodes of {plant.task.name!r} never end without a horizon: give --steps")
+        raise ValueError(f"episodes of {plant.task.name!r} have no time limit: give --steps")
     task = plant.task.task
     value = None if options.value is None else load_value(options.value)
     config = options.mppi.on_top_of(task_config(task, value))
@@ -229,7 +229,7 @@ def _worlds(
     def make(setting: RealTimeSetting | None) -> MPPI:
         chosen, physics = config, {}
         if setting is not None:
-            # keep the time between knots
+            # a longer replanning interval keeps the time between knots
             knots = config.knots and max(1, config.knots * setting.horizon // config.horizon)
             chosen = config.changed({"samples": setting.samples, "horizon": setting.horizon, "knots": knots})
             if setting.physics not in (None, _suggested_physics(task)):
@@ -240,14 +240,14 @@ def _worlds(
 
 
 _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
-"""Numbers of samples to choose from in real time, besides the task's own number."""
+"""The numbers of samples from which real-time planning chooses, in addition to the task's own number."""
 
 
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
-    """Choose the settings that are not given as flags, from measured planning times; None if all are given.
+    """Choose the settings that no flag gives, from measured planning times; return None if flags give all settings.
 
-    The deadline is a step of the plant. If no setting meets it, the deadline is a step of the planner, which may be
-    longer.
+    A plan must be ready within a step of the plant. If no setting is fast enough, a plan may take a step of the
+    planner, which may be longer.
     """
     task, flags = plant.task.task, given(options.mppi)
     config = options.mppi.on_top_of(task_config(task))
@@ -274,21 +274,21 @@ def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) 
 
 
 def _suggested_physics(task: type[Task]) -> str | None:
-    """Name of the physics that a task suggests for planners."""
+    """Return the name of the physics that a task suggests for planners."""
     return EnvOptions().changed(task.planning.options).physics.base
 
 
 def _fill(words: tuple[str, ...]) -> Any:
-    """Parse --fill: a word, one number, or several."""
+    """Parse --fill: a word, or one or more numbers."""
     try:
         numbers = [float(word) for word in words]
     except ValueError:
-        return " ".join(words)  # MPPIConfig checks the words
+        return " ".join(words)  # MPPIConfig refuses unknown words
     return numbers[0] if len(numbers) == 1 else numbers
 
 
 def _model(path: Path) -> Path:
-    """The path of the planner's model."""
+    """Return the path of the planner's model."""
     path = path.expanduser().resolve()
     if not path.is_file():
         raise FileNotFoundError(f"--planner-model: there is no file {path}")
@@ -322,7 +322,7 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
             done.append(trajectory)
             display.done(trajectory)
             _save(run, done, options)
-    except BaseException as error:  # further signals are ignored until the files are written
+    except BaseException as error:  # ignore further signals until the files are written
         if done:
             _save(run, done, options)
         path = aborted[0].save(_file(run, len(done))) if aborted else None
@@ -354,7 +354,7 @@ def _save(run: Run, done: list[Trajectory], options: Plan) -> None:
 
 
 def _summary(done: list[Trajectory], options: Plan) -> ControlReport:
-    """The report of some episodes. The deadline of a plan is the time until the next plan."""
+    """Make the report of the given episodes. The deadline of a plan is the time until the next plan."""
     return control_report(done, rate=1 / (options.replan_every * done[0].period))
 
 

@@ -6,16 +6,16 @@ import mujoco
 import numpy as np
 
 _STEP = 0.02
-"""Desired duration of a step, seconds."""
+"""The desired duration of a step in seconds."""
 
 _EPISODE = 10.0
-"""Duration of an episode, seconds."""
+"""The duration of an episode in seconds."""
 
 _NAMES = 8
-"""Maximum number of names that a comment lists per kind of element."""
+"""The maximum number of names of each kind of element that a comment lists."""
 
 _WIDTH = 118
-"""Width of a comment after the #, in characters."""
+"""The width of a comment in characters, without the #."""
 
 _ELEMENTS = {
     "bodies": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
@@ -30,19 +30,19 @@ _ELEMENTS = {
 _Sensor = mujoco.mjtSensor
 
 _UNOBSERVED = (_Sensor.mjSENS_USER, _Sensor.mjSENS_PLUGIN, _Sensor.mjSENS_CLOCK)
-"""Sensors that do not measure the robot's state, or that need custom code."""
+"""Types of sensors that do not measure the robot's state, or that need custom code."""
 
 _FREE_SENSORS = (_Sensor.mjSENS_FRAMEQUAT, _Sensor.mjSENS_GYRO, _Sensor.mjSENS_FRAMEANGVEL)
-"""If a floating body has one of these sensors, the model measures the body's motion."""
+"""Types of sensors that measure the motion of a floating body."""
 
 
 def task_text(file: str, class_name: str, source: str, title: str, model: mujoco.MjModel) -> str:
-    """The text of a task file, formatted as ruff formats it.
+    """Generate the text of a task file, in ruff's format.
 
     Args:
         file: The name of the file.
         class_name: The name of the task's class.
-        source: The model as a Python expression, such as ``"robot.xml"`` including the quotes.
+        source: The model as a Python expression, such as ``"robot.xml"`` with its quotes.
         title: The description of the model in the docstring.
         model: The compiled model.
     """
@@ -60,7 +60,7 @@ def task_text(file: str, class_name: str, source: str, title: str, model: mujoco
 
 
 def _lengths(model: mujoco.MjModel) -> list[str]:
-    """The lines that set the lengths of steps and episodes."""
+    """Generate the lines that set the lengths of steps and episodes."""
     substep = model.opt.timestep
     frame_skip = max(1, round(_STEP / substep))
     horizon = max(1, round(_EPISODE / (frame_skip * substep)))
@@ -77,9 +77,10 @@ def _has_other_ranges(model: mujoco.MjModel) -> bool:
 
 
 def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list[str]]:
-    """The fields of World, the sizes of the observation's parts, and the lines that write the observation.
+    """Generate the fields of World, the sizes of the observation's parts, and the lines that write the observation.
 
-    The observation is only the sensors if they measure every joint; otherwise positions, velocities and sensors.
+    If sensors measure every joint, the observation has only sensors; otherwise it has positions, velocities and
+    sensors.
     """
     fields = ["qpos: Row[float]", "qvel: Row[float]"]
     sensed = _sensor_places(model)
@@ -104,7 +105,7 @@ def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list
 
 
 def _sensor_places(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """The ranges (first, last) of sensordata that the policy observes, with first <= i < last."""
+    """Return the ranges (first, last) of sensordata that the policy observes; last is exclusive."""
     places: list[tuple[int, int]] = []
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
         return places
@@ -142,7 +143,7 @@ def _all_joints_are_sensed(model: mujoco.MjModel) -> bool:
 
 
 def _elements(model: mujoco.MjModel) -> str:
-    """A comment that names the model's elements, with an example of their use."""
+    """Generate a comment that names the model's elements and shows an example of their use."""
     names = {kind: [name for name in _names(model, kind) if name.isprintable() and name] for kind in _ELEMENTS}
     names["bodies"] = [name for name in names["bodies"] if name != "world"]
     mocap = {name for i, name in enumerate(_names(model, "bodies")) if model.body_mocapid[i] >= 0}
@@ -163,13 +164,13 @@ def _elements(model: mujoco.MjModel) -> str:
 
 
 def _names(model: mujoco.MjModel, kind: str) -> list[str]:
-    """Names of all elements of a kind; empty for unnamed elements."""
+    """Return the names of all elements of a kind; unnamed elements have empty names."""
     objtype, count = _ELEMENTS[kind]
     return [mujoco.mj_id2name(model, objtype, i) or "" for i in range(getattr(model, count))]
 
 
 def _listed(kind: str, names: list[str]) -> list[str]:
-    """A line with as many names of a kind as fit; no line if there are no names."""
+    """Generate a line with as many names of a kind as fit, or no line if there are no names."""
     for shown in range(min(len(names), _NAMES), 0, -1):
         rest = f", ... ({len(names)} in all)" if shown < len(names) else ""
         line = f"  {kind}: {', '.join(names[:shown])}{rest}"
@@ -183,7 +184,7 @@ def _indented(lines: list[str]) -> str:
 
 
 def literal(text: str) -> str:
-    """A string as a Python literal in double quotes."""
+    """Write a string as a Python literal in double quotes."""
     return json.dumps(text, ensure_ascii=False)
 
 

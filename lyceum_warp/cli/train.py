@@ -52,7 +52,7 @@ _KEPT = {
     "from_run": "--from", "task": "TASK", "algorithm": "--algorithm", "seed": "--seed", "threads": "--threads",
     "out": "--out",
 }  # fmt: skip
-"""Flags that are refused with --resume."""
+"""Flags that have no effect with --resume."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -84,7 +84,7 @@ class Train:
     )  # fmt: skip
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
-    """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
+    """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class."""
     algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac")] = None
     """npg, the natural policy gradient; ppo; or sac, soft actor-critic with a replay buffer. By default the algorithm
     that the task suggests, with its hyperparameters: ppo for walking robots, npg for others."""
@@ -93,24 +93,25 @@ class Train:
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Seed of the networks, the noise and the worlds' initial states."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """The run's folder, new or empty; by default runs/TASK-DATE."""
+    """The run's folder, which must be new or empty; by default runs/TASK-DATE."""
     resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Continue the run in this folder exactly, with its settings, up to --iterations."""
     from_run: Annotated[Path | None, tyro.conf.arg(name="from", metavar="RUN")] = None
     """Start a new run from the policy, the value function and the normaliser of this run. The run's settings are the
-    defaults, except the parameters if TASK is a different task, and the hyperparameters if --algorithm is different."""
+    defaults, but a different TASK has its own parameters, and a different --algorithm its own hyperparameters."""
     which: str = "last"
-    """Which policy of --from: last, best, or the number of a saved iteration."""
+    """The policy to start from with --from: last, best, or the number of a saved iteration."""
     target_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """End the run once the return of the mean policy reaches this number; with --mean-every 0, the mean return of the
-    sampled episodes."""
+    """End the run once the return of the mean policy reaches this number. With --mean-every 0, the mean return of the
+    sampled episodes counts."""
     minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """Time limit: training ends after the iteration that exceeds it. --resume continues."""
+    """Time limit in minutes: training ends after the iteration that exceeds it. --resume continues the run."""
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Iterations between two numbered policies; 0 for none. The last and the best policy are always saved."""
+    """Iterations between two saved policies with numbers; 0 saves none. The last and the best policy are always
+    saved."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Iterations between two saves of the policy and the complete state, from which a killed run resumes; 0 for every
-    30 s, or more often if saving takes at most 1 % of the time."""
+    """Iterations between two saves of the policy and the complete state, from which a killed run resumes. 0 saves every
+    30 s, or more often if that takes at most 1 % of the time."""
     tensorboard: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to also write metrics for TensorBoard into the run's folder."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
@@ -119,18 +120,19 @@ class Train:
     and episodes of 1,000 steps), otherwise segments of episodes."""
     threads: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 1)")] = None
     """Number of torch threads on the CPU. Small networks gain little from more threads. Runs are identical bit for bit
-    only with the same number. --nthread sets the threads of the mujoco engine."""
+    only if they use the same number of threads. --nthread sets the threads of the mujoco engine."""
     param: ParamWords = ()
     video: bool = True
     """Whether to write a video of one episode of the trained policy."""
     video_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Iterations between two videos of the mean policy, videos/000100.mp4 and so on in the run's folder; 0 for none."""
+    """Iterations between two videos of the mean policy, videos/000100.mp4 and so on in the run's folder; 0 writes
+    none."""
     camera: CameraWords = ()
     transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to test at the end whether the policy performs equally on the other engine, and write transfer.json. By
-    default only cheap comparisons run: a GPU with the C engine, and the run's physics with the task's own. With
-    --transfer a policy trained on CPU cores is also tested on the Warp engine (compiling its kernels may take minutes),
-    and each physics of the task is compared."""
+    default only two cheap comparisons run: the C engine after training on a GPU, and the task's own physics if the run
+    has other physics. With --transfer a policy trained on CPU cores is also tested on the Warp engine, whose kernels
+    may take minutes to compile, and under each physics of the task."""
     trust: Trust = False
     take_over: bool = False
     """Continue a run that another process has locked, on this or another host. The other process ends at its next
@@ -138,7 +140,7 @@ class Train:
     view: bool = False
     """Whether to show the newest policy during training, like lyceum-warp view FOLDER --follow in another shell."""
     port: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Port of the page of --view; by default the first free port from 8080 on."""
+    """Port of the viewer with --view; by default the first free port from 8080 on."""
     plot: bool = True
     """Whether to plot the learning curve at the end."""
     require_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
@@ -156,7 +158,7 @@ class Train:
         if self.resume is not None:
             for name, flag in _KEPT.items():
                 if getattr(self, name) is not None:
-                    raise ValueError(f"{flag} has no effect with --resume, which continues a run as it is: omit it")
+                    raise ValueError(f"{flag} has no effect with --resume, which keeps the run's settings: omit it")
         elif self.from_run is None and self.task is None:
             raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
         folder = self.resume or self.from_run
@@ -210,7 +212,7 @@ class Train:
             return self._report(run, learner, console)
 
     def _suggestion(self) -> Training:
-        """The task's settings for training; only the algorithm of the flag if that is another one."""
+        """Return the task's settings for training, or only the flag's algorithm if that is another one."""
         assert self.task is not None
         suggestion = find_task(self.task).training
         if self.algorithm in (None, suggestion.algorithm):
@@ -218,14 +220,14 @@ class Train:
         return Training(algorithm=self.algorithm)
 
     def configuration(self, source: Run | None, team: Team) -> Configuration:
-        """The configuration of the source run, or the defaults, overridden by the given flags."""
+        """Return the configuration of the source run, or the defaults, with the given flags applied."""
         words = given(self.env) | given(self.physics)
         for name, value in (("nworld", self.nworld), ("seed", self.seed)):
             if value is not None:
                 words[name] = value
         if source is None:
             suggestion = self._suggestion()
-            few = 8 if suggestion.algorithm == "sac" else 64  # each of SAC's worlds has an update per step
+            few = 8 if suggestion.algorithm == "sac" else 64  # SAC makes one update per world and step
             nworld = 4096 * team.size if (self.env.device or "cpu").startswith("cuda") else few
             options = EnvOptions(nworld=nworld, device="cpu")
             base = Configuration(
@@ -246,8 +248,9 @@ class Train:
         algorithm = self.algorithm or base.algorithm
         if source is not None and self.algorithm is None and algorithm not in ALGORITHMS:
             raise ValueError(
-                f"the run in {source.folder} was trained by {algorithm!r}, a learner of a program: resume it there, by "
-                "lw.train(..., resume=True), or begin a new run with its policy, by --from and --algorithm"
+                f"the run in {source.folder} was trained by {algorithm!r}, which is not part of this package: resume "
+                "it in Python by lw.train(..., resume=True), or begin a new run from its policy by --from and "
+                "--algorithm"
             )
         known = base.hyperparameters if algorithm == base.algorithm else None
         return dataclasses.replace(
@@ -259,7 +262,7 @@ class Train:
         )  # fmt: skip
 
     def _learner(self, source: Run | None, team: Team) -> tuple[Learner, Path, dict[str, Any]]:
-        """Make the learner; return it with the run's folder and additional entries for config.json."""
+        """Make the learner, and return it, the run's folder and additional entries for config.json."""
         configuration = self.configuration(source, team)
         if self.out is not None and team.leads:
             Run.check_free(self.out)
@@ -287,7 +290,7 @@ class Train:
         return learner, self.resume or self.out or Path("runs", name), entries
 
     def _report(self, run: Run, learner: Learner, console: Console) -> int:
-        """Print the table, evaluate the policy, make the plot and the video; return the exit code."""
+        """Print the table of iterations, evaluate the policy, make the plot and the video, and return the exit code."""
         env, policy, seed = learner.env, learner.policy, learner.env.options.seed + 1
         console.print(curve_table(run.rows(), console))
         few = evaluation_worlds(env, _FINAL_EPISODES)

@@ -15,7 +15,7 @@ from lyceum_warp.tuning.search import Tuning, tune
 from lyceum_warp.tuning.trial import DIVERGENCE_STEPS, NUDGE
 
 Cell: TypeAlias = Callable[[dict[str, Any]], str]
-"""Formats a cell of a row."""
+"""A function that formats one cell of a row."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,28 +34,29 @@ class Tune:
 
     task: TaskWord
     run_folder: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
-    """A run of this task. The run's policy also plays the episodes, and the run's task parameters are the defaults."""
+    """The folder of a run of the task. The run's policy also plays the episodes, and the run's task parameters are the
+    defaults."""
     which: str = "last"
-    """Which policy of --run: last, best, or the number of a saved iteration."""
+    """The policy of --run to use: last, best, or the number of a saved iteration."""
     tolerance: Annotated[str, tyro.conf.arg(metavar="strict|loose|any")] = "strict"
     """Largest difference of returns, relative to the mean absolute return: the 95 % interval must lie within 2 %
     (strict) or 5 % (loose); any accepts all settings without additional faults."""
     short: bool = False
     """Compare the first 100 steps of episodes, for a few seconds for each setting, instead of whole episodes."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Number of episodes of each setting; by default chosen for the width of the interval, within a minute (5 s with
+    """Number of episodes of each setting. By default as many as the interval needs, within a minute (5 s with
     --short)."""
     planning: bool = False
-    """Find physics for the task's planner: compare planning times, and the rankings of the same samples under the
-    coarser physics and the unchanged task. --nworld is then the number of samples, and --episodes the number of states
-    of each kind."""
+    """Find physics for the task's planner: compare planning times, and compare how coarser physics and the task's own
+    rank the same samples. --nworld is then the number of samples, and --episodes the number of states of each kind."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Number of worlds; by default 256, or 4096 on a GPU. With --planning the planner's samples, by default 64."""
+    """Number of worlds; by default 256, or 4096 on a GPU. With --planning, the number of the planner's samples, by
+    default 64."""
     seed: int = 0
     """Seed of initial states and actions."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File of the results, by default tune/TASK.jsonl or tune/TASK-planning.jsonl. Existing results are not measured
-    again."""
+    """File of the results, by default tune/TASK.jsonl or tune/TASK-planning.jsonl. Results that the file already
+    contains are not measured again."""
     param: ParamWords = ()
     env: Annotated[Placement, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
         default_factory=Placement
@@ -83,7 +84,7 @@ def _progress(row: dict[str, Any]) -> None:
 
 
 def _report(tuning: Tuning, options: Tune) -> None:
-    """Print the table of all settings, the best setting, and what was not tried."""
+    """Print the table of all settings, the best setting, and the settings that were not tried."""
     console, reference = make_console(), tuning.reference
 
     def line(text: str) -> None:
@@ -126,7 +127,7 @@ def _report(tuning: Tuning, options: Tune) -> None:
 
 
 def _columns(reference: dict[str, Any]) -> dict[str, Cell]:
-    """The columns of the table, by heading."""
+    """Make the columns of the table, by heading."""
 
     def divergence(i: int) -> Cell:
         return lambda row: _short(row["divergence"][i] / max(reference["nudged_divergence"][i], 1e-300))
@@ -145,7 +146,7 @@ def _columns(reference: dict[str, Any]) -> dict[str, Cell]:
 
 
 def _planning_columns(reference: dict[str, Any]) -> dict[str, Cell]:
-    """The columns of the table with --planning, by heading."""
+    """Make the columns of the table with --planning, by heading."""
 
     def ranks(kind: str) -> Cell:
         return lambda row: "{mean:.2f} [{low:.2f}, {high:.2f}]".format(**row["ranks"][kind])

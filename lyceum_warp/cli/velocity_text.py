@@ -11,19 +11,19 @@ from lyceum_warp import walkers
 from lyceum_warp.cli.task_text import literal
 
 TRAINING = "--algorithm ppo --device cuda --iterations 800"
-"""Options of lyceum-warp train with which robots learn to walk on one GPU."""
+"""Options of lyceum-warp train by which robots learn to walk on one GPU."""
 
 _STEP = 0.02
 """Seconds in a step."""
 
 _NEAR = 0.1
-"""The end of a leg is a foot if it is at most this fraction of the base's height above the lowest point of all legs."""
+"""The end of a leg is a foot if its height above the lowest leg is at most this fraction of the base's height."""
 
 _FLAT = 0.01
-"""Maximum height of a sole's spheres above its lowest sphere, m."""
+"""The maximum height in metres of a sole's spheres above the sole's lowest sphere."""
 
 _AT = 0.06
-"""A site of the robot marks a foot if it is at most this far from the centre of the sole, m."""
+"""The maximum distance in metres between the centre of a sole and a site that marks the foot."""
 
 _Kind = mujoco.mjtObj
 
@@ -31,33 +31,33 @@ _Kind = mujoco.mjtObj
 @dataclasses.dataclass
 class _Foot:
     name: str
-    """Name of the foot's site, which exists in the model or is added by the task."""
+    """The name of the foot's site, which the model has or the task adds."""
     body: int
     element: str = ""
-    """A body, joint or geom in the foot's body; empty if the model has the site."""
+    """The name of a body, joint or geom that finds the foot's body; empty if the model has the site."""
     position: tuple[float, ...] = ()
-    """Position of the new site in the body, m."""
+    """The position of the new site in the body, m."""
     height: float = 0.0
-    """Height of the site in the home pose, m."""
+    """The height of the site in the home pose, m."""
 
 
 class Walker:
-    """The legs of a robot: the base, the feet, and the joints that move them.
+    """Finds a robot's base, its feet, and the joints that move the feet.
 
     Args:
         spec: The model.
-        feet: Names of sites, bodies or geoms that are feet; by default the ends of the legs that reach lowest.
-        joints: Names of the actuated joints; by default the leg joints that have an actuator.
+        feet: Names of the sites, bodies or geoms that are feet; by default the lowest ends of legs.
+        joints: Names of the joints to control; by default the leg joints that have an actuator.
 
     Raises:
-        ValueError: The robot has no floating base, no feet or no joints, or an element that the task file refers to has
+        ValueError: The robot has no floating base, no feet or no joints, or an element that the task file must name has
             no name.
     """
 
     def __init__(self, spec: mujoco.MjSpec, feet: Sequence[str] = (), joints: Sequence[str] = ()) -> None:
         self.model = spec.copy().compile()
         if not (self.model.geom_bodyid == 0).any():
-            raise ValueError("the model has no floor: give a scene, which includes the robot and has a plane")
+            raise ValueError("the model has no floor: give the file of a scene with the robot and a plane")
         self.base = walkers.base(self.model)
         self.data = mujoco.MjData(self.model)
         self.data.qpos[:] = walkers.home_qpos(self.model)
@@ -69,18 +69,18 @@ class Walker:
         self.joints = list(joints) or self._leg_joints()
         for name in self.joints:
             if mujoco.mj_name2id(self.model, _Kind.mjOBJ_JOINT, name) < 0:
-                raise ValueError(f"the model has no joint {name!r}: --joints takes names, separated by spaces")
+                raise ValueError(f"the model has no joint {name!r}: give names after --joints, separated by spaces")
         ids = [self.model.joint(name).id for name in self.joints]
         self.servos = walkers.servos(self.model, _Joints(ids))
         self.pose = [float(self.data.qpos[self.model.jnt_qposadr[joint]]) for joint in ids]
         lowest = min(self._lowest(foot.body) for foot in self.feet)
         self.height = float(self.data.xpos[self.base, 2]) - lowest
-        """Height of the base above the soles in the home pose, m."""
+        """The height of the base above the soles in the home pose, m."""
         for foot in self.feet:
             foot.height -= lowest
 
     def _bend(self) -> None:
-        """Move joints into 90 % of their ranges."""
+        """Limit joint positions to the middle 90 % of the joint ranges."""
         for joint in np.flatnonzero(self.model.jnt_limited & (self.model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)):
             low, high = self.model.jnt_range[joint]
             margin = 0.05 * (high - low)
@@ -103,7 +103,7 @@ class Walker:
         near = ground + _NEAR * (float(self.data.xpos[self.base, 2]) - ground)
         bodies = [body for body, height in lowest.items() if np.isfinite(height) and height <= near]
         if not bodies:
-            raise ValueError("no end of a leg can touch the ground: name the feet with --feet")
+            raise ValueError("no leg of the robot can touch the ground with its end: name the feet with --feet")
         return [self._foot(body, f"foot_{i}") for i, body in enumerate(bodies, 1)]
 
     def _named_foot(self, name: str) -> _Foot:
@@ -113,7 +113,7 @@ class Walker:
                 if kind == _Kind.mjOBJ_SITE:
                     return _Foot(name, int(bodies[i]), height=float(self.data.site_xpos[i, 2]))
                 return self._foot(int(bodies[i]), f"{name}_foot")
-        raise ValueError(f"the model has no site, geom or body {name!r}: --feet takes their names, separated by spaces")
+        raise ValueError(f"the model has no site, geom or body {name!r}: give names after --feet, separated by spaces")
 
     def _foot(self, body: int, name: str) -> _Foot:
         """Find the site at the centre of a body's sole, or describe a new site there."""
@@ -131,12 +131,14 @@ class Walker:
         return _Foot(name, body, self._called(body), tuple(round(float(x), 4) + 0.0 for x in local), float(middle[2]))
 
     def _called(self, body: int) -> str:
-        """The name of a body, or of a joint or geom in it."""
+        """Return the name of a body, or of a joint or geom in it."""
         ids = ((_Kind.mjOBJ_BODY, [body]), (_Kind.mjOBJ_JOINT, np.flatnonzero(self.model.jnt_bodyid == body)),
                (_Kind.mjOBJ_GEOM, np.flatnonzero(self.model.geom_bodyid == body)))  # fmt: skip
         names = [mujoco.mj_id2name(self.model, kind, int(i)) for kind, found in ids for i in found]
         if not any(names):
-            raise ValueError(f"body number {body}, its joints and its geoms have no names: name the body of each foot")
+            raise ValueError(
+                f"body number {body}, its joints and its geoms have no names: give the body of each foot a name"
+            )
         return next(name for name in names if name)
 
     def _leg_joints(self) -> list[str]:
@@ -150,7 +152,7 @@ class Walker:
         return names
 
     def _moved(self) -> np.ndarray:
-        """Whether an actuator moves each joint, (njnt,); actuators of tendons count, too."""
+        """Return the mask of the joints that an actuator moves, (njnt,), also through a tendon."""
         m, d = self.model, self.data
         mujoco.mj_forward(m, d)
         moment = np.zeros((m.nu, m.nv))
@@ -159,7 +161,7 @@ class Walker:
 
     @property
     def has_motors(self) -> bool:
-        """Whether a joint has a motor, not a servo."""
+        """Whether a joint's actuator is a motor instead of a servo."""
         return bool((self.model.actuator_biastype[self.servos] == mujoco.mjtBias.mjBIAS_NONE).any())
 
 
@@ -207,7 +209,7 @@ def velocity_text(file: str, class_name: str, source: str, title: str, walker: W
 
 
 def _wrapped(start: str, parts: Sequence[str], end: str, indent: int = 4) -> list[str]:
-    """Lines of a list in Python, one line if it fits."""
+    """Write a Python list, in one line if it fits."""
     line = f"{start}{', '.join(parts)}{end}"
     if indent + len(line) <= 120:
         return [line]

@@ -33,14 +33,14 @@ from lyceum_warp.viewer.session.clock import Watcher
 from lyceum_warp.viewer.show import view
 
 _RUN_WORLDS = 16
-_WAIT = 10.0  # seconds that --follow waits for a run
+_WAIT = 10.0  # the time that --follow waits for a run
 _LONG = 1e9
-_NICE = 10  # niceness of the subprocess of `lw.RunViewer`
+_NICE = 10  # the niceness of the subprocess of `lw.RunViewer`
 
 
 @optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)")
 class Place:
-    """Engine and device of the worlds; with --mppi, of the planner's worlds."""
+    """Engine and device of the shown worlds, or with --mppi of the planner's worlds."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto."""
@@ -56,8 +56,8 @@ class View:
     time. For a run, it shows the run's policy, and with --follow the newest policy while the run trains. Episode files,
     or a folder of lyceum-warp plan, are played back.
 
-    The viewer is a web page. The command prints its address, which contains a secret, and over ssh the command that
-    forwards the port.
+    The viewer is a web page. The command prints the address of the page, which contains a secret, and over ssh also the
+    command that forwards the port.
 
     $ lyceum-warp view hopper
     $ lyceum-warp view go1_velocity --pretrained
@@ -72,23 +72,23 @@ class View:
     what: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TASK|RUN|FILE...")]
     """A task's name or file, a run's folder, or episode files."""
     pretrained: bool = False
-    """Show the pretrained policy of a task, which is part of the package."""
+    """Show the package's pretrained policy of a task."""
     mppi: bool = False
     """Control the shown world with a planner: MPPI, or with --update a different one."""
     follow: bool = False
     """Show the newest policy of a run while it trains."""
     which: str = "last"
-    """Which policy of a run: last, best, or the number of a saved iteration."""
+    """The policy of a run to show: last, best, or the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """The task of a run or of episodes, as a name or a file, if it cannot be found."""
+    """The task's name or file, for a run or episodes from which the task cannot be found."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Number of worlds: by default 16 for a run, 1 otherwise."""
+    """Number of worlds: by default 16 for a run, and 1 for anything else."""
     seed: int = 0
     """Seed of the initial states."""
     paused: bool = False
     """Whether to start paused."""
     host: str = "127.0.0.1"
-    """Address on which to serve the page. The default is reachable only from this machine."""
+    """Address on which to serve the page. The default address is reachable only from this machine."""
     port: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Port of the page; by default the first free port from 8080 on."""
     param: ParamWords = ()
@@ -100,14 +100,14 @@ class View:
     planner: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
 
     def run(self) -> int:
-        """Run the command; returns the exit code."""
+        """Run the command, and return the exit code."""
         return self.show(_WAIT)
 
     def show(self, seconds: float) -> int:
         """Run the command until the viewer is closed, and return the exit code.
 
         Args:
-            seconds: Maximum time that --follow waits for the run.
+            seconds: The longest time that --follow waits for the run.
         """
         _check(self)
         if self.pretrained:
@@ -118,7 +118,9 @@ class View:
         kind = _kind(self.what)
         for flag, fits in (("follow", ("run",)), ("mppi", ("task", "run")), ("trust", ("run",))):
             if getattr(self, flag) and kind not in fits:
-                raise ValueError(f"--{flag} needs a {' or a '.join(fits)}, and {self.what[0]} is not one: leave it out")
+                raise ValueError(
+                    f"--{flag} needs a {' or a '.join(fits)}, and {self.what[0]} is not one: omit the flag"
+                )
         shown: dict[str, Any] = {name: getattr(self, name) for name in ("paused", "host", "port")}
         watchers: list[Watcher] = []
         if kind == "episodes":
@@ -150,7 +152,7 @@ class View:
 
 
 def _check(options: View) -> None:
-    """Refuse numbers out of range and flags without effect, before worlds are made."""
+    """Refuse numbers out of range and flags that have no effect, before worlds are made."""
     whole_number("seed", options.seed, low=0)
     if options.nworld is not None:
         whole_number("nworld", options.nworld, low=1)
@@ -162,7 +164,7 @@ def _check(options: View) -> None:
 
 
 def _kind(what: tuple[str, ...]) -> str:
-    """What to show: "task", "run" or "episodes"."""
+    """Return the kind of the arguments: "task", "run" or "episodes"."""
     first = Path(what[0])
     if first.suffix == ".npz":
         return "episodes"
@@ -179,29 +181,29 @@ def _kind(what: tuple[str, ...]) -> str:
 
 
 def _episodes_env(options: View, episodes: dict[Path, Trajectory]) -> Env:
-    """A world for the playback of episodes."""
+    """Make a world for the playback of episodes."""
     if options.nworld is not None and options.nworld > 1:
-        raise ValueError(f"--nworld {options.nworld} has no effect for episodes: leave it out")
+        raise ValueError(f"--nworld {options.nworld} has no effect for episodes: omit it")
     return episode_env(episodes, task=options.task, **parameters(options.param, options))
 
 
 def _task_worlds(options: View) -> Env:
     params = parameters(options.param, options)
     nworld = options.nworld or 1
-    if options.mppi and nworld == 1:  # these episodes are shown in the plant itself
+    if options.mppi and nworld == 1:  # the viewer shows such episodes in the plant
         return Env(options.what[0], autoreset=False, nthread=1, **params)
     return Env(options.what[0], nworld=nworld, **_words(options), **params)
 
 
 def _planner(options: View, env: Env) -> MPPI:
-    """The planner, on the engine and device given by the flags."""
+    """Make the planner, on the engine and device that the flags give."""
     config = options.planner.on_top_of(task_config(env.task.task, None))
     words = _words(options) | ({} if env.options.model is None else {"model": env.options.model})
     return MPPI(env.task.task, config, seed=options.seed, params=env.given_params, **words)
 
 
 def _words(options: View) -> dict[str, Any]:
-    """The options of the worlds, or with --mppi of the planner's worlds."""
+    """Return the options of the worlds, or with --mppi of the planner's worlds."""
     return given(options.place) | given(options.physics)
 
 
@@ -210,7 +212,7 @@ def _run(options: View, seconds: float) -> Run:
     if not options.follow:
         return Run.open(folder)
     if options.which != "last":
-        raise ValueError(f"--follow shows the newest policy, not {options.which!r}: leave out one of them")
+        raise ValueError(f"--follow shows the newest policy, not {options.which!r}: omit one of them")
     return wait_for_run(folder, seconds=seconds)
 
 
@@ -221,7 +223,7 @@ def _run_worlds(options: View, run: Run) -> Env:
 
 
 def attached() -> None:
-    """Run the subprocess of ``lw.RunViewer``, which reads its job from stdin and ends with its parent."""
+    """Run the subprocess of ``lw.RunViewer``, which reads its arguments from stdin and ends with its parent process."""
     with contextlib.suppress(OSError, AttributeError):  # not on Windows
         os.nice(_NICE)
     job = json.loads(sys.stdin.readline())
@@ -236,7 +238,7 @@ def attached() -> None:
 
 
 def _end_with_parent() -> None:
-    """Wait for EOF, which follows the end of the parent, even by SIGKILL; then end this process."""
+    """Wait for EOF on stdin, which follows any end of the parent process, even SIGKILL; then end this process."""
     with contextlib.suppress(OSError, ValueError):
         sys.stdin.read()
     os.kill(os.getpid(), signal.SIGTERM)

@@ -21,31 +21,31 @@ from lyceum_warp.support.docstrings import document_attributes
 class Engine(abc.ABC):
     """Many worlds of one model, stepped together.
 
-    An engine knows nothing of tasks. The fields of an engine are Warp arrays with a leading ``nworld`` axis. The
+    An engine does not depend on a task. The fields of an engine are Warp arrays with a leading ``nworld`` axis. The
     addresses of the fields never change, so graphs that read fields are captured once.
 
-    The order of calls in a step is: write ``ctrl`` and other inputs, call ``step`` and ``find_faults``, read fields and
+    In each step the caller writes ``ctrl`` and other inputs, calls ``step`` and ``find_faults``, and reads fields and
     ``fault``. For worlds that restart, the caller then calls ``reset``, writes state fields and model fields, and calls
     ``commit``, ``apply_model``, optionally ``settle``, and ``refresh``. A new engine holds no state: reset all worlds
     first. Model fields start at the model's values, and resets do not change them.
 
     Args:
-        model: The compiled model; the engine stores it and does not change it.
+        model: The compiled model, which the engine does not change.
         nworld: Number of worlds.
-        device: Where the arrays live.
-        fields: The fields to provide, from ``fields.describe``. Other fields cannot be read later.
+        device: The device of the arrays.
+        fields: The fields to provide, from ``fields.describe``. The engine provides no other fields.
         dynamics: The model fields that differ between worlds, from ``model_fields.describe_model_field``.
-        initial: The state that ``reset`` puts worlds into, (integration_size,); None for the model's own.
+        initial: The initial state for ``reset``, (integration_size,); None for the model's own.
 
     Raises:
-        ValueError: A field is listed both lagged and current, the initial state has the wrong shape, or a model field
-            cannot differ between worlds of this model.
+        ValueError: A field is described as both lagged and current, the initial state has the wrong shape, or a model
+            field cannot differ between worlds of this model.
     """
 
     name: str
     """The engine's name, as in ``make(engine=...)``."""
     launch_threads: int = 1
-    """Threads that share the worlds in kernel launches around a step.
+    """The number of threads that divide the worlds in kernel launches around a step.
 
     An engine with several threads must launch kernels only through ``lyceum_warp.support.arrays``.
     """
@@ -59,31 +59,32 @@ class Engine(abc.ABC):
     nworld: int
     """Number of worlds."""
     device: wp.Device
-    """Where the arrays live."""
+    """The device of the arrays."""
     fields: dict[str, Field]
-    """The fields that the engine provides, by name; always includes ``ctrl``."""
+    """The fields that the engine provides, by name, always including ``ctrl``."""
     dynamics: dict[str, ModelField]
     """The model fields that differ between worlds, by name."""
     nominal: dict[str, wp.array]
-    """The model's own values of these fields, (1, ...), float32."""
+    """The model's values of the fields in ``dynamics``, (1, ...), float32."""
     initial: np.ndarray
-    """The state that ``reset`` puts worlds into, (integration_size,), float64."""
+    """The initial state of worlds after ``reset``, (integration_size,), float64."""
     arrays: dict[str, wp.array]
-    """The live arrays of the fields and model fields, (nworld, ...), by name; filled by each engine's constructor."""
+    """The live arrays of the fields and model fields, (nworld, ...), by name; the engine's constructor fills this
+    dict."""
     ctrl: wp.array
-    """Controls of the next step, (nworld, nu), float32; ``arrays["ctrl"]``, reset and restored with the state."""
+    """The controls of the next step, ``arrays["ctrl"]``, (nworld, nu), float32; part of the state."""
     fault: wp.array
-    """Bits of ``Done`` for each world, (nworld,), int32; set by ``find_faults``."""
+    """The faults of each world as bits of ``Done``, (nworld,), int32; set by ``find_faults``."""
     stage: Stage
-    """The last stage that must run after the substeps, so that fields match the new state."""
+    """The last stage of MuJoCo's forward pass that must run after the substeps, so that fields match the new state."""
     reset_stage: Stage
-    """The last stage that must run after a reset."""
+    """The last stage of MuJoCo's forward pass that must run after a reset."""
     snapshots: list[Field]
-    """Fields that are not a function of the integration state, in state-vector order."""
+    """The fields that do not follow from the integration state, in the order of the state vector."""
     integration_size: int
-    """Number of floats in one world's integration state (mjSTATE_INTEGRATION)."""
+    """The number of floats in one world's integration state (mjSTATE_INTEGRATION)."""
     state_size: int
-    """Number of floats in one world's state: the integration state, the snapshots, and the model fields."""
+    """The number of floats in one world's state: the integration state, ``snapshots`` and the model fields."""
 
     def __init__(
         self, model: mujoco.MjModel, nworld: int, device: wp.Device, fields: Iterable[Field],
@@ -122,15 +123,15 @@ class Engine(abc.ABC):
     def bytes_per_world(
         cls, model: mujoco.MjModel, fields: Iterable[Field], dynamics: Iterable[ModelField] = (), **options: Any
     ) -> int:
-        """Estimated bytes of memory per world; takes the constructor's arguments.
+        """Estimate the bytes of memory per world, from the constructor's arguments.
 
-        The default counts a float64 state and one float32 array for each field.
+        This implementation counts a float64 state and one float32 array for each field.
         """
         floats = sum(field.size for field in fields) + sum(field.size for field in dynamics)
         return 8 * _integration_size(model) + 4 * floats + 8
 
     def prepare_capture(self) -> None:  # noqa: B027
-        """Allocate memory for graphs; called once every kernel is compiled, before the first capture.
+        """Allocate memory for graphs; called when every kernel is compiled, before the first capture.
 
         Raises:
             ValueError: The memory is too small for this many worlds.
@@ -142,42 +143,45 @@ class Engine(abc.ABC):
     def step(self, nstep: int) -> None:
         """Advance every world by ``nstep`` substeps under ``ctrl`` and the other inputs, and update the fields.
 
-        The engine first reads the arrays of all fields with ``written``.
+        The engine first reads the arrays of the fields for which ``written`` is set.
         """
 
     def step_phases(self, nstep: int) -> list[Phase]:
-        """The phases of ``step``. So an engine that is not ``capturable`` can still capture its copies of fields."""
+        """The phases of ``step``, for capture.
+
+        An engine that is not ``capturable`` can capture some of its phases, such as its copies of fields.
+        """
         return [Phase("physics", partial(self.step, nstep), engine=True)]
 
     @abc.abstractmethod
     def find_faults(self, mask: wp.array) -> None:
-        """Write the masked worlds' ``fault``: non-finite states, and overflows and warnings since the last call.
+        """Write ``fault`` of the masked worlds: non-finite states, and overflows and warnings since the last call.
 
-        Made of Warp launches on every engine.
+        The method consists of Warp launches on every engine.
         """
 
     def check_room(self) -> None:  # noqa: B027
-        """Log a warning if worlds need more contacts or constraints than fit; called once, after the first reset."""
+        """Log a warning if worlds exceed the limits on contacts or constraints; called once, after the first reset."""
 
     @abc.abstractmethod
     def reset(self, mask: wp.array) -> None:
-        """Put the masked worlds into the model's initial state, state fields included.
+        """Put the masked worlds and their state fields into the initial state.
 
-        Consists of Warp launches on every engine. ``refresh`` then updates derived fields.
+        The method consists of Warp launches on every engine. The caller then updates derived fields by ``refresh``.
         """
 
     @abc.abstractmethod
     def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
-        """Copy the masked worlds' state fields, by default all, into the engine.
+        """Copy the state fields of the masked worlds, by default of all worlds, into the engine.
 
-        Made of Warp launches.
+        The method consists of Warp launches.
         """
 
     def apply_model(self, mask: wp.array) -> None:
         """Apply the masked worlds' model fields, and recompute the constants derived from them.
 
-        Unchanged values cost almost nothing. ``refresh`` or ``refresh_current`` then updates derived fields. An engine
-        that accepts ``dynamics`` must implement this method.
+        The cost is negligible for unchanged values. The caller then updates derived fields by ``refresh`` or
+        ``refresh_current``. An engine that accepts ``dynamics`` must implement this method.
         """
         if self.dynamics:
             raise NotImplementedError(f"the {self.name} engine does not let model fields differ between worlds")
@@ -185,13 +189,13 @@ class Engine(abc.ABC):
     def settle(self, mask: wp.array, nstep: int) -> None:
         """Advance only the masked worlds by ``nstep`` substeps from their committed states, and update state fields.
 
-        Afterwards the time of these worlds is 0; ``refresh`` then updates derived fields. No bit of any other world
-        changes.
+        The time of the masked worlds is then 0, and the caller updates derived fields by ``refresh``. No bit of any
+        other world changes.
         """
         raise NotImplementedError(f"the {self.name} engine cannot settle individual worlds")
 
     def run_for(self, mask: wp.array, run: Callable[[], None]) -> None:
-        """Run launches that affect only the masked worlds; a capturable engine may skip them if the mask is empty."""
+        """Run launches that affect only the masked worlds; capturable engines may skip them if the mask is empty."""
         run()
 
     @abc.abstractmethod
@@ -200,10 +204,10 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def refresh_current(self, mask: wp.array) -> None:
-        """Compute the masked worlds' derived fields and sensors that belong to the current state.
+        """Compute the derived fields and sensors of the masked worlds, except in the acceleration stage.
 
-        Fields and sensors of the acceleration stage keep their values from the last substep. Other worlds and all
-        sensor histories do not change.
+        Fields and sensors of the acceleration stage keep their values from the last substep. Other worlds do not
+        change, nor do the histories of sensors.
         """
 
     # rollouts
@@ -211,7 +215,7 @@ class Engine(abc.ABC):
     def rollout(self, state: wp.array, controls: wp.array, nstep: int, buffers: Mapping[str, wp.array]) -> None:
         """Roll out every world from a given state under given controls, and copy fields into buffers at each step.
 
-        Afterwards the state fields and ``find_faults`` describe the final state; derived fields may be stale.
+        The state fields and ``find_faults`` then describe the final state; derived fields may be stale.
 
         Args:
             state: States to start from, (nworld, state_size or more) float64, as from ``get_state``.
@@ -220,7 +224,7 @@ class Engine(abc.ABC):
             buffers: Destinations of fields and model fields, by name, (steps + 1, nworld, ...); row 0 is the initial
                 state.
         """
-        self.reset(self._everyone)  # clears the last rollout's warnings and warm starts
+        self.reset(self._everyone)  # find_faults also clears the last rollout's warnings and warm starts
         self.set_state(state, self._everyone)
         self._copy_fields(buffers, 0)
         for t in range(len(controls)):
@@ -230,7 +234,7 @@ class Engine(abc.ABC):
             self._copy_fields(buffers, t + 1)
 
     def rollout_bytes_per_world(self, steps: int, nstep: int, fields: Iterable[Field]) -> int:
-        """Estimated bytes of memory per world for ``rollout``, without its arguments.
+        """Estimate the bytes of memory per world that ``rollout`` needs in addition to its arguments.
 
         Args:
             steps: Number of steps in the horizon.
@@ -247,9 +251,9 @@ class Engine(abc.ABC):
     # state
 
     def get_state(self, state: wp.array, mask: wp.array | None = None) -> None:
-        """Write the masked worlds' states, by default all, into ``state``, (nworld, state_size) float64, exactly.
+        """Copy the masked worlds' exact states, by default of all, into ``state``, (nworld, state_size) float64.
 
-        Made of Warp launches.
+        The method consists of Warp launches.
         """
         mask = self._everyone if mask is None else mask
         self._get_integration(state[:, : self.integration_size], mask)
@@ -261,7 +265,7 @@ class Engine(abc.ABC):
             start += field.size
 
     def set_state(self, state: wp.array, mask: wp.array) -> None:
-        """Put the masked worlds into the given states, exactly; all fields match them afterwards."""
+        """Put the masked worlds into the given states, exactly, and update all fields."""
         self._set_integration(state[:, : self.integration_size], mask)
         if self.dynamics:
             self._read_columns(state, mask, self.dynamics.values(), self.state_size - self._dynamics_size)
@@ -270,18 +274,18 @@ class Engine(abc.ABC):
         self._read_columns(state, mask, self.snapshots, self.integration_size)
 
     def _read_columns(self, state: wp.array, mask: wp.array, fields: Iterable[Field | ModelField], start: int) -> None:
-        """Read the masked worlds' fields from consecutive columns of a state, rounded to float32."""
+        """Copy consecutive columns of a state into the masked worlds' fields, rounded to float32."""
         for field in fields:
             launch_rows(narrow, mask, state[:, start : start + field.size], flat(self.arrays[field.name]))
             start += field.size
 
     def _saved(self) -> list[Field | ModelField]:
-        """The fields after the integration state in a state vector, in order."""
+        """The fields that follow the integration state in a state vector, in order."""
         return [*self.snapshots, *self.dynamics.values()]
 
     @property
     def _dynamics_size(self) -> int:
-        """Number of columns of the model fields, which come last in a state."""
+        """The number of columns of the model fields, which come last in a state."""
         return sum(field.size for field in self.dynamics.values())
 
     @abc.abstractmethod
@@ -292,9 +296,10 @@ class Engine(abc.ABC):
 
 
 EngineFactory = Callable[..., Engine]
-"""Called with (model, nworld, device, fields, dynamics, initial, **options).
+"""A function that makes an engine from (model, nworld, device, fields, dynamics, initial, **options).
 
-Engine classes are factories. If a factory has ``bytes_per_world``, as engine classes do, memory is checked first.
+Engine classes are factories. Available memory is checked first if a factory has ``bytes_per_world``, as engine classes
+do.
 """
 
 
@@ -303,7 +308,7 @@ def _integration_size(model: mujoco.MjModel) -> int:
 
 
 def _initial_state(model: mujoco.MjModel) -> np.ndarray:
-    """The integration state of a new MjData."""
+    """Return the integration state of a new MjData."""
     state = np.empty(_integration_size(model))
     mujoco.mj_getState(model, mujoco.MjData(model), state, mujoco.mjtState.mjSTATE_INTEGRATION.value)
     return state

@@ -19,20 +19,20 @@ def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: 
     """Refuse a batch that does not fit into the free memory, before its arrays are allocated.
 
     Args:
-        bytes_per_world: Memory that each world takes.
+        bytes_per_world: The memory that each world takes.
         nworld: Number of worlds.
-        device: Where they will run.
+        device: The device of the worlds.
         model: The model's name, for the message.
-        held: Bytes that the batch has already allocated.
+        held: The bytes that the batch has already allocated.
 
     Raises:
         NotEnoughMemoryError: The batch does not fit; the message names the largest number of worlds that does.
     """
     free = free_memory(device)
     if free is not None and nworld > _most(bytes_per_world, free + held):
-        gc.collect()  # free environments that are no longer used
+        gc.collect()  # collect garbage, to free environments that are no longer used
         if device.is_cuda:
-            torch.cuda.empty_cache()  # free memory that torch has cached
+            torch.cuda.empty_cache()  # torch caches free memory, which this releases
         free = free_memory(device)
     if free is None or nworld <= (most := _most(bytes_per_world, free + held)):
         return

@@ -26,15 +26,16 @@ _DETERMINISTIC = "lyceum_warp.engines.deterministic.deterministic_engine", "Dete
 """The engine that replaces "warp" on a CUDA device with deterministic=True."""
 
 _SAMPLES_PER_CORE = 40
-"""With fewer samples per CPU core than this, the C engine plans faster than an H100. Measured with 16 cores, the
+"""The number of samples per CPU core below which the C engine plans faster than an H100. Measured on 16 cores, the
 break-even points are 27 samples per core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah
 (bench/README.md)."""
 
 _MOST_CORES = 16
-"""Further cores do not count: more were not measured, and the other work of a plan runs on one core."""
+"""The largest number of CPU cores that counts. More cores were not measured, and the rest of a plan's work runs on one
+core."""
 
 _NOSLIP = 6
-"""Factor on the break-even point if the model uses the noslip solver, which is slow on a GPU."""
+"""The factor on the break-even point if the model uses the noslip solver, which is slow on a GPU."""
 
 
 def find_device(device: str | None) -> wp.Device:
@@ -44,7 +45,7 @@ def find_device(device: str | None) -> wp.Device:
         ValueError: This machine has no such device.
     """
     name, error, remarks = str(device or "cpu"), None, start_warp()
-    if wp.is_cuda_available() or not name.startswith("cuda"):  # without a driver, Warp would print a message first
+    if wp.is_cuda_available() or not name.startswith("cuda"):  # Warp would print a message if there is no driver
         try:
             found = wp.get_device(name)
         except (ValueError, RuntimeError) as cause:
@@ -53,7 +54,7 @@ def find_device(device: str | None) -> wp.Device:
             if found.is_cuda and not torch.cuda.is_available():
                 raise ValueError(
                     f"Warp has the device {name!r}, but torch {torch.__version__} is built without CUDA or does not "
-                    "see it: install a CUDA build of torch"
+                    "find the device: install a CUDA build of torch"
                 )
             return found
     names = ", ".join(repr(d.alias) for d in wp.get_devices())
@@ -65,11 +66,11 @@ def find_device(device: str | None) -> wp.Device:
 
 
 def engine_name(engine: str | EngineFactory, device: str | wp.Device | None) -> str:
-    """The name of an engine; "auto" is "warp" on a CUDA device and "mujoco" on the CPU.
+    """Return the name of an engine; "auto" becomes "warp" on a CUDA device and "mujoco" on the CPU.
 
     Args:
         engine: A name, "auto", or an engine class or factory.
-        device: A device or its name; it need not exist on this machine.
+        device: A device or its name; this machine need not have the device.
     """
     if callable(engine):
         return str(getattr(engine, "name", getattr(engine, "__name__", engine)))
@@ -88,16 +89,16 @@ def open_engine(
         engine: "mujoco", "warp", "auto", or a callable with the signature of ``base.Engine``.
         model: The compiled model.
         nworld: Number of worlds.
-        device: Where they run.
+        device: The device of the worlds.
         fields: The fields to provide, from ``fields.describe``.
         dynamics: The model fields that differ between worlds, from ``model_fields.describe_model_field``.
-        initial: The state that a reset puts worlds into; None for the model's own.
-        reserved: Bytes for each world that the caller allocates.
-        options: Keyword-only arguments of the engine's constructor. None means the engine's default. A flag (True or
-            False) that the engine does not have is ignored.
+        initial: The initial state for resets; None for the model's own.
+        reserved: The bytes per world that the caller allocates.
+        options: Keyword-only arguments of the engine's constructor. None stands for the engine's default. An unknown
+            option is ignored if its value is True or False.
 
     Raises:
-        ValueError: There is no such engine, the worlds do not fit into memory, or the engine does not support the
+        ValueError: The engine does not exist, the worlds do not fit into memory, or the engine does not support the
             model, the device, an option, or model fields that differ between worlds.
     """
     fields, dynamics = list(fields), list(dynamics)
@@ -112,25 +113,25 @@ def bytes_per_world(
     engine: str | EngineFactory, model: mujoco.MjModel, device: wp.Device, fields: Iterable[Field],
     dynamics: Iterable[ModelField] = (), **options: Any,
 ) -> int:  # fmt: skip
-    """Estimated bytes of memory per world, for the engine that ``open_engine`` makes; 0 if unknown."""
+    """Estimate the bytes of memory per world for the engine that ``open_engine`` makes; 0 if unknown."""
     factory, given = _resolved(engine, device, options)
     estimate = getattr(factory, "bytes_per_world", None)
     return 0 if estimate is None else int(estimate(model, list(fields), list(dynamics), **given))
 
 
 def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
-    """The options to change for an environment of a few worlds, as for an evaluation.
+    """Return the options to change for an environment with few worlds, such as for an evaluation.
 
-    On a GPU a step of a few worlds takes nearly as long as a step of thousands. With engine="auto" they therefore run
-    on the C engine, on CPU cores and in double precision.
+    On a GPU a step of a few worlds takes nearly as long as a step of thousands. With engine="auto", few worlds
+    therefore run on the C engine, on CPU cores and in double precision.
     """
     return options_on_cores() if engine == "auto" and engine_name(engine, device) == "warp" else {}
 
 
 def options_for_plant(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
-    """The options to change for a world that a planner controls in real time.
+    """Return the options to change for a world that a planner controls in real time.
 
-    On a GPU its steps would wait for the planner's launches, so it runs on the C engine, on a CPU core.
+    On a GPU the world's steps would wait for the planner's launches, so the world runs on the C engine, on a CPU core.
     """
     name = device.alias if isinstance(device, wp.Device) else device
     on_gpu = engine in ("auto", "warp") and find_device(name).is_cuda
@@ -141,14 +142,16 @@ def place_samples(
     engine: str | EngineFactory, device: str | None, *, nthread: int | None, samples: int,
     spec: Callable[[], mujoco.MjSpec], solver: Mapping[str, int | float] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """The options to change for a planner's worlds. With engine="auto" on a GPU, the number of samples decides.
+    """Return the options to change for a planner's worlds.
+
+    With engine="auto" on a GPU, the engine depends on the number of samples.
 
     Args:
         engine: The requested engine.
         device: The requested device.
-        nthread: Threads of the C engine; None for all cores.
+        nthread: Number of threads of the C engine; None for all cores.
         samples: Number of samples, each in a world.
-        spec: Returns the planner's model; called only if the choice depends on its noslip solver.
+        spec: A function that returns the planner's model; called only if the choice depends on the noslip solver.
         solver: The option ``solver`` of the planner's physics.
 
     Raises:
@@ -168,7 +171,7 @@ def place_samples(
 
 
 def options_on_cores() -> dict[str, Any]:
-    """The options that move an environment to the C engine; options that this engine does not have become None."""
+    """Return the options that move an environment to the C engine; options that the C engine lacks become None."""
     known = _options_of(_engine_class("mujoco", wp.get_device("cpu"), False)) or []
     defaults = EnvOptions().for_engine()
     others = {name: None for name, default in defaults.items() if default is None and name not in known}
@@ -178,7 +181,7 @@ def options_on_cores() -> dict[str, Any]:
 def _resolved(
     engine: str | EngineFactory, device: wp.Device, options: dict[str, Any]
 ) -> tuple[EngineFactory, dict[str, Any]]:
-    """The engine's class or factory, and the options to pass to it."""
+    """Return the engine's class or factory, and the options to pass to it."""
     name = engine_name(engine, device.alias)
     factory = engine if callable(engine) else _engine_class(name, device, bool(options.get("deterministic")))
     given = {key: value for key, value in options.items() if value is not None and value is not False}
@@ -202,7 +205,7 @@ def _engine_class(name: str, device: wp.Device, deterministic: bool) -> type[Eng
 
 
 def _options_of(factory: EngineFactory) -> list[str] | None:
-    """The names of an engine's options, or None if it accepts any."""
+    """Return the names of an engine's options, or None if the engine accepts any."""
     parameters = inspect.signature(factory).parameters.values()
     if any(parameter.kind == parameter.VAR_KEYWORD for parameter in parameters):
         return None
@@ -210,6 +213,6 @@ def _options_of(factory: EngineFactory) -> list[str] | None:
 
 
 def _model_name(model: mujoco.MjModel) -> str:
-    """The name in the model's file; empty if it has none."""
+    """Return the model's name, which is empty if its file has none."""
     name = model.names[: model.names.index(b"\0")].decode(errors="replace")
     return "" if name == "MuJoCo Model" else name

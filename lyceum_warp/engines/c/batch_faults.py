@@ -8,14 +8,15 @@ from mujoco.batch import Batch, SimulationError
 log = logging.getLogger(__name__)
 
 _COUNTED_AS = mujoco.mjtWarning.mjWARN_INERTIA.value
-"""Errors are counted as this type of warning."""
+"""The type of warning under which errors are counted."""
 
 
 class ErrorsAsWarnings:
-    """Context that counts errors of individual worlds as warnings, for ``find_faults``, instead of raising them.
+    """A context manager that counts errors of individual worlds as warnings, which ``find_faults`` reads.
 
-    After an error MuJoCo restores the world's state from before the call, and finishes the other worlds. This is a
-    class, and all steps share one instance, because entering a generator-based context takes four times as long.
+    After an error in a world, MuJoCo restores the state that the world had before the call, and steps the other worlds.
+    All steps share one instance of this class, because a generator-based context manager takes four times as long to
+    enter.
 
     Args:
         batch: The worlds.

@@ -42,19 +42,19 @@ from lyceum_warp.support.mujoco_log import quiet
 from lyceum_warp.support.validate import whole_number
 
 _BATCH_BYTES = 150
-"""Bytes that ``Batch`` stores per world besides the state: warnings, a status, an error message."""
+"""The bytes that ``Batch`` stores per world for warnings, a status and an error message."""
 
 _MOST_MASKS = 16
-"""Maximum number of cached mask views; an environment has fewer masks."""
+"""The maximum number of cached views of masks; an environment has fewer masks."""
 
 
 class MujocoEngine(Engine):
-    """Worlds as rows of float64 state in ``mujoco.batch.Batch``, with float32 copies of the fields.
+    """Steps worlds in ``mujoco.batch.Batch``, which stores float64 states, and copies fields to float32 arrays.
 
     Args:
         model, nworld, fields, dynamics: See ``Engine``.
         device: Must be the CPU.
-        initial: The state that ``reset`` puts worlds into, rounded to float32; None for the model's own.
+        initial: The initial state for ``reset``, which is rounded to float32; None for the model's own.
         nthread: Threads of the pool; 0 for all cores.
 
     Raises:
@@ -82,11 +82,11 @@ class MujocoEngine(Engine):
         super().__init__(model, nworld, device, fields, dynamics, initial)
         quiet()
         self.nthread = whole_number("nthread", nthread, low=0)
-        # one thread, because a subclass may launch over all worlds, and every thread would repeat this
+        # use one thread, because every thread would repeat a subclass's launches over all worlds
         self.launch_threads = (self.nthread or cpu_cores()) if type(self) is MujocoEngine else 1
         self.native_model = copy.copy(model)
-        """The model that the batch runs."""
-        # a world with a fault must be reported, not silently reset within a step
+        """The model that the batch steps."""
+        # autoreset would hide a fault, because MuJoCo would silently reset the world within a step
         self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         # The batch is not persistent. A persistent batch could reuse the stages computed after the last step, but one
         # MjData per world does not fit into the CPU's caches: the six tasks that need such stages became 4 to 33 %
@@ -107,16 +107,16 @@ class MujocoEngine(Engine):
         computed = [field for field in self._derived if field.refresh > Stage.NONE]
         positions = all(DERIVED_FIELDS.get(field.name) == Stage.POSITION for field in computed)
         self._apart = bool(computed) and (positions or any(field.lagged for field in kept))
-        """Whether the stage after the substeps needs a separate call."""
+        """Whether a separate call must compute the last stage after the substeps."""
         shown = [field for field in kept if field.name != "ctrl"]  # an input
         late = [field for field in shown if field not in computed or field.snapshot] if self._apart else []
         self._before_stage = [field for field in late if field.name not in STATE_FIELDS]
-        """Fields to copy before the separate call, because it may run in an MjData that another world used."""
+        """The fields to copy before the separate call, which may use the MjData of another world."""
         self._after_stage = [field for field in self._before_stage if field in computed]
-        """Fields of which the separate call computes only a part: sensors up to its stage."""
+        """The fields that the separate call computes only in part, such as sensors up to a stage."""
         self._last = [field for field in shown if field not in self._before_stage]
-        """Fields to copy at the end of a step, by kernel launches."""
-        # skip collision detection, most of the position stage: positions do not depend on contacts
+        """The fields that kernel launches copy at the end of a step."""
+        # skip collision detection, which takes most of the position stage, because positions do not depend on contacts
         without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if positions and computed else 0
         self._disabled = self.batch.expand("opt.disableflags") if without else np.zeros(0, dtype=int)
         self._step_flags, self._stage_flags = self._disabled.copy(), self._disabled | without
@@ -134,7 +134,10 @@ class MujocoEngine(Engine):
         self._models.apply(self._values)
 
     def _on_host(self, mask: wp.array) -> np.ndarray:
-        """A mask's memory as a NumPy array. The view is cached, because making it takes longer than reading it."""
+        """Return a mask's memory as a NumPy array.
+
+        The view is cached, because creating a view takes longer than reading it.
+        """
         if (kept := self._masks.get(id(mask))) is not None:  # the dict keeps the mask alive, so the id stays unique
             return kept[1]
         view: np.ndarray = mask.numpy()
@@ -146,17 +149,17 @@ class MujocoEngine(Engine):
         return wp.array(rows, dtype=wp.float64, device=self.device, copy=False)
 
     def _rounded_initial(self) -> wp.array:
-        """The initial state rounded to float32, as the fields would hold it."""
+        """Round the initial state to float32, the precision of the fields."""
         initial = self.initial.copy()
         for name in STATE_FIELDS:
             if name in READ_ONLY:
-                continue  # rounding would shift the time stamps of delayed sensor samples
+                continue  # rounding the time would shift the time stamps of delayed sensor samples
             columns = state_columns(self.model, name)
             initial[columns] = initial[columns].astype(np.float32)
         return wp.array(initial, dtype=wp.float64, device=self.device)
 
     def _bind(self, field: Field) -> None:
-        """Allocate a field's float32 array, and find the float64 array that it mirrors."""
+        """Allocate a field's float32 array, and find the engine's float64 array from which it is copied."""
         array = wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
         self.arrays[field.name] = array
         if field.name in STATE_FIELDS:
@@ -223,10 +226,10 @@ class MujocoEngine(Engine):
 
         Args:
             fields: The fields to copy.
-            mask: Mask of the worlds; None for all.
-            early: Whether to skip sensors of the acceleration stage.
+            mask: The mask of the worlds; None for all worlds.
+            early: Whether to skip the sensors of the acceleration stage.
         """
-        with np.errstate(over="ignore"):  # a world with a fault may hold numbers beyond float32
+        with np.errstate(over="ignore"):  # a world with a fault may hold numbers outside the range of float32
             for field in fields:
                 target, source = self._copies[field.name]
                 where: Any = True if mask is None else mask.reshape(-1, *[1] * (target.ndim - 1))
@@ -310,7 +313,7 @@ class MujocoEngine(Engine):
         launch_several_rows(widen_four, mask, numbers)
 
     def refresh(self, mask: wp.array) -> None:
-        computed = [field for field in self._derived if field.reset > Stage.NONE]  # clear the other bits
+        computed = [field for field in self._derived if field.reset > Stage.NONE]  # clear all other bits
         self._forward(mask, self.reset_stage, computed)
 
     def refresh_current(self, mask: wp.array) -> None:

@@ -14,12 +14,12 @@ from lyceum_warp.model_fields import ModelField
 
 
 def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
-    """Whether ``Batch.rollout`` returns the same values as one call of ``Batch.step`` per step.
+    """Whether ``Batch.rollout`` returns the same values as a ``Batch.step`` for each step.
 
-    Each row of a native rollout holds values as ``mj_step`` leaves them. Its state is the new state, but quantities of
-    the position and velocity stages belong to the state before the last substep, and the next row holds their new
-    values. With RK4 they belong to an intermediate stage instead. Sensor data mix the stages, so they are not exact
-    either.
+    Each row of a native rollout holds values as ``mj_step`` leaves them. The state in a row is the new state.
+    Quantities of the position and velocity stages belong to the state before the last substep, and their new values are
+    in the next row. With RK4, these quantities belong to an intermediate stage. Sensor data come from several stages,
+    so a native rollout cannot return them exactly.
     """
     current = [field for field in fields if field.refresh > Stage.NONE]
     if any(field.snapshot for field in current):
@@ -28,12 +28,12 @@ def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
 
 
 class NativeRollout:
-    """Rolls out the worlds of a batch, which then hold the final states.
+    """Rolls out the worlds of a batch, and leaves the final states in the batch.
 
     Args:
-        batch: The worlds; no fields may be bound.
-        steps: Steps of the horizon.
-        nstep: Substeps in a step.
+        batch: The worlds; the batch must have no bound fields.
+        steps: Number of steps in the horizon.
+        nstep: Number of substeps in a step.
         fields: The fields to copy into buffers.
         snapshots: The fields that follow the integration state in a state vector, in order.
         dynamics: The model fields that follow the snapshots.
@@ -57,18 +57,18 @@ class NativeRollout:
         self.fields = [field for field in fields if field.size]
         self.stage = max((field.refresh for field in self.fields), default=Stage.NONE)
         self.start: dict[str, slice] = {}
-        """Columns of the state vector that hold a field's initial value."""
+        """The columns of the state vector that hold a field's initial value."""
         self.final: dict[str, np.ndarray] = {}
-        """Values at the end of the rollout, for fields that a forward pass must compute."""
+        """The final values of the fields that a forward pass must compute."""
         self.rows: dict[Any, np.ndarray] = {}
-        """One row per substep, for each component of the state and each derived field."""
+        """Buffers of the state's components and the derived fields, with one row per substep."""
         column = batch.nstate
         for field in snapshots:
             self.start[field.name] = slice(column, column + field.size)
             column += field.size
         self.models = WorldModels(batch, dynamics)
         self.model_columns: dict[str, slice] = {}
-        """Columns of the state vector with the model fields."""
+        """The columns of the state vector that hold the model fields."""
         for varied in dynamics:
             self.model_columns[varied.name] = slice(column, column + varied.size)
             column += varied.size
@@ -86,14 +86,14 @@ class NativeRollout:
         self._outputs: dict[str, Any] = {"record": list(self.rows), "out": self.rows}
 
     def run(self, *given: Any) -> None:
-        """Roll out and copy the fields; leave final states in ``batch.state`` and warnings in ``batch.warning``.
+        """Roll out the worlds, and copy the fields; the batch keeps the final states and the warnings.
 
         Args:
             given: The state, the controls and the buffers of ``Engine.rollout``.
         """
         if self._given is None or any(a is not b for a, b in zip(given, self._given, strict=True)):
             self._given, (start, held, arrays) = given, given
-            # making views of Warp arrays takes longer than filling them
+            # cache the views, because making views of Warp arrays takes longer than filling them
             self._views = start.numpy(), held.numpy(), {name: buffer.numpy() for name, buffer in arrays.items()}
         state, controls, buffers = self._views
         batch = self.batch
@@ -102,13 +102,13 @@ class NativeRollout:
         if self.model_columns:
             self.models.apply({name: state[:, part].astype(np.float32) for name, part in self.model_columns.items()})
         np.copyto(self.by_step, controls.transpose(1, 0, 2)[:, :, None])
-        # a world with a warning stops and repeats its last row, so the warnings must be read
+        # after a warning a world stops and repeats its last row, so the caller must read the warnings
         with ErrorsAsWarnings(batch):
             batch.rollout(nstep=self.control.shape[1], control=self.control, **self._outputs)
         if self.stage > Stage.NONE:
             with ErrorsAsWarnings(batch):
                 batch.forward(stage=self.stage)
-        with np.errstate(over="ignore"):  # a world with a fault may hold numbers beyond float32
+        with np.errstate(over="ignore"):  # a world with a fault may hold numbers outside the range of float32
             for field in self.fields:
                 self._copy(field, state, buffers[field.name])
 
@@ -116,7 +116,7 @@ class NativeRollout:
         key = STATE_FIELDS[field.name].value if field.name in STATE_FIELDS else field.name
         rows, nstep = self.rows[key], self.nstep
         if field.name in self.final:
-            # the first substep's row holds the values from before the step
+            # the row of the first substep holds the values before the step
             values, end = rows[:, ::nstep], self.final[field.name]
             np.copyto(target[:-1], values.swapaxes(0, 1).reshape(target[:-1].shape), "unsafe")
             np.copyto(target[-1], end.reshape(target[-1].shape), "unsafe")

@@ -13,8 +13,8 @@ from lyceum_warp.model_fields import ModelField
 class WorldModels:
     """Writes values of model fields into a batch, and recomputes the constants derived from them.
 
-    Only the float32 values matter: a value equal to the model's rounded value becomes the model's float64 value; all
-    other values are written unchanged.
+    A value that equals the model's own value in float32 becomes the model's float64 value. All other values are written
+    unchanged.
 
     Args:
         batch: The worlds.
@@ -36,17 +36,17 @@ class WorldModels:
             self._rounded[field.name] = self._own[field.name].astype(np.float32)
             if field.name in self._follows:
                 self._applied[field.name] = self._rows[field.name].astype(np.float32)
-        # set_const computes all constants, also for the model's own values, so that equal values give equal constants
+        # call set_const even for the model's own values, so that equal values give equal constants
         self._stale = np.full(batch.nsim, bool(self._follows))
 
     def apply(self, values: Mapping[str, np.ndarray], mask: np.ndarray | None = None) -> None:
         """Write values, and recompute the constants of the worlds in which any value changed.
 
         Args:
-            values: By name, (nworld, size) float32.
-            mask: Mask of the worlds; None for all.
+            values: The values of model fields by name, (nworld, size) float32.
+            mask: The mask of the worlds; None for all worlds.
         """
-        if mask is not None and 1 not in mask.tobytes():  # the usual case; faster than mask.any()
+        if mask is not None and 1 not in mask.tobytes():  # usually none; faster than mask.any()
             return
         worlds = np.arange(self.batch.nsim) if mask is None else np.flatnonzero(mask)
         derive = self._stale[worlds]
@@ -64,7 +64,7 @@ class WorldModels:
             self._set_const(chosen)
 
     def _set_const(self, worlds: np.ndarray) -> None:
-        """Recompute constants; a world whose values MuJoCo rejects gets a warning, and is retried next time."""
+        """Recompute constants; if MuJoCo rejects a world's values, count a warning and try again next time."""
         counted = self.batch.warning[:, :, 1].sum(axis=1)
         with ErrorsAsWarnings(self.batch):
             self.batch.set_const(worlds)
@@ -72,11 +72,11 @@ class WorldModels:
 
 
 def bytes_per_world(model: mujoco.MjModel, fields: Iterable[ModelField]) -> int:
-    """Bytes of a batch's model fields and of ``WorldModels`` per world."""
+    """Estimate the bytes per world of a batch's model fields and of ``WorldModels``."""
     fields = list(fields)
     batch = Batch(model, 1, 1)
     models = WorldModels(batch, fields)
     moved = {field.name: 1.001 * field.value(model).reshape(1, -1).astype(np.float32) for field in models.fields}
-    models.apply(moved)  # a constant takes memory only if it differs
+    models.apply(moved)  # a constant takes memory only if it differs between worlds
     expanded = [rows for name in MODEL_FIELDS if (rows := batch.expanded(name)) is not None]
     return sum(rows.nbytes for rows in expanded) + 4 * sum(field.size for field in fields)

@@ -16,16 +16,16 @@ class CanonicalOrder:
     """Sorts a Data's contacts and constraint rows in every forward pass, through MuJoCo Warp's callbacks.
 
     MuJoCo Warp's own deterministic mode makes sums of atomic additions reproducible, but does not sort contacts and
-    rows. The callbacks run after collision detection, and between making and solving constraints. For
-    the order see ``order_kernels``.
+    rows. The callbacks run after collision detection, and after the constraint rows are made but before they are
+    solved. ``order_kernels`` describes the order.
 
     Args:
         model: MuJoCo Warp's model, whose callbacks are set.
         data: MuJoCo Warp's data.
-        between: Called at the start of both callbacks.
+        between: A function that both callbacks call first.
 
     Raises:
-        ValueError: The model has flexes, or MuJoCo Warp's contacts have a field that is not sorted.
+        ValueError: The model has flexes, or MuJoCo Warp's contacts have an unknown field.
     """
 
     def __init__(self, model: mjw.Model, data: mjw.Data, between: Callable[[], None] = lambda: None) -> None:
@@ -36,8 +36,8 @@ class CanonicalOrder:
         for field in dataclasses.fields(data.contact):
             if field.name not in order.Contacts.vars:  # type: ignore[attr-defined]
                 raise ValueError(
-                    f"deterministic=True can't sort contacts with the field {field.name!r} of this mujoco_warp: use "
-                    "mujoco-warp 4.0"
+                    f"deterministic=True can't sort contacts with the field {field.name!r} of this mujoco_warp: "
+                    "install mujoco-warp 4.0"
                 )
             words = _words(getattr(data.contact, field.name))
             setattr(self._contacts, field.name, words)
@@ -46,7 +46,7 @@ class CanonicalOrder:
         for name in order.Rows.vars:  # type: ignore[attr-defined]
             array = getattr(data.efc, name)
             setattr(self._rows, name, array)
-            if name == "J" and model.is_sparse:  # entries of a sparse Jacobian are not moved
+            if name == "J" and model.is_sparse:  # the kernels do not move the entries of a sparse Jacobian
                 array = wp.empty((0, 0, 0), dtype=float)
             elif name != "jtdaj_nblock":
                 array = wp.empty_like(array)
@@ -58,7 +58,7 @@ class CanonicalOrder:
         model.callback.passive = self.sort_rows
 
     def sort_contacts(self, model: mjw.Model, data: mjw.Data) -> None:
-        """Sort the contacts; called after collision detection."""
+        """Sort the contacts; MuJoCo Warp calls this after collision detection."""
         self._between()
         n, count = data.naconmax, data.nacon
         wp.launch(order.contact_keys, n, [count, self._contacts, n, self._key, self._place])
@@ -68,7 +68,7 @@ class CanonicalOrder:
         wp.launch(order.gather_contacts, n, [count, self._place, False, n, *args[::-1]])
 
     def sort_rows(self, model: mjw.Model, data: mjw.Data) -> None:
-        """Sort the constraint rows of every world; called in the velocity stage."""
+        """Sort the constraint rows of every world; MuJoCo Warp calls this in the velocity stage."""
         self._between()
         nrow, shape = data.nefc, self._rank.shape
         wp.launch(order.rank_rows, shape, [nrow, model.eq_type, self._rows, self._rank])
@@ -83,7 +83,7 @@ class CanonicalOrder:
 
 
 def _words(array: wp.array) -> wp.array:
-    """The same memory as 32-bit words, (naconmax, words)."""
+    """Return a view of a contact field as 32-bit words, (naconmax, words)."""
     rows = array.shape[0] if array.ndim else 0
     size = array.size * wp.types.type_size_in_bytes(array.dtype) // 4
     if not rows or not size:

@@ -19,21 +19,21 @@ from lyceum_warp.graphs.capture import capturing
 from lyceum_warp.model_fields import ModelField
 
 _TIMES_THE_MEMORY = 5
-"""Memory of a world, divided by the estimate for the plain Warp engine. Measured: 4.9 on humanoid, 6.1 on half_cheetah
-and 6.3 on hopper. ``prepare_capture`` measures it for the actual model."""
+"""The factor from the plain Warp engine's estimated memory per world to this engine's. Measured factors are 4.9 on
+humanoid, 6.1 on half_cheetah and 6.3 on hopper. ``prepare_capture`` later measures the memory for the given model."""
 
 _FEW = 256
-"""Below this number of worlds, scratch memory fits on any device and is allocated on demand."""
+"""With fewer worlds than this, scratch memory fits on any device, and is allocated on demand."""
 
 
 class DeterministicEngine(WarpEngine):
     """A Warp engine whose steps are reproducible bit for bit on a CUDA device, as on the CPU.
 
     The engine sorts contacts and constraint rows, makes MuJoCo Warp sum in a fixed order, and uses the same scratch
-    memory for all launches. The arguments are the same as for ``WarpEngine``.
+    memory for all launches. The constructor takes the same arguments as ``WarpEngine``.
     """
 
-    __signature__ = inspect.signature(WarpEngine)  # placement reads the names of the options from this signature
+    __signature__ = inspect.signature(WarpEngine)  # placement.py reads the option names from here
 
     partial_refresh = False
 
@@ -52,15 +52,16 @@ class DeterministicEngine(WarpEngine):
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
         """Make another Model and Data with the same options and sizes, to benchmark MuJoCo Warp alone.
 
-        A graph of their step takes about a hundred times the memory, because its launches do not share scratch memory.
+        A graph of a step of this Model and Data takes about a hundred times the memory, because its launches do not
+        share scratch memory.
         """
         model, data = super().bare()
         with wp.ScopedDevice(self.device):
-            CanonicalOrder(model, data)  # the model's callbacks keep the sorter alive
+            CanonicalOrder(model, data)  # the model's callbacks hold references to the sorter
         return model, data
 
     def prepare_capture(self) -> None:
-        """Measure the scratch memory that graphs need, and allocate it; compiles the kernels of a step."""
+        """Measure the scratch memory that graphs need, and allocate it; this also compiles the kernels of a step."""
         if self.nworld < _FEW:
             return
         sizes = ScratchSizes.probe(self._captured_step)
@@ -75,7 +76,7 @@ class DeterministicEngine(WarpEngine):
         try:
             check_fit(plain + needed, self.nworld, self.device, held=self.nworld * plain)
         except ValueError as error:
-            raise ValueError(f"{error}, or omit deterministic=True, which takes most of it") from None
+            raise ValueError(f"{error}, or omit deterministic=True, which takes most of the memory") from None
         self._scratch.add_block(sizes.bytes_of(self.nworld))
 
     def _captured_step(self, nworld: int) -> Scratch:

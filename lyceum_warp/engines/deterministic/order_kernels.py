@@ -1,8 +1,8 @@
 """Sort contacts and constraint rows into an order that does not depend on thread timing: kernels.
 
-MuJoCo Warp assigns indices to contacts and constraint rows by atomic counters. On a GPU, sums over them are therefore
-rounded differently in each run, and runs diverge. These kernels sort contacts by (world, geoms, index within the pair),
-and each world's rows by (type, object, index within the constraint).
+MuJoCo Warp assigns indices to contacts and constraint rows by atomic counters. On a GPU the order of contacts and rows
+therefore varies, sums over them are rounded differently in each run, and runs diverge. These kernels sort contacts by
+(world, geoms, index within the pair), and each world's rows by (type, object, index within the constraint).
 """
 
 import warp as wp
@@ -96,7 +96,7 @@ def gather_contacts(
 
 @wp.struct
 class Rows:
-    """The fields of constraint rows, (nworld, njmax or more); a Jacobian's columns are its third axis."""
+    """The fields of constraint rows, (nworld, njmax or more); the third axis of the Jacobian has its columns."""
 
     type: wp.array2d[int]
     id: wp.array2d[int]

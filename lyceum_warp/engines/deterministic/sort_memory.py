@@ -9,18 +9,19 @@ import warp as wp
 from lyceum_warp.engines.warp.group import Reserve, aligned
 
 LARGEST_BUFFER = 2**31 - 1
-"""Bytes of the largest byte array that Warp can make: an axis has fewer than 2**31 elements."""
+"""The size of the largest byte array that Warp can make, because an axis has fewer than 2**31 elements."""
 
 _PROBED = 1024, 2048
-"""Numbers of worlds to extrapolate from; large enough that all of Warp's buffers exceed their minimum size."""
+"""Two numbers of worlds from which memory is extrapolated, so large that all of Warp's buffers exceed their minimum
+size."""
 
 
 class Scratch(Reserve):
     """An allocator that places the buffers of all launches in the same memory.
 
     By default Warp allocates separate buffers for each launch in a graph, about a hundred times the memory of the
-    worlds. But launches run one after another and clear their buffers first, so they can share memory. Warp also clears
-    the buffers during a capture, so no graph may run then.
+    worlds. Launches can share this memory, because they run one after another and clear their buffers first. Warp also
+    clears the buffers during a capture, so no graph may run then.
 
     Args:
         device: A CUDA device.
@@ -40,14 +41,15 @@ class Scratch(Reserve):
 
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
-        """Within the context, serve captured launches from the reserve."""
+        """Return a context in which captured launches allocate from the reserve."""
         self.open()
         with wp.ScopedAllocator(self.device, self):
             yield
 
     def allocate(self, size_in_bytes: int) -> int:
-        """Allocate memory, from a new block once the reserve is used up, and return its address."""
-        # Warp allocates these buffers on a separate stream, outside the capture; other memory belongs to the graph
+        """Allocate memory from the reserve, or from a new block if the reserve is used up, and return its address."""
+        # Warp allocates buffers for sorting on a separate stream, outside the capture; all other memory belongs to the
+        # graph
         if not self.device.is_capturing or self.device.stream.is_capturing:
             return int(self.below.allocate(size_in_bytes))
         size = aligned(size_in_bytes)
@@ -63,10 +65,10 @@ class Scratch(Reserve):
 
 @dataclasses.dataclass(frozen=True)
 class ScratchSizes:
-    """Scratch bytes needed by a number of worlds, and the largest possible number of worlds."""
+    """Holds the scratch memory that worlds need, and the largest possible number of worlds."""
 
     fixed: int
-    """Bytes independent of the number of worlds."""
+    """The bytes that do not depend on the number of worlds."""
     each: int
     """Bytes per world."""
     most: int
@@ -77,7 +79,8 @@ class ScratchSizes:
         """Extrapolate from the scratch memory measured for two numbers of worlds.
 
         Args:
-            capture: Captures a step of a number of worlds and returns the scratch memory that it used.
+            capture: A function that captures a step of a number of worlds, and returns the scratch memory that the step
+                used.
         """
         few, more = (capture(nworld) for nworld in _PROBED)
         fixed, each = _line(few.peak, more.peak)
@@ -85,7 +88,7 @@ class ScratchSizes:
         return cls(fixed, each, (LARGEST_BUFFER - fixed_buffer) // max(1, each_buffer))
 
     def bytes_of(self, nworld: int) -> int:
-        """Bytes for a number of worlds."""
+        """Return the scratch bytes for a number of worlds."""
         return self.fixed + nworld * self.each
 
 

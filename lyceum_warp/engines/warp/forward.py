@@ -22,7 +22,7 @@ Part = Callable[[mjw.Model, mjw.Data], None]
 """A part of a forward pass, for every world of a Data."""
 
 POSITION: tuple[Part, ...] = (mjw.kinematics, mjw.com_pos, mjw.camlight, mjw.flex, mjw.tendon)
-"""The first parts of substeps and forward passes; they depend only on positions."""
+"""The first parts of substeps and forward passes, which depend only on positions."""
 
 
 def step(model: mjw.Model, data: mjw.Data, done: Collection[Part] = ()) -> None:
@@ -31,7 +31,7 @@ def step(model: mjw.Model, data: mjw.Data, done: Collection[Part] = ()) -> None:
     Args:
         model: MuJoCo Warp's model.
         data: MuJoCo Warp's data.
-        done: Parts of ``POSITION`` that are already computed for the current state.
+        done: The parts of ``POSITION`` that are already computed for the current state.
     """
     _without(frozenset(done))["step"](model, data)
 
@@ -49,14 +49,14 @@ def inertia(model: mjw.Model, data: mjw.Data) -> None:
 
 @functools.cache
 def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
-    """MuJoCo Warp's own functions, except that the first forward pass skips the parts in ``done``.
+    """Copy MuJoCo Warp's functions; the first forward pass of the copies skips the parts in ``done``.
 
-    The functions are copies with some global names replaced, so a step equals MuJoCo Warp's step, and other users of
-    MuJoCo Warp are not affected.
+    The copies have some global names replaced, so that a step equals MuJoCo Warp's step, and other users of MuJoCo Warp
+    are not affected.
 
     For connect and weld constraints, ``mjw.make_constraint`` reads body velocities before MuJoCo Warp has computed
-    them: it reads stale values of the last forward pass or, after a fault, NaN. Here ``com_vel`` runs right after the
-    positions, in every stage of a Runge-Kutta step.
+    them, so it reads stale values of the last forward pass or, after a fault, NaN. In the copies, ``com_vel`` runs
+        right after the positions, in every stage of a Runge-Kutta step.
     """
     own_smooth = vars(forward_functions()["smooth"])
     smooth = types.SimpleNamespace(**own_smooth | {part.__name__: _nothing for part in done})
@@ -79,12 +79,12 @@ def _copy(function: str, **names: Any) -> Callable[..., Any]:
     """Copy a MuJoCo Warp function with some of its global names replaced."""
     inner: Any = inspect.unwrap(forward_functions()[function])
     if unknown := names.keys() - set(inner.__code__.co_names):
-        raise ImportError(f"{function} of this mujoco_warp uses no {min(unknown)}: use mujoco-warp 4.0")
+        raise ImportError(f"{function} of this mujoco_warp does not use {min(unknown)}: install mujoco-warp 4.0")
     return types.FunctionType(inner.__code__, inner.__globals__ | names, function, inner.__defaults__)
 
 
 def _nothing(model: mjw.Model, data: mjw.Data) -> None:
-    """No-op that replaces a part that is already computed."""
+    """Do nothing, in place of a part that is already computed."""
 
 
 _NEEDS: dict[Part, tuple[Part, ...]] = {
@@ -99,7 +99,7 @@ _NEEDS: dict[Part, tuple[Part, ...]] = {
     mjw.fwd_velocity: (mjw.com_pos, mjw.flex, mjw.tendon, mjw.transmission),
     mjw.subtree_vel: (mjw.com_vel,),
 }
-"""All parts except collisions and constraints, in order, each with the parts that it needs; ``fwd_velocity`` includes
+"""All parts except collisions and constraints, in order, each with the parts that it needs. ``fwd_velocity`` includes
 ``com_vel``."""
 
 _FIELDS: dict[Part, str] = {
@@ -132,7 +132,7 @@ _SENSORS: dict[str, tuple[Part, ...]] = {
     "VELOCIMETER GYRO FRAMELINVEL FRAMEANGVEL SUBTREELINVEL SUBTREEANGMOM": (mjw.com_vel,),
     "TENDONVEL ACTUATORVEL": (mjw.fwd_velocity,),
 }
-"""The parts that sensors of the position and velocity stages need, by type; all other types need a full forward
+"""The parts that sensors of the position and velocity stages need, by sensor type; all other types need a full forward
 pass."""
 
 _PARTS_OF_SENSOR = {
@@ -143,9 +143,9 @@ _PARTS_OF_SENSOR = {
 
 
 def forward_parts(model: mujoco.MjModel, names: Collection[str]) -> tuple[Part, ...] | None:
-    """The parts of a forward pass that compute the named fields, in order, without collisions and constraints.
+    """Return the parts of a forward pass that compute the named fields, in order, without collisions and constraints.
 
-    For ``sensordata`` they compute the sensors of the position and velocity stages.
+    For ``sensordata``, the parts compute the sensors of the position and velocity stages.
 
     Args:
         model: The compiled model.
@@ -177,7 +177,7 @@ def forward_parts(model: mujoco.MjModel, names: Collection[str]) -> tuple[Part, 
 
 
 def _parts_of_sensors(model: mujoco.MjModel) -> set[Part] | None:
-    """The parts that the model's sensors of the position and velocity stages need; None for a full forward pass."""
+    """Return the parts that position and velocity sensors need, or None if they need a full forward pass."""
     wanted: set[Part] = set()
     camera = int(mujoco.mjtObj.mjOBJ_CAMERA)
     for i in range(model.nsensor):
@@ -193,13 +193,13 @@ def _parts_of_sensors(model: mujoco.MjModel) -> set[Part] | None:
 
 
 def _last_stage(model: mujoco.MjModel) -> Stage:
-    """The last stage, position or velocity, that any sensor belongs to."""
+    """Return the last stage, position or velocity, to which any sensor belongs."""
     stages = [int(stage) for stage in model.sensor_needstage if stage < Stage.ACCELERATION]
     return Stage(max(stages, default=0))
 
 
 def _touching(model: mujoco.MjModel) -> bool:
-    """Whether contacts affect actuators or passive forces, as with adhesion and a flex's passive contacts."""
+    """Whether contacts affect actuators or passive forces, such as adhesion or a flex's passive contacts."""
     by_body = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()
     return bool(by_body or model.flg_adhesion or model.flex_passive.any())
 
@@ -210,8 +210,8 @@ _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 class PartialForward:
     """Computes the masked worlds' fields in a small group of scratch worlds, and copies them back.
 
-    A forward pass of all worlds costs as much as a substep, but few worlds restart in a step. So the masked worlds'
-    states are copied into the group, in as many batches as necessary.
+    A forward pass of all worlds costs as much as a substep, but few worlds restart in a step. The masked worlds' states
+    are therefore copied into the group, in as many batches as necessary.
 
     Args:
         rows: MuJoCo Warp's model for the group.
