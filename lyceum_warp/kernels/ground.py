@@ -1,8 +1,8 @@
 """Provide Warp functions for rough ground: look up its height in a table, and choose levels of difficulty.
 
-A table of heights is ``lw.height_field(name)``: heights z with their coordinates, x in the first row, y in the first
-column, at constant distances. Heights in between are interpolated on MuJoCo's triangles: the diagonal of each cell goes
-from its point with the smallest x and y to its point with the largest x and y.
+``lw.height_field(name)`` makes a table of heights z at constant distances. The first row holds the coordinates x, the
+first column the coordinates y. Heights between the points are interpolated on MuJoCo's triangles: each cell's diagonal
+runs from the corner with the smallest x and y to the corner with the largest.
 """
 
 import warp as wp

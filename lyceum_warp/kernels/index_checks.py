@@ -1,7 +1,8 @@
 """Check array indices in the instrumented copies of a task's functions that ``check_task`` runs.
 
-``report`` is (places, 3). Each row belongs to one place in the source: how often its index was out of range, the first
-bad index, and the size of the array. The functions are not inlined, to keep compile times short.
+``report`` is (places, 3). Each row belongs to an index in the source. It holds how often the index was out of range,
+the first bad index, and the size of the array. Functions are not inlined, because inlining would increase compile
+times.
 """
 
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import warp as wp
 
 MOST_ROUNDS = wp.constant(1_000_000)
-"""Iterations after which a ``while`` loop is reported as endless."""
+"""The number of iterations after which a ``while`` loop is reported as endless."""
 
 
 @wp.func(inline=False)

@@ -1,9 +1,9 @@
 """Interpolate plans from spline knots, and move the knots forward in time.
 
-K knots over a horizon of H steps are H / K steps apart, on a grid that is fixed in time. The horizon moves over the
-grid, so a plan that moves forward in time keeps the actions of its remaining steps (MuJoCo MPC calls this a sliding
-plan). Positions are whole numbers, in units of 1 / H of the knot spacing: a step advances by K units, and the phase,
-the position of the first step after its knot, is from 0 to H - 1.
+With K knots over a horizon of H steps, the distance between knots is H / K steps, on a grid that is fixed in time. The
+horizon moves over the grid, so a plan that moves forward in time keeps the actions of its remaining steps (MuJoCo MPC
+calls this a sliding plan). Positions are whole numbers, in units of 1 / H of the distance between knots, so a step
+advances by K units. The phase is the position of the first step after its knot, from 0 to H - 1.
 """
 
 import math
@@ -16,11 +16,11 @@ ORDERS = {"zero": 0, "linear": 1, "cubic": 3}
 """Spline orders by name."""
 
 _NEEDED = {"zero": 1, "linear": 2, "cubic": 4}
-"""Number of knots that an interpolated value depends on."""
+"""The number of knots from which a value is interpolated."""
 
 
 def knot_count(horizon: int, knots: int, spline: str) -> int:
-    """The number of knots that a plan needs at any phase."""
+    """Return the number of knots that a plan needs at any phase."""
     largest_phase = horizon - math.gcd(horizon, knots)
     return ((horizon - 1) * knots + largest_phase) // horizon + _NEEDED[spline]
 

@@ -1,7 +1,7 @@
 """Plan by sampling: controls of open-loop rollouts, noise around a plan, weights, and the weighted mean.
 
-Plans are (horizon, nplant, nact), and the actions of samples (horizon, nsample, nact), with the samples of a plant in
-consecutive rows. With spline knots the first axis has one entry per knot instead.
+Plans have the shape (horizon, nplant, nact). Actions of samples have the shape (horizon, nsample, nact), with the
+samples of a plant in consecutive rows. With spline knots, the first axis has one entry per knot.
 """
 
 import warp as wp
@@ -11,13 +11,14 @@ from lyceum_warp.kernels.random import stream, world_key
 
 ACTION = wp.constant(int(Done.ACTION))
 NOISE = wp.constant(-2)
-"""Replaces the episode number in the streams of the noise, so that they are independent of the worlds' streams."""
+"""The number that replaces the episode in the noise's streams, which makes them independent of the worlds' streams."""
 DRAWS = wp.constant(-3)
-"""Replaces the episode number in the stream keys of the samples."""
+"""The number that replaces the episode in the samples' stream keys."""
 
 _TILES = f"{__name__}.tiles"
-"""Warp module of the kernels with tiles. On the CPU all kernels of a module write a shared variable, the address of the
-tiles; ``graphs.capture`` serialises only kernels with tiles, so kernels without tiles need a separate module."""
+"""The Warp module of the kernels with tiles. On the CPU all kernels of a module write a shared variable, the address of
+the tiles. Kernels without tiles need a separate module, because ``graphs.capture`` serialises only kernels with
+tiles."""
 
 
 @wp.func
@@ -405,7 +406,7 @@ def value_kernel(value: wp.Function) -> wp.Kernel:
     """Make a kernel that calls a value function, ``value(obs: Row[float]) -> float``, for each sample.
 
     Raises:
-        ValueError: The function has other arguments.
+        ValueError: The function has different arguments.
     """
     types = list(value.input_types.values())
     if len(types) != 1 or getattr(types[0], "ndim", 0) != 1 or types[0].dtype is not wp.float32:

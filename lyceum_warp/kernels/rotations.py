@@ -1,7 +1,8 @@
 """Compute with unit quaternions in MuJoCo's order w, x, y, z, in Warp functions for tasks.
 
-No function normalises its arguments: MuJoCo's fields hold unit quaternions. Docstrings name the equivalent MuJoCo
-function. Warp's own quaternion functions have the order x, y, z, w and do not accept these quaternions.
+The functions do not normalise their arguments, because MuJoCo's fields hold unit quaternions. Docstrings name the
+equivalent MuJoCo function. Warp's own quaternion functions have the order x, y, z, w and do not accept these
+quaternions.
 """
 
 import warp as wp

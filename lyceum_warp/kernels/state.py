@@ -1,8 +1,8 @@
 """Cast and copy masked rows between the arrays of an environment and an engine.
 
-Float64 arrays are often strided views of an engine's own rows, so an unmasked write would round the other worlds. Most
-masks are nearly empty and most rows short: ``launch_rows`` launches one thread per world (``lanes``) on the CPU, and up
-to a warp on a GPU.
+Float64 arrays are often strided views of an engine's own rows, so an unmasked write would round the states of worlds
+outside the mask. Most masks are nearly empty and most rows are short, so ``launch_rows`` uses a single thread per world
+on the CPU, and at most a warp per world on a GPU.
 """
 
 import warp as wp

@@ -19,12 +19,12 @@ ALL_FAULTS = wp.constant(int(FAULTS))
 EVENT = wp.constant(-2)
 """Substream of a step's stream for events."""
 STARTUP = wp.constant(-1)
-"""Replaces the episode number."""
+"""The number that replaces the episode in the stream of ``startup``."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ActKernels:
-    """Kernels that map actions to controls and advance the task's memory."""
+    """Kernels that map actions to controls, and advance the task's memory."""
 
     keep_before: wp.Kernel | None
     act: wp.Kernel
@@ -295,8 +295,7 @@ class Kernels(ActKernels, JudgeKernels, BeginKernels, RolloutKernels, SharedKern
     """The kernels of a step, and the structs of their arrays. Kernels that the task does not need are None."""
 
     views: Mapping[Any, wp.Function]
-    """For each struct of the task, the function that makes it: World from a batch and a world's index, observation
-    structs from a row."""
+    """The functions that make the task's structs, by struct: World from a batch and a world's index, observation structs from a row."""
     terms: Mapping[str, wp.Function]
     """The generated functions of a task with terms: ``reward``, ``score`` and ``terminated``."""
     Batch: Any

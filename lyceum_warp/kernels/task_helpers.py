@@ -10,7 +10,7 @@ from lyceum_warp.support.docstrings import document_overloads
 
 
 class Sigmoid(enum.IntEnum):
-    """How ``tolerance`` falls from 1 to ``value_at_margin`` over the margin, as in dm_control's ``rewards.py``."""
+    """The shapes of ``tolerance`` between the bounds and the margin, as in dm_control's ``rewards.py``."""
 
     GAUSSIAN = 0
     HYPERBOLIC = 1
@@ -77,7 +77,7 @@ def put(row: wp.array[float], at: int, value: wp.array[Any]) -> int:
     return put(row, at, value, 0, value.shape[0])
 
 
-# this overload comes last, because Warp uses the first overload that fits
+# define this overload last, because Warp uses the first one that fits
 @wp.func
 def put(row: wp.array[float], at: int, value: Any) -> int:
     for i in range(len(value)):

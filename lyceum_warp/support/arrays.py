@@ -10,35 +10,36 @@ import torch
 import warp as wp
 
 WORLDS_A_BLOCK = 32
-"""Threads in a CUDA block if each thread processes a world. Larger blocks would leave most multiprocessors idle."""
+"""The number of threads in a CUDA block if each thread processes a world. Larger blocks would leave most
+multiprocessors idle."""
 
 _SPARE = 256
-"""Elements allocated behind an empty array."""
+"""The number of elements that are allocated behind an empty array."""
 
 
 def alias(array: wp.array, dtype: type, shape: tuple[int, ...], strides: tuple[int, ...] | None = None) -> wp.array:
-    """An alias of an array's memory with a different type, shape or strides; it keeps the memory alive."""
+    """Make an alias of an array's memory with a different type, shape or strides; it keeps the memory alive."""
     view: Any = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device)
     view.owner = array
     return view
 
 
 def flat(array: wp.array) -> wp.array:
-    """The same memory as a (nworld, n) float32 array, for type-agnostic copies."""
+    """View an array's memory as a (nworld, n) float32 array, for copies that do not depend on the type."""
     n = array.size * wp.types.type_size_in_bytes(array.dtype) // 4 // max(array.shape[0], 1)
     return alias(array, wp.float32, (array.shape[0], n))
 
 
 def shared_rows(row: np.ndarray, dtype: type, count: int, device: wp.Device) -> wp.array:
-    """A read-only array of equal rows, (count, ...), that all share the memory of one row (stride 0)."""
+    """Make a read-only array of equal rows, (count, ...), which share the memory of one row (stride 0)."""
     single: Any = wp.array(row[None], dtype=dtype, device=device)
     return alias(single, dtype, (count, *single.shape[1:]), (0, *single.strides[1:]))
 
 
 def with_memory(array: wp.array) -> wp.array:
-    """The array itself, or, if it is empty, an empty array of the same shape with memory behind it.
+    """Return the array, or for an empty array an empty one of the same shape with memory behind it.
 
-    Without the memory, a task that reads an element by mistake would crash the process.
+    Without this memory, a task that reads an element by mistake would crash the process.
     """
     if array.size:
         return array
@@ -46,21 +47,22 @@ def with_memory(array: wp.array) -> wp.array:
 
 
 def torch_view(array: wp.array) -> torch.Tensor:
-    """The torch tensor that shares an array's memory."""
+    """Return the torch tensor that shares an array's memory."""
     return wp.to_torch(array, requires_grad=False)
 
 
 _PART: ContextVar[tuple[int, int]] = ContextVar("_PART", default=(0, 1))
-"""The index of the part of the worlds for which the functions below launch kernels, and the number of parts."""
+"""The current part of the worlds, for which this module's functions launch kernels: its index, and the number of
+parts."""
 
 
 @contextlib.contextmanager
 def part_of_worlds(part: int, parts: int) -> Iterator[None]:
-    """Context in which the functions below launch kernels only for one part of the worlds.
+    """Return a context in which this module's functions launch kernels only for one part of the worlds.
 
     Args:
-        part: Index of the part.
-        parts: Number of parts, of about equal size.
+        part: The index of the part.
+        parts: The number of parts, which have about equal sizes.
     """
     token = _PART.set((part, parts))
     try:
@@ -70,7 +72,7 @@ def part_of_worlds(part: int, parts: int) -> Iterator[None]:
 
 
 def _launch(kernel: wp.Kernel, dim: Sequence[int], axis: int, args: Sequence[Any], device: Any, **options: Any) -> None:
-    """Launch a kernel for the current part of the worlds; ``axis`` is the axis of ``dim`` for worlds.
+    """Launch a kernel for the current part of the worlds; ``axis`` is the axis of the worlds in ``dim``.
 
     The kernel's last argument is the first world of the part.
     """
@@ -98,7 +100,8 @@ def launch_parts(kernel: wp.Kernel, parts: int, nworld: int, args: Sequence[Any]
 def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device) -> None:
     """Launch a kernel over (nworld, lanes); its last arguments are the number of lanes and the first world.
 
-    The lanes are threads that share a world's rows: one on the CPU, and a warp on a GPU for coalesced access.
+    The lanes are threads that share a world's rows: a single thread on the CPU, and a warp on a GPU, for coalesced
+    access.
     """
     lanes = 32 if device.is_cuda else 1
     _launch(kernel, (nworld, lanes), 0, [*args, lanes], device)
@@ -116,7 +119,7 @@ def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.
 
 
 PAIRS_A_LAUNCH = 4
-"""Number of pairs of arrays that one launch of ``narrow_four`` or ``widen_four`` copies."""
+"""The number of pairs of arrays that one launch of ``narrow_four`` or ``widen_four`` copies."""
 
 
 def launch_several_rows(kernel: wp.Kernel, mask: wp.array, pairs: Sequence[tuple[wp.array, wp.array]]) -> None:
@@ -126,8 +129,8 @@ def launch_several_rows(kernel: wp.Kernel, mask: wp.array, pairs: Sequence[tuple
 
     Args:
         kernel: The kernel.
-        mask: Rows to copy, (n,) bool.
-        pairs: Sources and targets, (n, columns) each.
+        mask: The mask of the rows to copy, (n,) bool.
+        pairs: Pairs of a source and a target, both (n, columns).
     """
     pairs = [pair for pair in pairs if pair[1].size]
     for i in range(0, len(pairs), PAIRS_A_LAUNCH):

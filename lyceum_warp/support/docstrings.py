@@ -1,8 +1,8 @@
 """Make ``help()`` show the docstrings of attributes and of overloaded Warp functions.
 
 Python discards a string after an attribute, so ``help`` does not show it. ``document_attributes`` reads these strings
-from the source and appends them to the docstring of the class. An overloaded Warp function has no docstring;
-``document_overloads`` sets it.
+from the source and appends them to the docstring of the class. ``document_overloads`` sets the docstring of an
+overloaded Warp function, which has none.
 """
 
 import ast
@@ -21,7 +21,7 @@ _parse = functools.lru_cache(maxsize=1)(ast.parse)  # the classes of a module ar
 
 
 def attribute_docs(cls: type) -> dict[str, str]:
-    """The docstrings of a class's attributes by name, in source order; empty if there is no source."""
+    """Return the docstrings of a class's attributes by name, in source order; empty if there is no source."""
     try:
         lines, _ = inspect.findsource(inspect.getmodule(cls) or cls)
         body: list[ast.stmt] = _parse("".join(lines)).body
@@ -42,13 +42,13 @@ def attribute_docs(cls: type) -> dict[str, str]:
 
 
 def listed(docs: dict[str, str]) -> str:
-    """Names and their docstrings as the body of an ``Attributes:`` or ``Args:`` section."""
+    """Format names and their docstrings as the body of an ``Attributes:`` or ``Args:`` section."""
     entries = (f"{name}: {text}".splitlines() for name, text in docs.items())
     return "\n".join("\n".join(["    " + lines[0], *("        " + line for line in lines[1:])]) for lines in entries)
 
 
 def document_attributes(cls: Class) -> Class:
-    """Class decorator: append the docstrings of attributes, also of inherited dataclass fields, to the docstring."""
+    """Class decorator: append the docstrings of attributes, including inherited dataclass fields, to the class's."""
     docs: dict[str, str] = {}
     for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__[1:])):
         docs |= attribute_docs(base)
@@ -68,11 +68,11 @@ def document_overloads(function: Any) -> None:
 
 
 def document_arguments(function: Any, meanings: Mapping[str, str]) -> None:
-    """Append the meanings of a Warp function's arguments, of all its overloads, to its docstring.
+    """Append descriptions of a Warp function's arguments, for all overloads, to its docstring.
 
     Args:
         function: The function.
-        meanings: A meaning for each argument, by name; additional names are ignored.
+        meanings: The descriptions by argument name; additional names are ignored.
     """
     overloads = (*function.user_overloads.values(), *function.user_templates.values())
     names = dict.fromkeys(name for overload in overloads for name in overload.input_types)

@@ -1,4 +1,4 @@
-"""Replace files atomically, and report file formats of newer releases."""
+"""Replace files atomically, and refuse file formats of newer releases."""
 
 import contextlib
 import os
@@ -10,15 +10,16 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def replaced(path: Path, *, durable: bool = False, previous: Path | None = None) -> Iterator[Path]:
-    """Replace a file atomically: a reader finds the old file or the complete new one.
+    """Replace a file atomically, so that a reader finds either the old file or the complete new file.
 
     The block writes to the yielded path, a temporary file beside the target. If the block raises, the target stays
     unchanged and the temporary file is deleted.
 
     Args:
         path: The file.
-        durable: Whether to flush the new content to disk before replacing the old file, in case of a power loss.
-        previous: Where to save the old file; by default it is lost.
+        durable: Whether to flush the new content to disk before it replaces the old file, so that it survives a power
+            loss.
+        previous: The path to which the old file is saved; by default the old file is lost.
     """
     temporary = path.with_name(path.name + ".tmp")
     try:
@@ -30,15 +31,15 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
             previous.unlink(missing_ok=True)
             try:
                 os.link(path, previous)
-            except OSError:  # a file system without hard links
+            except OSError:  # the file system may not support hard links
                 shutil.copyfile(path, previous)
         try:
             os.replace(temporary, path)
-        except OSError:  # on a network drive, or while another program reads the file
+        except OSError:  # the file may be on a network drive, or open in another program
             time.sleep(0.1)
             os.replace(temporary, path)
     except OSError as error:
-        if error.filename is None:  # for instance on a full disk
+        if error.filename is None:  # the disk may be full
             error.filename = str(path)
         raise
     finally:
@@ -47,7 +48,7 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
 
 
 def newer_format(path: Path, number: int, known: int) -> ValueError:
-    """The error for a file that a newer release wrote.
+    """Return the error for a file that a newer release wrote.
 
     Args:
         path: The file.

@@ -10,7 +10,7 @@ _kept: list[object] = []
 
 
 class LeftInParent:
-    """Placeholder for an attribute that a forked child must not use."""
+    """Replaces an attribute that a forked child must not use."""
 
     def __getattr__(self, name: str) -> Any:
         raise RuntimeError(
@@ -20,7 +20,7 @@ class LeftInParent:
 
 
 def leave_in_parent(thing: Any, *attributes: str) -> None:
-    """Replace attributes of an object in all children forked later; there they raise RuntimeError."""
+    """Make attributes of an object raise RuntimeError in all children that are forked later."""
     _watched[thing] = attributes
 
 
@@ -37,7 +37,7 @@ def _call_in(process: int, function: Callable[[], object]) -> None:
 def _after_fork() -> None:
     for thing, attributes in _watched.items():
         for name in attributes:
-            _kept.append(getattr(thing, name))  # destroying an engine would also wait for its threads
+            _kept.append(getattr(thing, name))  # destroying it would wait for missing threads
             setattr(thing, name, LeftInParent())
 
 

@@ -18,7 +18,7 @@ class Interrupted(BaseException):
 
 
 def _ignore(number: int, frame: Any) -> None:
-    """Ignore a signal after Interrupted was raised. Unlike SIG_IGN, this handler is replaced by ``obeyed``."""
+    """Ignore a signal after Interrupted was raised. ``obeyed`` replaces this handler, but not SIG_IGN."""
 
 
 def _interrupt(number: int, frame: Any) -> None:
@@ -41,10 +41,10 @@ def signals(handler: Callable[[int, Any], None] = _interrupt, *, replaces: Any =
             background programs ignore SIGINT, and nohup makes programs ignore SIGHUP.
 
     Yields:
-        The replaced handlers by signal, to be restored at the end.
+        The replaced handlers by signal, which the context restores at its end.
     """
     previous: dict[int, Any] = {}
-    with contextlib.suppress(ValueError):  # only the main thread may set handlers
+    with contextlib.suppress(ValueError):  # only the main thread may set signal handlers
         for number in _NUMBERS:
             current = signal.getsignal(number)
             if current is replaces or (replaces is None and current not in (signal.SIG_IGN, _ignore)):
@@ -59,7 +59,7 @@ def signals(handler: Callable[[int, Any], None] = _interrupt, *, replaces: Any =
 def obeyed() -> contextlib.AbstractContextManager[object]:
     """Within the context, a second Ctrl-C, SIGTERM or SIGHUP (after the first in ``signals``) raises Interrupted, too.
 
-    This allows the user to cancel long work at the end of a program.
+    The user can then cancel long work at the end of a program.
     """
     return signals(replaces=_ignore)
 
@@ -67,7 +67,7 @@ def obeyed() -> contextlib.AbstractContextManager[object]:
 def _raise(number: int) -> None:
     """Raise a signal for its current handler.
 
-    The default of SIGTERM and SIGHUP would end the program without its ``finally`` blocks.
+    The default handlers of SIGTERM and SIGHUP would end the program without running its ``finally`` blocks.
 
     Raises:
         SystemExit: The signal has its default handler.
@@ -79,17 +79,17 @@ def _raise(number: int) -> None:
 
 @contextlib.contextmanager
 def postponed(*, insist: bool = False) -> Iterator[list[int]]:
-    """Within the context, collect Ctrl-C, SIGTERM and SIGHUP in the yielded list; the first is handled at the end.
+    """Return a context that collects Ctrl-C, SIGTERM and SIGHUP in a list, and handles the first one at its end.
 
-    A signal that the program does not handle then raises SystemExit. Once Interrupted is raised, later signals are
-    ignored.
+    If the program does not handle that signal, the context raises SystemExit. After Interrupted is raised, further
+    signals are ignored.
 
     Args:
         insist: Whether a second signal is handled immediately.
 
     Raises:
-        Interrupted: A signal was postponed, and ``signals`` is active.
-        SystemExit: A signal was postponed that has its default handler.
+        Interrupted: A signal came within the context, and ``signals`` is active.
+        SystemExit: A signal with its default handler came within the context.
     """
     noted: list[int] = []
 

@@ -9,18 +9,18 @@ import numpy as np
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
-# a figure has intervals at hundreds of points, most of them of equally many values
+# cached, because a figure has intervals at hundreds of points, mostly with equal degrees of freedom
 @functools.lru_cache(maxsize=256)
 def student_quantile(probability: float, freedom: float) -> float:
     """Compute a quantile of Student's t distribution, by bisection on the integral of its density.
 
     Args:
         probability: At least 0.5.
-        freedom: Degrees of freedom.
+        freedom: The number of degrees of freedom.
     """
     log_factor = math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2) - 0.5 * math.log(freedom * math.pi)
 
-    # with x = sqrt(freedom) tan(angle) the integral is over a finite interval and its integrand is smooth
+    # the substitution x = sqrt(freedom) tan(angle) gives a smooth integrand on a finite interval
     def beyond_half(angle: float) -> float:
         at = 0.5 * angle * (_NODES + 1.0)
         density = math.sqrt(freedom) * np.exp(log_factor) * np.cos(at) ** (freedom - 1)
@@ -45,15 +45,15 @@ def mean_interval(values: Sequence[float] | np.ndarray, confidence: float = 0.95
 def share_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
     """Compute the difference of two paired proportions, and the half-width of its 95 % confidence interval.
 
-    Half an observation is added to each of the four outcomes of a pair (Agresti and Min 2005, "Simple improved
-    confidence intervals for comparing matched proportions"), so that the interval has a width if all pairs agree.
+    As in Agresti and Min (2005, "Simple improved confidence intervals for comparing matched proportions"), half an
+    observation is added to each of a pair's four outcomes, so that the interval has a width even if all pairs agree.
 
     Args:
-        first: Whether something happened in each pair, (pairs,) bool.
-        second: The same for the other member of each pair.
+        first: The outcome of each pair's first member, (pairs,) bool.
+        second: The outcome of each pair's second member, (pairs,) bool.
 
     Returns:
-        The difference, second minus first, at the centre of the interval, and the half-width.
+        The difference, second minus first, at the centre of the interval, and the half-width of the interval.
     """
     gained, lost = (np.count_nonzero(~first & second) + 0.5, np.count_nonzero(first & ~second) + 0.5)
     pairs = len(first) + 2.0

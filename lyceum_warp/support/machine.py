@@ -7,12 +7,12 @@ import warp as wp
 
 
 def cpu_cores() -> int:
-    """Number of CPU cores that this process may use."""
+    """Return the number of CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def free_memory(device: wp.Device) -> int | None:
-    """Free bytes on a device, or None if the system does not report them."""
+    """Return the free bytes on a device, or None if the system does not report them."""
     if device.is_cuda:
         return int(device.free_memory)
     try:

@@ -1,6 +1,6 @@
 """Access and patch internals of Warp and MuJoCo Warp.
 
-No other module does this, so only this one depends on their versions.
+Only this module uses such internals, so no other module depends on the versions of these packages.
 """
 
 import contextlib
@@ -15,21 +15,21 @@ import warp as wp
 
 
 def builtin_functions() -> Mapping[str, Any]:
-    """Warp's built-in functions by name; ``wp.tid`` and others are not attributes of ``warp``."""
+    """Return Warp's built-in functions by name; some, such as ``wp.tid``, are not attributes of ``warp``."""
     functions: Mapping[str, Any] = wp._src.context.builtin_functions
     return functions
 
 
 def extend_structs() -> None:
-    """Let Python classes extend a ``wp.struct``: ``class World(go1.World)`` under ``@wp.struct`` inherits its fields.
+    """Let a Python class extend a ``wp.struct`` and inherit its fields, as in ``class World(go1.World)``.
 
-    Warp refuses such a class, because a struct is not a type. A class derived from the struct's Python class
-    would lose the inherited fields, because Warp reads only the annotations of the class itself.
+    Warp refuses a class that extends a struct, because a struct is not a type. A class that extends the struct's Python
+    class would lose the inherited fields, because Warp reads only the class's own annotations.
     """
     codegen: Any = wp._src.codegen
 
     def merge(cls: Any, /, **keywords: Any) -> None:
-        if not issubclass(cls, codegen.StructInstance):  # Warp derives a class for the instances, too
+        if not issubclass(cls, codegen.StructInstance):  # Warp's instance class is also a subclass
             inherited: dict[str, Any] = {}
             for base in reversed(cls.__mro__[1:]):
                 inherited |= vars(base).get("__annotations__", {})
@@ -43,9 +43,9 @@ def extend_structs() -> None:
 
 
 def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
-    """Whether a module of kernels is loaded or in Warp's cache, for a block size.
+    """Whether a module of kernels for a block size is loaded or in Warp's cache.
 
-    If Warp's internals have changed it returns False, which only costs time.
+    The result is False if Warp's internals have changed, which only costs time.
     """
     if (device.context, block) in module.execs:
         return True
@@ -61,12 +61,12 @@ def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
 
 
 def forward_functions() -> Mapping[str, Any]:
-    """The namespace of MuJoCo Warp's forward pass and step: functions and imported modules by name."""
+    """Return the namespace of MuJoCo Warp's forward pass and step: functions and imported modules by name."""
     return vars(importlib.import_module("mujoco_warp._src.forward"))
 
 
 def has_sdf_functions() -> bool:
-    """Whether a distance function for SDF plugins was registered with MuJoCo Warp; its default only raises an error."""
+    """Whether MuJoCo Warp has a registered distance function for SDF plugins; its default function raises an error."""
     collision_sdf = importlib.import_module("mujoco_warp._src.collision_sdf")
     return bool(collision_sdf.user_sdf.func.__module__ != collision_sdf.__name__)
 
@@ -86,9 +86,9 @@ class _PerThread(threading.local):
 def separate_captures() -> None:
     """Make captures of CPU launches thread-local.
 
-    Warp's native library captures only launches of the thread that started the capture, but its Python code applies the
-    capture to all threads: loops of other threads would enter the graph, and their launches would overwrite its
-    arguments.
+    Warp's native library captures only launches of the thread that started the capture, but Warp's Python code applies
+    the capture to all threads. Loops of other threads would enter the graph, and launches of other threads would
+    overwrite the graph's arguments.
     """
     for name in ("_apic_capture", "_apic_graph"):
         setattr(wp._src.context.Runtime, name, _PerThread())
@@ -102,8 +102,8 @@ class _Tiles(threading.local):
 
 tiles = _Tiles()
 TILES_ON_CPU = threading.RLock()
-"""Lock held while kernels with tiles run on the CPU. Kernels that are compiled for x86 store the address of their tiles
-in a static variable, so two threads would overwrite each other's tiles."""
+"""The lock that is held while kernels with tiles run on the CPU. Kernels that are compiled for x86 store the address of
+their tiles in a static variable, so two threads would overwrite each other's tiles."""
 
 
 def separate_tiles() -> None:
@@ -141,20 +141,20 @@ def replaced_in_this_thread(functions: Mapping[str, Callable[..., Any]]) -> Iter
 
 
 _REMADE = ("reset_data", "get_state", "set_state")
-"""Functions of MuJoCo Warp that make their kernels again in every call. The sources depend only on whether there is a
-mask, their only free variable."""
+"""The functions of MuJoCo Warp that make their kernels again in every call. The kernels' sources depend only on their
+single free variable, whether there is a mask."""
 
 
 def quicken_mujoco_warp() -> None:
-    """Spare MuJoCo Warp's host code repeated work: most of the time of a step or a reset that is not captured.
+    """Cache results in MuJoCo Warp's host code, which takes most of the time of a step or a reset without graphs.
 
-    For each pair of types of geoms it calls a Warp function from Python, and each call resolves overloads. The
+    For each pair of geom types, MuJoCo Warp calls a Warp function from Python, and each call resolves overloads. The
     functions in ``_REMADE`` parse and hash their kernels in every call, and ``put_model`` parses packages' metadata.
     """
     convex: Any = importlib.import_module("mujoco_warp._src.collision_convex")
     primitive: Any = importlib.import_module("mujoco_warp._src.collision_primitive")
     for module in (convex, primitive):
-        module.upper_trid_index = module.upper_trid_index.func  # no kernel of these modules calls it
+        module.upper_trid_index = module.upper_trid_index.func  # no kernel of these modules calls the replaced function
     packages: Any = importlib.import_module("mujoco_warp._src.util_pkg")
     packages.check_version = functools.cache(packages.check_version)
     make, made = wp.kernel, {}

@@ -60,7 +60,7 @@ def check_flag(name: str, value: Any) -> None:
     """Check that a value is True or False.
 
     Raises:
-        ValueError: The value is something else.
+        ValueError: The value is neither True nor False.
     """
     if not isinstance(value, bool):
         raise ValueError(f"{name} must be True or False, not {value!r}")
@@ -70,7 +70,7 @@ def check_word(name: str, value: Any, words: Sequence[str], others: str = "") ->
     """Check that a value is one of the given words; the message appends ``others``, which describes additional values.
 
     Raises:
-        ValueError: The value is something else.
+        ValueError: The value is not one of the words.
     """
     if not isinstance(value, str) or value not in words:
         *first, last = map(repr, words)
@@ -112,7 +112,7 @@ def check_tensor(value: Any, name: str, like: torch.Tensor) -> None:
 
 
 def described(value: Any) -> str:
-    """A short description of a value, for error messages."""
+    """Describe a value in a few words, for error messages."""
     if isinstance(value, torch.Tensor):
         return f"a {str(value.dtype).removeprefix('torch.')} tensor of shape {tuple(value.shape)}"
     if isinstance(value, torch.nn.Module):

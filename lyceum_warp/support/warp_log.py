@@ -19,18 +19,18 @@ _remarks: list[str] | None = None
 def start_warp() -> list[str]:
     """Initialise Warp quietly, and log its messages about the CUDA driver.
 
-    At its default log level, Warp prints a banner and a line for every module that it loads, so the level is raised to
-    warnings, unless the user has set another one. Without a GPU, Warp's native library prints messages about the driver
-    to stderr; these are logged instead, and all other output is printed.
+    At its default log level, Warp prints a banner and a line for every loaded module. The level is therefore raised to
+    warnings, unless the user has set a level. Without a GPU, Warp's native library prints messages about the driver to
+    stderr; these are logged instead, and all other output is printed.
 
     Returns:
-        Messages about the CUDA driver, which callers add to errors about a missing device.
+        The messages about the CUDA driver, which callers add to errors about a missing device.
     """
     global _remarks
     with _lock:
         if _remarks is None:
             level = wp.LOG_WARNING if wp.config.log_level == wp.LOG_INFO else wp.config.log_level
-            wp.config.log_level = max(level, wp.LOG_ERROR)  # Warp's Python code would repeat one of the messages
+            wp.config.log_level = max(level, wp.LOG_ERROR)  # Warp's Python code would print one of these messages again
             try:
                 printed = _stderr_of_start()
             finally:
@@ -48,7 +48,7 @@ def _stderr_of_start() -> list[str]:
     with contextlib.ExitStack() as restored:
         try:
             stderr = os.dup(2)
-        except OSError:  # stderr is closed, as under pythonw
+        except OSError:  # stderr may be closed, as under pythonw
             wp.init()
             return []
         restored.callback(os.close, stderr)

@@ -233,11 +233,11 @@ class PartialForward:
     def __call__(
         self, mask: wp.array, forward: Callable[[mjw.Model, mjw.Data], None], targets: Mapping[str, wp.array]
     ) -> None:
-        """Compute the masked worlds' fields; consists of launches.
+        """Compute the masked worlds' fields, by Warp launches only.
 
         Args:
-            mask: The worlds, (nworld,) bool.
-            forward: Computes the fields of a Data.
+            mask: The mask of the worlds, (nworld,) bool.
+            forward: A function that computes the fields of a Data.
             targets: Destinations of the fields, (nworld, ...), by their names in MuJoCo Warp's Data.
         """
         group = self._group
@@ -252,7 +252,7 @@ class PartialForward:
             self._run(mask, work)
 
     def settle(self, mask: wp.array, nstep: int) -> None:
-        """Advance the masked worlds' states by ``nstep`` substeps, and set their time to 0; consists of launches."""
+        """Advance the masked worlds' states by ``nstep`` substeps, and set their time to 0, by Warp launches only."""
 
         def work() -> None:
             for _ in range(nstep):
@@ -262,11 +262,11 @@ class PartialForward:
 
         with wp.ScopedDevice(self._device):
             self._run(mask, work)
-            launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # time is a state's first column
+            launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # the first column of a state is the time
             mjw.set_state(self._rows.whole, self._data, self._states, _SPEC, mask)
 
     def _run(self, mask: wp.array, work: Callable[[], None]) -> None:
-        """Call ``work`` for each group of masked worlds, with their states and model fields copied into the group."""
+        """Copy masked worlds' states and model fields into the group, one group at a time, and call ``work``."""
         model, group = self._rows.model, self._group
 
         def turn() -> None:

@@ -12,7 +12,7 @@ _ALIGNED = 512
 
 
 class Reserve:
-    """Blocks of memory that live as long as this object, because graphs hold their addresses.
+    """Holds blocks of memory, which are freed with this object, because graphs store their addresses.
 
     Subclasses implement ``allocate`` and can then serve as Warp allocators.
 
@@ -23,17 +23,17 @@ class Reserve:
     def __init__(self, device: wp.Device) -> None:
         self.device = device
         self.below = device.get_allocator()
-        """The device's own allocator, for the blocks and for memory that is not reserved."""
+        """The device's allocator, for the blocks and for memory that is not reserved."""
         self.blocks: list[wp.array] = []
 
     def add_block(self, size: int) -> None:
         """Allocate a block of at least ``size`` bytes."""
-        rows = aligned(max(size, 1)) // _ALIGNED  # an axis has fewer than 2**31 elements
+        rows = aligned(max(size, 1)) // _ALIGNED  # two axes, because an axis has fewer than 2**31 elements
         with wp.ScopedAllocator(self.device, self.below):
             self.blocks.append(wp.empty((rows, _ALIGNED), dtype=wp.uint8, device=self.device))
 
     def deallocate(self, ptr: int, size_in_bytes: int) -> None:
-        """Free an address, unless it lies in a block."""
+        """Free an address, unless it is inside a block."""
         if not any(block.ptr <= ptr < block.ptr + block.size for block in self.blocks):
             self.below.deallocate(ptr, size_in_bytes)
 
@@ -44,21 +44,22 @@ def aligned(size: int) -> int:
 
 
 def group_size(nworld: int, device: wp.Device) -> int:
-    """Number of worlds in a group: more than usually restart in a step, but few enough for a cheap forward pass."""
+    """Return the number of worlds in a group: more than usually restart in a step, but few for a cheap forward pass."""
     return min(nworld, max(1 if device.is_cpu else 64, nworld // 16))
 
 
 class Turns:
-    """Copies the masked worlds into a group and back, one group at a time; consists of launches.
+    """Copies the masked worlds into a group and back, one group at a time, by Warp launches only.
 
-    If the mask is empty, there is no turn.
+    An empty mask takes no turn.
 
     Args:
         nworld: Number of worlds.
         size: Number of worlds in the group.
-        device: Where they live.
-        loop: Whether turns run in a loop. If False, the group must have room for every world, and any mask takes
-            exactly one turn. Deterministic launches require False, because they cannot allocate within a graph's loop.
+        device: The device of the worlds.
+        loop: Whether turns run in a loop, one for each group. Without a loop, the group must have room for every world,
+            and any mask takes exactly one turn. Deterministic launches require ``loop=False``, because they cannot
+            allocate within a graph's loop.
     """
 
     def __init__(self, nworld: int, size: int, device: wp.Device, *, loop: bool = True) -> None:
@@ -69,7 +70,7 @@ class Turns:
         self._memory = Arena(device)
 
     def run(self, mask: wp.array, turn: Callable[[], None]) -> None:
-        """Call ``turn`` for each group; it may call ``take`` and ``give``."""
+        """Call ``turn`` for each group; ``turn`` may call ``take`` and ``give``."""
         with wp.ScopedDevice(self.device):
             self._count.zero_()
             self._first.zero_()
@@ -89,30 +90,30 @@ class Turns:
                 wp.capture_while(self._left, while_body=body)
 
     def take(self, source: wp.array, target: wp.array) -> None:
-        """Copy the rows of the group's worlds, (nworld, ...), into the group, (size, ...)."""
+        """Copy rows of all worlds, (nworld, ...), into the rows of the group, (size, ...)."""
         rows = flat(target)
         if rows.size:
             wp.launch(kernels.take_rows, rows.shape, [self._world, self._left, flat(source), rows])
 
     def give(self, source: wp.array, target: wp.array) -> None:
-        """Copy the group's rows, (size, ...), back to the rows of its worlds, (nworld, ...)."""
+        """Copy the group's rows, (size, ...), back into the rows of all worlds, (nworld, ...)."""
         rows = flat(source)
         if rows.size:
             wp.launch(kernels.return_rows, rows.shape, [self._world, self._left, rows, flat(target)])
 
     def give_bits(self, source: wp.array, target: wp.array) -> None:
-        """Combine (bitwise or) the group's bits, (size,), into the bits of its worlds, (nworld,)."""
+        """Combine the group's bits, (size,), with the bits of all worlds, (nworld,), by bitwise or."""
         wp.launch(kernels.return_bits, self.size, [self._world, self._left, source, target])
 
 
 class Arena(Reserve):
     """An allocator for loops and branches of CUDA graphs, where Warp cannot allocate.
 
-    A run outside a graph allocates from the device, counts the bytes, and reserves the same number. Graphs then use the
-    reserve. The graphs never run at the same time, so they can share the reserve.
+    A run outside a graph allocates from the device, counts the bytes, and reserves as many. A graph allocates from the
+    reserve. Graphs share the reserve, because they never run at the same time.
 
     Args:
-        device: Where the launches run; on the CPU nothing is reserved.
+        device: The device of the launches; on the CPU nothing is reserved.
     """
 
     def __init__(self, device: wp.Device) -> None:
@@ -126,7 +127,7 @@ class Arena(Reserve):
 
     @contextlib.contextmanager
     def __call__(self) -> Iterator[None]:
-        """Context of the launches: a capture uses the reserve; any other run counts bytes and reserves them."""
+        """Return the context of the launches: a capture uses the reserve; another run counts and reserves bytes."""
         if self.device.is_cpu:
             yield
             return
@@ -147,17 +148,19 @@ class Arena(Reserve):
             self._size = max(self._size, self._used)
             return int(self.below.allocate(size_in_bytes))
         if not self.blocks or self._used > self.blocks[-1].size:
-            raise RuntimeError("a graph needs more memory than is reserved: call the function once before its capture")
+            raise RuntimeError(
+                "a graph needs more memory than is reserved: call the captured function once before the capture"
+            )
         return int(self.blocks[-1].ptr) + start
 
 
 class Conditional:
-    """Runs launches within a graph only if a mask is not empty.
+    """Skips launches within a graph if a mask is empty.
 
-    Outside a graph it always runs them, because reading the mask would wait for the device.
+    Outside a graph the launches always run, because reading the mask would wait for the device.
 
     Args:
-        device: Where the launches run.
+        device: The device of the launches.
     """
 
     def __init__(self, device: wp.Device) -> None:
@@ -167,7 +170,7 @@ class Conditional:
         self._inside = False
 
     def __call__(self, mask: wp.array, run: Callable[[], None]) -> None:
-        """Run launches that affect only the masked worlds, (nworld,) bool; nested calls always run."""
+        """Run launches that affect only the masked worlds, (nworld,) bool; a nested call always runs them."""
         if self._inside:
             run()
             return

@@ -22,11 +22,11 @@ log = logging.getLogger(__name__)
 _WORLDS, _HOLDS, _SUBSTEPS = 32, 25, 20
 
 _LEAST, _LEAST_WITH_FLEX = (8, 8), (256, 512)
-"""The smallest sizes, without and with a flex. A probe may miss bursts of contacts: a geom pressed into a flex touches
-up to 50 of its elements. The sizes with a flex are MuJoCo Warp's defaults."""
+"""The smallest capacities, for a model without and with a flex. A probe may miss many contacts, because a geom that is
+pressed into a flex touches up to 50 of its elements. The capacities with a flex are MuJoCo Warp's defaults."""
 
 _FIRST = 32
-"""Maximum number of worlds whose initial states are checked."""
+"""The maximum number of worlds of which the initial states are checked."""
 
 _FRICTION = {"dof_frictionloss", "tendon_frictionloss"}
 _LIMITS = {"jnt_range", "jnt_margin", "tendon_range", "tendon_margin", "qpos0"}
@@ -37,19 +37,19 @@ _known: dict[str, tuple[int, int]] = {}
 
 
 def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[int, int]:
-    """Numbers of contacts and constraints to allocate for each world.
+    """Measure how many contacts and constraints to allocate for each world.
 
-    The sizes are twice the peak of random rollouts, plus constraints that a task may turn on: inactive equality
-    constraints, friction losses if they are randomized, and all limits if their ranges are randomized. In the rollouts,
-    32 worlds start in the model's initial state or a keyframe, half of them with random velocities, and run 500
-    substeps on the C engine under random controls, each held for 20 substeps. The result is cached per model.
+    The numbers are twice the peak of random rollouts, plus constraints that a task may turn on. These are inactive
+    equality constraints, friction losses if randomized, and all limits if their ranges are randomized. In the rollouts,
+    32 worlds run 500 substeps on the C engine under random controls, each held for 20 substeps. They start in the
+    model's initial state or a keyframe, half of them with random velocities. Results are cached for each model.
 
     Args:
         model: The compiled model.
         varied: The names of the model fields that differ between worlds.
 
     Returns:
-        (nconmax, njmax), multiples of 8: each at least 8, with a flex at least 256 and 512.
+        (nconmax, njmax), both multiples of 8, and at least (8, 8), or (256, 512) with a flex.
 
     Raises:
         NotImplementedError, ValueError: MuJoCo Warp does not support the model.
@@ -59,11 +59,11 @@ def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[in
 
 
 def warn_of_unknown_sizes(varied: Collection[str], nconmax: int, njmax: int) -> None:
-    """Log a warning if contacts depend on randomized fields, whose values the probe does not know."""
+    """Log a warning if the numbers of contacts depend on randomized fields, because the probe does not randomize."""
     if names := sorted(_CONTACTS.intersection(varied)):
         log.warning(
-            "nconmax=%d and njmax=%d were measured on the model's own %s, which the task draws: give make() both if "
-            "worlds end with contact_overflow or constraint_overflow", nconmax, njmax, ", ".join(names),
+            "nconmax=%d and njmax=%d were measured on the model's own %s, which the task draws: give make() larger values "
+            "if worlds end with contact_overflow or constraint_overflow", nconmax, njmax, ", ".join(names),
         )  # fmt: skip
 
 
@@ -76,13 +76,13 @@ def warn_of_little_room(
     nconmax: float,
     njmax: int,
 ) -> None:
-    """Log a warning if worlds start with more contacts or constraints than fit.
+    """Log a warning if worlds start with more contacts or constraints than their capacities.
 
     Args:
         model: The compiled model.
         states: Integration states of worlds, (n, integration size); the first 32 are checked.
         fields: The model fields that differ between worlds.
-        values: Values of these fields, by name, (n, ...).
+        values: The values of ``fields`` by name, (n, ...).
         nconmax: Contact capacity per world, on average.
         njmax: Constraint capacity of each world.
     """
@@ -105,14 +105,14 @@ def warn_of_little_room(
         constraints.append(data.nefc)
     if np.mean(contacts) > nconmax or max(constraints) > njmax:
         log.warning(
-            "worlds begin with up to %d constraints and %.3g contacts on average, and have room for njmax=%d and "
-            "nconmax=%d: give make() larger ones, or steps end with constraint_overflow or contact_overflow",
+            "worlds begin with up to %d constraints and %.3g contacts on average, but njmax=%d and nconmax=%d: "
+            "give make() larger values, or steps end with constraint_overflow or contact_overflow",
             max(constraints), np.mean(contacts), njmax, nconmax,
         )  # fmt: skip
 
 
 def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> mujoco.MjModel:
-    """Copy a model, and turn on every friction loss that a world may turn on."""
+    """Copy a model, and turn on every friction loss that any world may have."""
     if names := _FRICTION.intersection(varied):
         model = copy.copy(model)
         for name in names:
@@ -122,7 +122,7 @@ def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> muj
 
 
 def _inactive(model: mujoco.MjModel) -> int:
-    """The number of constraint rows that inactive equality constraints would add."""
+    """Count the constraint rows that inactive equality constraints would add."""
     every = copy.copy(model)
     every.eq_active0[:] = True
     return _equalities(every) - _equalities(model)
@@ -135,7 +135,7 @@ def _equalities(model: mujoco.MjModel) -> int:
 
 
 def _limits(model: mujoco.MjModel, varied: Collection[str]) -> int:
-    """The total number of limits if randomized fields determine which limits are reached, else 0."""
+    """Count all limits if randomized fields determine which limits are reached; otherwise return 0."""
     drawn = not _LIMITS.isdisjoint(varied)
     return int(model.jnt_limited.sum() + model.tendon_limited.sum()) if drawn else 0
 
@@ -151,7 +151,7 @@ def _probe_once(model: mujoco.MjModel) -> tuple[int, int]:
 
 def _probe(model: mujoco.MjModel) -> tuple[int, int]:
     with wp.ScopedDevice("cpu"):
-        mjw.put_model(model)  # an unsupported model raises here, before the probe, which may take a minute
+        mjw.put_model(model)  # refuse an unsupported model before the probe, which may take a minute
     batch = Batch(model, _WORLDS)
     rng = np.random.default_rng(0)
     ncon, nefc = batch.bind("ncon"), batch.bind("nefc")
@@ -163,7 +163,7 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
     for _ in range(_HOLDS):
         batch.ctrl[:] = rng.uniform(low, high, size=(_WORLDS, model.nu))
         for _ in range(_SUBSTEPS):
-            # if the memory is too small, the counts are still correct
+            # the counts are correct even if the memory is too small
             with contextlib.suppress(SimulationError):
                 batch.step()
             contacts, constraints = max(contacts, int(ncon.max())), max(constraints, int(nefc.max()))
@@ -174,20 +174,20 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 _TEMPORARIES = 1.25
-"""A world's memory divided by the memory of MuJoCo Warp's Data. A step's temporary arrays take 1 to 9 % (measured); the
-rest is for graphs and for the group of a partial forward pass. CPU graphs keep all temporary arrays alive and take up
-to three times as much."""
+"""The factor from the memory of MuJoCo Warp's Data to the memory of a world. In measurements a step's temporary arrays
+took 1 to 9 %; the rest is for graphs and for the group of a partial forward pass. CPU graphs keep all temporary arrays
+alive and take up to three times as much."""
 
 _TEMPORARIES_CONVEX = 3.5
-"""The same factor with convex collisions or the noslip solver: on adroit_pen the temporary arrays take 1.5 to 2.4 times
-the memory of the Data."""
+"""The factor for models with convex collisions or the noslip solver. On adroit_pen the temporary arrays take 1.5 to 2.4
+times the memory of the Data."""
 
 _CONVEX = {mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_MESH,
            mujoco.mjtGeom.mjGEOM_HFIELD}  # fmt: skip
 
 
 def data_bytes(model: mujoco.MjModel, nconmax: int, njmax: int) -> int:
-    """Bytes of MuJoCo Warp's Data per world for given capacities, including temporary arrays."""
+    """Estimate the bytes per world of MuJoCo Warp's Data for given capacities, including temporary arrays."""
     sizes = []
     for nworld in (1, 2):
         with wp.ScopedDevice("cpu"):
@@ -197,7 +197,7 @@ def data_bytes(model: mujoco.MjModel, nconmax: int, njmax: int) -> int:
 
 
 def _bytes_of(data: Any) -> int:
-    """Bytes of all arrays in a dataclass, including nested dataclasses."""
+    """Count the bytes of all arrays in a dataclass, including nested dataclasses."""
     total = 0
     for field in dataclasses.fields(data):
         value = getattr(data, field.name)
@@ -209,7 +209,7 @@ def _bytes_of(data: Any) -> int:
 
 
 def _margin(model: mujoco.MjModel) -> float:
-    """Memory of a world, divided by the memory of MuJoCo Warp's Data."""
+    """Return the factor from the memory of MuJoCo Warp's Data to the memory of a world."""
     collides = (model.geom_contype | model.geom_conaffinity) != 0
     kinds = [int(kind) for kind in model.geom_type[collides]]
     convex = not _CONVEX.isdisjoint(kinds) or kinds.count(int(mujoco.mjtGeom.mjGEOM_BOX)) > 1
@@ -221,11 +221,11 @@ _BITS = mjw.OverflowType
 CONTACT_BITS = int(_BITS.BROADPHASE | _BITS.NARROWPHASE)
 CONSTRAINT_BITS = int(_BITS.NEFC | _BITS.NJMAX_NNZ | _BITS.NVMAX)
 IGNORED_BITS = int(_BITS.ITERATIONS | _BITS.LS_ITERATIONS)
-"""Bits that are not faults: a solver that reaches its iteration limit still returns a solution."""
+"""Warning bits that are not faults. A solver that reaches its iteration limit still returns a solution."""
 
 
 def report_pool_overflow(data: mjw.Data, mask: wp.array) -> None:
-    """Set the masked worlds' overflow bit if contacts did not fit in a forward pass.
+    """Set the masked worlds' overflow bit if a forward pass found too many contacts.
 
     ``mujoco_warp.step`` sets the bit itself; ``mujoco_warp.forward`` does not.
     """

@@ -17,12 +17,12 @@ _POSED_BY = {"geom_pos", "geom_quat", "body_pos", "body_quat"}
 
 
 class StaticGeoms:
-    """Places geoms that cannot move, if model fields that determine their poses differ between worlds.
+    """Computes the poses of static geoms if model fields that determine them differ between worlds.
 
     Args:
         model: The compiled model.
-        varied: The names of the model fields that differ.
-        device: Where the worlds live.
+        varied: The names of the model fields that differ between worlds.
+        device: The device of the worlds.
     """
 
     def __init__(self, model: mujoco.MjModel, varied: Iterable[str], device: wp.Device) -> None:
@@ -32,7 +32,7 @@ class StaticGeoms:
         self._geoms: wp.array = wp.array(np.flatnonzero(fixed), dtype=int, device=device)
 
     def place(self, model: mjw.Model, data: mjw.Data, mask: wp.array) -> None:
-        """Compute the poses in the masked worlds of a Data; consists of launches."""
+        """Compute the poses in the masked worlds of a Data, by Warp launches only."""
         if self._geoms.size:
             fields = [model.geom_bodyid, model.body_parentid]
             # MuJoCo stores a quaternion as (w, x, y, z), unlike Warp's type
@@ -49,13 +49,13 @@ OUTPUTS = {
     ),
     Constants.INERTIAL: "dof_invweight0 body_invweight0 tendon_invweight0 actuator_acc0".split(),
 }
-"""The constants that ``mujoco_warp.set_const`` writes, by group."""
+"""The constants that ``mujoco_warp.set_const`` computes, by group."""
 
 _GEOM_BOUNDS = {"geom_aabb", "geom_rbound"}
 
 
 def constants_of(fields: Iterable[ModelField]) -> Constants:
-    """The groups of constants derived from any of the fields."""
+    """Return the groups of constants that are derived from any of the fields."""
     groups = Constants.NONE
     for field in fields:
         groups |= field.constants
@@ -63,7 +63,7 @@ def constants_of(fields: Iterable[ModelField]) -> Constants:
 
 
 def outputs_of(fields: Collection[ModelField]) -> list[str]:
-    """The names of the constants that differ between worlds if these fields differ."""
+    """Return the names of the constants that differ between worlds if the given fields do."""
     groups = constants_of(fields)
     names = [name for group, outputs in OUTPUTS.items() if group & groups for name in outputs]
     sized = any(field.name == "geom_size" for field in fields)
@@ -71,15 +71,15 @@ def outputs_of(fields: Collection[ModelField]) -> list[str]:
 
 
 def owner(model: mjw.Model, name: str) -> mjw.Model | mjw.Option:
-    """The object that has a model field as an attribute: the model or its options."""
+    """Return the object with a model field as an attribute: the model or its options."""
     return model if hasattr(model, name) else model.opt
 
 
 def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nworld: int) -> mjw.Model:
-    """MuJoCo Warp's model with one row per world in the given fields and in the constants derived from them.
+    """Make MuJoCo Warp's model with one row per world in the given fields and in the constants derived from them.
 
-    ``mjw.put_model`` disables parts of the physics whose fields are all zero. Parts whose fields may become non-zero in
-    a world are enabled here.
+    ``mjw.put_model`` disables parts of the physics whose fields are all zero. This function enables the parts whose
+    fields may become non-zero in a world.
     """
     fields = [field for field in fields if field.size]
     names = [field.name for field in fields if not field.option]
@@ -112,16 +112,15 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
 
 
 class ModelRows:
-    """A model for a group of worlds, with its own rows of fields that differ; all other fields are shared.
+    """Make the model of a group of worlds, with its own rows of fields that differ; all other fields are shared.
 
-    With the model of all worlds, MuJoCo Warp would read row ``world % rows`` of a field, which belongs to another
-    world.
+    With the model of all worlds, MuJoCo Warp would read a field's row ``world % rows``, which belongs to another world.
 
     Args:
         whole: The model of all worlds.
-        names: The fields with a row for each world.
+        names: The fields with one row per world.
         size: Number of worlds in the group.
-        own: Additional fields to copy, because the group writes them.
+        own: Additional fields that the group writes and that are therefore copied.
     """
 
     def __init__(self, whole: mjw.Model, names: Iterable[str], size: int, own: Iterable[str] = ()) -> None:
@@ -143,13 +142,13 @@ class ModelRows:
             setattr(self.model, name, wp.clone(getattr(whole, name)))
 
     def take(self, turns: Turns) -> None:
-        """Copy the rows of the group's worlds into the group."""
+        """Copy rows of all worlds into the rows of the group."""
         if self.model is not self.whole:
             for source, group in self._pairs.values():
                 turns.take(source, group)
 
     def give(self, turns: Turns, names: Iterable[str]) -> None:
-        """Copy the group's rows of some fields back to its worlds."""
+        """Copy the group's rows of the given fields back into the rows of all worlds."""
         for name in names:
             if name in self._pairs:
                 source, group = self._pairs[name]
@@ -173,9 +172,9 @@ class ModelConstants:
         model: The compiled model.
         put: MuJoCo Warp's model, with one row per world in the fields and in the derived constants.
         fields: The fields that differ between worlds and from which constants are derived.
-        static: Geoms whose poses ``mujoco_warp.set_const`` does not compute; tendons may wrap around them.
+        static: The static geoms, around which tendons may wrap; ``mujoco_warp.set_const`` does not compute their poses.
         nworld: Number of worlds.
-        device: Where they live.
+        device: The device of the worlds.
         loop: See ``Turns``.
     """
 
@@ -201,7 +200,7 @@ class ModelConstants:
             self._rows = ModelRows(put, [*names, *self._outputs], size, written - set(self._outputs))
             self._scratch = mjw.make_data(model, nworld=size, nconmax=1, njmax=1)
             self._given = [flat(getattr(owner(put, name), name)).view(wp.int32) for name in names]
-            # the bits of a NaN that no computation produces
+            # start with the bits of a NaN that no computation produces
             self._applied = [wp.full_like(given, -1) for given in self._given]
             self._changed = wp.zeros(nworld, dtype=bool)
             self._everyone = wp.full(size, True, dtype=bool)
@@ -211,7 +210,7 @@ class ModelConstants:
         self._turns = Turns(nworld, size, device, loop=loop)
 
     def __call__(self, mask: wp.array) -> None:
-        """Update the masked worlds' constants; consists of launches."""
+        """Update the masked worlds' constants, by Warp launches only."""
         self._changed.zero_()
         for given, applied in zip(self._given, self._applied, strict=True):
             args = [mask, given, applied, self._changed]

@@ -37,17 +37,17 @@ quicken_mujoco_warp()
 
 
 class WarpEngine(Engine):
-    """Worlds in ``mujoco_warp``'s own arrays, exposed without a copy.
+    """Steps worlds by MuJoCo Warp, and exposes MuJoCo Warp's arrays without a copy.
 
     Args:
         model, nworld, fields: See ``Engine``.
-        device: A CUDA device, or the CPU (single-threaded, for tests).
+        device: A CUDA device, or the CPU, which uses a single thread and is for tests.
         dynamics: The model fields that differ between worlds. Contact and constraint capacities are probed with the
             model's own values; see ``sizes.probe_sizes``.
-        initial: The state that ``reset`` puts worlds into, rounded to float32; None for the model's own.
-        nconmax: Contact capacity per world, on average. None probes the model, and adds capacity for one world in which
-            all geoms touch.
-        njmax: Constraint capacity of each world; None probes the model.
+        initial: The initial state for ``reset``, rounded to float32; None for the model's own.
+        nconmax: Contact capacity per world, as an average over the worlds. By default the model is probed, and capacity
+            is added for one world in which all geoms touch.
+        njmax: Constraint capacity of each world; by default the model is probed.
 
     Raises:
         ValueError: MuJoCo Warp does not support the model, or an option is out of range.
@@ -57,7 +57,7 @@ class WarpEngine(Engine):
     capturable = True
 
     partial_refresh = True
-    """Whether the forward pass after restarts covers only the restarting worlds and is skipped if there are none."""
+    """Whether a forward pass after restarts covers only the restarting worlds, and is skipped if there are none."""
 
     def __init__(
         self,
@@ -92,7 +92,7 @@ class WarpEngine(Engine):
             self.arrays[varied.name] = self._alias_model(varied)
         self._static = StaticGeoms(model, self.dynamics, device)
         self._constants = self._model_constants()
-        # MuJoCo Warp derives its initial state from model fields, which may differ between worlds
+        # the state that MuJoCo Warp derives from model fields may differ between worlds
         self._start: wp.array | None = None
         if initial is not None or self.dynamics.keys() & {"qpos0", "body_pos", "body_quat"}:
             self._start = wp.array(self.initial, dtype=float, device=device)
@@ -103,7 +103,7 @@ class WarpEngine(Engine):
         if self.reset_stage < Stage.ACCELERATION:
             self._reset_parts = forward_parts(model, self._reset)
         self._columns: wp.array = wp.array(early_sensor_columns(model), dtype=int, device=device)
-        # parts that the last step or restart already computed for the next step's initial state
+        # the parts that the last step or restart has already computed for the next step's initial state
         moved = any(field.written for name, field in self.fields.items() if name in ("mocap_pos", "mocap_quat"))
         current_parts = () if moved else self._current_parts or ()
         self._shared = tuple(part for part in current_parts if part in forward.POSITION)
@@ -123,12 +123,12 @@ class WarpEngine(Engine):
         """MuJoCo Warp's model with the engine's options."""
         with wp.ScopedDevice(self.device):
             model = put_varied_model(self.model, list(self.dynamics.values()), self.nworld)
-        # overflows are reported per world; messages printed by kernels would fill the disk
+        # kernels must not print: each world reports its overflows, and printed messages could fill the disk
         model.opt.warn_overflow = 0
         return model
 
     def _on_device(self) -> contextlib.AbstractContextManager[object]:
-        """The context for every call of MuJoCo Warp."""
+        """Return the context for calls of MuJoCo Warp."""
         return wp.ScopedDevice(self.device)
 
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
@@ -158,14 +158,14 @@ class WarpEngine(Engine):
     # fields
 
     def _alias_model(self, field: ModelField) -> wp.array:
-        """A view of a model field's memory with the type in ``model_fields``."""
+        """Return a view of a model field's memory with the type in ``model_fields``."""
         source = getattr(owner(self.m, field.name), field.name)
         if not field.size:
             return wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
         return alias(source, field.dtype, (self.nworld, *field.shape))
 
     def _model_constants(self) -> ModelConstants | None:
-        """The constants derived from the model fields, or None if there are none."""
+        """Make the object that computes derived constants, or return None if no constant depends on the fields."""
         fields = [field for field in self.dynamics.values() if field.size and constants_of([field])]
         if not fields:
             return None
@@ -173,7 +173,7 @@ class WarpEngine(Engine):
         return ModelConstants(self.model, self.m, fields, self._static, self.nworld, self.device, loop=loop)
 
     def _alias(self, field: Field) -> wp.array:
-        """A view of a field's memory with the type in ``fields``; MuJoCo Warp's types differ only in name."""
+        """Return a view of a field's memory with the type in ``fields``; MuJoCo Warp's types differ only in name."""
         return alias(getattr(self.d, field.name), field.dtype, (self.nworld, *field.shape))
 
     def _copy_snapshots(self, mask: wp.array, fields: Iterable[Field]) -> None:
@@ -196,7 +196,7 @@ class WarpEngine(Engine):
         data: mjw.Data | None = None,
         model: mjw.Model | None = None,
     ) -> None:
-        """Run parts of a forward pass in every world of a Data; None for all parts up to ``stage``."""
+        """Run parts of a forward pass in every world of a Data; with None, run all parts up to ``stage``."""
         m, d = self.m if model is None else model, self.d if data is None else data
         with self._on_device():
             if parts is not None:
@@ -212,7 +212,7 @@ class WarpEngine(Engine):
                 if stage == Stage.VELOCITY:
                     mjw.fwd_velocity(m, d)
                     mjw.sensor_vel(m, d)
-                if "energy" in self.fields:  # no sensor of the model computes this field
+                if "energy" in self.fields:  # the model has no sensor that computes this field
                     mjw.energy_pos(m, d)
                     mjw.energy_vel(m, d)
 
@@ -243,7 +243,7 @@ class WarpEngine(Engine):
         self._settle_among_all(mask, nstep)
 
     def _settle_among_all(self, mask: wp.array, nstep: int) -> None:
-        """Step all worlds, and restore the worlds outside the mask."""
+        """Step all worlds, and restore the state of worlds outside the mask."""
         states, bits = wp.empty_like(self._state), wp.clone(self.d.overflow)
         with self._on_device():
             mjw.get_state(self.m, self.d, states, _SPEC)
@@ -278,7 +278,7 @@ class WarpEngine(Engine):
                 mjw.set_state(self.m, self.d, self._state, _SPEC, mask)
 
     def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
-        """No-op: the fields are the engine's own arrays."""
+        """Do nothing, because the fields are the engine's own arrays."""
 
     def run_for(self, mask: wp.array, run: Callable[[], None]) -> None:
         if self.partial_refresh:
@@ -294,7 +294,7 @@ class WarpEngine(Engine):
 
     def _forward_group(self, model: mjw.Model, group: mjw.Data) -> None:
         self._forward(None, self.reset_stage, group, model)
-        self._forward(self._shared, self.reset_stage)  # the next step does not compute these parts again
+        self._forward(self._shared, self.reset_stage)  # the next step skips the parts that are already computed
 
     def _refresh(self, mask: wp.array) -> None:
         """Run a forward pass of all worlds; the fields of worlds outside the mask do not change."""
@@ -306,11 +306,11 @@ class WarpEngine(Engine):
 
     def _is_partial(self) -> bool:
         """Whether a group of worlds can be stepped separately."""
-        # sweep-and-prune, the broadphase for large models, needs memory that cannot be reserved within a graph
+        # the broadphase of large models, sweep-and-prune, needs memory that cannot be reserved within a graph
         return self.partial_refresh and self.m.opt.broadphase == mjw.BroadphaseType.NXN
 
     def _partial_forward(self) -> PartialForward | None:
-        """A forward pass for only the restarting worlds, or None if it is impossible or saves nothing."""
+        """Make a forward pass for only the restarting worlds, or return None if this is impossible or saves nothing."""
         return self._group_of_worlds() if self._is_partial() and self._reset_parts is None else None
 
     def _group_of_worlds(self) -> PartialForward:
@@ -323,7 +323,7 @@ class WarpEngine(Engine):
 
     @contextlib.contextmanager
     def _histories_kept(self) -> Iterator[None]:
-        """Context that restores sensor histories, because the next step adds the same samples as the forward pass."""
+        """Return a context that restores sensor histories, because the next step adds the same samples again."""
         if self.d.history.size:
             wp.copy(self._history, self.d.history)
         yield
@@ -345,7 +345,7 @@ class WarpEngine(Engine):
 
 @contextlib.contextmanager
 def _refusals() -> Iterator[None]:
-    """Context that explains how to fix a model that MuJoCo Warp does not support."""
+    """Return a context that explains how to fix a model that MuJoCo Warp does not support."""
     try:
         yield
     except (NotImplementedError, ValueError) as error:
@@ -356,7 +356,7 @@ def _refusals() -> Iterator[None]:
 
 
 def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied: Collection[str]) -> tuple[int, int]:
-    """Contact and constraint capacities per world: the given numbers, else probed ones."""
+    """Return the contact and constraint capacities per world: the given numbers, or else probed numbers."""
     given = {"nconmax": nconmax, "njmax": njmax}
     sizes = [size if size is None else whole_number(name, size, low=1) for name, size in given.items()]
     with _refusals():
@@ -367,12 +367,12 @@ def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied
 
 
 def _check_sdf_plugins(model: mujoco.MjModel) -> None:
-    """Refuse SDF plugins unless a distance function was registered with MuJoCo Warp, which has none itself."""
+    """Refuse SDF plugins unless MuJoCo Warp has a registered distance function; by default there is none."""
     if (model.geom_plugin >= 0).any() and not has_sdf_functions():
-        raise NotImplementedError("it cannot evaluate SDF plugins")
+        raise NotImplementedError("SDF plugins need a registered distance function")
 
 
 def _contacts_of_one_world(model: mjw.Model) -> int:
-    """Contacts of a single world in which all bodies touch, which is about to be reset."""
+    """Return the number of contacts of a single world in which all bodies touch, just before its reset."""
     pairs = len(model.nxn_geom_pair_filtered)
     return int(min(max(256, 4 * pairs), 4096))
