@@ -1,9 +1,9 @@
 """AdroitDoor: turn a latch with the hand and pull the door open (Gymnasium-Robotics' AdroitHandDoor-v1).
 
-The hand's model needs the extra "hand". The door's frame is a mocap body here, so its position is part of the state.
-The model lists the contact pair of ring and little fingertip twice; here it is listed once. As in the original, site
-positions lag by one substep, as ``mj_step`` leaves them. The reward grows with the palm's distance from the handle: a
-mistake of gymnasium-robotics 1.2.1 to 1.4.2, which is kept. ``palm_weight=-0.1`` corrects it, as in version 1.2.0.
+The hand's model needs the extra "hand". The door's frame is a mocap body, so that its position is part of the state.
+The contact pair of ring and little fingertip, which the model lists twice, is used once. As in Gymnasium-Robotics, site
+positions lag by one substep, as ``mj_step`` leaves them. The reward grows with the palm's distance from the handle,
+which is a mistake of gymnasium-robotics 1.2.1 to 1.4.2. ``palm_weight=-0.1`` corrects the mistake, as in version 1.2.0.
 """
 
 import mujoco
@@ -15,7 +15,7 @@ from lyceum_warp import Row
 
 @wp.struct
 class World:
-    qpos: Row[float]  # the arm's 4 joints, the hand's 24, the door's hinge, then its latch
+    qpos: Row[float]  # 4 joints of the arm, 24 of the hand, the door's hinge, the latch
     qvel: Row[float]
     site_xpos: Row[wp.vec3]
     mocap_pos: Row[wp.vec3]
@@ -24,9 +24,9 @@ class World:
 @wp.struct
 class Params:
     dt: float
-    sparse: bool = False  # a reward of 10 for success, else -0.1
+    sparse: bool = False  # the reward is 10 for success, otherwise -0.1
     palm_weight: float = 0.1
-    success_angle: float = 1.35  # rad; the hinge's range ends at 1.57
+    success_angle: float = 1.35  # rad; the hinge opens to 1.57
     frame_low: wp.vec3 = wp.vec3(-0.3, 0.25, 0.252)
     frame_high: wp.vec3 = wp.vec3(-0.2, 0.35, 0.35)
     hinge: int = lw.qpos("door_hinge")

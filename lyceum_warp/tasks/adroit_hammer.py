@@ -1,9 +1,10 @@
 """AdroitHammer: pick up a hammer and drive a nail into a board (Gymnasium-Robotics' AdroitHandHammer-v1).
 
-The hand's model needs the extra "hand". The board is a mocap body here, so its height is part of the state. The model
-lists the contact pair of ring and little fingertip twice; here it is listed once. As in the original, positions and the
-force on the nail lag by one substep, as ``mj_step`` leaves them. The reward grows with the palm's distance from the
-hammer: a mistake of gymnasium-robotics 1.2.1 to 1.4.2, which is kept. ``palm_weight=-0.1`` corrects it (as in 1.2.0).
+The hand's model needs the extra "hand". The board is a mocap body, so that its height is part of the state. The contact
+pair of ring and little fingertip, which the model lists twice, is used once. As in Gymnasium-Robotics, positions and
+the force on the nail lag by one substep, as ``mj_step`` leaves them. The reward grows with the palm's distance from the
+hammer, which is a mistake of gymnasium-robotics 1.2.1 to 1.4.2. ``palm_weight=-0.1`` corrects the mistake, as in
+version 1.2.0.
 """
 
 import mujoco
@@ -17,7 +18,7 @@ vec5 = wp.types.vector(length=5, dtype=wp.float32)
 
 @wp.struct
 class World:
-    qpos: Row[float]  # the arm's 2 joints, the hand's 24, the nail, then the hammer's 3 slides and 3 hinges
+    qpos: Row[float]  # 2 joints of the arm, 24 of the hand, the nail, 3 slides and 3 hinges of the hammer
     qvel: Row[float]
     xpos: Row[wp.vec3]
     xquat: Row[lw.quat]
@@ -29,15 +30,15 @@ class World:
 @wp.struct
 class Params:
     dt: float
-    sparse: bool = False  # a reward of 10 for success, else -0.1
+    sparse: bool = False  # the reward is 10 for success, otherwise -0.1
     palm_weight: float = 0.1
-    success_distance: float = 0.01  # m between the nail's head and its goal
+    success_distance: float = 0.01  # m, from the nail's head to the goal
     board_height: wp.vec2 = wp.vec2(0.1, 0.25)
     hammer: int = lw.body("Object")
     head: int = lw.site("tool")
     palm: int = lw.site("S_grasp")
     nail: int = lw.site("S_target")
-    goal: int = lw.site("nail_goal")  # goal of the nail's head
+    goal: int = lw.site("nail_goal")  # the goal of the nail's head
     board: int = lw.mocap("nail_board")
     nail_force: int = lw.sensor("S_nail")
 

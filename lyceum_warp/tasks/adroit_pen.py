@@ -1,8 +1,8 @@
 """AdroitPen: turn a pen in the hand to a target orientation (Gymnasium-Robotics' AdroitHandPen-v1).
 
-The hand's model needs the extra "hand". The target is a mocap body here, so it is part of the state. The target does
-not collide; in the original, the pen can collide with it. The model lists the contact pair of ring and little fingertip
-twice; here it is listed once. As in the original, positions lag by one substep, as ``mj_step`` leaves them.
+The hand's model needs the extra "hand". The target is a mocap body, so that it is part of the state. The pen does not
+collide with the target; in Gymnasium-Robotics it does. The contact pair of ring and little fingertip, which the model
+lists twice, is used once. As in Gymnasium-Robotics, positions lag by one substep, as ``mj_step`` leaves them.
 Success: the pen has been in the goal orientation in more than 20 steps of the episode.
 """
 
@@ -15,7 +15,7 @@ from lyceum_warp import Row
 
 @wp.struct
 class World:
-    qpos: Row[float]  # the hand's 24 joints, then the pen's 3 slides and 3 hinges
+    qpos: Row[float]  # 24 joints of the hand, 3 slides and 3 hinges of the pen
     qvel: Row[float]
     xpos: Row[wp.vec3]
     site_xpos: Row[wp.vec3]
@@ -26,7 +26,7 @@ class World:
 @wp.struct
 class Params:
     dt: float
-    sparse: bool = False  # a reward of 10 at the goal, else -0.1
+    sparse: bool = False  # the reward is 10 at the goal, otherwise -0.1
     goal_distance: float = 0.075
     goal_similarity: float = 0.95
     goal_steps: float = 20.0
@@ -39,7 +39,7 @@ class Params:
     target: int = lw.mocap("target")
     target_top: int = lw.site("target_top")
     target_bottom: int = lw.site("target_bottom")
-    palm: int = lw.site("eps_ball")  # goal position of the pen
+    palm: int = lw.site("eps_ball")  # the pen's goal position
 
 
 @wp.func

@@ -1,10 +1,10 @@
 """AdroitRelocate: pick up a ball and carry it to a target (Gymnasium-Robotics' AdroitHandRelocate-v1).
 
-The hand's model needs the extra "hand". The target is a mocap body here, and resets move the ball by its own joints, so
-both positions are part of the state. The model lists the contact pair of ring and little fingertip twice; here it is
-listed once. As in the original, positions lag by one substep, as ``mj_step`` leaves them. The reward grows with the
-palm's distance from the ball: a mistake of gymnasium-robotics 1.2.1 to 1.4.2, which is kept. ``palm_weight=-0.1``
-corrects it, as in version 1.2.0.
+The hand's model needs the extra "hand". The target is a mocap body, and resets move the ball by its joints, so that
+both positions are part of the state. The contact pair of ring and little fingertip, which the model lists twice, is
+used once. As in Gymnasium-Robotics, positions lag by one substep, as ``mj_step`` leaves them. The reward grows with the
+palm's distance from the ball, which is a mistake of gymnasium-robotics 1.2.1 to 1.4.2. ``palm_weight=-0.1`` corrects
+the mistake, as in version 1.2.0.
 """
 
 import mujoco
@@ -16,7 +16,7 @@ from lyceum_warp import Row
 
 @wp.struct
 class World:
-    qpos: Row[float]  # the arm's 6 joints, the hand's 24, then the ball's 3 slides and 3 hinges
+    qpos: Row[float]  # 6 joints of the arm, 24 of the hand, 3 slides and 3 hinges of the ball
     xpos: Row[wp.vec3]
     site_xpos: Row[wp.vec3]
     mocap_pos: Row[wp.vec3]
@@ -25,10 +25,10 @@ class World:
 @wp.struct
 class Params:
     dt: float
-    sparse: bool = False  # a reward of 10 for success, else -0.1
+    sparse: bool = False  # the reward is 10 for success, otherwise -0.1
     palm_weight: float = 0.1
     success_distance: float = 0.1  # m
-    lifted_height: float = 0.04  # m; the ball's radius is 0.035
+    lifted_height: float = 0.04  # m; the ball has a radius of 0.035
     ball_low: wp.vec2 = wp.vec2(-0.15, -0.15)
     ball_high: wp.vec2 = wp.vec2(0.15, 0.3)
     target_low: wp.vec3 = wp.vec3(-0.2, -0.2, 0.15)

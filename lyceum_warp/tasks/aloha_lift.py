@@ -1,7 +1,7 @@
 """AlohaLift: lift a pot by its two handles with two arms (ALOHA and pot of mujoco_warp's test data).
 
-Meshes are visual only. Collision geoms are the simple shapes of the MJCF file beside this one, and capsules fitted to
-the arms, which do not collide with each other. Actions are velocities of the targets of the model's position servos.
+Meshes are visual only. Collision geoms are the simple shapes in the task's MJCF file, and capsules fitted to the arms.
+The arms do not collide with each other. Actions are velocities of the position servos' targets.
 Success: the pot has been above the goal height for ten consecutive steps.
 """
 
@@ -14,10 +14,10 @@ from lyceum_warp import Row
 
 @wp.struct
 class World:
-    # per arm, left first: 6 joints and 2 fingers; then position and quaternion of the pot, and its lid
+    # 6 joints and 2 fingers of the left arm, then of the right; position and quaternion of the pot; the lid
     qpos: Row[float]
     qvel: Row[float]
-    act: Row[float]  # servo targets of both arms
+    act: Row[float]  # the servo targets of both arms
     xpos: Row[wp.vec3]
     xmat: Row[wp.mat33]
     site_xpos: Row[wp.vec3]
@@ -28,8 +28,8 @@ class World:
 class Params:
     dt: float
     goal_height: float = 0.1
-    rest_height: float = 0.0658  # height of the pot at rest on the table, m
-    place: wp.vec3 = wp.vec3(0.03, 0.03, 0.25)  # bounds of the pot's initial pose: x, y (m) and yaw (rad)
+    rest_height: float = 0.0658  # the pot's height when it rests on the table, m
+    place: wp.vec3 = wp.vec3(0.03, 0.03, 0.25)  # the initial pose's bounds: x, y (m) and yaw (rad)
     pot: int = lw.body("partnet_100015/")
     left_grip: int = lw.site("lift/left_grip")
     right_grip: int = lw.site("lift/right_grip")
@@ -112,10 +112,10 @@ class AlohaLift(lw.Task):
                 geom.rgba = (0.75, 0.77, 0.8, 1.0)
         spec.camera("collaborator_pov").mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK  # the camera of videos
         for light in spec.lights:
-            light.castshadow = False  # shadows make rendering without a GPU 17 times slower
+            light.castshadow = False  # shadows slow rendering without a GPU down by a factor of 17
         child = lw.package_model("lyceum_warp", "tasks/aloha_lift.xml").spec()
         for part in child.worldbody.bodies:
             spec.body(part.name).add_frame().attach_body(part, "lift/", "")
-        arm = [0, -1.05, 1.06, 0, 0.78, 1.57, 0.035, 0.035]  # the gripper beside a handle, one finger above the other
+        arm = [0, -1.05, 1.06, 0, 0.78, 1.57, 0.035, 0.035]  # the grippers are beside the handles
         pot = [0, 0, 0.0658, 0.7071068, 0, 0, 0.7071068, 0]
         spec.add_key(name="start", qpos=arm + arm + pot, act=2 * arm[:7])

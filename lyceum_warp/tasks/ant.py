@@ -1,9 +1,9 @@
 """Ant: walk forward on four legs (Gymnasium's Ant-v5).
 
-The contact forces are from MuJoCo's sensor stage. Under RK4, the model's integrator, this stage runs in the first of a
-substep's four passes; Gymnasium computes ``cfrc_ext`` once more after the last pass. With pyramidal friction cones, the
-model's default, MuJoCo Warp uses a different contact frame than MuJoCo for a steep leg on the floor: both are valid,
-but trajectories diverge. With ``cone="elliptic"`` they agree.
+Contact forces are computed in MuJoCo's sensor stage. Under RK4, the model's integrator, the sensor stage runs in the
+first of a substep's four passes; Gymnasium computes ``cfrc_ext`` again after the last pass. With pyramidal friction
+cones, the model's default, MuJoCo Warp uses a different contact frame than MuJoCo for a steep leg on the floor: both
+are valid, but trajectories diverge. With ``cone="elliptic"``, both engines agree.
 """
 
 import warp as wp
@@ -27,7 +27,7 @@ class Params:
     ctrl_cost_weight: float = 0.5
     contact_cost_weight: float = 5e-4
     healthy_reward: float = 1.0
-    main_body: int = lw.body("torso")  # the reward is its forward speed
+    main_body: int = lw.body("torso")  # the forward speed of this body is rewarded
     terminate_when_unhealthy: bool = True
     healthy_z_range: wp.vec2 = wp.vec2(0.2, 1.0)
     contact_force_range: wp.vec2 = wp.vec2(-1.0, 1.0)

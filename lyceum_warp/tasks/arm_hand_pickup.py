@@ -1,8 +1,9 @@
 """ArmHandPickup: pick up a ball with an arm and a hand, and hold it at a goal (Lyceum's ArmHandPickup).
 
-Arm and hand are Kinova's Jaco (extra "dm-control"). Goal, reward and initial states are Lyceum's, except that Lyceum's
-code uses, by mistake, the distance from the ball to (ball - goal), which is constant; here it is the distance to the
-goal. Actions are joint velocities. Success: the ball has been within 5 cm of the goal for ten consecutive steps, 0.2 s.
+Arm and hand are Kinova's Jaco (extra "dm-control"). Goal, reward and initial states are Lyceum's, with one correction:
+the reward uses the distance from the ball to the goal. Lyceum's code uses the distance from the ball to (ball - goal),
+which is constant. Actions are joint velocities. Success: the ball has been within 5 cm of the goal for ten consecutive
+steps, 0.2 s.
 """
 
 import mujoco
@@ -19,7 +20,7 @@ def jaco(file: str) -> lw.ModelFile:
 
 @wp.struct
 class World:
-    qpos: Row[float]  # 6 joints of the arm, 3 of the fingers, the ball's position and quaternion
+    qpos: Row[float]  # 6 joints of the arm, 3 of the fingers, position and quaternion of the ball
     qvel: Row[float]
     xpos: Row[wp.vec3]
     geom_xpos: Row[wp.vec3]
@@ -29,14 +30,14 @@ class World:
 @wp.struct
 class Params:
     dt: float
-    far: float = 0.5  # upper limit of distances, m
-    near: float = 0.03  # the reward includes the goal if palm and ball are closer than this, m
+    far: float = 0.5  # distances are clipped to this, m
+    near: float = 0.03  # the goal counts only if palm and ball are closer than this, m
     finger_weight: float = 0.1
     success_distance: float = 0.05
     ball: int = lw.body("table/ball")
     goal: int = lw.site("table/goal")
     palm: int = lw.site("hand/pinchsite")
-    finger: int = lw.geom("hand/finger_tip_1")  # the other two fingertips are 2 and 4 geoms further on
+    finger: int = lw.geom("hand/finger_tip_1")  # the second and third fingertip follow 2 and 4 geoms later
 
 
 @wp.func
@@ -94,7 +95,7 @@ class ArmHandPickup(lw.Task):
     keyframe, frame_skip, horizon, success_steps = "home", 4, 300, 10
     obs = {"joints": 9, "velocity": 9, "ball_velocity": 3, "ball": 3, "palm": 3, "goal": 3, "fingers": 9}
     metrics, action_range = ("palm_distance", "goal_distance", "finger_distances"), (-1.0, 1.0)
-    planning = lw.Planning(  # this reward has a longer range, and a stronger term for closing the hand
+    planning = lw.Planning(  # the planner's reward has a longer range, and weighs closing the hand more
         settings=dict(horizon=32, samples=64, temperature=0.1, noise=0.8, fill="repeat", include_plan=False),
         params={"far": 1.0, "finger_weight": 2.0},
     )
@@ -104,8 +105,8 @@ class ArmHandPickup(lw.Task):
         """Add the hand, a table, and motors that control joint velocities."""
         spec.attach(jaco("jaco_hand.xml").spec(), site=spec.site("wristsite"), prefix="hand/")
         for geom in spec.geoms:
-            geom.contype, geom.conaffinity = 0, 1  # arm and hand collide with table and ball, not with each other
-        # gain, maximum rad/s and maximum N m of large joints, small joints and fingers
+            geom.contype, geom.conaffinity = 0, 1  # the arm and the hand do not collide with each other
+        # the gain, the maximum rad/s and the maximum N m of large joints, small joints and fingers
         for i, joint in enumerate(spec.joints):
             gain, speed, torque = ((500, 0.628, 30.5), (500, 0.838, 6.8), (100, 1.0, 1.0))[i // 3]
             motor = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
@@ -115,5 +116,5 @@ class ArmHandPickup(lw.Task):
         scene = lw.package_model("lyceum_warp", "tasks/arm_hand_pickup.xml").spec()
         spec.option = scene.option
         spec.attach(scene, frame=spec.worldbody.add_frame(), prefix="table/")
-        above = (1.775, 3.682, 1.303, 3.395, 5.351, 3.133, 0.2, 0.2, 0.2)  # the hand points down, open, over the ball
+        above = (1.775, 3.682, 1.303, 3.395, 5.351, 3.133, 0.2, 0.2, 0.2)  # the open hand points down, above the ball
         spec.add_key(name="home", qpos=[*above, 0, 0, 0.035, 1, 0, 0, 0])

@@ -1,8 +1,8 @@
 """Cartpole: keep a pole upright on a cart in the middle of its rail (dm_control's cartpole balance).
 
 The reward is dm_control's smooth reward; ``sparse=True`` selects the reward of balance_sparse. Success: cart and pole
-are within the bounds of the sparse reward. Episodes do not terminate. In Gymnasium's CartPole-v1, for comparison,
-episodes end when the pole tilts by 12 degrees, and the action is one of two forces.
+are within the bounds of the sparse reward. Episodes do not terminate. Gymnasium's CartPole-v1 differs: its episodes end
+when the pole tilts by 12 degrees, and its action is one of two forces.
 """
 
 import warp as wp
@@ -22,10 +22,10 @@ class Params:
     dt: float
     sparse: bool = False
     cart_range: wp.vec2 = wp.vec2(-0.25, 0.25)  # m, for balance
-    cosine_range: wp.vec2 = wp.vec2(0.995, 1.0)  # of the pole's angle, for balance
+    cosine_range: wp.vec2 = wp.vec2(0.995, 1.0)  # bounds for the cosine of the pole's angle
     reset_cart: float = 0.1  # +-, m
     reset_pole: float = 0.034  # +-, rad
-    reset_velocity: float = 0.01  # standard deviation, m/s and rad/s
+    reset_velocity: float = 0.01  # standard deviation, m/s or rad/s
 
 
 @wp.func

@@ -1,10 +1,11 @@
 """HerbReach: move the hands of two 7-joint Barrett arms to targets in space (HERB in the Lyceum paper).
 
-The paper's model is not published; this one is built from the robot's published data (see herb.xml). An action is a
-fraction of each motor's peak torque, including the fingers, and is added to gravity compensation. The targets are mocap
-bodies, and so part of the state. The targets are drawn from two boxes within reach, in front of the shoulders. Episodes
-start near HERB's home position. Success: both palms have been within 5 cm of their targets for ten consecutive steps,
-0.2 s. MuJoCo Warp finds fewer contact points than MuJoCo between two boxes of the arms.
+The paper's model is not published, so the task's model was built from published data of the robot (see herb.xml). An
+action is a fraction of each motor's peak torque, including the fingers, and is added to gravity compensation. The
+targets are mocap bodies, so that they are part of the state. The targets are drawn from two boxes within reach, in
+front of the shoulders. Episodes start near HERB's home position. Success: both palms have been within 5 cm of their
+targets for ten consecutive steps, 0.2 s. Between two boxes of the arms, MuJoCo Warp finds fewer contact points than
+MuJoCo.
 """
 
 import warp as wp
@@ -15,7 +16,7 @@ from lyceum_warp import Row
 
 @wp.struct
 class World:
-    qpos: Row[float]  # 15 joints of the left arm and hand, then 15 of the right
+    qpos: Row[float]  # 15 joints of the left arm and hand, then of the right
     qvel: Row[float]
     site_xpos: Row[wp.vec3]
     mocap_pos: Row[wp.vec3]
@@ -27,9 +28,9 @@ class Params:
     success_distance: float = 0.05
     precision_weight: float = 0.5
     ctrl_cost_weight: float = 0.01
-    target_low: wp.vec3 = wp.vec3(0.6, 0.1, 0.7)  # of the left target; mirrored in y for the right target
+    target_low: wp.vec3 = wp.vec3(0.6, 0.1, 0.7)  # the left target's box; the right target's is mirrored in y
     target_high: wp.vec3 = wp.vec3(0.95, 0.6, 1.3)
-    reset_noise_scale: float = 0.1  # bound of the arms' initial joint angles, rad
+    reset_noise_scale: float = 0.1  # largest initial joint angle of the arms, rad
     left_arm: int = lw.qpos("left/j1")
     right_arm: int = lw.qpos("right/j1")
     left_palm: int = lw.site("left/palm")
@@ -97,7 +98,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     s.mocap_pos[p.right_target][1] = -s.mocap_pos[p.right_target][1]
 
 
-# less noise for the wrist, whose links are light: large torques would only shake the hand
+# the wrist gets less noise, because its links are light, and large torques would only shake the hand
 ARM_NOISE, FINGER_NOISE = (0.14, 0.07, 0.035, 0.1, 0.02, 0.02, 0.02), (0.0, 0.0, 0.0, 0.0)
 
 

@@ -1,8 +1,8 @@
 """Humanoid: walk forward on two legs without falling over (Gymnasium's Humanoid-v5).
 
-The contact forces are from MuJoCo's sensor stage. Under RK4, the model's integrator, this stage runs in the first of a
-substep's four passes; Gymnasium computes ``cfrc_ext`` once more after the last pass. The forces differ while feet touch
-the ground; everything else is equal. The solver is Newton instead of the model's PGS.
+Contact forces are computed in MuJoCo's sensor stage. Under RK4, the model's integrator, the sensor stage runs in the
+first of a substep's four passes; Gymnasium computes ``cfrc_ext`` again after the last pass. The contact forces differ
+while feet touch the ground; everything else is equal. The solver is Newton instead of the model's PGS.
 """
 
 import warp as wp
@@ -94,7 +94,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 @lw.register
 class Humanoid(lw.Task):
     model, frame_skip, gymnasium = "humanoid.xml", 5, "Humanoid-v5"
-    # 13 times faster than RK4 with five substeps; plans made with it reach 92 to 103 % of the returns
+    # 13 times faster than RK4 with five substeps, and plans reach 92 to 103 % of the returns
     physics = {"fast": lw.PhysicsOptions(integrator="implicitfast", timestep=0.015, frame_skip=1)}
     planning = lw.Planning(options={"physics": "fast"})
     lagged = ("subtree_com", "cinert", "cvel")

@@ -1,8 +1,8 @@
 """HumanoidStandup: stand up from the floor (Gymnasium's HumanoidStandup-v5).
 
-The contact forces are from MuJoCo's sensor stage, as in humanoid. The first observation of an episode also contains
-them, whereas Gymnasium's contains zeros. The solver is Newton instead of the model's PGS. Gymnasium documents
-``uph_cost_weight`` but does not use it; here it weighs the height.
+Contact forces are computed in MuJoCo's sensor stage, as in the task humanoid. The first observation of an episode
+contains contact forces; Gymnasium's contains zeros. The solver is Newton instead of the model's PGS.
+``uph_cost_weight`` weighs the height; Gymnasium documents this parameter but does not use it.
 """
 
 import warp as wp

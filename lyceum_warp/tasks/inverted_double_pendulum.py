@@ -1,7 +1,7 @@
 """InvertedDoublePendulum: keep a pole of two links upright on a cart (Gymnasium's InvertedDoublePendulum-v5).
 
-As in Gymnasium, the tip's position and the constraint force on the cart, which is not zero at the ends of the rail, lag
-by one substep, as ``mj_step`` leaves them.
+As in Gymnasium, the tip's position and the constraint force on the cart lag by one substep, as ``mj_step`` leaves them.
+The force is zero except at the ends of the rail.
 """
 
 import warp as wp
@@ -12,7 +12,7 @@ from lyceum_warp import Row
 
 @wp.struct
 class World:
-    qpos: Row[float]  # position of the cart (m), angles of the lower and the upper link (rad)
+    qpos: Row[float]  # the cart's position (m), the angles of the lower and the upper link (rad)
     qvel: Row[float]
     site_xpos: Row[wp.vec3]
     qfrc_constraint: Row[float]

@@ -8,7 +8,7 @@ from lyceum_warp import Row
 
 @wp.struct
 class World:
-    qpos: Row[float]  # position of the cart (m), angle of the pole from upright (rad)
+    qpos: Row[float]  # the cart's position (m), the pole's angle from upright (rad)
     qvel: Row[float]
 
 

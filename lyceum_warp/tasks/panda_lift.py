@@ -1,9 +1,9 @@
 """PandaLift: grasp a cube on a table and lift it (a Franka Panda with its gripper, as in robosuite's Lift).
 
-The arm needs the extra "robots" and has no gripper; hand, table and cube are MJCF files beside this one. Actions are
-velocities of the targets of position servos. The arm compensates gravity, as the real robot does. Meshes are visual
-only: capsules fitted to the arm collide with table and cube. Success: the cube has been above the goal height for ten
-consecutive steps.
+The arm needs the extra "robots" and has no gripper. Hand, table and cube are in MJCF files of the package. Actions are
+velocities of the position servos' targets. The arm compensates gravity, as the real robot does. Meshes are visual
+only, and capsules fitted to the arm collide with table and cube. Success: the cube has been above the goal height for
+ten consecutive steps.
 """
 
 import mujoco
@@ -12,14 +12,14 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row
 
-HOME = (0.0, 0.1, 0.0, -2.1, 0.0, 2.2, 0.785, 0.03, 0.03)  # arm and fingers; the gripper points down
+HOME = (0.0, 0.1, 0.0, -2.1, 0.0, 2.2, 0.785, 0.03, 0.03)  # arm and fingers, with the gripper pointing down
 
 
 @wp.struct
 class World:
-    qpos: Row[float]  # 7 joints of the arm, 2 fingers, the cube's position and quaternion
+    qpos: Row[float]  # 7 joints of the arm, 2 fingers, position and quaternion of the cube
     qvel: Row[float]
-    act: Row[float]  # servo targets of arm and gripper
+    act: Row[float]  # the servo targets of arm and gripper
     xpos: Row[wp.vec3]
     xmat: Row[wp.mat33]
     site_xpos: Row[wp.vec3]
@@ -31,11 +31,11 @@ class Params:
     dt: float
     goal_height: float = 0.1
     half_size: float = 0.02  # of the cube, m
-    area: wp.vec4 = wp.vec4(0.45, 0.65, -0.15, 0.15)  # of the cube at the start: x min, x max, y min, y max, m
+    area: wp.vec4 = wp.vec4(0.45, 0.65, -0.15, 0.15)  # initial x min, x max, y min, y max of the cube, m
     cube: int = lw.body("table/cube")
     cube_qpos: int = lw.qpos("table/cube")
     finger: int = lw.qpos("hand/left_finger")
-    grip: int = lw.site("hand/grip")  # between the fingers' pads
+    grip: int = lw.site("hand/grip")  # between the finger pads
 
 
 @wp.func
@@ -97,10 +97,10 @@ class PandaLift(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Add the hand, a table and the cube, and make the motors servos that follow velocities."""
+        """Add the hand, a table and the cube, and replace the motors by servos that follow velocities."""
         spec.option.timestep, spec.option.cone = 0.005, mujoco.mjtCone.mjCONE_ELLIPTIC
         for i, (motor, joint) in enumerate(zip(spec.actuators, spec.joints, strict=True)):
-            kp, force = (4500.0, 87.0) if i < 4 else (2000.0, 12.0)  # the published torque limits, N m
+            kp, force = (4500.0, 87.0) if i < 4 else (2000.0, 12.0)  # the robot's published torque limits, N m
             motor.set_to_position(kp=kp, kv=0.05 * kp)
             motor.ctrlrange, motor.forcerange = joint.range, (-force, force)
             lw.follow_velocity(motor, 1.0)  # rad/s

@@ -1,7 +1,7 @@
 """Pusher: push a cylinder to a goal with a 7-joint arm (Gymnasium's Pusher-v5).
 
-As in Gymnasium, body positions lag by one substep, as ``mj_step`` leaves them. Success, which Gymnasium does not
-define: the cylinder's centre is over the goal's disc.
+As in Gymnasium, body positions lag by one substep, as ``mj_step`` leaves them. An episode succeeds if the
+cylinder's centre is over the goal's disc; Gymnasium defines no success.
 """
 
 import warp as wp
@@ -12,7 +12,7 @@ from lyceum_warp import Row
 
 @wp.struct
 class World:
-    qpos: Row[float]  # 7 angles; y and x of the cylinder, then of the goal, relative to their positions in the model
+    qpos: Row[float]  # 7 angles, y and x of the cylinder, y and x of the goal, relative to the model's positions
     qvel: Row[float]
     xpos: Row[wp.vec3]
 
@@ -23,7 +23,7 @@ class Params:
     reward_near_weight: float = 0.5
     reward_dist_weight: float = 1.0
     reward_control_weight: float = 0.1
-    success_distance: float = 0.08  # the radius of the disc
+    success_distance: float = 0.08  # radius of the disc
     tips: int = lw.body("tips_arm")
     cylinder: int = lw.body("object")
     goal: int = lw.body("goal")

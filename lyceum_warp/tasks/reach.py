@@ -1,8 +1,8 @@
 """Reach: move the hand of a 7-joint arm to a target in space (the arm that the Lyceum paper calls Sawyer).
 
-The model has no gravity. The target is a mocap body, and so part of the state. Success: the mean distance over the
-last ten steps is below 5 cm. With ``random_start`` one episode in five begins with the palm inside the table, and
-contact forces push it out.
+The model has no gravity. The target is a mocap body, so that it is part of the state. Success: the hand's mean distance
+from the target over the last ten steps is below 5 cm. With ``random_start`` one episode in five begins with the palm
+inside the table, and contact forces push it out.
 """
 
 import warp as wp
@@ -11,9 +11,9 @@ import lyceum_warp as lw
 from lyceum_warp import Row
 
 REMEMBERED = 10
-"""Number of steps over which the distance is averaged."""
+"""The number of steps over which the distance is averaged."""
 FAR = 10.0
-"""Initial value of the distances in memory, m: large enough to prevent success before the tenth step."""
+"""The initial value of the distances in memory, m, so large that success is impossible before the tenth step."""
 
 
 @wp.struct
@@ -23,14 +23,14 @@ class World:
     site_xpos: Row[wp.vec3]
     mocap_pos: Row[wp.vec3]
     jnt_range: Row[wp.vec2]
-    distances: Row[float] = lw.memory(REMEMBERED)  # distances, m; the latest is last
+    distances: Row[float] = lw.memory(REMEMBERED)  # distances, m, with the latest last
 
 
 @wp.struct
 class Params:
     dt: float
     success_distance: float = 0.05
-    random_start: bool = False  # the paper's text draws joints from their ranges; its code sets them to zero
+    random_start: bool = False  # initial joints are random in the paper's text, zero in its code
     target_range: wp.vec3 = wp.vec3(0.3, 0.2, 0.25)
     finger: int = lw.site("finger")
     target: int = lw.mocap("target")
@@ -95,6 +95,6 @@ class Reach(lw.Task):
     frame_skip = 2
     obs = {"position": 7, "velocity": 7, "hand": 3, "error": 3}
     horizon = 75
-    physics = {"fast": lw.PhysicsOptions(frame_skip=1, timestep=0.02)}  # 1.7 times faster, returns within 0.2 %
-    # the paper's settings; its inverse temperature is 5
+    physics = {"fast": lw.PhysicsOptions(frame_skip=1, timestep=0.02)}  # 1.7 times faster, with returns within 0.2 %
+    # the paper's settings, with its inverse temperature of 5
     planning = lw.Planning(settings={"horizon": 16, "samples": 30, "temperature": 0.2, "noise": 1.0})

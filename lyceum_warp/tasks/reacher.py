@@ -1,7 +1,7 @@
 """Reacher: move the tip of a planar arm of two links to a target (Gymnasium's Reacher-v5).
 
-As in Gymnasium, body positions lag by one substep, as ``mj_step`` leaves them. Success, which Gymnasium does not
-define: the tip touches the target.
+As in Gymnasium, body positions lag by one substep, as ``mj_step`` leaves them. An episode succeeds if the tip
+touches the target; Gymnasium defines no success.
 """
 
 import warp as wp
@@ -12,7 +12,7 @@ from lyceum_warp import Row
 
 @wp.struct
 class World:
-    qpos: Row[float]  # two angles, then x and y of the target
+    qpos: Row[float]  # two angles, x and y of the target
     qvel: Row[float]
     xpos: Row[wp.vec3]
 
@@ -22,7 +22,7 @@ class Params:
     dt: float
     reward_dist_weight: float = 1.0
     reward_control_weight: float = 1.0
-    success_distance: float = 0.019  # the sum of both spheres' radii
+    success_distance: float = 0.019  # sum of both spheres' radii
     fingertip: int = lw.body("fingertip")
     target: int = lw.body("target")
 

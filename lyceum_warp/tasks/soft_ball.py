@@ -10,7 +10,7 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row
 
-NODE = 4  # first index of the ball in qpos and qvel, after the gripper's joints: 8 corners with 3 numbers each
+NODE = 4  # the ball's first index in qpos and qvel, after the gripper's joints; it has 8 corners with 3 numbers each
 
 
 @wp.struct
@@ -26,9 +26,9 @@ class World:
 class Params:
     dt: float
     success_distance: float = 0.03
-    reach: float = 0.4  # the ball is lost beyond this distance from the origin, m
+    reach: float = 0.4  # an episode ends if the ball is further from the origin, m
     diameter: float = 0.09
-    start_range: float = 0.2  # bound of the initial positions of ball and target along x, m
+    start_range: float = 0.2  # largest initial x of ball and target, m
     heights: wp.vec2 = wp.vec2(0.15, 0.3)  # of the target, m
     grip: int = lw.site("grip")
     target: int = lw.mocap("target")

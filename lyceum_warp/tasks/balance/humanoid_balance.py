@@ -2,8 +2,8 @@
 
 Actions are offsets of the joints' targets from a default pose with bent knees. The motors act as servos at the control
 rate, within Gymnasium's torque limits. The feet are spheres, so the robot can only balance by stepping and by swinging
-its body. Balance is measured by the distance from the line between the feet to the capture point, where a foot must
-stand to stop the robot (Pratt et al. 2006, "Capture point: a step toward humanoid push recovery").
+its body. Balance is measured by the distance of the capture point from the line between the feet. A foot at the capture
+point would stop the robot (Pratt et al. 2006, "Capture point: a step toward humanoid push recovery").
 
 At each of ``push_times`` the robot gets an impulse in a random horizontal direction: the velocities of all bodies
 change by impulse / mass. Planners do not foresee pushes.
@@ -44,7 +44,7 @@ class Params:
     stiffness: wp.array[float] = [*3 * [80.0], *2 * [60.0, 60.0, 150.0, 100.0], *6 * [10.0]]  # N m / rad
     damping: wp.array[float] = [*3 * [0.0], *2 * [0.0, 0.0, 0.0, 4.0], *6 * [0.0]]  # N m s / rad
     gear: wp.array[float] = lw.from_model(lambda model, p: [float(model.actuator_gear[i, 0]) for i in p.motors])
-    # numbers of the reward terms
+    # parameters of the reward terms
     forward_speed: float = 0.0  # m/s
     target_height: float = 1.22  # of the torso, m
     least_height: float = 0.8
@@ -76,7 +76,7 @@ def velocity(s0: World, s1: World, p: Params) -> wp.vec2:  # height of the centr
     return wp.vec2(moved[0] - p.forward_speed, moved[1])
 
 
-# reward terms; their arguments are found by name
+# reward terms, with arguments that are found by name
 
 
 @wp.func
@@ -223,7 +223,7 @@ def stands(s: World, p: Params) -> bool:
 
 @lw.register
 class HumanoidGetUp(HumanoidStand):
-    """Gymnasium's humanoid gets up from lying on its back or its front; success: it has stood for a second."""
+    """Gymnasium's humanoid gets up from its back or its front, and succeeds if it stands for a second."""
 
     Params, initialize, randomize, success = GetUpParams, lie_down, turn_over, stands
     terminations, success_steps = (), 67

@@ -32,4 +32,4 @@ TASKS = {
     "dm/walker_stand": "dm_walker",
     "dm/walker_walk": "dm_walker",
 }
-"""The modules of the tasks, by the tasks' names; the registry reads them without running this file."""
+"""The modules of the tasks, by task name; the registry reads this dict without running the file."""

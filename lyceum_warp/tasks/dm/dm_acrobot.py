@@ -45,7 +45,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class AcrobotSwingup(lw.Task):
     model, frame_skip = suite.model("acrobot"), 1
     obs = {"orientations": 4, "velocity": 2}
-    # the planner sees a wider target, and coarser physics
+    # the planner's model has a wider target and coarser physics
     planning = lw.Planning(
         settings={"horizon": 75, "samples": 64, "noise": 1.0},
         options={"timestep": 0.02, "integrator": "euler"},

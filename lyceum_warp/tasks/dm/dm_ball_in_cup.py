@@ -10,7 +10,7 @@ from lyceum_warp.tasks.dm import suite
 
 @wp.struct
 class World:
-    qpos: Row[float]  # cup x and z, ball x and z
+    qpos: Row[float]  # x and z of cup and ball
     qvel: Row[float]
     xpos: Row[wp.vec3]
     site_xpos: Row[wp.vec3]
@@ -55,10 +55,10 @@ class BallInCupCatch(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Count contacts, so that no episode starts with one.
+        """Add a sensor that counts contacts, so that no episode starts with a contact.
 
-        A keyframe with the ball in the cup is for the probe of MuJoCo Warp's capacities, which finds too few
-        constraints from the model's initial state alone.
+        Also add a keyframe with the ball in the cup. The probe of MuJoCo Warp's capacities would find too few
+        constraints if it started only in the model's initial state.
         """
         suite.count_contacts(spec)
         spec.add_key(name="caught", qpos=[0.0, 0.0, 0.0, 0.333])

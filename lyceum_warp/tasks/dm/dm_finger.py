@@ -1,6 +1,6 @@
 """FingerSpin: a finger with two joints spins a body.
 
-The target of the turning tasks is a mocap body here, so its position is part of the state.
+The target of the turning tasks is a mocap body, so that its position is part of the state.
 """
 
 import mujoco
@@ -64,7 +64,7 @@ def reject(s: World, p: Params) -> bool:
 class FingerSpin(lw.Task):
     model, frame_skip = suite.model("finger"), 2
     obs = {"position": 4, "velocity": 3, "touch": 2}
-    # the planner's reward begins to rise at rest, and its physics is coarser
+    # the planner's reward rises from rest, and the planner's physics is coarser
     planning = lw.Planning(
         settings={"horizon": 32, "samples": 48},
         options={"timestep": 0.02, "frame_skip": 1},
@@ -73,7 +73,7 @@ class FingerSpin(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Count contacts, so that no episode starts with one; let the body spin easily, and hide the target."""
+        """Count contacts, so that no episode starts with a contact; let the body spin easily, and hide the target."""
         suite.count_contacts(spec)
         spec.joint("hinge").damping[0] = 0.03
         for site in ("target", "tip"):
@@ -134,7 +134,7 @@ class FingerTurnEasy(FingerSpin):
 
     @classmethod
     def edit_model(cls, spec: mujoco.MjSpec) -> None:
-        """Count contacts, so that no episode starts with one; give each world a target of its own."""
+        """Count contacts, so that no episode starts with a contact, and give each world its own target."""
         suite.count_contacts(spec)
         suite.free_target(spec)
         spec.site("target").size[0] = cls.target_radius

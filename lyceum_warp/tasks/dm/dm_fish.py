@@ -10,7 +10,7 @@ from lyceum_warp.tasks.dm import suite
 
 @wp.struct
 class World:
-    qpos: Row[float]  # the free joint, then 7 hinges
+    qpos: Row[float]  # a free joint and 7 hinges
     qvel: Row[float]
     xmat: Row[wp.mat33]
 
@@ -51,7 +51,7 @@ class FishUpright(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Hide the target of the other task."""
+        """Hide the target of FishSwim."""
         spec.geom("target").rgba[3] = 0.0
 
 
@@ -101,7 +101,7 @@ def randomize_swim(s: SwimWorld, p: SwimParams, rng: Row[wp.uint32]):
 class FishSwim(FishUpright):
     """A fish swims to a target.
 
-    The target is a mocap body here, so its position is part of the state.
+    The target is a mocap body, so that its position is part of the state.
     """
 
     World, Params = SwimWorld, SwimParams
@@ -110,5 +110,5 @@ class FishSwim(FishUpright):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Give each world a target of its own."""
+        """Give each world its own target."""
         suite.free_target(spec)

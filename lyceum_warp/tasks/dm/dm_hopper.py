@@ -18,7 +18,7 @@ class World:
 
 @wp.struct
 class Params(suite.RandomJoints):
-    stand_height: float = 0.6  # of the torso above the foot, m
+    stand_height: float = 0.6  # torso above foot, m
     hop_speed: float = 0.0  # m/s
     torso: int = lw.body("torso")
     foot: int = lw.body("foot")

@@ -1,6 +1,6 @@
 """ManipulatorBringBall: a planar arm with a hand brings a ball to a target.
 
-The target is a mocap body here, so its pose is part of the state.
+The target is a mocap body, so that its pose is part of the state.
 """
 
 import mujoco
@@ -13,7 +13,7 @@ from lyceum_warp.tasks.dm import suite
 ARM = ("arm_root", "arm_shoulder", "arm_elbow", "arm_wrist", "finger", "fingertip", "thumb", "thumbtip")
 BALL = ("ball_x", "ball_z", "ball_y")
 TOUCH = ("palm_touch", "finger_touch", "thumb_touch", "fingertip_touch", "thumbtip_touch")
-IN_HAND, IN_TARGET = wp.constant(0.1), wp.constant(0.1)  # probabilities of initial positions of the ball
+IN_HAND, IN_TARGET = wp.constant(0.1), wp.constant(0.1)  # probabilities of the ball's initial positions
 
 
 @wp.struct
@@ -38,7 +38,7 @@ class Params:
             joint.range if model.jnt_limited[joint.id] else (-wp.pi, wp.pi) for joint in map(model.joint, ARM)
         ]
     )
-    links: wp.vec4 = wp.vec4(0.18, 0.15, 0.12, 0.065)  # lengths from the root of the arm to the grasp, m
+    links: wp.vec4 = wp.vec4(0.18, 0.15, 0.12, 0.065)  # lengths of the links, m
     root: wp.vec3 = lw.from_model(lambda model, p: model.body("upper_arm").pos)
     ball_qpos: wp.array[int] = lw.qposes(*BALL)
     ball_dof: wp.array[int] = lw.dofs(*BALL)
@@ -119,10 +119,10 @@ class ManipulatorBringBall(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Count contacts, so that no episode starts with one; give each world a target of its own; remove props.
+        """Count contacts, so that no episode starts with a contact, give each world its own target, and remove props.
 
-        A keyframe with the ball in the hand is for the probe of MuJoCo Warp's capacities, which finds too few
-        constraints from the model's initial state alone.
+        Also add a keyframe with the ball in the hand. The probe of MuJoCo Warp's capacities would find too few
+        constraints if it started only in the model's initial state.
         """
         suite.count_contacts(spec)
         for name in ("peg", "target_peg", "cup", "slot"):

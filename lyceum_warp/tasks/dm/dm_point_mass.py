@@ -43,7 +43,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class PointMassEasy(lw.Task):
     model, frame_skip = suite.model("point_mass"), 1
     obs = {"position": 2, "velocity": 2}
-    # the planner sees a wider target, and coarser physics
+    # the planner's model has a wider target and coarser physics
     planning = lw.Planning(
         settings={"horizon": 50, "temperature": 0.05}, options={"timestep": 0.04}, params={"margin": 0.2}
     )

@@ -10,30 +10,30 @@ import lyceum_warp as lw
 from lyceum_warp import Row, terms
 from lyceum_warp.tasks.dm import suite
 
-RESOLUTION = wp.constant(0.01)  # of the height of a start, m
+RESOLUTION = wp.constant(0.01)  # steps of the initial height, m
 
 
 def solid(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The geoms of the quadruped, at the model's initial pose."""
+    """Return the indices of the quadruped's geoms."""
     return np.flatnonzero(model.geom_bodyid > 0)
 
 
 def centers(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The centres of the geoms in the axes of the torso, m, (geoms, 3)."""
+    """Return the centres of the geoms in the torso's axes, m, (geoms, 3)."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     return data.geom_xpos[p.geoms] - data.xpos[p.torso]
 
 
 def axes(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The axes of the geoms in the axes of the torso, (geoms, 3, 3)."""
+    """Return the axes of the geoms in the torso's axes, (geoms, 3, 3)."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     return data.geom_xmat[p.geoms].reshape(-1, 3, 3)
 
 
 def radii(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The radii of each geom along its axes, m, and the half length of a capsule or a cylinder, (geoms, 4)."""
+    """Return each geom's radii along its axes, and a capsule's or cylinder's half length, m, (geoms, 4)."""
     kind = mujoco.mjtGeom
     found = np.zeros((len(p.geoms), 4))
     for row, geom in zip(found, p.geoms, strict=True):
@@ -47,7 +47,7 @@ def radii(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 @wp.struct
 class World:
-    qpos: Row[float]  # the free joint, then 16 hinges
+    qpos: Row[float]  # a free joint and 16 hinges
     qvel: Row[float]
     act: Row[float]
     xmat: Row[wp.mat33]

@@ -1,6 +1,6 @@
 """SwimmerSwimmer6: a chain of six links swims to a target.
 
-The target is a mocap body here, so its position is part of the state.
+The target is a mocap body, so that its position is part of the state.
 """
 
 import mujoco
@@ -18,7 +18,7 @@ class World:
     xmat: Row[wp.mat33]
     geom_xpos: Row[wp.vec3]
     mocap_pos: Row[wp.vec3]
-    sensordata: Row[float]  # of each link a velocimeter and a gyroscope, after 12 numbers
+    sensordata: Row[float]  # each link's velocimeter and gyroscope follow 12 other numbers
 
 
 @wp.struct
@@ -66,7 +66,7 @@ class SwimmerSwimmer6(lw.Task):
 
     @classmethod
     def edit_model(cls, spec: mujoco.MjSpec) -> None:
-        """Give each world a target of its own, and add the links behind the head."""
+        """Give each world its own target, and add the links behind the head."""
         suite.free_target(spec)
         link, sensor = spec.body("head"), mujoco.mjtSensor
         visual, inertial = spec.find_default("visual"), spec.find_default("inertial")

@@ -17,7 +17,7 @@ def model(domain: str) -> lw.ModelFile:
 
 
 def free_target(spec: mujoco.MjSpec) -> None:
-    """Move the geom or the site "target" into a mocap body "target", so that each world has a target of its own."""
+    """Move the geom or the site "target" into a mocap body "target", so that each world has its own target."""
     fixed = spec.geom("target") or spec.site("target")
     target = spec.worldbody.add_body(name="target", mocap=True, pos=fixed.pos)
     looks = {"name": "target", "type": fixed.type, "size": fixed.size.copy(), "material": fixed.material}
@@ -27,19 +27,19 @@ def free_target(spec: mujoco.MjSpec) -> None:
 
 
 def count_contacts(spec: mujoco.MjSpec) -> None:
-    """Add a sensor "contacts", the number of contacts."""
+    """Add a sensor "contacts", which counts contacts."""
     found = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)
     spec.add_sensor(name="contacts", type=mujoco.mjtSensor.mjSENS_CONTACT, intprm=[found, 0, 1])
 
 
 def random_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The indices in ``qpos`` of the joints that an episode draws: those with limits, and hinges."""
+    """Return the indices in ``qpos`` of the joints with random initial positions: hinges, and joints with limits."""
     drawn = model.jnt_limited.astype(bool) | (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
     return model.jnt_qposadr[drawn]
 
 
 def random_range(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """The range of each drawn joint, (joints, 2); for a hinge without limits, a whole turn."""
+    """Return the range of each drawn joint, (joints, 2), which is a whole turn for a hinge without limits."""
     joints = np.searchsorted(model.jnt_qposadr, p.drawn_joints)
     return np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.pi, np.pi])
 

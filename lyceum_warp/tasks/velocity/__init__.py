@@ -10,4 +10,4 @@ TASKS = {
     "h1_velocity": "h1",
     "t1_velocity": "t1",
 }
-"""Modules of the tasks, by task name; the registry reads this dict without running the file."""
+"""The modules of the tasks, by task name; the registry reads this dict without running the file."""

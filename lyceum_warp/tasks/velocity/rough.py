@@ -1,6 +1,6 @@
-"""Add rough ground to velocity tasks: patches by level, a height scan in both groups, and levels by distance walked.
+"""Add rough ground to velocity tasks: patches with levels of difficulty, a height scan, and changes of level.
 
-The kinds of patches and their columns are from Isaac Lab's rough terrain, the scan from legged_gym.
+The kinds of patches and their columns come from Isaac Lab's rough terrain, and the height scan from legged_gym.
 """
 
 import warp as wp
@@ -19,8 +19,8 @@ TERRAIN = lw.Terrain(
 class World(walking.World):
     level: Row[float] = lw.lasting_memory()
     column: Row[float] = lw.lasting_memory()
-    walked: Row[float] = lw.lasting_memory()  # distance from the centre of the patch, m
-    commanded: Row[float] = lw.lasting_memory()  # distance that an episode at the present command would cover, m
+    walked: Row[float] = lw.lasting_memory()  # the distance from the patch's centre, m
+    commanded: Row[float] = lw.lasting_memory()  # an episode's distance at the present command, m
 
 
 @wp.struct

@@ -1,13 +1,13 @@
 """Define velocity tasks for walking robots, which follow commanded velocities and yaw rates on flat ground.
 
 Actions are offsets of the joints' servo targets from the default pose. A robot's file names the model, the actuated
-joints and the feet, and sets robot-specific numbers; other tables are computed from the model. Observations, rewards,
+joints and the feet, and sets parameters of the robot; tables are computed from the model. Observations, rewards,
 commands, pushes and resets are taken from mjlab 1.6.0's velocity tasks.
 
-The base is the body of the first joint, which is free. Functions read the state after the last substep. Only the forces
-on the feet belong to the beginning of that substep; they are 0 at the start of an episode. Positions and velocities of
-the feet are computed from the joints, which saves a forward pass. A foot is in contact if a sphere of its sole
-(``soles``) reaches the ground. Only ``ground`` and ``distance`` depend on the shape of the ground.
+The robot's base is the body of the model's first joint, a free joint. Functions read the state after the last substep.
+Only the forces on the feet belong to the start of the last substep, and they are 0 at the start of an episode.
+Positions and velocities of the feet are computed from the joints, which saves a forward pass. A foot is in contact if a
+sphere of its sole (``soles``) reaches the ground. Only ``ground`` and ``distance`` depend on the shape of the ground.
 """
 
 import math
@@ -18,7 +18,7 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row, terms, walkers
 
-# terms and their arguments
+# terms, and arguments of terms
 from lyceum_warp.terms import (  # noqa: F401
     action_rate_l2,
     active,
@@ -44,23 +44,23 @@ from lyceum_warp.terms import (  # noqa: F401
 class World:
     qpos: Row[float]
     qvel: Row[float]
-    sensordata: Row[float]  # forces on the feet, in the world's axes, N
+    sensordata: Row[float]  # forces on the feet in the world's axes, N
     body_ipos: Row[wp.vec3]
     jnt_range: Row[wp.vec2]
     geom_friction: Row[wp.vec3]
-    drawn_velocity: Row[wp.vec3] = lw.memory()  # drawn command: forward velocity, lateral velocity and yaw rate
+    drawn_velocity: Row[wp.vec3] = lw.memory()  # the drawn forward velocity, lateral velocity and yaw rate
     heading_target: Row[float] = lw.memory()  # commanded heading, rad
-    heading_controlled: Row[float] = lw.memory()  # 1 if the heading determines the yaw rate
-    standing: Row[float] = lw.memory()  # 1 if the command is to stand
-    command_timer: Row[float] = lw.memory()  # seconds until a new command
+    heading_controlled: Row[float] = lw.memory()  # 1 if the yaw rate follows the heading
+    standing: Row[float] = lw.memory()  # 1 if the robot should stand
+    command_timer: Row[float] = lw.memory()  # seconds until the next command
     push_timer: Row[float] = lw.memory()  # seconds until a push
     last_action: Row[float] = lw.memory("joints")
     previous_action: Row[float] = lw.memory("joints")
-    contact_time: Row[float] = lw.memory("feet")  # seconds since each foot came into contact; 0 in the air
-    air_time: Row[float] = lw.memory("feet")  # seconds since each foot left the ground; 0 in contact
-    swing_height: Row[float] = lw.memory("feet")  # greatest height of each foot in its last swing, m
+    contact_time: Row[float] = lw.memory("feet")  # seconds of each foot's contact; 0 in the air
+    air_time: Row[float] = lw.memory("feet")  # seconds of each foot's swing; 0 in contact
+    swing_height: Row[float] = lw.memory("feet")  # greatest height in each foot's last swing, m
     encoder_bias: Row[float] = lw.lasting_memory("joints")  # rad
-    peak_height: Row[float] = lw.lasting_memory("feet")  # greatest height of each foot since its last landing, m
+    peak_height: Row[float] = lw.lasting_memory("feet")  # greatest height since each foot's last landing, m
     env_steps: Row[float] = lw.lasting_memory()
 
 
@@ -68,11 +68,11 @@ class World:
 class Params:
     dt: float
     substep_dt: float
-    # the robot: actuated joints, sites of the feet, and values computed from them
+    # parameters of the robot: joints, feet, and tables that are computed from both
     joints: wp.array[int] = lw.joints()
     feet: wp.array[int] = lw.sites()
     trunk: int = lw.from_model(walkers.base)
-    imu: wp.vec3 = wp.vec3(0.0)  # position of the velocimeter on the base, m
+    imu: wp.vec3 = wp.vec3(0.0)  # the velocimeter's position on the base, m
     joint_qpos: wp.array[int] = lw.from_model(walkers.joint_qpos)
     joint_dof: wp.array[int] = lw.from_model(walkers.joint_dof)
     controls: wp.array[int] = lw.from_model(walkers.controls)
@@ -84,31 +84,31 @@ class Params:
     foot_geoms: wp.array[int] = lw.from_model(walkers.foot_geoms)
     foot_forces: wp.array[int] = lw.from_model(walkers.foot_forces)
     soles: wp.array2d[wp.vec4] = lw.from_model(walkers.soles)
-    # numbers of the reward terms
+    # parameters of the reward terms
     linear_velocity_variance: float = 0.25  # (m/s)^2
     angular_velocity_variance: float = 0.5  # (rad/s)^2
     tilt_variance: float = 0.2
     standing_pose_std: wp.array[float] = lw.from_model(lambda model, p: len(p.joints) * [0.05])  # rad
     walking_pose_std: wp.array[float] = lw.from_model(lambda model, p: len(p.joints) * [0.3])
     soft_limit: float = 0.9  # share of a joint's range
-    swing_target: float = 0.1  # height of a foot's site in a swing, m
-    longest_step: float = 0.4  # s; in a longer single stance the term is constant
-    least_command: float = 0.05  # for smaller commands, the gait terms are 0 and the pose term uses standing_pose_std
+    swing_target: float = 0.1  # desired foot height in a swing, m
+    longest_step: float = 0.4  # longest rewarded single stance, s
+    least_command: float = 0.05  # below this, gait terms are 0, and pose uses standing_pose_std
     fall_angle: float = math.radians(70.0)
     least_height: float = 0.0  # of the base, m
     # actions
     default_pose: wp.array[float] = lw.from_model(walkers.home_pose)  # rad
     action_scale: wp.array[float] = lw.from_model(walkers.quarter_of_force)  # rad
-    # command stages: first step, minimum and maximum forward velocity (m/s), maximum yaw rate (rad/s)
+    # stages of the commands: first step, minimum and maximum forward velocity (m/s), maximum yaw rate (rad/s)
     stages: wp.array2d[float] = [[0.0, -1.0, 1.0, 0.5], [120e3, -1.5, 2.0, 0.7], [240e3, -2.0, 3.0, 0.7]]
     lateral_velocity: float = 1.0
     command_seconds: wp.vec2 = wp.vec2(3.0, 8.0)
-    heading_share: float = 0.3  # fraction of commands whose yaw rate follows a heading
+    heading_share: float = 0.3  # fraction of commands with a heading
     heading_gain: float = 0.5  # 1/s
     standing_share: float = 0.1
-    forward_share: float = 0.2  # fraction of commands that are forward only
+    forward_share: float = 0.2  # fraction of commands straight forward
     least_forward_velocity: float = 0.3
-    # bounds of the uniform noise on the policy's observations
+    # largest uniform noise on the policy's observations
     linear_velocity_noise: float = 0.5
     angular_velocity_noise: float = 0.2
     gravity_noise: float = 0.05
@@ -120,7 +120,7 @@ class Params:
     push_spin: wp.vec3 = wp.vec3(0.52, 0.52, 0.78)  # largest, in the world's axes, rad/s
     # differences between robots
     encoder_bias: float = 0.015  # largest, rad
-    trunk_offset: wp.vec3 = wp.vec3(0.025, 0.025, 0.03)  # largest shift of the trunk's centre of mass, m
+    trunk_offset: wp.vec3 = wp.vec3(0.025, 0.025, 0.03)  # largest shift of the centre of mass, m
     sliding_friction: wp.vec2 = wp.vec2(0.3, 1.5)
     spinning_friction: wp.vec2 = wp.vec2(1e-4, 2e-2)  # log-uniform, like the rolling friction
     rolling_friction: wp.vec2 = wp.vec2(1e-5, 5e-3)
@@ -340,7 +340,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     draw_command(s, p, rng)
 
 
-# reward terms; their arguments are found by name, and the command belongs to the state before the step
+# arguments of the reward terms are found by name; the command belongs to the state before the step
 
 
 @wp.func
@@ -408,7 +408,7 @@ class Velocity(lw.Task):
     metrics = ("velocity_error", "yaw_rate_error")
     terminations = ("fell_over", "too_low")
     deployment, mirror = staticmethod(walkers.deployment), staticmethod(walkers.mirror)
-    cleared = ("sensordata",)  # zero before the first substep; mjlab computes the value for the first state
+    cleared = ("sensordata",)  # the forces are zero before the first substep; mjlab computes them for the first state
 
 
 @wp.struct
@@ -420,7 +420,10 @@ class BipedParams(Params):
 
 
 class Biped(Velocity):
-    """A robot with two legs, which is rewarded for steps and for a calm trunk. Two sites mark the feet."""
+    """A robot with two legs that follows velocity commands, with rewards for steps and for a calm trunk.
+
+    Two sites mark the feet.
+    """
 
     frame_skip, keyframe = 5, "home"
     training = lw.Training(algorithm="ppo", settings={"log_std": -0.7}, iterations=800)
