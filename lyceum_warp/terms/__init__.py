@@ -1,7 +1,7 @@
 """Offer reward terms, commands, contact clocks, noise, random draws and motors as functions of values and rows.
 
 Every function is a ``wp.func`` of numbers, vectors, rows of ``World`` and tables of ``Params``, so it works in any
-task. Arguments of the same name mean the same in all functions; ``ARGUMENTS`` explains them.
+task. An argument's name has the same meaning in all functions; ``ARGUMENTS`` explains the names.
 """
 
 from lyceum_warp.support.docstrings import document_arguments
@@ -176,7 +176,8 @@ ARGUMENTS = {
     "wanted_air_time": "least seconds of a swing that is rewarded",
     "width": "numbers in one value of a history",
 }
-"""The meanings of the functions' arguments. "memory" is a row of the task's memory, "table" an array of Params."""
+"""The meanings of the functions' arguments by name. "memory" stands for a row of the task's memory, "table" for an
+array of Params."""
 
 for _name in __all__:
     document_arguments(globals()[_name], ARGUMENTS)

@@ -1,8 +1,9 @@
 """Time the contacts of feet, and compute reward terms for their swings, slips and landings.
 
-All tables list the feet in the same order: ``feet`` (sites), ``foot_velocities``, ``foot_forces`` and ``foot_contacts``
-(sensors), and rows of memory with one element per foot. Call the clocks in ``substep`` and ``follow_swing`` in
-``advance``. Heights are measured from the plane z = 0; on other ground, sum ``clearance`` over the feet.
+The tables ``feet`` (sites), ``foot_velocities``, ``foot_forces`` and ``foot_contacts`` (sensors) list the feet in the
+same order, and so do the rows of memory with one element per foot. Call ``run_clocks`` in ``substep``, and
+``follow_swing`` in ``advance``. Heights are measured from the plane z = 0; on uneven ground, a task must sum
+``clearance`` over the feet.
 """
 
 import warp as wp

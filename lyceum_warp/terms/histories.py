@@ -1,7 +1,7 @@
 """Keep the last values of a row in a ring, for observation histories and delays.
 
-To store the last n values of ``width`` numbers, declare ``history: Row[float] = lw.memory(1 + n * width)``: a counter,
-and the ring. At the start of an episode the memory is 0, which means an empty history.
+To store the last n values of ``width`` numbers, declare ``history: Row[float] = lw.memory(1 + n * width)``. The row
+holds a counter and the ring. Memory is 0 at the start of an episode, so the history is empty.
 """
 
 import warp as wp

@@ -1,4 +1,4 @@
-"""Push a robot in mid-episode."""
+"""Push a robot within an episode."""
 
 import warp as wp
 

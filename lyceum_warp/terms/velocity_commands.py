@@ -1,6 +1,6 @@
 """Draw, time and read velocity commands: (forward velocity, lateral velocity, yaw rate) in the base's axes.
 
-The parts of a command are rows of memory, each drawn by one call::
+A command has several parts, which are rows of memory. A call draws each part::
 
     terms.draw_timer(s.command_timer, p.command_seconds, rng)
     terms.draw_velocity(s.drawn_velocity, p.command_low, p.command_high, rng)
@@ -8,7 +8,8 @@ The parts of a command are rows of memory, each drawn by one call::
     terms.draw_flag(s.standing, p.standing_share, rng)
     terms.draw_forward_only(s.drawn_velocity, p.forward_share, p.least_forward_velocity, rng)
 
-The order follows ``UniformVelocityCommand`` of mjlab 1.6.0. ``velocity_command`` computes the command from the parts.
+The order of the calls follows ``UniformVelocityCommand`` of mjlab 1.6.0. ``velocity_command`` computes the command from
+the parts.
 """
 
 import warp as wp

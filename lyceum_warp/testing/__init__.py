@@ -1,7 +1,7 @@
 """Check the rules of an environment for any task on any engine.
 
-Each check is one rule. A check takes the environments under test, raises an AssertionError that names the task, the
-engine, the rule, the values, the seed and a world's state, and leaves the environments usable for the next check.
+Each check tests one rule. A check takes the environments under test, and leaves them usable for the next check. Its
+AssertionError names the task, the engine, the rule, the values, the seed and a world's state.
 """
 
 import dataclasses
@@ -34,26 +34,26 @@ CHECKS: tuple[Callable[[Context], None], ...] = tuple(
     for name, value in vars(module).items()
     if name.startswith("check_")
 )
-"""All checks, the functions ``check_*`` of the rule modules, in the order in which they run."""
+"""All checks in the order in which they run: the functions ``check_*`` of the rule modules."""
 
 
 @document_attributes
 @dataclasses.dataclass
 class Report:
-    """The result of ``check_task`` for a task that follows every rule."""
+    """Reports the result of ``check_task`` for a task that follows every rule."""
 
     task: str
     """The task's name."""
     engine: str
     """The engine's name."""
     device: str
-    """The device that the worlds stepped on."""
+    """The device of the worlds."""
     nworld: int
     """Number of worlds."""
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    """Duration of each check, by the name of its rule."""
+    """The duration of each check in seconds, by the rule's name."""
     unused: list[str] = dataclasses.field(default_factory=list)
-    """Unused parts of the task: functions that are never called, and memory that is never read."""
+    """The unused parts of the task: functions that are never called, and memory that is never read."""
 
     def __str__(self) -> str:
         head = f"{self.task} on the {self.engine} engine ({self.device}, {self.nworld} worlds) keeps the rules:"
@@ -75,8 +75,8 @@ def check_task(
     """Check that a task follows every rule of an environment on an engine.
 
     Args:
-        task: Name of a task, a file with one, or its class.
-        engine: See ``make``; or an engine class (see ``engines.base``).
+        task: The name, the file or the class of a task.
+        engine: The engine's name, as for ``make``, or an engine class (see ``engines.base``).
         device: See ``make``.
         nworld: Number of worlds, at least 2.
         steps: Number of steps in long checks (determinism, memory).
@@ -86,17 +86,17 @@ def check_task(
             by default, because the rules compare numbers bit for bit.
 
     Returns:
-        A report of the checks, which can be printed.
+        A printable report of the checks.
 
     Raises:
         AssertionError: Rules are broken; the message lists them.
-        ValueError: There are fewer than 2 worlds or no step, or an option does not fit.
+        ValueError: ``nworld`` is less than 2, ``steps`` is less than 1, or an option does not fit.
 
     Example:
         >>> print(check_task("hopper", engine="mujoco"))
     """
     if nworld < 2:
-        raise ValueError(f"the checks compare worlds with one another: nworld must be at least 2, not {nworld}")
+        raise ValueError(f"the checks compare worlds: nworld must be at least 2, not {nworld}")
     steps = whole_number("steps", steps, low=1)
     if str(device or "").startswith("cuda"):
         options = {"deterministic": True} | options
@@ -111,7 +111,7 @@ def check_task(
     for check in checks:
         ctx.rule = check.__name__.removeprefix("check_")
         start = time.perf_counter()
-        ctx.restart()  # so that a result does not depend on earlier checks
+        ctx.restart()  # reset, so that results do not depend on earlier checks
         try:
             check(ctx)
         except AssertionError as error:

@@ -7,7 +7,7 @@ from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 
 
 def check_spaces(ctx: Context) -> None:
-    """Every space has the shape and type of its buffer, its parts cover it, and lower bounds are below upper ones."""
+    """Every space has its buffer's shape and type, parts that cover it, and lower bounds below upper bounds."""
     env = ctx.a
     pairs = {
         "obs": (env.obs_space, env.obs), "action": (env.action_space, env.action),
@@ -58,7 +58,7 @@ def check_addresses(ctx: Context) -> None:
 
 
 def check_getters(ctx: Context) -> None:
-    """``get_x(out=)`` writes the result of ``get_x()``, a copy of ``env.x``."""
+    """A getter ``get_x`` returns a copy of ``env.x``, and ``get_x(out=)`` writes the same values."""
     env = ctx.a
     ctx.restart()
     for action in ctx.actions(3):

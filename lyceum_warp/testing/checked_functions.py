@@ -1,7 +1,7 @@
 """Copy a task's functions with a bounds check for every index, and make kernels that run the copies.
 
 In a copy each index of a row, a vector or a matrix goes through a function that compares it with the size, and each
-``while`` loop counts its iterations. Nothing else changes, so a copy computes the same numbers. Native functions
+``while`` loop counts its iterations. A copy is otherwise unchanged, so it computes the same numbers. Native functions
 (``wp.func_native``) are C++ and cannot be checked.
 """
 
@@ -24,18 +24,18 @@ _SHAPES = ("shape", "strides")
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """An index or a loop in the source of a function."""
+    """An index or a loop in a function's source."""
 
     function: str
     text: str
-    """The expression with the index, as in the source."""
+    """The source of the expression with the index."""
     where: str
-    """The file and the line."""
+    """The file and the line of the index."""
     verb: str
-    """The action: reads, writes or loops."""
+    """The kind of access: reads, writes or loops."""
 
     def problem(self, index: int, size: int) -> str:
-        """The message about an index out of range, or about an endless loop."""
+        """Return the message about an index out of range, or about an endless loop."""
         if self.verb == "loops":
             rounds = int(index_checks.MOST_ROUNDS)
             return f"{self.function} is still in its loop {self.text!r} after {rounds} rounds ({self.where})"
@@ -47,19 +47,20 @@ _HELPERS = {
     "bounds_at": index_checks.at, "bounds_from_end": index_checks.from_end, "bounds_element": index_checks.element,
     "bounds_is_endless": index_checks.is_endless,
 }  # fmt: skip
-"""Functions that the copies call, under names that a task is unlikely to use."""
+"""The functions that the copies call, under names that a task is unlikely to use."""
 
 
 class Unchecked(Exception):  # noqa: N818
-    """A function can't be checked; the message says why."""
+    """Raised if a function can't be checked; the message gives the reason."""
 
 
 class CheckedFunctions:
-    """The checked copies of some functions, with a kernel for each.
+    """Makes checked copies of functions, and a kernel for each copy.
 
-    A kernel's arguments are the report and, for each argument of the function, the values of all worlds: a ``Batch``
-    for World, (nworld,) or (1,) for Params, (nworld, size) for a row. The report, (places, 3) int32, has a row per
-    indexing expression: how often its index was out of range, the first such index, and the size of the array.
+    A kernel takes the report and, for each argument of the function, the values of all worlds. These are a ``Batch``
+    for World, (nworld,) or (1,) for Params, and (nworld, size) for a row. The report, (places, 3) int32, has a row per
+    indexing expression. A row holds how often the index was out of range, the first such index, and the size of the
+    array.
 
     Raises:
         Unchecked: A function can't be copied.
@@ -72,7 +73,7 @@ class CheckedFunctions:
         self._copies: dict[int, wp.Function] = {}
         self._scopes: list[tuple[dict[str, Any], list[int]]] = []
         self.kernels = {name: self._kernel(name, function) for name, function in functions.items()}
-        for scope, numbers in self._scopes:  # after all copies are made, because functions may call each other
+        for scope, numbers in self._scopes:  # make kernels after all copies, because functions may call each other
             scope |= {f"bounds_{number}": self._copies[number] for number in numbers}
 
     def load(self, device: wp.Device) -> None:
@@ -87,12 +88,12 @@ class CheckedFunctions:
         return wp.zeros((max(len(self.places), 1), 3), dtype=int, device=device)
 
     def problems(self, report: wp.array) -> list[str]:
-        """The messages for a report, one line each."""
+        """Return the messages for a report, one line each."""
         found: np.ndarray = report.numpy()
         return list(dict.fromkeys(place.problem(*found[i, 1:]) for i, place in enumerate(self.places) if found[i, 0]))
 
     def place(self, source: FunctionSource, node: ast.AST, text: str, verb: str) -> int:
-        """Add a place, and return its number."""
+        """Add an index or a loop to the report, and return the number of its row."""
         self.places.append(Place(source.name, text, source.place(node), verb))
         return len(self.places) - 1
 
@@ -126,7 +127,7 @@ class CheckedFunctions:
         types |= {"bounds_report_type": wp.array2d(dtype=int), "bounds_result_type": returned}
         scope = source.scope | _HELPERS | types | defaults
         scope |= {"bounds_wp": wp, "bounds_module": wp.get_module(self._module)}
-        if number in self._copies:  # Warp then adds the new copy as an overload
+        if number in self._copies:  # with the same key, Warp adds the new copy as an overload
             scope[tree.name] = self._copies[number]
         self._scopes.append((scope, rewriter.callees))
         self._run(ast.unparse(ast.fix_missing_locations(tree)), scope, len(self._scopes))
@@ -138,7 +139,7 @@ class CheckedFunctions:
         sources.run_source(text, f"<{self._module} {part}>", scope)
 
     def _kernel(self, name: str, function: wp.Function) -> wp.Kernel:
-        """The kernel that runs a function's copy in every world."""
+        """Make the kernel that runs a function's copy in every world."""
         number = self.number(function)
         scope: dict[str, Any] = {"wp": wp, "copy": self._copies[number]}
         arguments, lines, values = ["report: wp.array2d[int]"], ["w = wp.tid()"], ["report"]
@@ -168,7 +169,7 @@ class _Rewriter(ast.NodeTransformer):
         """Whether the current expression is part of an assignment target."""
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
-        """Do not visit the annotation."""
+        """Visit the assigned value, but not the annotation."""
         node.target = self.visit(node.target)
         node.value = node.value and self.visit(node.value)
         return node
@@ -201,7 +202,7 @@ class _Rewriter(ast.NodeTransformer):
         if kind == "static":
             return node
         if callee is None and self.source.is_static(node.func):
-            raise Unchecked(f"{self.source.name} calls a function that a loop chooses ({self.source.place(node)})")
+            raise Unchecked(f"{self.source.name} calls a function that a loop selects ({self.source.place(node)})")
         if kind == "native" and any(is_row(given) or is_struct(given) for given in callee.input_types.values()):
             raise Unchecked(
                 f"{self.source.name} calls the native function {name_of(callee)} ({self.source.place(node)}), which "
@@ -251,13 +252,13 @@ class _Rewriter(ast.NodeTransformer):
         return node
 
     def _is_constant(self, node: ast.Subscript) -> bool:
-        """Whether the subscript belongs to a type, a tuple or a shape, for which Warp requires a constant index."""
+        """Whether a subscript belongs to a type, a tuple or a shape, for which Warp requires a constant index."""
         value = self.source.value(node.value)
         type_or_tuple = value is not None and not hasattr(value, "_wp_scalar_type_")
         return type_or_tuple or (isinstance(node.value, ast.Attribute) and node.value.attr in _SHAPES)
 
     def _checked(self, node: ast.AST, text: str, verb: str, base: ast.expr, axis: int, index: ast.expr) -> ast.expr:
-        """The checked index along one axis."""
+        """Return the checked index along one axis."""
         place = ast.Constant(self.checked.place(self.source, node, text, verb))
         for _ in range(axis):
             base = ast.Subscript(_loaded(base), ast.Constant(0), ast.Load())
@@ -303,7 +304,7 @@ def checked_functions(
 ) -> CheckedFunctions:
     """Get the copies of a task's functions, compiled for a device and cached for equal functions.
 
-    ``name`` names their Warp module; ``views`` come from the task's kernels.
+    ``name`` is the name of the copies' Warp module, and ``views`` come from the task's kernels.
 
     Raises:
         Unchecked: A function can't be checked.

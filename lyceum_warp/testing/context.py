@@ -18,22 +18,22 @@ OUTCOMES = (*step_types.OUTCOMES, "obs", "final_obs")
 """The buffers that a step fills."""
 
 SHORT = 8
-"""Number of steps in short checks."""
+"""The number of steps in short checks."""
 
 
 @document_attributes
 @dataclasses.dataclass
 class Context:
-    """Two environments made with the same options, and comparisons that name the rule and the values."""
+    """Holds two environments with the same options, and compares values; errors name the rule and the values."""
 
     a: Env
-    """The environment that most checks use."""
+    """The environment for most checks."""
     b: Env
-    """An environment to compare with."""
+    """A second environment, for comparisons."""
     make: Callable[..., Env]
-    """Makes another environment with the same options and the given changes."""
+    """A function that makes another environment with the same options, except for the given changes."""
     steps: int
-    """Number of steps in long checks."""
+    """The number of steps in long checks."""
     seed: int
     """Seed of the worlds and of the random actions."""
     task: str
@@ -41,10 +41,10 @@ class Context:
     engine: str
     """The engine's name."""
     rule: str = ""
-    """Name of the rule that is being checked."""
+    """The name of the rule that is being checked."""
 
     def fail(self, problem: str, world: int = 0) -> NoReturn:
-        """Raise the AssertionError for a problem, with the seed, and the step and the state of a world of ``a``."""
+        """Raise the AssertionError for a problem, with the seed, the step and the state of a world of ``a``."""
         state, parts = self.a.get_state()[world], self.a.state_space.parts
         values = ", ".join(f"{name} {state[part].tolist()}" for name, part in parts.items())
         where = f"with seed {self.seed}, world {world} in step {int(state[parts['step']])} of its episode: {values}"
@@ -76,7 +76,7 @@ class Context:
             env.rand_reset(self.seed if seed is None else seed)
 
     def actions(self, steps: int, salt: int = 0) -> torch.Tensor:
-        """Random actions within their bounds, or within -1 and 1 if there are none, (steps, nworld, nact)."""
+        """Draw random actions within their bounds, or from -1 to 1 without bounds, (steps, nworld, nact)."""
         env = self.a
         assert env.action_space.low is not None and env.action_space.high is not None
         low = torch.as_tensor(np.where(np.isfinite(env.action_space.low), env.action_space.low, -1.0))
@@ -86,23 +86,23 @@ class Context:
         return (low + draws * (high - low)).to(env.action)
 
     def mask(self, *worlds: int) -> torch.Tensor:
-        """Mask of the given worlds, by default of every second world, (nworld,) bool."""
+        """Return a mask of the given worlds, by default of every second world, (nworld,) bool."""
         numbers = torch.arange(self.a.nworld)
         mask = torch.isin(numbers, torch.tensor(worlds)) if worlds else numbers % 2 == 0
         return mask.to(self.a.action.device)
 
     def faulty(self, env: Env) -> torch.Tensor:
-        """A mask of the worlds that had a fault in the last step, (nworld,) bool."""
+        """Return a mask of the worlds that had a fault in the last step, (nworld,) bool."""
         return (env.done_reason & int(FAULTS)) != 0
 
     def calm(self, env: Env) -> torch.Tensor:
-        """A mask of the worlds that no event changed after the last step, (nworld,) bool."""
+        """Return a mask of the worlds that no event changed after the last step, (nworld,) bool."""
         if env.task.functions["event"] is None:
             return torch.ones_like(env.done)
         return ~env.worlds.changed_view
 
     def run(self, env: Env, actions: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Apply a sequence of actions, and return the state and the outcome of every step, (steps, nworld, ...)."""
+        """Apply a sequence of actions, and return the states and outcomes of all steps, (steps, nworld, ...)."""
         kept: dict[str, list[torch.Tensor]] = {name: [] for name in ("state", "calm", *OUTCOMES)}
         for action in actions:
             env.step(action)
@@ -119,7 +119,7 @@ class Context:
 
     @contextlib.contextmanager
     def changed(self, *envs: Env, **choices: Any) -> Iterator[None]:
-        """Context in which environments have a different ``horizon``, ``autoreset`` or ``graphs``."""
+        """Return a context in which environments have a different ``horizon``, ``autoreset`` or ``graphs``."""
         kept: list[Any] = [
             {"horizon": env.horizon, "autoreset": env.autoreset, "graphs": env.worlds.programs.graphs.enabled}
             for env in envs
@@ -133,7 +133,7 @@ class Context:
                 env.worlds.configure(**values)
 
     def buffers(self, env: Env) -> dict[str, torch.Tensor]:
-        """Copies of an environment's buffers, fields and state."""
+        """Copy an environment's buffers, fields and state."""
         shown = {name: getattr(env, name).clone() for name in (*OUTCOMES, "action", "time")}
         fields = {f"field {name}": torch_view(array).clone() for name, array in env.engine.arrays.items()}
         return shown | fields | {"state": env.get_state()}

@@ -1,4 +1,4 @@
-"""Check the end of episodes, graphs, and the memory that steps use."""
+"""Check how episodes end, whether graphs change results, and whether steps leak memory."""
 
 import gc
 import tracemalloc
@@ -10,7 +10,7 @@ from lyceum_warp.done import Done
 from lyceum_warp.env import Env
 from lyceum_warp.testing.context import Context
 
-# tolerance for the interpreter's caches; a leak of one float per step is 3,200 bytes after 100 steps
+# bytes that the interpreter's caches may take; a leak of one float per step is 3,200 bytes after 100 steps
 _PYTHON_BYTES = 2_048
 
 
@@ -26,8 +26,8 @@ def check_truncation(ctx: Context) -> None:
 
     ``final_obs`` is the last observation of the episode, and ``obs`` the first observation of the next one.
 
-    Truncation does not set ``terminated``. In worlds that continue, both observations are equal. All of this holds for
-    every group of observations.
+    Truncation does not set ``terminated``. In worlds that continue, ``final_obs`` and ``obs`` are equal. These rules
+    hold for every group of observations.
     """
     a, b, horizon = ctx.a, ctx.b, 4
     with ctx.changed(a, horizon=horizon, autoreset=True), ctx.changed(b, horizon=horizon, autoreset=False):
@@ -41,7 +41,7 @@ def check_truncation(ctx: Context) -> None:
             _check_flags(ctx, a)
             ctx.equal(a.truncated, steps >= horizon, f"truncated after {steps.tolist()} steps of an episode")
             going, state = ~a.done & ctx.calm(a), a.get_state()
-            # until a world's first episode ends, its values are the same without automatic resets
+            # automatic resets change no value before the end of a world's first episode
             for name, obs in a.obs_groups.items():
                 final = a.final_obs_groups[name]
                 ctx.equal(final[alive], b.final_obs_groups[name][alive], f"the final group {name} without resets")

@@ -11,7 +11,7 @@ from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 
 
 def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, what: str) -> None:
-    """Cause a fault in one world of env a, and compare with env b, which has no fault."""
+    """Cause a fault in one world of environment a, and compare a with environment b, which has no fault."""
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
     ctx.restart()
     others = ~ctx.mask(bad)
@@ -45,12 +45,12 @@ def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, 
         b.step(action)
         ctx.finite(a, f"{i + 1} steps after {what}")
         again = again or bool(ctx.faulty(a)[bad])
-        diverges = diverges or bool(ctx.faulty(b)[bad])  # the task may be unstable even without this fault
+        diverges = diverges or bool(ctx.faulty(b)[bad])  # the task may be unstable even without the fault
     ctx.that(not again or diverges, f"{what}: the world has another fault")
 
 
 def check_bad_state(ctx: Context) -> None:
-    """A state that is NaN or beyond 1e10 ends its world's episode and changes no other world."""
+    """A state with NaN or a magnitude above 1e10 ends its world's episode, and changes no other world."""
     for part, value in (("qpos", np.nan), ("qvel", np.nan), ("qvel", np.inf), ("qpos", 1e11), ("qvel", -1e11)):
 
         def spoil(env: Env, world: int, part: str = part, value: float = value) -> None:
@@ -72,7 +72,7 @@ def check_bad_action(ctx: Context) -> None:
 
 
 def check_bad_warmstart(ctx: Context) -> None:
-    """A NaN warm start changes no other world, and a reset clears it."""
+    """A warm start with NaN changes no other world, and a reset clears it."""
     a, b, bad = ctx.a, ctx.b, 0
     if "qacc_warmstart" not in a.state_space.parts:
         return
@@ -85,7 +85,7 @@ def check_bad_warmstart(ctx: Context) -> None:
         a.step(action)
         b.step(action)
         if i == 0 and not ctx.faulty(a)[bad]:
-            # without contacts the solver does not read its warm start
+            # the solver reads its warm start only if there are contacts
             ctx.that(torch.isfinite(a.obs[bad]).all(), "the observation is not finite, but there is no fault")
         diverges = diverges or bool(ctx.faulty(b)[bad])
         ctx.that(i == 0 or diverges or not ctx.faulty(a)[bad], f"the world has another fault at step {i}")
@@ -96,12 +96,12 @@ def check_bad_warmstart(ctx: Context) -> None:
 def check_not_finite(ctx: Context) -> None:
     """A reward or an observation that is not finite is a fault of its world, and changes no other world.
 
-    Each parameter of the task is made infinite in one world, in turn.
+    The check makes each parameter of the task infinite in one world, one parameter after the other.
     """
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
     others, actions = ~ctx.mask(bad), ctx.actions(2)
     names = [name for name, value in a.task.params.items() if name not in ("dt", "substep_dt") and _is_real(value)]
-    with ctx.changed(a, b, graphs=False):  # values per world would require new graphs
+    with ctx.changed(a, b, graphs=False):  # parameters that differ between worlds require new graphs
         for name in names:
             kept = a.task.params[name]
             ctx.restart()

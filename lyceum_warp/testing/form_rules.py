@@ -9,7 +9,7 @@ from lyceum_warp.world_arrays import memory_columns
 
 
 def check_groups(ctx: Context) -> None:
-    """The group ``policy`` is ``env.obs``, and a fault leaves the last valid observation of every group."""
+    """The group ``policy`` equals ``env.obs``, and after a fault every group keeps its last valid observation."""
     a = ctx.a
     ctx.that(a.obs is a.obs_groups["policy"], "the group policy is not env.obs")
     ctx.that(a.final_obs is a.final_obs_groups["policy"], "the final group policy is not env.final_obs")
@@ -28,7 +28,7 @@ def check_groups(ctx: Context) -> None:
 
 
 def check_noise(ctx: Context) -> None:
-    """The noise of an observation is a function of the state, and differs between worlds, episodes and steps."""
+    """An observation's noise depends only on the state, and differs between worlds, episodes and steps."""
     env = ctx.a
     if not env.task.noisy_groups:
         return
@@ -37,7 +37,7 @@ def check_noise(ctx: Context) -> None:
     state = env.get_state()
     ctx.equal(env.get_obs(state), env.obs, "the noise of a state")
     parts = env.state_space.parts
-    # copies of one state that differ only in their position in the random stream
+    # these copies of a state differ only in their position in the random stream
     same = state[:1].expand_as(state).contiguous()
     changes: dict[str, torch.Tensor] = {"key": state[:, parts["key"]]}
     for name in ("episode", "step"):
@@ -48,13 +48,13 @@ def check_noise(ctx: Context) -> None:
         moved[:, parts[name]] = values
         shown = [env.get_obs(moved, group=group) for group in env.task.noisy_groups]
         differ[name] = any(bool((obs[1:] != obs[:1]).any(dim=1).all()) for obs in shown)
-    if any(differ.values()):  # the scale of the noise may be 0
+    if any(differ.values()):  # a task's noise may have scale 0
         for name, found in differ.items():
             ctx.that(found, f"the noise is the same for every {'world' if name == 'key' else name}")
 
 
 def check_metrics(ctx: Context) -> None:
-    """``episode_metrics`` sum ``metrics`` over an episode, belong to the state, and skip faults."""
+    """``episode_metrics`` are the sums of ``metrics`` over an episode without faults, and belong to the state."""
     a, b, horizon = ctx.a, ctx.b, 4
     if not a.metrics:
         return
@@ -86,11 +86,11 @@ def check_metrics(ctx: Context) -> None:
 
 
 def check_success_steps(ctx: Context) -> None:
-    """``success`` requires ``success_steps`` successful steps in a row.
+    """``success`` requires ``success_steps`` consecutive steps that meet the goal.
 
-    The count belongs to the state; a reset clears it.
+    The count of such steps belongs to the state, and a reset clears it.
 
-    To find whether a state meets the goal, the check sets the state with a full count and reads ``success``.
+    The check finds whether a state meets the goal by setting the state with a full count and reading ``success``.
     """
     a, b, needed = ctx.a, ctx.b, int(ctx.a.task.task.success_steps)
     if needed == 1:
@@ -111,7 +111,7 @@ def check_success_steps(ctx: Context) -> None:
             full = state.clone()
             full[:, column] = float(needed)
             b.set_state(full)
-            calm = ctx.calm(a) & good  # an event changes the state after it was judged
+            calm = ctx.calm(a) & good  # an event changes the state after the step is judged
             count = torch.where(calm & b.success, (count + 1).clamp(max=needed), 0.0)
             ctx.equal(found[calm], count[calm], f"the count of steps in a row after step {i}")
             ctx.equal(a.success[good], found[good] == needed, f"success of step {i} with the counts {found.tolist()}")
@@ -124,9 +124,9 @@ def check_success_steps(ctx: Context) -> None:
 
 
 def check_events(ctx: Context) -> None:
-    """An event runs after a step is judged, and changes the state and the next observation of some worlds.
+    """An event runs after a step's reward and end are computed, and changes some worlds' states and next observations.
 
-    Events do not run in worlds that restart, and worlds without an event keep every bit.
+    Events do not run in worlds that restart, and do not change any bit of worlds without an event.
     """
     a, b = ctx.a, ctx.b
     if a.task.functions["event"] is None:
@@ -194,7 +194,7 @@ def check_substep(ctx: Context) -> None:
 
 
 def check_lasting_memory(ctx: Context) -> None:
-    """Lasting memory outlives resets; ``rand_reset(seed)`` clears it."""
+    """Resets preserve lasting memory, except ``rand_reset(seed)``, which clears it."""
     a, b = ctx.a, ctx.b
     if (columns := memory_columns(a.task, a.state_space).get("lasting_memory")) is None:
         return

@@ -15,20 +15,20 @@ from lyceum_warp.testing.context import Context
 from lyceum_warp.worlds import Worlds
 
 _RESET = ("startup", "initialize", "randomize")
-"""The functions that a reset runs, in order."""
+"""The functions of a reset, in order."""
 
 _FEW = 20
-"""Number of steps on a slow engine, MuJoCo Warp on a CPU."""
+"""The number of steps on a slow engine: MuJoCo Warp on a CPU."""
 
 _MOST_LISTED = 8
-"""Maximum number of problems listed in a failure message."""
+"""The maximum number of problems that a failure message lists."""
 
 
 def check_bounds(ctx: Context) -> None:
     """No function of the task reads or writes a row, a vector or a matrix out of range.
 
-    A negative index, which Warp counts from the end, is out of range, too, unless it is a constant such as ``-1``.
-    Copies of the functions with checks run on the states of random steps.
+    Warp counts negative indices from the end; the check allows only constants such as ``-1``. The check runs
+    instrumented copies of the functions on the states of random steps.
     """
     run = _Run(ctx)
     with ctx.changed(ctx.a, autoreset=False):
@@ -70,11 +70,11 @@ class _Run:
         self.rows["ended"] = wp.full(1, True, dtype=bool, device=self.env.device)
 
     def steps(self) -> None:
-        """Run the functions on the states of random steps and of resets between them."""
+        """Run the functions on the states of random steps, and of resets between the steps."""
         env = self.env
         self._keep_start()
         self.ctx.restart()
-        # the functions are the same on every engine, so a few steps suffice on a slow engine
+        # functions are the same on every engine, so a few steps suffice on a slow engine
         slow = env.engine.capturable and env.device.is_cpu
         for i, action in enumerate(self.ctx.actions(min(self.ctx.steps, _FEW) if slow else self.ctx.steps)):
             ended = env.done.clone()
@@ -92,9 +92,9 @@ class _Run:
             self._run_step(self.worlds)
 
     def _run_before_restart(self, state: torch.Tensor, action: torch.Tensor) -> None:
-        """Run a step's functions on the state in which a fault ended the episode, before ``env`` restarts.
+        """Run a step's functions on the state in which a fault ended the episode, before the world restarts.
 
-        A read out of range may return NaN and so cause the fault.
+        A read out of range may have caused the fault by returning NaN.
         """
         env = self.ctx.b
         env.set_state(state)
@@ -112,7 +112,7 @@ class _Run:
                 continue
             if dirty:
                 self._copy(worlds.after, self.after)
-            if name == "advance":  # the function gets the memory of the previous step
+            if name == "advance":  # advance gets the memory of the previous step
                 for memory in MEMORIES:
                     if memory in self.env.task.types:
                         wp.copy(getattr(self.after, memory), getattr(self.before, memory))
@@ -138,7 +138,7 @@ class _Run:
         env.reset()
 
     def _run(self, name: str, state: Any) -> None:
-        """Run the copy of a function, if the task has it; ``state`` is ``s`` or ``s1``."""
+        """Run the copy of a function, if the task has such a function; ``state`` is its argument ``s`` or ``s1``."""
         if name not in self.functions:
             return
         draws = self.rng.integers(0, 2**32, (self.env.nworld, 1), dtype=np.uint32)
@@ -149,13 +149,13 @@ class _Run:
             values["obs"] = self.obs[name]
         types = self.functions[name].input_types
         form = FUNCTIONS.get("observe" if name in self.obs else name)
-        names = form.argument_names[: len(types)] if form else types  # the problems belong to a generated function
+        names = form.argument_names[: len(types)] if form else types  # a generated function has its own argument names
         given = [values[argument] for argument in names]
         kernel = self.checked.kernels[name]
         wp.launch(kernel, self.env.nworld, [self.report, *given], device=self.env.device)
 
     def _batch(self) -> Any:
-        """Arrays for copies of the task's fields."""
+        """Allocate arrays for copies of the task's fields."""
         batch = self.env.task.kernels.Batch()
         for name in self.env.task.types:
             live = getattr(self.worlds.after, name)
@@ -165,7 +165,10 @@ class _Run:
         return batch
 
     def _array(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        """An array of zeros. An empty row has memory for one element, which a checked function may access."""
+        """Allocate an array of zeros.
+
+        An empty array gets memory for one element, because a checked function may access it.
+        """
         with wp.ScopedDevice(self.env.device):
             made: wp.array = wp.zeros([max(size, 1) for size in shape], dtype=dtype)
             self.keep.append(made)

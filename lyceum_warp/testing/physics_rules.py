@@ -1,6 +1,6 @@
 """Check the effects of inputs and of model fields that differ between worlds.
 
-The reference is ``mj_step``: an engine's result must be nearer to it than to a simulation without inputs or fields.
+An engine's result must be nearer to the result of ``mj_step`` than to a simulation without inputs or fields.
 """
 
 import copy
@@ -16,22 +16,22 @@ from lyceum_warp.testing.context import SHORT, Context
 from lyceum_warp.world_arrays import memory_columns
 
 _SMALLEST = 1e-4
-"""If inputs and model fields move every coordinate by less than this, coordinates are not compared."""
+"""Coordinates are not compared if inputs and model fields move every coordinate by less than this distance."""
 
 
 def predicted(
     env: Env, before: torch.Tensor, after: torch.Tensor | None = None, *, nstep: int, dynamics: bool = True,
     inputs: bool = True,
 ) -> np.ndarray:  # fmt: skip
-    """The coordinates of every world after ``mj_step``, (nworld, nq), as computed by MuJoCo itself.
+    """Compute the coordinates of every world after ``mj_step`` by MuJoCo itself, (nworld, nq).
 
     Args:
-        env: The environment of the states.
+        env: The environment to which the states belong.
         before: Initial states, (nworld, state_space.size).
         after: States that hold the controls and inputs of the step; by default ``before``.
         nstep: Number of substeps.
-        dynamics: If True, take model fields from ``before``; otherwise use their nominal values.
-        inputs: If True, take inputs from ``after``; otherwise from ``before``.
+        dynamics: Whether to take model fields from ``before`` instead of the nominal values.
+        inputs: Whether to take inputs from ``after`` instead of ``before``.
     """
     parts, size = env.state_space.parts, env.engine.integration_size
     start = before.cpu().numpy().copy()
@@ -73,7 +73,7 @@ def closer(
 
 
 def check_inputs(ctx: Context) -> None:
-    """Inputs written by ``control`` act in the same step and belong to the state; a reset clears them."""
+    """Inputs from ``control`` act in the same step, belong to the state, and are cleared by a reset."""
     env, b = ctx.a, ctx.b
     written = [name for name in INPUTS if name in env.task.writes.get("control", ())]
     if not written:
@@ -85,7 +85,7 @@ def check_inputs(ctx: Context) -> None:
             before = env.get_state()
             b.set_state(before)
             b.action.copy_(action)
-            b.worlds.act()  # compute the inputs without a step
+            b.worlds.act()  # call the task's control without a step
             env.step(action)
             after = env.get_state()
             calm = ctx.calm(env) & ~ctx.faulty(env)
@@ -108,7 +108,7 @@ def check_inputs(ctx: Context) -> None:
 
 
 def check_dynamics(ctx: Context) -> None:
-    """A world's model fields belong to its state and affect its physics; draws never accumulate over resets.
+    """A world's model fields belong to its state and affect its physics, and draws do not accumulate over resets.
 
     ``reset`` restores nominal values, except in fields that are drawn once for each world.
     """
@@ -143,7 +143,7 @@ def check_dynamics(ctx: Context) -> None:
         b.rand_reset(ctx.seed + 7)
         b.set_state(after)
         compare(b, after, "after set_state")
-    # the next draw is the same after many resets as after one reset
+    # many resets and one reset lead to the same next draw
     for _ in range(3 * SHORT):
         a.rand_reset()
     late = a.get_state()

@@ -9,7 +9,7 @@ from lyceum_warp.testing.context import Context
 from lyceum_warp.testing.physics_rules import closer, predicted
 
 _RESETS = 6
-"""Number of resets in the check of rejected draws."""
+"""The number of resets in the check of rejected draws."""
 
 
 def check_keyframe(ctx: Context) -> None:
@@ -18,7 +18,7 @@ def check_keyframe(ctx: Context) -> None:
     if (name := env.task.task.keyframe) is None:
         return
     key = env.task.model.key(name)
-    env.engine.reset(env.worlds.everyone)  # the state before the task's functions change it
+    env.engine.reset(env.worlds.everyone)  # the initial state, before the task's functions change it
     state = env.get_state()
     env.rand_reset(ctx.seed)
     given = {"qpos": key.qpos, "qvel": key.qvel, "act": key.act, "ctrl": key.ctrl, "mocap_pos": key.mpos}
@@ -30,7 +30,7 @@ def check_keyframe(ctx: Context) -> None:
 
 
 def check_rejection(ctx: Context) -> None:
-    """No episode starts in a state that the task rejects, unless all draws are used; worlds draw independently."""
+    """No episode starts in a rejected state before the maximum number of draws; worlds draw independently."""
     a, b = ctx.a, ctx.b
     reject = a.task.kernels.reject_worlds
     if reject is None:

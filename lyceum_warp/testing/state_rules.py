@@ -10,7 +10,10 @@ from lyceum_warp.testing.context import SHORT, Context
 
 
 def check_round_trip(ctx: Context) -> None:
-    """A state that is set and read again is the same. ``get_state`` with a mask writes only rows of masked worlds."""
+    """A state that is set and read again is the same.
+
+    With a mask, ``get_state`` writes only the rows of masked worlds.
+    """
     env = ctx.a
     ctx.restart()
     ctx.run(env, ctx.actions(5))
@@ -26,7 +29,7 @@ def check_round_trip(ctx: Context) -> None:
 
 
 def check_restoring(ctx: Context) -> None:
-    """Steps after ``set_state`` repeat the original steps, through automatic resets and even in another environment."""
+    """Steps after ``set_state`` repeat the original steps, even through automatic resets and in another environment."""
     a, b = ctx.a, ctx.b
     with ctx.changed(a, b, horizon=6):
         ctx.restart()
@@ -42,7 +45,7 @@ def check_restoring(ctx: Context) -> None:
 
 
 def check_masked_restoring(ctx: Context) -> None:
-    """``set_state`` with a mask changes no bit of the other worlds."""
+    """With a mask, ``set_state`` changes no bit of the worlds outside the mask."""
     a, b = ctx.a, ctx.b
     ctx.restart()
     mask = ctx.mask()
@@ -62,7 +65,7 @@ def check_masked_restoring(ctx: Context) -> None:
 
 
 def check_set_state_shows(ctx: Context) -> None:
-    """After ``set_state`` every getter reflects the state that was set."""
+    """After ``set_state`` every getter returns values of the new state."""
     a, b = ctx.a, ctx.b
     has_evaluate = a.task.functions["evaluate"] is not None
     with ctx.changed(a, b, autoreset=False, horizon=0):
@@ -81,15 +84,15 @@ def check_set_state_shows(ctx: Context) -> None:
             if has_evaluate:
                 ctx.equal(b.eval[calm], a.eval[calm], "eval after set_state")
             ctx.that((b.reward == 0).all(), f"the reward after set_state is {b.reward.tolist()}")
-            for name in ("terminated", "done", "done_reason"):  # the end of an episode stays set
+            for name in ("terminated", "done", "done_reason"):  # an ended episode stays ended
                 ctx.equal(getattr(b, name)[calm], getattr(a, name)[calm], f"{name} after set_state")
-            judged = calm & ~ctx.faulty(a)  # a world with a fault restarted at once
+            judged = calm & ~ctx.faulty(a)  # a world with a fault has already restarted
             ended |= a.get_terminated(state) & judged
             ctx.equal(ended[judged], a.terminated[judged], "get_terminated of all states up to this one")
 
 
 def check_purity(ctx: Context) -> None:
-    """Getters with old states and actions return the numbers of the live step at any later time, and change nothing."""
+    """Given old states and actions, getters return the original step's numbers at any time, without side effects."""
     env = ctx.a
     has_evaluate = env.task.functions["evaluate"] is not None
     with ctx.changed(env, autoreset=False, horizon=0):
@@ -102,7 +105,7 @@ def check_purity(ctx: Context) -> None:
         for pause in range(2):
             for i, action in enumerate(actions):
                 before = ctx.buffers(env)
-                # an event changes the state after it was judged
+                # an event changes the state after the step is judged
                 calm = live["calm"][: i + 1].all(dim=0)
                 fine = ((live["done_reason"][i] & int(FAULTS)) == 0) & calm
                 reward = env.get_reward(states[i], action, states[i + 1])
@@ -132,22 +135,22 @@ def check_determinism(ctx: Context) -> None:
 
 
 def _physics(env: Env, state: torch.Tensor) -> torch.Tensor:
-    """The parts of a state that do not depend on earlier episodes when an episode starts."""
+    """Select the parts of an episode's initial state that do not depend on earlier episodes."""
     names = [n for n in env.state_space.parts if n not in (*COUNTERS, *env.task.memory["lasting_memory"])]
     return torch.cat([state[:, env.state_space.parts[name]] for name in names], dim=1)
 
 
 def _lasting_columns(env: Env) -> list[slice]:
-    """The state columns that resets preserve: lasting memory, and model fields that no reset randomizes."""
+    """Return the state's columns that resets preserve: lasting memory, and model fields that no reset randomizes."""
     names = [field.name for field in env.task.dynamics if field.name not in env.task.reset_dynamics]
     parts = env.state_space.parts
     return [parts[name] for name in (*env.task.memory["lasting_memory"], *names)]
 
 
 def check_reset(ctx: Context) -> None:
-    """``reset`` leads to the same state regardless of the past, with zero actions.
+    """With zero actions, ``reset`` leads to the same state regardless of the past.
 
-    The state may depend on columns that resets keep, so the check first makes these columns equal in all worlds.
+    The check first makes the columns that resets preserve equal in all worlds, because the state may depend on them.
     """
     env = ctx.a
     lasting = _lasting_columns(env)
@@ -163,7 +166,7 @@ def check_reset(ctx: Context) -> None:
 
     reset()
     state, obs = _physics(env, env.get_state()), env.obs.clone()
-    noisy = bool(env.task.noisy_groups)  # each episode has its own noise
+    noisy = bool(env.task.noisy_groups)  # each episode has different noise
     if not noisy and not env.task.parameters.per_world:
         ctx.equal(obs, obs[:1].expand_as(obs).contiguous(), "the worlds' observations after reset")
     for action in ctx.actions(100):
@@ -180,7 +183,7 @@ def check_reset(ctx: Context) -> None:
 
 
 def check_masked_reset(ctx: Context) -> None:
-    """Resets with a mask change no bit of the other worlds."""
+    """Resets with a mask change no bit of the worlds outside the mask."""
     env = ctx.a
     mask = ~ctx.mask()
     for reset in (env.reset, env.rand_reset):
@@ -195,7 +198,7 @@ def check_masked_reset(ctx: Context) -> None:
 
 
 def check_rand_reset(ctx: Context) -> None:
-    """``rand_reset(seed)`` repeats its draws; later draws, other worlds and other seeds differ; actions are zero."""
+    """``rand_reset(seed)`` repeats its draws and zeros actions; draws differ between resets, worlds and seeds."""
     a, b = ctx.a, ctx.b
     ctx.run(a, ctx.actions(5))
     ctx.restart()

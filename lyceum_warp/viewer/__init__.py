@@ -1,4 +1,4 @@
-"""View worlds interactively in a browser: two processes, a folder for each.
+"""View worlds interactively in a browser, with two processes that have a folder each.
 
 =================  ====================================================================================================
 ``show.py``        ``lw.view``: open a session and its window

@@ -1,7 +1,7 @@
 """Follow a training run: show its newest policy in separate worlds.
 
-The viewer only reads the run's files. So the run has the same numbers with and without it, also on another machine that
-shares the folder.
+The viewer only reads the run's files. A run therefore gives the same numbers with and without a viewer. The viewer may
+run on another machine that shares the folder.
 """
 
 import contextlib
@@ -22,15 +22,15 @@ from lyceum_warp.runs.folder import Run, load
 
 
 class Follower:
-    """The newest policy of a run: ``policy(obs)`` is the mean action.
+    """Loads the newest policy of a run; ``policy(obs)`` returns mean actions.
 
     Args:
         run: The run.
-        device: Device of the worlds.
+        device: The device of the worlds.
 
     Raises:
         FileNotFoundError: The run has no policy yet.
-        ValueError: The policy cannot be read, or its network is a class of the user's own.
+        ValueError: The policy cannot be read, or its network is a class that the user defined.
     """
 
     def __init__(self, run: Run, *, device: str | torch.device = "cpu") -> None:
@@ -44,14 +44,14 @@ class Follower:
         return acting(self.policy)(obs)
 
     def update(self) -> list[str]:
-        """Load new weights, if there are any, and return messages about them."""
+        """Load the weights if the file is new, and return messages for the user."""
         stamp = self._stamp()
         if stamp is None or stamp == self._seen:
             return []
         try:
             content = self._read()
             self.policy.load_state_dict(content["policy"]["state"])
-        except (FileNotFoundError, ValueError, RuntimeError) as error:  # the file is being replaced, or the run is new
+        except (FileNotFoundError, ValueError, RuntimeError) as error:  # the file may be changing
             self._seen = stamp
             return [f"the policy of {self.run.folder} was not read: {str(error).splitlines()[0]}"]
         self._seen, self.iteration = stamp, content["iteration"]
@@ -61,7 +61,7 @@ class Follower:
         return read_checkpoint(self.run.policy_file(), self.device, parts=("iteration", "policy"))
 
     def _stamp(self) -> tuple[int, int, int] | None:
-        """Attributes of the file that change when it is replaced."""
+        """Read attributes of the policy's file that change when the file is replaced."""
         try:
             found = os.stat(self.run.policy_file())
         except OSError:
@@ -96,42 +96,42 @@ def wait_for_run(folder: Path, *, seconds: float) -> Run:
 class RunViewer:
     """Shows a run while it trains, in another process: ``with lw.RunViewer(folder): lw.train(npg, folder)``.
 
-    The process waits for the folder, and shows the run's newest policy in worlds of its own on the CPU, at a lower
+    The process waits for the folder, and shows the run's newest policy in separate worlds on the CPU, at a lower
     priority than the training. The viewer ends with ``close``, at the end of a ``with`` block, and with this program.
-    Closing its window does not end the training.
+    Closing the viewer's window does not end the training.
 
     Args:
         folder: The run's folder, which need not exist yet.
-        options: Further flags of ``lyceum-warp view`` by name, such as ``port=8080``, ``nworld=64``.
+        options: Flags of ``lyceum-warp view`` by name, such as ``port=8080`` or ``nworld=64``.
     """
 
     def __init__(self, folder: str | Path, **options: Any) -> None:
         self.folder = Path(folder)
         job = json.dumps({"folder": str(self.folder.absolute()), "options": options})
-        # multiprocessing would import the caller's program again
+        # a subprocess, because multiprocessing would import the caller's program again
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-c", "from lyceum_warp.cli.view import attached; attached()"],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, process_group=0,
         )  # fmt: skip
         threading.Thread(target=self._print, daemon=True).start()
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError):  # a process that ended at once has printed the reason
+        with contextlib.suppress(OSError):  # a process that has already ended has printed the reason
             self._process.stdin.write(job + "\n")
             self._process.stdin.flush()
 
     def _print(self) -> None:
-        """Print the viewer's output through this process, so that a live display stays below it."""
+        """Print the viewer's output through this process, so that a live progress display stays below the output."""
         assert self._process.stdout is not None
         for line in self._process.stdout:
             print(line, end="", flush=True)
 
     @property
     def is_open(self) -> bool:
-        """Whether the process runs."""
+        """Whether the viewer's process runs."""
         return self._process.poll() is None
 
     def close(self) -> None:
-        """End the process. A second call does nothing."""
+        """End the viewer's process; a second call does nothing."""
         self._process.terminate()
         try:
             self._process.wait(10.0)

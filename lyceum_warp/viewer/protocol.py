@@ -11,42 +11,43 @@ import numpy as np
 Mode: TypeAlias = Literal["passive", "controller", "playback"]
 
 WorldChoice: TypeAlias = int | Literal["next", "previous", "best", "worst"]
-"""A world's number, or a rule that finds it: the best and the worst by their returns so far."""
+"""The number of a world, or a rule that selects a world; "best" and "worst" compare the returns so far."""
 
 MOST_GHOSTS = 32
-"""Maximum number of other worlds, and of other episodes, that are drawn at once."""
+"""The maximum number of other worlds, and of other episodes, that are drawn at once."""
 MOST_BURST = 50
-"""Maximum number of states along a trajectory that are drawn at once."""
+"""The maximum number of states along a trajectory that are drawn at once."""
 
 TRACE_COLOUR = (0.6, 0.65, 0.75, 0.5)
 BEST_COLOUR = (0.1, 0.75, 0.3, 1.0)
 """Colours of a planner's samples and of the best sample, in the window and in videos."""
 
 MAX_POINTS, MAX_MESSAGES = 20_000, 200
-"""Maximum numbers of curve points and messages of skipped frames that the next frame contains."""
+"""The maximum numbers of curve points and of messages that a frame takes over from skipped frames."""
 
 
-# from the session to the window
+# messages from the session to the window
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """The constant part of the display."""
+    """The part of the display that never changes."""
 
     title: str
-    """Title of the window."""
+    """The title of the window."""
     model: bytes
     """The model, as ``mujoco.mj_saveModel`` writes it."""
     nworld: int
     modes: tuple[Mode, ...]
-    """Available modes; the session starts in the first one."""
+    """The available modes; the session starts in the first mode."""
     controllers: tuple[str, ...]
     episodes: tuple[str, ...]
-    """Names of the saved episodes."""
+    """The names of the saved episodes."""
     curves: tuple[str, ...]
-    """Names of the live curves: "reward", "eval" and the task's metrics."""
+    """The names of the live curves: "reward", "eval" and the task's metrics."""
     speeds: tuple[float, float, float] | None = None
-    """Largest forward and lateral velocity, m/s, and yaw rate, rad/s, of a robot that can be driven."""
+    """The largest forward velocity and lateral velocity, m/s, and yaw rate, rad/s, of a robot that the user can
+    drive."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,18 +64,18 @@ class Pose:
 
 @dataclasses.dataclass(frozen=True)
 class Ghost:
-    """A further pose that is drawn."""
+    """An additional pose to draw."""
 
     pose: Pose
     colour: tuple[float, float, float, float] | None
-    """Red, green, blue and opacity, each from 0 to 1; None for the model's own colours."""
+    """Red, green, blue and opacity, from 0 to 1; None for the model's own colours."""
     shift: tuple[float, float] = (0.0, 0.0)
-    """Displacement of the drawn bodies from their positions, metres."""
+    """The displacement of the ghost from its world's position, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Arrow:
-    """An arrow in the scene."""
+    """An arrow in the scene, such as a commanded velocity."""
 
     start: np.ndarray
     """(3,), metres."""
@@ -84,23 +85,23 @@ class Arrow:
 
 @dataclasses.dataclass(frozen=True)
 class SetGhosts:
-    """Choose which ghosts are drawn."""
+    """Choose the ghosts to draw."""
 
     worlds: int = 0
-    """Number of worlds to draw as ghosts, at most ``MOST_GHOSTS``, beginning after the shown world."""
+    """The number of worlds to draw as ghosts, at most ``MOST_GHOSTS``, beginning after the shown world."""
     grid: bool = False
-    """Whether these worlds are drawn beside each other, in their own colours."""
+    """Whether to draw these worlds beside each other, in the model's colours."""
     episodes: int = 0
-    """Number of episodes to draw as ghosts, at the same step, beginning after the shown episode."""
+    """The number of episodes to draw as ghosts, at the shown step, beginning after the shown episode."""
     burst: int = 0
-    """Number of past (red) and future (blue) states along the trajectory, at most ``MOST_BURST``."""
+    """The number of past (red) and future (blue) states to draw along the trajectory, at most ``MOST_BURST``."""
     plan: bool = True
-    """Whether the plan's final pose and the samples' traces are drawn."""
+    """Whether to draw the plan's final pose and the traces of the samples."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Status:
-    """The contents of the panel."""
+    """The contents of the window's panel."""
 
     mode: Mode
     controller: str | None
@@ -110,34 +111,34 @@ class Status:
     step: int
     """Step within the episode."""
     steps: int
-    """Length of the episode in playback; otherwise the horizon, or 0 without a horizon."""
+    """The length of the episode in playback; otherwise the task's horizon, or 0 if there is none."""
     time: float
     """Simulated seconds since the start of the episode."""
     paused: bool
     speed: float
-    """Target speed, simulated seconds per second."""
+    """The desired speed, in simulated seconds per second."""
     measured_speed: float
-    """Measured speed; NaN while paused."""
+    """The measured speed; NaN while paused."""
     plan_ms: float
-    """Milliseconds of the controller's last call; NaN before the first."""
+    """The duration of the controller's last call in milliseconds; NaN before the first call."""
     backwards: bool
     """Whether the playback runs backwards."""
     video: str | None
-    """Name of the current video; None without one."""
+    """The name of the current video; None if there is none."""
     ghosts: SetGhosts = SetGhosts()
     """The ghosts that are drawn."""
     command: tuple[float, float, float] | None = None
-    """Commanded forward and lateral velocity, m/s, and yaw rate, rad/s, of a walking robot."""
+    """The commanded forward velocity and lateral velocity, m/s, and yaw rate, rad/s, of a walking robot."""
     driven: bool = False
-    """Whether the user gave the command."""
+    """Whether the command comes from the user."""
     planner: tuple[tuple[str, float], ...] = ()
-    """Names and values of the planner's settings that can be changed."""
+    """The names and values of the planner's settings that the user can change."""
     params: tuple[tuple[str, float], ...] = ()
-    """Names and values of the task's parameters that can be changed."""
+    """The names and values of the task's parameters that the user can change."""
     seekable: tuple[int, int] = (0, 0)
-    """First and last step of the slider."""
+    """The first and the last step on the slider."""
     text: tuple[tuple[str, str], ...] = ()
-    """Further lines of the panel: names and values."""
+    """Additional lines of the panel, as names and values."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,22 +147,23 @@ class Frame:
 
     pose: Pose
     state: np.ndarray
-    """Argument of ``mujoco.mj_setState`` (``mjSTATE_INTEGRATION``), float64."""
+    """The state for ``mujoco.mj_setState`` with ``mjSTATE_INTEGRATION``, float64."""
     model_fields: dict[str, np.ndarray]
-    """This world's model fields that differ from the model, by MuJoCo's names."""
+    """The world's model fields that differ from the model, by MuJoCo's names."""
     status: Status
     ghosts: tuple[Ghost, ...] = ()
     traces: np.ndarray | None = None
-    """Paths of the planner's samples, (samples, points, 3), metres."""
+    """The paths of the planner's samples, (samples, points, 3), metres."""
     best: int | None = None
-    """Index of the best sample."""
+    """The index of the best sample."""
     arrows: tuple[Arrow, ...] = ()
     samples: np.ndarray | None = None
-    """New points of the curves, (points, 2 + curves): simulated seconds, 1 if the episode ended, a value per curve."""
+    """New points of the curves, (points, 2 + curves). A point holds simulated seconds, 1 if the episode ended, and a
+    value per curve."""
     messages: tuple[str, ...] = ()
-    """New messages: ends of episodes, faults, refused commands."""
+    """New messages about ends of episodes, faults and refused commands."""
     files: tuple[str, ...] = ()
-    """New videos, pages and pictures, as absolute paths, which the page offers for download."""
+    """The absolute paths of new videos, pages and pictures, which the page offers for download."""
 
 
 def latest(older: Frame | None, newer: Frame) -> Frame:
@@ -177,7 +179,7 @@ def latest(older: Frame | None, newer: Frame) -> Frame:
     )
 
 
-# from the window to the session: commands
+# commands from the window to the session
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,9 +188,9 @@ class SetMode:
 
     mode: Mode
     controller: str | None = None
-    """Name of the controller; None keeps it."""
+    """The name of the controller; None keeps the current one."""
     episode: int | None = None
-    """Index of the episode; None keeps it."""
+    """The index of the episode; None keeps the current one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -210,12 +212,12 @@ class SetSpeed:
     """Change the speed."""
 
     speed: float
-    """Simulated seconds per second, 1/16 to 16."""
+    """The speed in simulated seconds per second, from 1/16 to 16."""
 
 
 @dataclasses.dataclass(frozen=True)
 class StepBy:
-    """Pause, and take ``steps`` steps; negative numbers step back."""
+    """Pause, and make ``steps`` steps; a negative number steps back."""
 
     steps: int
 
@@ -245,13 +247,13 @@ class Reset:
 class Perturb:
     """Push bodies, move a free body while paused, or move a mocap body at any time.
 
-    The forces act until the next ``Perturb``; zeros end the push.
+    Forces act until the next ``Perturb``; forces of zero end the push.
     """
 
     forces: np.ndarray
-    """(nbody, 6) float64: force (N) and torque (Nm) in world coordinates."""
+    """Forces (N) and torques (Nm) on all bodies in world coordinates, (nbody, 6) float64."""
     qpos: np.ndarray | None = None
-    """(nq,) float64; takes effect only while paused."""
+    """Positions, (nq,) float64, which take effect only while paused."""
     mocap_pos: np.ndarray | None = None
     """(nmocap, 3) float64, metres."""
     mocap_quat: np.ndarray | None = None
@@ -263,7 +265,7 @@ class Drive:
     """Command a walking robot."""
 
     command: tuple[float, float, float] | None
-    """Forward and lateral velocity, m/s, and yaw rate, rad/s; None lets the task draw commands again."""
+    """The forward velocity and lateral velocity, m/s, and yaw rate, rad/s; with None the task draws commands again."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -280,7 +282,7 @@ class SetVideo:
     """Start a video, or end it."""
 
     camera: dict[str, Any] | None
-    """Attributes of the ``mujoco.MjvCamera``; None ends the video."""
+    """The attributes of the ``mujoco.MjvCamera``; None ends the video."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -288,12 +290,12 @@ class TakePicture:
     """Write a picture of the scene."""
 
     camera: dict[str, Any]
-    """Attributes of the ``mujoco.MjvCamera``."""
+    """The attributes of the ``mujoco.MjvCamera``."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Close:
-    """End the session. Closing a page does not end it, because the page can be opened again."""
+    """End the session. Closing the page does not end the session, because the page can be opened again."""
 
 
 Command: TypeAlias = (
@@ -302,7 +304,7 @@ Command: TypeAlias = (
 )  # fmt: skip
 
 
-# how the window process starts and reports
+# messages about the start and the end of the window process
 
 
 @dataclasses.dataclass(frozen=True)
@@ -311,14 +313,14 @@ class Opening:
 
     scene: Scene
     host: str
-    """Address that the page is served on."""
+    """The address on which the page is served."""
     port: int | None
-    """Port of the page; None for the first free port from 8080."""
+    """The port of the page; None for the first free port from 8080."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Opened:
-    """The window is open."""
+    """Reports that the window is open."""
 
     address: str
     """The page's address with its token."""
@@ -328,16 +330,16 @@ class Opened:
 
 @dataclasses.dataclass(frozen=True)
 class Failed:
-    """The window ended with an error."""
+    """Reports that the window ended with an error."""
 
     reason: str
     refused: bool = False
-    """Whether the host or port was invalid or in use."""
+    """Whether the host or the port was invalid or in use."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Taken:
-    """The window is ready for another frame."""
+    """Reports that the window is ready for another frame."""
 
 
 Reply: TypeAlias = Opened | Failed | Taken | Command

@@ -32,27 +32,29 @@ def view(
     back. The panel and its keys choose the mode, the world, the speed, ghosts and the camera.
 
     The viewer steps the worlds of ``env``, and leaves them in their last state. A policy acts in all worlds. A
-    controller of one world acts in a copy of the shown world, in real time as with ``lw.control_async``, while the
-    other worlds wait; afterwards the shown world takes over the state of the copy. If ``env`` is one world on the CPU
-    without automatic resets, no copy is made.
+    controller of one world acts in a copy of the shown world, in real time as with ``lw.control_async``, while all
+    other worlds wait. Afterwards the shown world gets the copy's state. If ``env`` is one world on the CPU without
+    automatic resets, no copy is made.
 
     Args:
         env: The worlds, on any engine and device.
-        controllers: Controllers by name. A policy maps observations, (nworld, nobs), to actions, (nworld, nact), as
-            ``lw.load`` returns it. A controller of one world is called with a state and an observation; see
+        controllers: Controllers by name. A policy, such as the result of ``lw.load``, maps observations, (nworld,
+            nobs), to actions, (nworld, nact). A controller of one world is called with a state and an observation; see
             ``lw.Controller``.
-        episodes: Episodes to play back: trajectories, files of trajectories, or states, (steps + 1, state_space.size),
-            as rows of ``env.get_state()``; one of these, a sequence, or a mapping from names to them.
-        seed: Seed of a random reset at the start; by default there is no reset.
+        episodes: Episodes to play back: one, a sequence, or a mapping from names to episodes. An episode is a
+            trajectory, the file of a trajectory, or states, (steps + 1, state_space.size), as from ``env.get_state()``.
+        seed: The seed of a random reset at the start; by default there is no reset.
         paused: Whether to start paused.
-        host: Address to serve the page on. The default is the loopback address, which other machines cannot reach.
-        port: Port of the page; by default the first free port from 8080.
-        watchers: Functions that are called about twice a second and return new messages, a sequence of strings.
-        block: Whether to return only when the user quits. False steps the worlds in a thread: do not use them before
-            the view is closed. The default is False in a notebook, which then shows the page and a link to it.
+        host: The address on which the page is served. The default is the loopback address, which other machines cannot
+            reach.
+        port: The port of the page; by default the first free port from 8080.
+        watchers: Functions that are called about twice a second, and return a sequence of new messages.
+        block: Whether the call returns only when the user quits. With False, a thread steps the worlds, and the caller
+            must not use them until the view is closed. The default is False in a notebook, which then shows the page
+            and a link to it.
 
     Returns:
-        The running view, if the call does not block.
+        The running view, or None if the call blocks.
 
     Raises:
         ValueError: An argument is invalid, or the port is in use.
@@ -81,15 +83,15 @@ if (navigator.userAgentData && ["localhost", "127.0.0.1"].includes(location.host
   link.before(frame);
 }}
 </script>"""
-"""The page in a notebook, and a link to it. Only browsers of Chromium's family give a frame of another page the memory
-that the page needs, and they send the viewer's cookie only below the notebook's own host name."""
+"""Return the HTML of a notebook's output: the page, and a link to the page. Only Chromium-based browsers give an
+embedded page the memory that it needs. They send the viewer's cookie only below the notebook's own host name."""
 
 
 class BackgroundView:
-    """A view whose worlds are stepped in a thread; ``lw.view`` returns it if it does not block.
+    """A view that steps its worlds in a thread; ``lw.view`` returns a view if ``block`` is false.
 
-    A notebook shows the page as the output of the cell, and a link that opens it in a tab of its own. If the notebook
-    is served by another machine, or the browser is Firefox or Safari, it shows only the link.
+    A notebook shows the page as the output of the cell, and a link that opens the page in a separate tab. If the
+    notebook is served by another machine, or the browser is Firefox or Safari, it shows only the link.
     """
 
     def __init__(self, session: Session, window: Window) -> None:
@@ -105,7 +107,7 @@ class BackgroundView:
         return self._thread.is_alive()
 
     def close(self) -> None:
-        """End it, and leave the worlds in their last state. A second call does nothing."""
+        """End the view, and leave the worlds in their last state. A second call does nothing."""
         self._window.close()
         self._thread.join()
 
@@ -123,7 +125,7 @@ def in_notebook() -> bool:
 
 
 def opened(scene: Scene, **place: Any) -> Window:
-    """Open a window, and print where its page is. See ``Window``."""
+    """Open a window, and print the address of its page. See ``Window``."""
     window = Window(scene, **place)
     for line in window.instructions:
         print(line, flush=True)

@@ -17,30 +17,30 @@ from lyceum_warp.support.validate import positive_number
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FreeCamera:
-    """A camera that looks at a point or follows a body. Defaults come from MuJoCo's default free camera."""
+    """A camera that looks at a point or follows a body. The default values come from MuJoCo's default free camera."""
 
     lookat: tuple[float, float, float] | None = None
-    """Point to look at, metres. A camera that follows a body looks at the centre of mass of the body's subtree."""
+    """The point to look at, metres. A camera that follows a body looks at the centre of mass of the body's subtree."""
     distance: float | None = None
-    """Distance from that point, metres."""
+    """The distance from the point ``lookat``, metres."""
     azimuth: float | None = None
-    """Direction of the view around the vertical axis, degrees: 0 looks along x, 90 along y."""
+    """The direction of the view around the vertical axis, degrees; a camera at 0 looks along x, and at 90 along y."""
     elevation: float | None = None
-    """Direction of the view above the horizontal plane, degrees: -90 looks straight down."""
+    """The direction of the view above the horizontal plane, degrees; a camera at -90 looks straight down."""
     track: str | int | None = None
-    """Name or index of a body to follow."""
+    """The name or the index of a body to follow."""
 
 
 CameraChoice: TypeAlias = str | int | FreeCamera | mujoco.MjvCamera | None
-"""A camera of the model by name or index, a free camera ("free" for MuJoCo's default), or None for the default
-of a video: the model's first tracking camera, else its first camera fixed to the world, else a camera that follows the
-first body."""
+"""A camera of the model by name or index, a free camera ("free" for MuJoCo's default), or None for a video's default.
+The default is the model's first tracking camera, or else its first camera that is fixed to the world, or else a camera
+that follows the first body."""
 
 FREE = "free"
 
 
 def find_camera(model: mujoco.MjModel, camera: CameraChoice = None) -> mujoco.MjvCamera:
-    """The chosen camera as an ``MjvCamera``.
+    """Return the chosen camera as an ``MjvCamera``.
 
     Raises:
         ValueError: The model has no such camera or body, or a number is not valid.
@@ -67,7 +67,7 @@ def parsed_camera(words: Iterable[str]) -> str | FreeCamera | None:
 
     Args:
         words: A name or an index; or parts of a pose as NAME=VALUE: lookat=X,Y,Z, distance, azimuth, elevation, track.
-            Returns None if there are no words.
+            Without words, the result is None.
 
     Raises:
         ValueError: The words have a different form.
@@ -95,12 +95,12 @@ def parsed_camera(words: Iterable[str]) -> str | FreeCamera | None:
 
 
 def camera_names(model: mujoco.MjModel) -> list[str]:
-    """Names of the model's cameras, in order; "" for a camera without a name."""
+    """Return the names of the model's cameras, in order; a camera without a name has the name ""."""
     return [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_CAMERA, i) or "" for i in range(model.ncam)]
 
 
 def camera_values(camera: mujoco.MjvCamera) -> tuple[float, ...]:
-    """The values of a camera: type, index, tracked body, lookat (3), distance, azimuth, elevation, orthographic."""
+    """Return a camera's values: type, index, tracked body, lookat (3), distance, azimuth, elevation, orthographic."""
     return (
         int(camera.type), camera.fixedcamid, camera.trackbodyid, *map(float, camera.lookat), camera.distance,
         camera.azimuth, camera.elevation, int(camera.orthographic),
@@ -108,7 +108,7 @@ def camera_values(camera: mujoco.MjvCamera) -> tuple[float, ...]:
 
 
 def tracking_camera(model: mujoco.MjModel) -> int | None:
-    """Index of the model's first camera that follows a body, ``model.cam_bodyid``; None without one."""
+    """Return the index of the model's first camera that follows a body, or None if there is no such camera."""
     # convert to int, because MuJoCo's enums do not equal NumPy integers
     tracking = (int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK), int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
     return next((i for i, mode in enumerate(model.cam_mode) if int(mode) in tracking), None)

@@ -18,9 +18,10 @@ def control_plot(episodes: Sequence[Trajectory], out: str | Path, *, title: str 
     deadline.
 
     Args:
-        episodes: Episodes of one task, at least one. The deadline is the period of the first episode.
+        episodes: The episodes, at least one, all of the same task. The deadline is the control period of the first
+            episode.
         out: The PNG file.
-        title: Title of the plot; by default task, engine and mode.
+        title: The title of the plot; by default task, engine and mode.
 
     Returns:
         The file's path.
@@ -37,7 +38,7 @@ def control_plot(episodes: Sequence[Trajectory], out: str | Path, *, title: str 
     _draw_outcomes(reward, evaluation, episodes)
     _draw_times(planning, age, episodes)
     _draw_histogram(histogram, episodes)
-    histogram.xaxis.set_major_formatter(LogFormatter())  # plain numbers instead of powers of ten
+    histogram.xaxis.set_major_formatter(LogFormatter())  # write plain numbers instead of powers of ten
     histogram.xaxis.set_minor_formatter(LogFormatter())
     finish_axes((reward, evaluation, planning, age, histogram))
     first = episodes[0]
@@ -51,7 +52,7 @@ def _line_style(episodes: Sequence[Trajectory]) -> dict[str, Any]:
 
 def _draw_outcomes(reward: Any, evaluation: Any, episodes: Sequence[Trajectory]) -> None:
     for episode in episodes:
-        line = _line_style(episodes) | {"marker": "." if episode.steps < 3 else ""}  # else a single point is invisible
+        line = _line_style(episodes) | {"marker": "." if episode.steps < 3 else ""}  # a line of one point is invisible
         seconds = episode.timestep * np.arange(1, episode.steps + 1)
         reward.plot(seconds, episode.rewards, **line)
         evaluation.plot(seconds, episode.evals, **line)
@@ -70,7 +71,7 @@ def _draw_outcomes(reward: Any, evaluation: Any, episodes: Sequence[Trajectory])
 def _draw_times(planning: Any, age: Any, episodes: Sequence[Trajectory]) -> None:
     dots = _line_style(episodes) | {"linestyle": "", "marker": ".", "markersize": 3}
     for episode in episodes:
-        # the first plan loads kernels; its time would dominate the scale
+        # skip the first plan, which loads kernels, because its time would dominate the scale
         planning.plot(episode.plan_starts[1:], 1000 * episode.plan_times[1:], **dots)
         age.plot(episode.times, 1000 * episode.ages, **dots)
     deadline = 1000 * episodes[0].period

@@ -22,7 +22,7 @@ from lyceum_warp.viz import EXTRA, NoVideoError
 from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
 from lyceum_warp.viz.render import CANNOT_DRAW, PICTURE, VIDEO, Shot
 
-_PATIENCE = 10.0  # seconds until the process is killed
+_PATIENCE = 10.0  # seconds until the subprocess is killed
 
 
 def check_video() -> None:
@@ -36,28 +36,28 @@ def check_video() -> None:
 
 
 def libraries() -> list[str]:
-    """Values of MUJOCO_GL to try, in order; "" is MuJoCo's default."""
+    """The values of MUJOCO_GL to try, in order; "" stands for MuJoCo's default."""
     given = os.environ.get("MUJOCO_GL", "")
     others = ["egl", "osmesa"] if sys.platform.startswith("linux") else [""]
     return list(dict.fromkeys([given, *others] if given else others))
 
 
 class DrawingProcess:
-    """A subprocess that renders poses, with the first graphics library that works; a context manager.
+    """A context manager for a subprocess that renders poses, with the first graphics library that works.
 
     Args:
         model: The model.
         camera: The camera.
-        size: Width and height in pixels.
-        fps: Frames per second of a video; None for pictures.
-        background: Whether the process has a low priority.
+        size: The width and the height in pixels.
+        fps: The frames per second of a video; None for pictures.
+        background: Whether the subprocess has a low priority.
 
     Raises:
         ValueError: The model has no such camera, or the size is out of range.
     """
 
     product = "the drawing"
-    """Name of the result in error messages."""
+    """The name of the result in error messages."""
 
     def __init__(
         self, model: mujoco.MjModel, *, camera: CameraChoice, size: tuple[int, int], fps: float | None,
@@ -72,7 +72,7 @@ class DrawingProcess:
         self._ends = contextlib.ExitStack()
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: Any = None
-        self._lock = threading.Lock()  # other threads may call abandon
+        self._lock = threading.Lock()  # the lock is needed because other threads may call abandon
         self._abandoned = False
 
     def __enter__(self) -> Self:
@@ -88,10 +88,10 @@ class DrawingProcess:
                 raise
             self._stop()
             failures.append(f"{library or 'OpenGL'}: {reason}")
-            if code > 0 and code != CANNOT_DRAW:  # another graphics library would also fail
+            if code > 0 and code != CANNOT_DRAW:  # no other graphics library would help
                 raise NoVideoError(f"{self.product} could not be written ({reason})")
         raise NoVideoError(
-            f"this machine cannot draw off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "
+            f"this machine cannot render off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "
             "libegl1 and libgl1-mesa-dri) or OSMesa (libosmesa6), or set MUJOCO_GL to a library that works"
         )
 
@@ -102,18 +102,18 @@ class DrawingProcess:
         """Draw a pose.
 
         Raises:
-            NoVideoError: The process has ended.
+            NoVideoError: The subprocess has ended.
         """
         if not self._send(shot) or self._answer() != "frame":
             raise NoVideoError(f"{self.product} could not be written ({self._ended()[1]})")
 
     def picture(self) -> np.ndarray:
-        """The last picture, (height, width, 3) uint8."""
+        """Return the last picture, (height, width, 3) uint8."""
         pixels = np.fromfile(Path(self._folder, PICTURE), dtype=np.uint8)
         return pixels.reshape(self.size[1], self.size[0], 3)
 
     def abandon(self) -> None:
-        """Kill the process and do not start another. Other threads may call this; it does not wait.
+        """Kill the subprocess, and do not start another one. Any thread may call this method, which does not wait.
 
         The rendering thread then gets a ``NoVideoError``.
         """
@@ -131,19 +131,19 @@ class DrawingProcess:
         mujoco.mj_saveModel(self._model, str(Path(self._folder, "model.mjb")), None)
         self._errors = tempfile.TemporaryFile("w+", errors="replace")  # noqa: SIM115
         self._ends.enter_context(self._errors)
-        # -P keeps modules beside render.py from shadowing packages
+        # with -P, modules beside render.py do not shadow packages
         command = [sys.executable, "-P", str(Path(__file__).with_name("render.py")), self._folder]
         with self._lock:
             if self._abandoned:
                 raise NoVideoError(f"{self.product} was cancelled")
             self._process = subprocess.Popen(
                 command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
-                start_new_session=True,  # Ctrl-C in the shell must reach only the parent
+                start_new_session=True,  # Ctrl-C in the shell must reach the parent only
             )  # fmt: skip
         self._send(self._job)
 
     def _send(self, message: Any) -> bool:
-        """Send a message; returns False if the process has ended."""
+        """Send a message; return False if the subprocess has ended."""
         assert self._process is not None and self._process.stdin is not None
         try:
             pickle.dump(message, self._process.stdin, protocol=pickle.HIGHEST_PROTOCOL)
@@ -153,15 +153,15 @@ class DrawingProcess:
         return True
 
     def _answer(self) -> str:
-        """The next reply of the process, or "" if it has ended."""
+        """Read the next reply of the subprocess, or "" if the subprocess has ended."""
         assert self._process is not None and self._process.stdout is not None
         for line in self._process.stdout:
-            if line in (b"ready\n", b"frame\n"):  # drivers may print other lines
+            if line in (b"ready\n", b"frame\n"):  # skip other lines, which drivers may print
                 return line.decode().strip()
         return ""
 
     def _ended(self) -> tuple[int, str]:
-        """The exit code of the process, and the last line of its errors."""
+        """Return the exit code of the subprocess, and the last line of its stderr."""
         assert self._process is not None
         code = self._process.wait()
         self._errors.seek(0)
@@ -169,7 +169,7 @@ class DrawingProcess:
         return code, lines[-1].strip()[:160] if lines else f"it ended with code {code}"
 
     def _stop(self) -> None:
-        """End the process if it runs, and delete its files."""
+        """End the subprocess if it runs, and delete its files."""
         with self._lock:
             process, self._process = self._process, None
         if process is None:
@@ -177,7 +177,7 @@ class DrawingProcess:
         else:
             assert process.stdin is not None and process.stdout is not None
             with contextlib.suppress(OSError):
-                process.stdin.close()  # EOF makes the process end
+                process.stdin.close()  # the subprocess ends at EOF
             try:
                 process.wait(_PATIENCE)
             except BaseException as error:
@@ -191,7 +191,7 @@ class DrawingProcess:
 
 
 class Drawing(DrawingProcess):
-    """A subprocess that draws poses into a video file; the arguments and errors are as for ``write_video``."""
+    """A subprocess that draws poses into a video file, with the arguments and errors of ``write_video``."""
 
     product = "the video"
 

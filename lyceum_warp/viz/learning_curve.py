@@ -13,18 +13,18 @@ from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_pn
 def learning_curve(run: str | Path | Run, out: str | Path | None = None) -> Path:
     """Draw a run's learning curve as PNG: returns, the evaluation metric and the task's own metrics against samples.
 
-    If no episode has ended and none was evaluated, the plot shows the mean reward per step instead of returns.
+    The plot shows the mean reward per step instead of returns if no episode has ended and no episode was evaluated.
 
     Args:
         run: A run, or its folder.
-        out: The PNG file; by default ``curve.png`` in the folder.
+        out: The PNG file; by default ``curve.png`` in the run's folder.
 
     Returns:
         The file's path.
 
     Raises:
         FileNotFoundError: The run does not exist.
-        ValueError: The table cannot be read, or has no row.
+        ValueError: The run's metrics.csv cannot be read, or has no row.
         ImportError: matplotlib is not installed.
     """
     figure = new_figure("a learning curve", 7.5, 6.0)
@@ -34,7 +34,7 @@ def learning_curve(run: str | Path | Run, out: str | Path | None = None) -> Path
     run = run if isinstance(run, Run) else Run.open(run)
     rows = run.rows()
     if not rows:
-        raise ValueError(f"{run.folder} has no complete iteration to draw: train it first")
+        raise ValueError(f"{run.folder} has no complete iteration to plot: continue its training")
 
     metrics = [name for name in rows[0] if name.startswith(METRIC_COLUMN)]
     figure.set_figheight(8.0 if metrics else 6.0)
@@ -43,12 +43,12 @@ def learning_curve(run: str | Path | Run, out: str | Path | None = None) -> Path
     top, bottom = panels[:2]
     samples = _column(rows, "samples")
     middle, spread, quantity = _column(rows, "return_mean"), _column(rows, "return_std"), "return"
-    if not any(map(math.isfinite, middle + _column(rows, "mean_return"))):  # no episode ended, and none was evaluated
+    if not any(map(math.isfinite, middle + _column(rows, "mean_return"))):  # no return is known
         middle, quantity = _column(rows, "reward_mean"), "reward of a step"
     low = [m - s for m, s in zip(middle, spread, strict=True)]
     high = [m + s for m, s in zip(middle, spread, strict=True)]
     top.fill_between(samples, low, high, color=LINE, alpha=0.2, linewidth=0, label="± standard deviation")
-    line: Any = dict(color=LINE, marker="." if len(rows) < 3 else "")  # a line of a single point is invisible
+    line: Any = dict(color=LINE, marker="." if len(rows) < 3 else "")  # a line through a single point is invisible
     top.plot(samples, middle, label="stochastic policy", **line)
     _draw_mean_policy(top, rows, "mean_return")
     top.set_ylabel(quantity)

@@ -7,11 +7,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 class LongWork:
-    """Progress of long work: a transient bar on a terminal, otherwise a line every 10 s, the first after 3 s.
+    """Shows the progress of long work: a transient bar on a terminal, otherwise a line after 3 s and then every 10 s.
 
     Args:
-        text: Name of the work.
-        unit: Name of the counted units, such as "frames".
+        text: The name of the work.
+        unit: The name of the counted units, such as "frames".
         console: The output; by default stderr.
     """
 
@@ -32,7 +32,7 @@ class LongWork:
         self.progress.stop()
 
     def __call__(self, done: int, total: int) -> None:
-        """Show the number of units done, and their total number."""
+        """Show the number of finished units, and the total number."""
         self.progress.update(self.bar, completed=done, total=total)
         seconds = time.monotonic() - self.start
         if not self.console.is_terminal and seconds >= self.next and done < total:

@@ -1,7 +1,7 @@
 """Write an episode as one HTML file: a scene that plays and turns in any browser, without a server or a network.
 
-The file holds triangles of the visible geoms, in the axes of their bodies, and the bodies' poses in each frame; the
-script in ``page.html`` draws them with WebGL. Textures are left out, except for the floor's squares.
+The file holds triangles of the visible geoms, in the axes of their bodies, and the bodies' poses in each frame. The
+script in ``page.html`` draws the triangles with WebGL. Textures are omitted, except for the floor's squares.
 """
 
 import base64
@@ -19,22 +19,22 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.files import replaced
 from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
 
-_GROUPS = 3  # groups of geoms that MuJoCo shows by default
-_AROUND, _ALONG = 24, 12  # parts of a circle, and of a half circle
-_RATE = 60  # most frames per second
-_FLOOR = 200.0  # half the side of an endless floor, m
+_GROUPS = 3  # the groups of geoms that MuJoCo shows by default
+_AROUND, _ALONG = 24, 12  # segments of a circle and of a half circle
+_RATE = 60  # maximum frames per second
+_FLOOR = 200.0  # half the side of an infinite floor, m
 Surface = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Vertices and normals, both (n, 3), and triangles (m, 3)."""
+"""The vertices and the normals of a surface, both (n, 3), and its triangles, (m, 3)."""
 
 
 def write_page(env: Env, states: torch.Tensor, out: str | Path, *, camera: CameraChoice = None) -> Path:
-    """Write states as a page that plays them in a browser; the file contains all that it needs.
+    """Write a self-contained page that plays states in a browser.
 
     Args:
-        env: Environment of the states.
-        states: States of one world, one row per step, (steps, state_space.size).
+        env: The environment of the states.
+        states: The states of one world, one row per step, (steps, state_space.size).
         out: The file. The file is replaced when the page is complete.
-        camera: The first camera, as in ``write_video``. The reader of the page can turn the camera.
+        camera: The initial camera, as in ``write_video``. The page's reader can turn the camera.
 
     Returns:
         The file's path.
@@ -66,11 +66,11 @@ def write_poses(
 
     Args:
         model: The model.
-        poses: qpos, mocap_pos and mocap_quat of each frame.
+        poses: The arrays qpos, mocap_pos and mocap_quat of each frame.
         out: The file.
-        dt: Seconds between frames.
-        title: Title of the page.
-        camera: The camera's values, as ``cameras.camera_values`` returns them.
+        dt: The seconds between frames.
+        title: The title of the page.
+        camera: The camera's values, from ``cameras.camera_values``.
     """
     data, frames = mujoco.MjData(model), []
     for qpos, place, turn in poses:
@@ -81,7 +81,7 @@ def write_poses(
         frames.append(np.concatenate([data.xpos, data.xquat], axis=1))
     vertices, indices, ranges = _triangles(model)
     _, fixed, tracked = (int(value) for value in camera[:3])
-    if fixed >= 0:  # a camera of the model
+    if fixed >= 0:  # the camera belongs to the model
         tracked, view = int(model.cam_bodyid[fixed]), model.stat.extent * 1.5
         camera = (0, -1, tracked, *model.stat.center, view, 120.0, -20.0)
     moving = np.flatnonzero(model.body_dofnum)
@@ -106,7 +106,7 @@ def _packed(array: np.ndarray) -> str:
 
 
 def _triangles(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[tuple[int, int]]]:
-    """Triangles of the visible geoms: packed vertices, indices, and each body's first index with their number."""
+    """Pack the triangles of the visible geoms: vertices, indices, and each body's first index and number of indices."""
     kind = np.dtype([("at", np.float32, 3), ("normal", np.int8, 4), ("colour", np.uint8, 4)])
     vertices: list[np.ndarray] = []
     indices: list[np.ndarray] = []
@@ -135,7 +135,7 @@ def _triangles(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[tupl
 
 
 def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Red, green, blue and opacity of a geom, from its material unless the geom has its own colour."""
+    """Return a geom's red, green, blue and opacity, from its material unless the geom has its own colour."""
     own, material = model.geom_rgba[geom].astype(float), model.geom_matid[geom]
     if material < 0 or not np.allclose(own, (0.5, 0.5, 0.5, 1.0)):
         return own
@@ -143,7 +143,7 @@ def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 
 def _surface(model: mujoco.MjModel, geom: int) -> Surface | None:
-    """Vertices, normals and triangles of a geom, in its axes; None for a kind that is not drawn."""
+    """Make a geom's vertices, normals and triangles, in its axes; None for a kind that is not drawn."""
     types = mujoco.mjtGeom
     kind, size = types(int(model.geom_type[geom])), model.geom_size[geom]
     if kind == types.mjGEOM_PLANE:
@@ -170,7 +170,7 @@ def _box(size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ground(model: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a height field."""
+    """Make the vertices and the triangles of a height field."""
     rows, columns = model.hfield_nrow[field], model.hfield_ncol[field]
     x, y, top, _ = model.hfield_size[field]
     heights = model.hfield_data[model.hfield_adr[field] :][: rows * columns].reshape(rows, columns)
@@ -182,7 +182,7 @@ def _ground(model: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _flat(points: np.ndarray, faces: np.ndarray) -> Surface:
-    """A surface of flat triangles; neighbours within 30 degrees share a normal, so that curved meshes look smooth."""
+    """Make a surface from triangles; neighbours within 30 degrees share a normal, so that curved meshes look smooth."""
     corners = points[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
@@ -197,15 +197,15 @@ def _flat(points: np.ndarray, faces: np.ndarray) -> Surface:
 
 
 def _round(kind: mujoco.mjtGeom, size: np.ndarray) -> Surface:
-    """A sphere, an ellipsoid, a capsule or a cylinder, along z."""
+    """Make a sphere, an ellipsoid, a capsule or a cylinder, along z."""
     types = mujoco.mjtGeom
-    if kind == types.mjGEOM_CYLINDER:  # rings: a cap's centre and edge, the side, the other cap's edge and centre
+    if kind == types.mjGEOM_CYLINDER:  # one cap, the side, the other cap
         height, radius = np.array([-1, -1, -1, 1, 1, 1.0]), np.array([0, 1, 1, 1, 1, 0.0])
         rise, out = np.array([-1, -1, 0, 0, 1, 1.0]), np.array([0, 0, 1, 1, 0, 0.0])
         place = np.stack([radius * size[0], height * size[1]])
     else:
         angle = np.linspace(-np.pi / 2, np.pi / 2, _ALONG + 1)
-        if kind == types.mjGEOM_CAPSULE:  # the middle of the capsule is doubled
+        if kind == types.mjGEOM_CAPSULE:  # the capsule has two middle rings
             angle = np.concatenate([np.linspace(-np.pi / 2, 0, _ALONG // 2), np.linspace(0, np.pi / 2, _ALONG // 2)])
         out, rise = np.cos(angle), np.sin(angle)
         lift = np.sign(np.arange(len(angle)) - len(angle) / 2 + 0.5) * size[1] if kind == types.mjGEOM_CAPSULE else 0.0

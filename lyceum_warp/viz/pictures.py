@@ -9,12 +9,12 @@ from lyceum_warp.viz.video import shots
 
 
 class WorldPictures(DrawingProcess):
-    """Renders the current state of an environment's worlds.
+    """Renders the current states of an environment's worlds.
 
     Args:
         env: The environment.
         camera: The camera, as in ``write_video``.
-        size: Width and height in pixels, even numbers.
+        size: The width and the height in pixels, both even.
 
     Raises:
         ValueError: The model has no such camera, or the size is odd.

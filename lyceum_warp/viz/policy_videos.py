@@ -22,7 +22,7 @@ from lyceum_warp.viz.video import Progress, write_video
 log = logging.getLogger(__name__)
 
 NamedProgress: TypeAlias = Callable[[str, str, int, int], object]
-"""Progress callback: (description, unit, amount done, total amount)."""
+"""A progress callback, called with (description, unit, finished amount, total amount)."""
 
 
 def policy_video(
@@ -58,12 +58,12 @@ class Videos:
 
     Args:
         learner: The algorithm.
-        folder: Folder of the videos, which are named by iteration.
-        every: Iterations between two videos; 0 for none.
-        seed: Seed of the initial state, the same for all videos.
+        folder: The folder of the videos; file names are numbers of iterations.
+        every: The number of iterations between two videos; 0 makes no videos.
+        seed: The seed of the initial state, which is the same for all videos.
         camera: The camera; see ``write_video``.
-        note: Called with the message about an error.
-        progress: Called regularly while a video is made.
+        note: A function that is called with the message of an error.
+        progress: A function that is called regularly while a video is made.
     """
 
     def __init__(
@@ -88,5 +88,5 @@ class Videos:
 
 
 def one_line(error: BaseException) -> str:
-    """The message of an error in one line."""
+    """Return an error's message in one line."""
     return " ".join(str(error).split()) or type(error).__name__

@@ -3,12 +3,13 @@
 ``drawing.py`` runs this program as a subprocess and writes pickled objects to its stdin: first a dict with ``size``,
 ``fps``, ``camera`` and ``background``, then a ``Shot`` for each picture, then None. The folder holds the model,
 ``model.mjb``. The program writes ``video.mp4``, or if ``fps`` is None each picture into ``picture.raw``. The process
-prints "ready" once it can draw, and "frame" after each picture. EOF without None means that its parent has died; it
-then deletes the folder.
+prints "ready" once it can draw, and "frame" after each picture. EOF without None means that the parent process has
+died; the program then deletes the folder.
 
-MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. ``drawing.py``
-therefore starts a process for each library that it tries. This file imports nothing of the package. Exit code 3 means
-that this machine cannot draw with this library; the last line on stderr holds the reason.
+MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. For this reason,
+``drawing.py`` starts a separate process for each graphics library that it tries. The program imports no module of the
+package. Exit code 3 means that the machine cannot draw with the chosen graphics library; the last line on stderr holds
+the reason.
 """
 
 import contextlib
@@ -26,20 +27,20 @@ CANNOT_DRAW = 3
 ABANDONED = 4
 
 VIDEO, PICTURE = "video.mp4", "picture.raw"
-"""Names of the output files. A picture is (height, width, 3) uint8."""
+"""The names of the output files. A picture has the shape (height, width, 3) and the type uint8."""
 
 
 class Shot(TypedDict):
     """The content of one or more successive frames."""
 
     pose: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """qpos, mocap_pos and mocap_quat."""
+    """The arrays qpos, mocap_pos and mocap_quat."""
     model_fields: dict[str, np.ndarray]
-    """Values of model fields by name. Other fields have the model's values."""
+    """The values of model fields by name. All other fields have the model's values."""
     ghosts: list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[float, ...] | None, tuple[float, float]]]
-    """Additional poses of the model, each with a colour, or None for the model's own, and a shift in x and y."""
+    """Additional poses of the model, each with a colour (None for the model's colours) and a shift in x and y."""
     lines: list[tuple[np.ndarray, tuple[float, ...], float]]
-    """Points of lines, (points, 3), each with a colour and a width in pixels."""
+    """Lines, each with its points, (points, 3), its colour and its width in pixels."""
     frames: int
     """Number of frames."""
 
@@ -49,8 +50,8 @@ class Painter:
 
     Args:
         mujoco: The module.
-        model: The model. Its fields are changed.
-        size: Width and height in pixels.
+        model: The model. The renderer changes the model's fields.
+        size: The width and the height in pixels.
         camera: The camera's values.
     """
 
@@ -116,7 +117,7 @@ class Painter:
 
 
 def set_camera(view: Any, values: tuple[float, ...]) -> None:
-    """Set the values of a camera, as ``cameras.camera_values`` returns them."""
+    """Set the values of a camera, which come from ``cameras.camera_values``."""
     view.type, view.fixedcamid, view.trackbodyid = (int(value) for value in values[:3])
     view.lookat[:] = values[3:6]
     view.distance, view.azimuth, view.elevation = values[6:9]
@@ -140,7 +141,7 @@ def _owner(model: Any, name: str) -> Any:
 
 
 def main(folder: str) -> int:
-    """Draw a frame for each pose of the input."""
+    """Draw a frame for each pose on stdin."""
     source = sys.stdin.buffer
     try:
         import mujoco
@@ -151,8 +152,8 @@ def main(folder: str) -> int:
         model = mujoco.MjModel.from_binary_path(str(Path(folder, "model.mjb")))
         painter = Painter(mujoco, model, job["size"], job["camera"])
         painter.renderer.update_scene(painter.data, painter.view)
-        painter.renderer.render()  # some drivers fail only here
-    except Exception as error:  # the type of the error depends on the library
+        painter.renderer.render()  # some drivers fail only when they draw
+    except Exception as error:  # the type of the error depends on the graphics library
         print(str(error).strip() or type(error).__name__, file=sys.stderr)
         return CANNOT_DRAW
     try:

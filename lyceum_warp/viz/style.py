@@ -1,4 +1,4 @@
-"""Define the common style of all plots: figure, colours, axes, file."""
+"""Define the common style of all plots, and write their files."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -13,9 +13,9 @@ def new_figure(purpose: str, width: float, height: float) -> Any:
     """Make a figure without pyplot, so that it needs no display and shares no state with the user's figures.
 
     Args:
-        purpose: Name of the plot, for the error message.
-        width: Width in inches.
-        height: Height in inches.
+        purpose: The plot's name, for the error message.
+        width: The width in inches.
+        height: The height in inches.
 
     Raises:
         ImportError: matplotlib is not installed.

@@ -1,6 +1,6 @@
 """Write curves of a run for TensorBoard, with the extra ``tensorboard``.
 
-``metrics.csv`` holds the same numbers; the files written here are a copy for another viewer.
+The files for TensorBoard contain the same numbers as ``metrics.csv``.
 """
 
 import importlib.util
@@ -14,14 +14,14 @@ from lyceum_warp.algos.learner import Iteration
 from lyceum_warp.env import Env
 
 EXTRA = "pip install 'lyceum-warp[tensorboard]'"
-"""Command that installs the package for TensorBoard."""
+"""The command that installs the package for TensorBoard."""
 
 _GROUPS = {
     "mean_": "mean_policy", "return_": "return", "value_": "value", "time_": "time", "metrics/": "metrics",
     "step_metrics/": "Episode_Metrics",
 }  # fmt: skip
-"""Groups of curves, by the prefix of their columns in metrics.csv. mjlab calls means of a metric per step
-Episode_Metrics."""
+"""The groups of curves, by the prefix of their columns in metrics.csv. As in mjlab, means of a metric per step are in
+the group Episode_Metrics."""
 
 _TAGS = {
     # as in rsl_rl
@@ -29,26 +29,25 @@ _TAGS = {
     "value_loss": "Loss/value", "surrogate_loss": "Loss/surrogate", "entropy": "Loss/entropy",
     "learning_rate": "Loss/learning_rate", "total_fps": "Perf/total_fps", "time_sample": "Perf/collection_time",
     "time_update": "Perf/learning_time",
-    # others that cannot be derived from the columns
+    # these names do not follow from the columns
     "iteration": "time/iteration", "samples": "time/samples", "samples_per_second": "time/samples_per_second",
     "terminal_reward": "episode/terminal_reward", "eval_mean": "episode/eval",
     "success": "episode/success", "faults": "episode/faults", "outliers": "episode/outliers",
     "skipped_updates": "policy/skipped_updates", "reward_mean": "return/reward",
     "explained_variance": "value/explained_variance",
 }  # fmt: skip
-"""Names of curves, by their columns."""
+"""The names of curves, by their columns."""
 
 
 class TensorBoard:
-    """Writes a run's iterations where TensorBoard reads them; the horizontal axis counts iterations from 0.
+    """Writes a run's iterations to files for TensorBoard; the horizontal axis counts iterations from 0.
 
-    Every number of an iteration becomes a curve. Curves that rsl_rl or mjlab writes, too, have their names, units and
-    axis, so that runs overlay: Train/, Loss/, Policy/, Perf/, Episode_Metrics/ and, with ``env``, Episode_Reward/ and
-    Episode_Termination/. The groups of the others are return/, episode/, mean_policy/, policy/, value/, time/ and
+    Every number of an iteration becomes a curve. Some curves have rsl_rl's or mjlab's names, units and axis, so that
+    runs can be overlaid: Train/, Loss/, Policy/, Perf/, Episode_Metrics/ and, with ``env``, Episode_Reward/ and
+    Episode_Termination/. All other curves are in the groups return/, episode/, mean_policy/, policy/, value/, time/ and
     metrics/.
 
-    In a folder that already holds curves, the curves continue: what they hold from the first new iteration on is
-    replaced.
+    Curves that exist in the folder are continued, and their values from the first new iteration on are replaced.
 
     Example:
         >>> with TensorBoard("runs/mine") as board:
@@ -56,9 +55,11 @@ class TensorBoard:
         ...         board(it)
 
     Args:
-        folder: The folder; it is made if it does not exist. ``tensorboard --logdir`` takes it, or one above it.
-        env: The environment of the run. Its rewards' terms become Episode_Reward/NAME, sums over an episode divided by
-            the time limit in seconds; its terminations Episode_Termination/NAME, terminations in a step of all worlds.
+        folder: The folder, which is created if it does not exist. Pass this folder, or one above it, to ``tensorboard
+            --logdir``.
+        env: The environment of the run. Episode_Reward/NAME is the sum of a reward term over an episode, divided by the
+            time limit in seconds. Episode_Termination/NAME is the number of terminations of that name in a step of all
+            worlds.
 
     Raises:
         ImportError: The package tensorboard is not installed.
@@ -78,7 +79,7 @@ class TensorBoard:
         self.close()
 
     def __call__(self, iteration: Iteration) -> None:
-        """Add an iteration. Non-finite numbers, such as returns if no episode ended, are omitted."""
+        """Add an iteration. Non-finite numbers are omitted, such as the return if no episode has ended."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
         values = []
@@ -89,7 +90,7 @@ class TensorBoard:
         self._write(Summary(value=values), iteration.iteration - 1)
 
     def close(self) -> None:
-        """Close the file. A later iteration opens a new one."""
+        """Close the file. A later iteration opens a new file."""
         if self._file is not None:
             file, self._file = self._file, None
             file.close()
@@ -103,7 +104,7 @@ class TensorBoard:
         self._file.flush()
 
     def _open(self, step: int) -> None:
-        """Open a file. Writers of torch and TensorBoard use a thread, which would hide a full disk."""
+        """Open a file. The writers of torch and TensorBoard use a thread, which would hide the error of a full disk."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
         from torch.utils.tensorboard import RecordWriter
 
@@ -111,7 +112,7 @@ class TensorBoard:
         name = f"events.out.tfevents.{int(time.time()):010d}.{number:04d}.{os.getpid()}"
         self._file = RecordWriter((self._folder / name).open("xb"))
         self._add(Event(file_version="brain.Event:2"))
-        if number:  # TensorBoard discards points of earlier files from this step on
+        if number:  # from this step on, TensorBoard discards points of earlier files
             self._add(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
 
     def _add(self, event: Any) -> None:
@@ -130,23 +131,23 @@ def check_tensorboard() -> None:
 
 
 def _terms(env: Env) -> dict[str, tuple[str, float]]:
-    """Curves with mjlab's names and units, with the factor of their values, by column."""
+    """Return the curves with mjlab's names and units by column, each with the factor of its values."""
     task, seconds = env.task.task, env.horizon * env.timestep
-    rewards = task.rewards if seconds else ()  # without a time limit there is no such unit
+    rewards = task.rewards if seconds else ()  # mjlab's unit requires a time limit
     return {f"metrics/{name}": (f"Episode_Reward/{name}", 1 / seconds) for name in rewards} | {
         f"step_metrics/{name}": (f"Episode_Termination/{name}", float(env.nworld)) for name in task.terminations
     }
 
 
 def _total_fps(iteration: Iteration) -> dict[str, float]:
-    """Samples per second of an iteration, without the evaluation of the mean policy; empty if times are unknown."""
+    """Compute an iteration's samples per second, without evaluation of the mean policy; empty if times are unknown."""
     times = {name: time for name, time in iteration.row().items() if name.startswith("time_") and name != "time_mean"}
     seconds = sum(filter(None, times.values()))
     return {"total_fps": iteration.samples / iteration.iteration / seconds} if seconds else {}
 
 
 def tag(column: str) -> str:
-    """The name of the curve for a column of ``metrics.csv``."""
+    """Return the name of the curve for a column of ``metrics.csv``."""
     if column in _TAGS:
         return _TAGS[column]
     for beginning, group in _GROUPS.items():

@@ -22,11 +22,11 @@ from lyceum_warp.viz.render import Shot
 __all__ = ["NoVideoError", "Progress", "Recorder", "check_video", "write_video"]
 
 Progress: TypeAlias = Callable[[int, int], object]
-"""Called with the number of units done, and their total number."""
+"""A progress callback, called with the number of finished units and the total number."""
 
-_MAX_RATE = 60  # frames per second; screens rarely show more
+_MAX_RATE = 60  # maximum frames per second, the rate of most screens
 _POSES = ("qpos", "mocap_pos", "mocap_quat")
-_KILLED = 5.0  # seconds to wait for the thread after its process was killed
+_KILLED = 5.0  # seconds to wait for the thread after the subprocess was killed
 
 
 def write_video(
@@ -41,20 +41,20 @@ def write_video(
 ) -> Path:
     """Render states into an mp4 file, each with its own model fields.
 
-    The video has at most 60 frames per second; with a shorter time step, states are skipped. A subprocess draws it,
-    without a display.
+    The video has at most 60 frames per second; with a shorter time step, states are skipped. A subprocess draws the
+    video, without a display.
 
     Args:
-        env: Environment of the states.
-        states: States of one world, one row per step, (steps, state_space.size).
+        env: The environment of the states.
+        states: The states of one world, one row per step, (steps, state_space.size).
         out: The file. The file is replaced when the video is complete.
         camera: A camera of the model by its name or index, a ``FreeCamera`` or ``mujoco.MjvCamera``, or "free" for
-            MuJoCo's default free camera. By default the model's first tracking camera, else its first camera fixed to
-            the world, else a camera that follows the first body.
-        size: Width and height in pixels, even numbers.
-        speed: Simulated seconds per second of the video.
-        progress: Called after each frame with the number of frames so far and in all. By default a bar is shown on a
-            terminal, and otherwise lines on stderr.
+            MuJoCo's default free camera. The default is the model's first tracking camera, or else its first camera
+        that is fixed to the world, or else a camera that follows the first body.
+        size: The width and the height in pixels, both even.
+        speed: The simulated seconds per second of the video.
+        progress: A function that is called after each frame with the number of frames so far and the total number. By
+            default a bar is shown on a terminal, and otherwise lines on stderr.
 
     Returns:
         The file's path.
@@ -80,10 +80,10 @@ def write_video(
 
 
 def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
-    """Yield a shot of each state, with its own model fields.
+    """Yield a shot of each state, with the state's model fields.
 
     Args:
-        env: Environment of the states.
+        env: The environment of the states.
         states: The states, (number of states, state_space.size), on the CPU.
     """
     parts = env.state_space.parts
@@ -100,20 +100,20 @@ def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
 
 
 class Recorder:
-    """A video of shots that arrive one by one, as from the viewer.
+    """Makes a video of shots that arrive one by one, for example from the viewer.
 
-    A subprocess draws them at a low priority, and ``add`` never waits for it. Shots wait in a queue; if it is full,
-    further ones are dropped, and the last one in the queue is shown longer, so that the video keeps its duration. The
-    file is written when the video is complete. After ``cancel``, or if the program is killed, an older file of this
-    name is unchanged.
+    A subprocess draws shots at a low priority, and ``add`` never waits for the subprocess. Shots wait in a queue. If
+    the queue is full, further shots are dropped, and the last shot in the queue is shown longer, so that the video
+    keeps its duration. The file is written when the video is complete. After ``cancel``, or if the program is killed,
+    an older file of the same name is unchanged.
 
     Args:
         model: The model.
         out: The file, whose name ends in ``.mp4``.
         camera: The camera, as in ``write_video``.
-        size: Width and height in pixels, even numbers.
-        fps: Frames per second of the video.
-        most_waiting: Maximum number of shots in the queue.
+        size: The width and the height in pixels, both even.
+        fps: The frames per second of the video.
+        most_waiting: The maximum number of shots in the queue.
 
     Raises:
         NoVideoError: A package for videos is not installed.
@@ -125,29 +125,29 @@ class Recorder:
     ) -> None:  # fmt: skip
         self.out = out
         self.added = 0
-        """Number of frames so far."""
+        """The number of frames so far."""
         self.dropped = 0
-        """Number of frames whose shots were dropped."""
+        """The number of frames that show an earlier shot, because theirs was dropped."""
         self._drawing = Drawing(model, out, camera=camera, size=size, fps=fps, background=True)
         self._most = most_waiting
         self._shots: deque[Shot] = deque()
-        self._changed = threading.Condition()  # also guards the queue
+        self._changed = threading.Condition()  # this lock also guards the queue
         self._ended = self._cancelled = False
         self._error: NoVideoError | OSError | None = None
-        # a join that a signal interrupts would mark the thread as stopped (Python 3.11)
+        # in Python 3.11, a join that a signal interrupts would mark the thread as stopped
         self._done = threading.Event()
         threading.Thread(target=self._draw, name="lyceum-warp video", daemon=True).start()
 
     @property
     def finished(self) -> bool:
-        """Whether the drawing has ended, with the file or with an error that ``close`` raises."""
+        """Whether the subprocess has ended, with a file, or with an error that ``close`` raises."""
         return self._done.is_set()
 
     def add(self, shot: Shot) -> None:
         """Add a shot.
 
         Raises:
-            NoVideoError: The drawing has failed.
+            NoVideoError: The rendering subprocess has failed.
             OSError: The file cannot be written.
         """
         self._check()
@@ -167,14 +167,14 @@ class Recorder:
             self._changed.notify_all()
 
     def wait(self, seconds: float) -> None:
-        """Wait until the drawing has ended, for some seconds at most."""
+        """Wait until the subprocess has ended, but at most for the given seconds."""
         self._done.wait(seconds)
 
     def close(self) -> Path:
         """Finish the video, wait until the file is complete, and return its path.
 
         Raises:
-            NoVideoError: The drawing has failed, the video was cancelled, or it has no shot.
+            NoVideoError: The rendering subprocess has failed, the video was cancelled, or it has no shot.
             OSError: The file cannot be written.
         """
         self.end()
@@ -183,7 +183,7 @@ class Recorder:
         return self.out
 
     def cancel(self) -> None:
-        """Cancel the video at once, and write no file, unless it is complete."""
+        """Cancel the video at once, and write no file, unless the video is complete."""
         if not self.finished:
             self._cancelled = True
             self._shots.clear()
@@ -204,13 +204,13 @@ class Recorder:
                 drawing.finish()
         except (NoVideoError, OSError) as error:
             self._error = NoVideoError(f"the video {self.out} was cancelled") if self._cancelled else error
-        except Exception as error:  # the thread has no caller that could catch the error
+        except Exception as error:  # store the error, because the thread has no caller that could catch it
             self._error = NoVideoError(f"the video could not be written ({' '.join(str(error).split())})")
         finally:
             self._done.set()
 
     def _next(self) -> Shot | None:
-        """The next shot, or None after the last one."""
+        """Return the next shot, or None after the last shot."""
         with self._changed:
             self._changed.wait_for(lambda: self._shots or self._ended)
             return self._shots.popleft() if self._shots else None

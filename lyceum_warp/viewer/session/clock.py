@@ -31,25 +31,25 @@ from lyceum_warp.viewer.session.window_process import Window
 from lyceum_warp.viz import NoVideoError
 
 _FPS = 30.0  # maximum number of frames per second
-_LAG = 0.25  # maximum seconds that the worlds may be behind the clock; beyond it the clock is moved
+_LAG = 0.25  # maximum seconds of lag behind the clock; more lag moves the clock
 _IDLE = 0.5  # seconds between two frames while nothing changes
 _CHECK = 0.5  # seconds between two calls of a watcher
 
 Watcher = Callable[[], Sequence[str]]
-"""Called about twice a second; returns new messages."""
+"""A function that returns new messages; called about twice a second."""
 
 
 class Session:
     """Show worlds in a window.
 
-    Policies act in all worlds, which the session steps by the clock. A controller of one world acts in a plant, as
-    with ``lw.control_async``; the session works only while the plant waits for its next step.
+    Policies act in all worlds, which the session steps by the clock. A controller of one world acts in a plant, as with
+    ``lw.control_async``. The session then handles commands and frames only while the plant waits for its next step.
 
     Args:
         env: The worlds.
         controllers: See ``lw.view``.
-        watchers: Called about twice a second; they return messages.
-        shown: Further arguments of ``Stage``.
+        watchers: Functions that return messages; called about twice a second.
+        shown: The other arguments of ``Stage``.
 
     Raises:
         ValueError: An argument is invalid.
@@ -74,12 +74,12 @@ class Session:
 
     @torch.no_grad()
     def run(self, window: Window) -> None:
-        """Run until the window is closed; close the window and the session, also after an exception."""
+        """Run until the window is closed; close the window and the session even after an exception."""
         self._window = window
         now = time.perf_counter()
         self._next_frame = self._next_check = now
         self._next_step = now + self.stage.env.timestep / self.stage.speed
-        with contextlib.ExitStack() as ends:  # closed in reverse order
+        with contextlib.ExitStack() as ends:  # these contexts close in reverse order
             ends.enter_context(self.stage.videos.finishing(print))
             ends.callback(self.stage.close)
             ends.callback(window.close)
@@ -96,7 +96,7 @@ class Session:
                     self._give_up_control(error)
 
     def _tick(self) -> None:
-        """Make the steps that are due, show a frame, and wait."""
+        """Make the steps that are due by the clock, show a frame, and wait."""
         stage, now = self.stage, time.perf_counter()
         if stage.paused:
             self._next_step = now
@@ -118,7 +118,7 @@ class Session:
             time.sleep(min(wake - now, POLL))
 
     def _poll(self) -> None:
-        """Obey the window's commands, and call the watchers when due."""
+        """Carry out the window's commands, and call the watchers twice a second."""
         assert self._window is not None
         if not self._window.is_open():
             self._waiting.append(Close())
@@ -133,7 +133,7 @@ class Session:
                     self.stage.frames.say(message)
 
     def _show_when_due(self, now: float) -> None:
-        """Show a frame if one is due, and if something has changed or the last frame is old."""
+        """Show a frame if one is due; while nothing changes in a paused view, frames are due less often."""
         assert self._window is not None
         stage, videos = self.stage, self.stage.videos
         if now < self._next_frame or not (videos.due or self._window.wants_frame):
@@ -151,7 +151,7 @@ class Session:
             videos.give_up()
             stage.frames.say(str(error))
 
-    # a plant in real time
+    # a plant that runs in real time
 
     def _by_the_clock(self) -> bool:
         """Whether a controller of one world acts in its plant in real time."""
@@ -176,11 +176,11 @@ class Session:
         self.stage.steps += 1
         if (
             time.perf_counter() - self._last_work > 1 / _FPS
-        ):  # a late or fast plant never waits, so `work` is not called
+        ):  # a late or fast plant never waits, so it never calls `work`
             self._work()
 
     def _work(self) -> None:
-        """Obey commands, and show a frame."""
+        """Carry out commands, and show a frame."""
         self._last_work = time.perf_counter()
         self._poll()
         self._show_when_due(self._last_work)
@@ -188,7 +188,7 @@ class Session:
     # commands
 
     def obey(self, command: Command) -> None:
-        """Carry out a command. An error becomes a message.
+        """Carry out a command. The message of an error is shown to the user.
 
         While a plant runs in real time, a command that needs its state interrupts the run.
         """
@@ -215,7 +215,7 @@ class Session:
     def _calls_have_ended(self) -> bool:
         """Show frames until no controller is being called; return whether the window is still open.
 
-        The first calls of another controller may capture graphs, which must not happen during other calls.
+        The first calls of a new controller may capture graphs, and a capture must not run during other calls.
         """
         while any(isinstance(each, WorldControl) and each.busy for each in self.stage.controllers.values()):
             if (window := self._window) is not None:

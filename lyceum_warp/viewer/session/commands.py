@@ -11,7 +11,7 @@ def obey(stage: Stage, command: protocol.Command) -> None:
     """Carry out a command.
 
     Raises:
-        ValueError: There is no such world, or a playback cannot be perturbed; the message is for the user.
+        ValueError: The command names an unknown world, or perturbs a playback; the message is for the user.
         NoVideoError: A video cannot be made.
         ControllerError: A controller raised an exception.
     """
@@ -58,7 +58,7 @@ def obey(stage: Stage, command: protocol.Command) -> None:
             _perturb(stage, command)
         case protocol.Drive(velocity):
             if stage.driving.limits is None or stage.mode == "playback":
-                raise ValueError("only a walking robot whose task draws commands can be driven, and not in a playback")
+                raise ValueError("only robots of velocity tasks can be driven, and not in a playback")
             stage.driving.wanted = velocity
             stage.driving.apply(stage.live)
         case protocol.SetNumber(of, name, value):
@@ -70,7 +70,7 @@ def obey(stage: Stage, command: protocol.Command) -> None:
 
 
 def _set_mode(stage: Stage, command: protocol.SetMode) -> None:
-    """Change the mode, the controller or the episode; after a playback, the shown world continues from its state."""
+    """Change the mode, the controller or the episode; after a playback, the world continues from the shown state."""
     mode, controller = command.mode, command.controller
     if command.episode is not None:
         stage.playback.choose(command.episode)
@@ -83,14 +83,14 @@ def _set_mode(stage: Stage, command: protocol.SetMode) -> None:
 
 
 def _perturb(stage: Stage, command: protocol.Perturb) -> None:
-    """Push bodies of the shown world, or place them while paused."""
+    """Push bodies of the shown world, or move bodies while paused."""
     given = {"mocap_pos": command.mocap_pos, "mocap_quat": command.mocap_quat}
     given["qpos"] = command.qpos if stage.paused else None
     parts = {name: value for name, value in given.items() if value is not None}
     push = bool(np.any(command.forces))
     if stage.mode == "playback":
         if push or parts:
-            raise ValueError("a playback cannot be perturbed: change the mode")
+            raise ValueError("a playback cannot be perturbed: select another mode")
         return
     stage.dragging = push
     if parts:

@@ -16,11 +16,11 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.validate import described
 
 MOST_SAMPLES = 24
-"""Maximum number of samples of a plan whose paths are drawn."""
+"""The maximum number of a plan's samples of which paths are drawn."""
 
 
 class ControllerError(Exception):
-    """A controller raised an exception, the ``__cause__``. The message is one line."""
+    """Raised if a controller raises an exception, which is the ``__cause__``. The message has a single line."""
 
     def __init__(self, name: str, error: BaseException) -> None:
         text = next(iter(str(error).splitlines()), "")
@@ -29,28 +29,29 @@ class ControllerError(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class PlanView:
-    """A plan and some of its samples, on the CPU."""
+    """A copy of a plan and of some of its samples on the CPU."""
 
     state: torch.Tensor
-    """Initial state, (state_space.size,) float64."""
+    """The initial state, (state_space.size,) float64."""
     actions: torch.Tensor
     """(horizon, nact)."""
     samples: torch.Tensor
-    """Actions of some samples, (horizon, samples, nact)."""
+    """The actions of the copied samples, (horizon, samples, nact)."""
     best: int | None
-    """Index of the sample with the largest return; None without samples."""
+    """The index of the copied sample with the largest return; None without samples."""
 
 
 class PolicyControl:
-    """A policy that acts in all worlds.
+    """Calls a policy that acts in all worlds.
 
     Args:
-        name: Its name in the viewer.
-        policy: Its ``act``, or the policy itself, maps observations, (nworld, nobs), to actions, (nworld, nact).
+        name: The policy's name in the viewer.
+        policy: A function, or an object with a method ``act``, that maps observations, (nworld, nobs), to actions,
+            (nworld, nact).
         env: The worlds.
 
     Raises:
-        ValueError: It cannot be called with the observations, or returns actions of another shape.
+        ValueError: The policy cannot be called with the observations, or returns actions of a wrong shape.
     """
 
     def __init__(self, name: str, policy: Policy, env: Env) -> None:
@@ -74,7 +75,7 @@ class PolicyControl:
         """Write the actions of all worlds.
 
         Raises:
-            ControllerError: The policy raised an exception, or returned actions of another shape.
+            ControllerError: The policy raised an exception, or returned actions of a wrong shape.
         """
         begun = time.perf_counter()
         try:
@@ -85,10 +86,10 @@ class PolicyControl:
 
 
 class WorldControl:
-    """A controller of one world, for several runs of a control loop.
+    """Calls a controller of one world, in several runs of a control loop.
 
     Args:
-        name: Its name in the viewer.
+        name: The controller's name in the viewer.
         controller: See ``lw.Controller``.
     """
 
@@ -96,29 +97,29 @@ class WorldControl:
         self.name, self.seconds = name, float("nan")
         self.controller = controller
         self.plans = hasattr(controller, "actions")
-        """Whether it has plans, which can be drawn."""
+        """Whether the controller has plans to draw."""
         self._busy = threading.Lock()
         self._run = self.calls = 0
         self._reset_due = self._wanted = False
         self._seen: PlanView | None = None
         self.hidden: slice | None = None
-        """Part of the state that is set to zero for the controller: a push, which a robot cannot foresee."""
+        """The part of the state that is zero for the controller: a push, which a robot cannot foresee."""
 
     def new_run(self) -> "ControlRun":
-        """The controller for a new run of a loop. From now on, calls from earlier runs fail."""
+        """Return the controller for a new run of a loop. Calls from earlier runs then fail."""
         self._run += 1
         return ControlRun(self, self._run)
 
     @property
     def busy(self) -> bool:
-        """Whether a call is running."""
+        """Whether a call of the controller is running."""
         return self._busy.locked()
 
     def reset(self) -> None:
-        """Reset the controller: now, or before its next call if a call is in progress.
+        """Reset the controller at once, or before the next call if a call is in progress.
 
         Raises:
-            ControllerError: It raised an exception.
+            ControllerError: The controller raised an exception.
         """
         self._reset_due = True
         if self._busy.acquire(blocking=False):
@@ -131,11 +132,11 @@ class WorldControl:
         """Call the controller.
 
         Raises:
-            ControllerError: The controller raised an exception, or another run has begun.
+            ControllerError: The controller raised an exception, or a newer run has begun.
         """
-        with self._busy:  # a call of an interrupted run may still be in progress
+        with self._busy:  # the lock waits for a call of an interrupted run
             if run != self._run:
-                raise ControllerError(self.name, RuntimeError("its run is over"))
+                raise ControllerError(self.name, RuntimeError("this run has ended"))
             self._reset_now()
             if (hidden := self.hidden) is not None:
                 state = state.clone()
@@ -161,19 +162,22 @@ class WorldControl:
                 raise ControllerError(self.name, error) from error
 
     def look(self) -> PlanView | None:
-        """The plan that was copied since the last call of ``look``, if any. The next plan will be copied."""
+        """Return the plan that was copied since the last call of ``look``, if any.
+
+        The controller's next plan will be copied.
+        """
         seen, self._seen = self._seen, None
         self._wanted = True
         return seen
 
 
 class ControlRun:
-    """A controller for one run of a loop, with the attributes and the signature of the controller itself."""
+    """Wraps a controller for one run of a loop, with the controller's attributes and signature."""
 
     def __init__(self, control: WorldControl, number: int) -> None:
         self._control, self._number = control, number
         self.__name__ = getattr(control.controller, "__name__", type(control.controller).__name__)
-        self.__wrapped__ = control.controller  # inspect.signature finds the signature of __wrapped__
+        self.__wrapped__ = control.controller  # inspect.signature returns the signature of __wrapped__
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._control.controller, name)
@@ -184,7 +188,7 @@ class ControlRun:
 
 
 def plan_view(controller: Any, state: torch.Tensor) -> PlanView | None:
-    """Copy the last plan of a controller to the CPU; None for a controller without plans."""
+    """Copy the last plan of a controller to the CPU; return None for a controller without plans."""
     plan = getattr(controller, "actions", None)
     if not isinstance(plan, torch.Tensor) or plan.ndim != 2:
         return None
@@ -204,7 +208,7 @@ Control = PolicyControl | WorldControl
 
 
 def controls(given: Mapping[str, Any], env: Env) -> dict[str, Control]:
-    """Check controllers: those with one argument are policies, and those with two control a single world.
+    """Check controllers: a policy takes one argument, and a controller of one world takes two.
 
     Args:
         given: Controllers by name; see ``lw.view``.
@@ -246,7 +250,7 @@ def _is_policy(controller: Any) -> bool:
 
 
 def _on_device(policy: Any, env: Env) -> Any:
-    """Copy a policy to the worlds' device if it is on another one."""
+    """Copy a policy to the worlds' device, unless it is already there."""
     if isinstance(policy, torch.nn.Module) and any(p.device != env.obs.device for p in policy.parameters()):
         return moved(policy, env)
     return policy

@@ -1,7 +1,7 @@
-"""Replace the drawn command of a walking robot, and draw arrows of commanded and measured velocities.
+"""Replace the task's command for a walking robot, and draw arrows for commanded and measured velocities.
 
-The memory of a velocity task names its command; see ``docs/velocity.md``. A robot's base is its first joint, which is
-free.
+The command is found by the names of a velocity task's memory; see ``docs/velocity.md``. A robot's first joint is the
+free joint of its base.
 """
 
 import math
@@ -14,13 +14,13 @@ from lyceum_warp.viewer.protocol import Arrow
 from lyceum_warp.viewer.session.live import Live
 
 _MEMORY = ("drawn_velocity", "heading_target", "heading_controlled", "standing", "command_timer")
-_NEVER = 1e9  # seconds until the task draws another command
-_HEIGHT, _SECONDS = 0.25, 0.4  # arrows begin above the base, m, and show the way of this time
+_NEVER = 1e9  # seconds until the task would draw a command
+_HEIGHT, _SECONDS = 0.25, 0.4  # the height of arrows above the base, m, and their seconds of motion
 _COMMANDED, _MEASURED = (0.1, 0.35, 0.95, 1.0), (0.1, 0.85, 0.55, 1.0)
 
 
 class Driving:
-    """The command of a walking robot.
+    """Reads and replaces the command of a walking robot.
 
     Args:
         env: The worlds.
@@ -29,15 +29,16 @@ class Driving:
     def __init__(self, env: Env) -> None:
         self._parts, self._params = env.state_space.parts, env.task.params
         self.limits: tuple[float, float, float] | None = None
-        """Largest forward and lateral velocity, m/s, and yaw rate, rad/s, of the task; None without a command."""
+        """The task's largest forward velocity and lateral velocity, m/s, and yaw rate, rad/s; None without a
+        command."""
         if all(name in self._parts for name in _MEMORY):
             _, _, forward, turn = np.asarray(self._params["stages"])[0]
             self.limits = float(forward), float(self._params["lateral_velocity"]), float(turn)
         self.wanted: tuple[float, float, float] | None = None
-        """The user's command; None if the task draws commands."""
+        """The user's command, or None if the task draws commands."""
 
     def command(self, state: np.ndarray) -> tuple[float, float, float] | None:
-        """The command in a state, (state_space.size,): forward and lateral velocity, yaw rate."""
+        """Return the command in a state, (state_space.size,): forward velocity, lateral velocity and yaw rate."""
         if self.limits is None:
             return None
         velocity, target, controlled, standing, _ = (state[self._parts[name]] for name in _MEMORY)
@@ -50,7 +51,7 @@ class Driving:
         return float(velocity[0]), float(velocity[1]), float(turn)
 
     def apply(self, live: Live) -> None:
-        """Write the user's command into the shown world, or let the task draw one with its next step."""
+        """Write the user's command into the shown world, or let the task draw a command in the next step."""
         if self.wanted is None:
             live.write(command_timer=np.zeros(1))
         else:
@@ -58,7 +59,7 @@ class Driving:
             live.write(drawn_velocity=np.array(self.wanted), command_timer=np.array([_NEVER]), **none)
 
     def arrows(self, state: np.ndarray) -> tuple[Arrow, ...]:
-        """Arrows above the base: velocities forward and sideways, and upward or downward yaw rates."""
+        """Make arrows above the base: horizontal arrows for velocities, and vertical arrows for yaw rates."""
         if (command := self.command(state)) is None:
             return ()
         qpos, qvel = state[self._parts["qpos"]], state[self._parts["qvel"]]

@@ -1,4 +1,4 @@
-"""Make the frames and messages of worlds and playbacks."""
+"""Make frames and messages from worlds and playbacks."""
 
 import functools
 import itertools
@@ -21,7 +21,7 @@ _COLOURS = (
     (0.30, 0.80, 0.80),
 )  # fmt: skip
 _PAST, _FUTURE, _PLAN = (0.90, 0.25, 0.20), (0.25, 0.40, 0.95), (0.25, 0.90, 0.45)
-_OPACITY, _FADE = 0.35, 0.95  # fade: opacity of each state in the burst, relative to the previous state
+_OPACITY, _FADE = 0.35, 0.95  # fade: the opacity of a state in the burst, relative to the previous state
 
 
 class FrameMaker:
@@ -29,15 +29,15 @@ class FrameMaker:
 
     Args:
         env: The worlds.
-        curves: Number of curves.
-        driving: The command of a walking robot.
+        curves: The number of curves.
+        driving: Reads and replaces the command of a walking robot.
     """
 
     def __init__(self, env: Env, curves: int, driving: Driving) -> None:
         self.ghosts = SetGhosts()
         """The ghosts that are drawn."""
         self.messages: list[str] = []
-        """Messages of the next frame."""
+        """The messages of the next frame."""
         self._env, self._curves, self._driving = env, curves, driving
         self._points: list[list[float]] = []
         self._seen_end = self._seen_fault = 0.0
@@ -47,7 +47,7 @@ class FrameMaker:
         self.messages.append(text)
 
     def forget_seen(self, live: Live) -> None:
-        """Report only ends and faults from now on."""
+        """Report only future ends of episodes and faults."""
         self._seen_end = self._seen_fault = float(live.made)
 
     def add_point(self, playback: Playback) -> None:
@@ -64,10 +64,10 @@ class FrameMaker:
 
         Args:
             live: The worlds.
-            main: All worlds, if ``live`` is a plant.
-            traces: Paths of a planner's samples.
-            status: Completes the status.
-            paused: Whether the frame must show the present state; otherwise it may lag by one frame.
+            main: All worlds, of which ``live`` is one or a copy of one.
+            traces: The paths of a planner's samples.
+            status: A function that makes the complete status.
+            paused: Whether the frame must show the present state; otherwise the frame may lag by one.
         """
         shown = _following(main.world, main.env.nworld, self.ghosts.worlds)
         wanted = shown if live is main else [], self.ghosts.burst
@@ -81,7 +81,7 @@ class FrameMaker:
             rows = live.take()
             assert rows is not None
             points.append(rows.points)
-        if live.asynchronous and not paused:  # for the next frame
+        if live.asynchronous and not paused:  # the request is for the next frame
             live.request(*wanted)
         state, parts = rows.states[0], live.env.state_space.parts
         self._report(rows, main.world if live is not main else None)
@@ -107,7 +107,7 @@ class FrameMaker:
         )  # fmt: skip
 
     def of_playback(self, playback: Playback, status: Callable[..., Status]) -> Frame:
-        """Make a frame of a playback; ``status`` completes the status."""
+        """Make a frame of a playback; the function ``status`` makes the complete status."""
         episode, state = playback.episode, playback.state
         shown = _following(playback.index, len(playback.episodes), self.ghosts.episodes)
         others = [playback.episodes[index].states for index in shown]
@@ -132,7 +132,7 @@ class FrameMaker:
         )  # fmt: skip
 
     def _report(self, rows: Rows, plant_of: int | None) -> None:
-        """Report an episode that ended, and faults; ``plant_of`` is the world that the plant was copied from."""
+        """Report the end of an episode, and faults; ``plant_of`` is the world of which the plant is a copy."""
         number, bits, returned, length, success = rows.end
         if number > self._seen_end:
             why = "success" if success else reasons(int(bits))
@@ -145,18 +145,18 @@ class FrameMaker:
         self._seen_fault = max(self._seen_fault, rows.fault[0])
 
     def _coloured(self, states: Iterable[np.ndarray]) -> list[Ghost]:
-        """Ghosts of other worlds or episodes."""
+        """Make ghosts of other worlds or episodes."""
         return [Ghost(self._pose(row), (*_COLOURS[i % len(_COLOURS)], _OPACITY)) for i, row in enumerate(states)]
 
     def _beside(self, states: Iterable[np.ndarray]) -> list[Ghost]:
-        """Other worlds in a grid around the shown one."""
+        """Place other worlds in a grid around the shown world."""
         cells = sorted(itertools.product(range(-3, 4), repeat=2), key=lambda cell: (max(map(abs, cell)), cell))[1:]
         step = self._grid_step
         return [Ghost(self._pose(row), None, (step * x, step * y)) for row, (x, y) in zip(states, cells, strict=False)]
 
     @functools.cached_property
     def _grid_step(self) -> float:
-        """Distance between the worlds of a grid, m: a bit more than the robot's size."""
+        """The distance between the worlds of a grid, m, slightly more than the robot's size."""
         model = self._env.task.model
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
@@ -165,7 +165,7 @@ class FrameMaker:
         return 2.2 * float(far[moving].max(initial=0.1))
 
     def _burst(self, states: Iterable[np.ndarray], colour: tuple[float, float, float]) -> list[Ghost]:
-        """Ghosts along a trajectory, the nearest to the present first."""
+        """Make ghosts along a trajectory, beginning with the nearest to the present."""
         return [Ghost(self._pose(row), (*colour, _OPACITY * _FADE ** (i + 1))) for i, row in enumerate(states)]
 
     def _pose(self, state: np.ndarray) -> Any:
@@ -175,7 +175,7 @@ class FrameMaker:
         return state[: mujoco.mj_stateSize(self._env.task.model, mujoco.mjtState.mjSTATE_INTEGRATION)].copy()
 
     def _model_fields(self, state: np.ndarray) -> dict[str, np.ndarray]:
-        """The model fields in a state that differ from the model."""
+        """Return the model fields of a state that differ from the model."""
         found = {}
         for field in self._env.task.dynamics:
             owner = self._env.task.model if hasattr(self._env.task.model, field.name) else self._env.task.model.opt
@@ -191,7 +191,7 @@ class FrameMaker:
 
 
 def _following(index: int, number: int, count: int) -> list[int]:
-    """Indices of the worlds or episodes after the given one, at most ``count``."""
+    """Return the indices of at most ``count`` worlds or episodes after the given one."""
     return [(index + i) % number for i in range(1, min(count, number - 1) + 1)]
 
 

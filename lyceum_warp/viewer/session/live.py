@@ -1,7 +1,7 @@
 """Step the worlds of a session, keep their history, and copy the rows of a frame to the host.
 
-All work of a step stays on the worlds' device: the history, the returns and the points of the curves. On a GPU no step
-waits for the device, and a frame copies its rows to the host asynchronously.
+A step works only on the worlds' device, including the history, the returns and the points of the curves. On a GPU no
+step waits for the device, and a frame copies its rows to the host asynchronously.
 """
 
 import dataclasses
@@ -15,23 +15,23 @@ from lyceum_warp.env import Env
 from lyceum_warp.viewer.protocol import Pose
 
 HISTORY_BYTES = 240 * 2**20
-"""Memory of the history of all worlds, in bytes."""
+"""The memory for the history of all worlds, in bytes."""
 PLANT_HISTORY_BYTES = 16 * 2**20
-"""Memory of the history of a plant, in bytes."""
+"""The memory for the history of a plant, in bytes."""
 HISTORY_STEPS = 2000
-"""Maximum number of steps in the history."""
+"""The maximum number of steps in the history."""
 
-_CURVE_ROWS = 512  # curve points between two frames; older points are overwritten
+_CURVE_ROWS = 512  # curve points between two frames; further points overwrite the oldest
 
 
 class Past:
-    """Ring buffer with the states of all worlds before each of the last steps.
+    """A ring buffer with the states of all worlds before each of the last steps.
 
     Without memory for two states of all worlds, the buffer stays empty.
 
     Args:
         env: The worlds.
-        limit: Memory in bytes.
+        limit: The maximum memory in bytes.
     """
 
     def __init__(self, env: Env, limit: int) -> None:
@@ -42,23 +42,23 @@ class Past:
         self.states = torch.empty(self.length, n, size, dtype=torch.float64, device=device)
         self.returns = torch.empty(self.length, n, dtype=torch.float64, device=device)
         self.pushed: list[int | None] = [None] * self.length
-        """The world that the user was pushing."""
+        """The world that the user was pushing in each step, if any."""
         self.now = self.newest = self.oldest = 0
-        """Numbers of the present step, of the newest step and of the oldest step."""
+        """The numbers of the present step, the newest step and the oldest step."""
 
     @property
     def behind(self) -> int:
-        """Number of steps that can be taken back."""
-        # once a step is taken back, the present state takes the place of the oldest state
+        """The number of steps that can be taken back."""
+        # when a step is taken back, the present state replaces the oldest state
         return min(self.now - self.oldest, max(self.length - 1, 0))
 
     @property
     def ahead(self) -> int:
-        """Number of steps that were taken back."""
+        """The number of steps that were taken back."""
         return self.newest - self.now
 
     def put(self, state: torch.Tensor, returns: torch.Tensor, pushed: int | None) -> None:
-        """Keep the present state."""
+        """Store the present state."""
         index = self.now % self.length
         self.states[index].copy_(state)
         self.returns[index].copy_(returns)
@@ -66,42 +66,42 @@ class Past:
         self.oldest = max(self.oldest, self.now - self.length + 1)
 
     def drop_ahead(self) -> None:
-        """Forget the steps that were taken back, so that they cannot be restored."""
+        """Discard the steps that were taken back."""
         self.newest = self.now
 
 
 @dataclasses.dataclass(frozen=True)
 class Rows:
-    """Rows of a frame, on the host."""
+    """The rows of a frame on the host."""
 
     worlds: tuple[int, ...]
-    """Indices of the worlds; the shown world comes first."""
+    """The indices of the worlds; the shown world comes first."""
     states: np.ndarray
-    """(worlds, state_space.size) float64."""
+    """The states of the worlds, (worlds, state_space.size) float64."""
     back: np.ndarray
     """Earlier states of the shown world, the latest first, (burst, state_space.size) float64."""
     episode_return: float
-    """Return of the shown world's episode so far."""
+    """The return of the shown world's episode so far."""
     end: tuple[float, ...]
-    """Last end of an episode of the shown world: number of the step, bits of ``Done``, return, length, success."""
+    """The last end of an episode in the shown world: the step's number, bits of ``Done``, return, length, success."""
     fault: tuple[float, ...]
-    """Last fault in any world: number of the step, bits of ``Done``, world, number of faults so far."""
+    """The last fault in any world: the step's number, bits of ``Done``, the world, and the number of faults so far."""
     points: np.ndarray
     """New points of the curves, (points, 2 + curves) float64."""
 
 
 class Live:
-    """Worlds that are stepped.
+    """Steps worlds, and keeps their history.
 
     Args:
-        env: The worlds, which keep their present state.
-        limit: Memory of the history in bytes.
+        env: The worlds, which start from their present state.
+        limit: The maximum memory of the history in bytes.
     """
 
     def __init__(self, env: Env, *, limit: int = HISTORY_BYTES) -> None:
         self.env, self.past = env, Past(env, limit)
         self.made = 0
-        """Number of steps since the session began."""
+        """The number of steps since the session began."""
         self.world = 0
         self.pushed: int | None = None
         """The world that the user is pushing."""
@@ -109,8 +109,8 @@ class Live:
         self.asynchronous = device.type != "cpu"
         """Whether rows are copied to the host asynchronously."""
         self.returns = torch.zeros(n, dtype=torch.float64, device=device)
-        """Return of each world's episode so far, (nworld,)."""
-        self._clock = 0  # steps since the session began, minus the steps taken back
+        """The return of each world's episode so far, (nworld,)."""
+        self._clock = 0  # steps since the session began, without steps that were taken back
         self._ends = torch.zeros(n, 5, dtype=torch.float64, device=device)
         self._fault = torch.zeros(4, dtype=torch.float64, device=device)
         self._ended, self._reward = torch.zeros(n, dtype=torch.bool, device=device), torch.zeros_like(env.reward)
@@ -119,7 +119,7 @@ class Live:
         self._state = env.get_state()
         self._reading: tuple[tuple[int, ...], list[float], list[torch.Tensor]] | None = None  # worlds, times, rows
         self._event = torch.cuda.Event() if device.type == "cuda" else None
-        # before the current step
+        # values before the current step
         self._length, self._over = env.episode_step.clone(), env.done.clone()
         self._number = torch.arange(n, device=device)
 
@@ -138,10 +138,11 @@ class Live:
     # steps
 
     def step(self, act: Callable[[], None]) -> None:
-        """Make a step, or restore the state after a step that was taken back.
+        """Make a step, or restore the next state if steps were taken back.
 
         Args:
-            act: Writes the actions of all worlds into ``env.action``. If the state is restored, ``act`` is not called.
+            act: A function that writes the actions of all worlds into ``env.action``. A restored state needs no
+                actions, so ``act`` is not called.
         """
         if self.past.ahead:
             self._move(1)
@@ -153,13 +154,13 @@ class Live:
         self._after_step()
 
     def expect_steps(self) -> None:
-        """Prepare for steps that other code makes; call ``stepped`` after each."""
+        """Prepare for steps that other code makes; call ``stepped`` after each of these steps."""
         self.past.drop_ahead()
         self.env.get_state(out=self._state)
         self._before_step()
 
     def stepped(self) -> None:
-        """Account for a step that other code made."""
+        """Update the statistics after a step that other code made."""
         self._keep(self._state)
         self._after_step()
         self.env.get_state(out=self._state)
@@ -181,11 +182,11 @@ class Live:
         self._clock += 1
         self.made += 1
         ended, reward = self._ended.copy_(env.done), self._reward.copy_(env.reward)
-        if not env.autoreset:  # done stays set, and the return keeps its value
+        if not env.autoreset:  # without autoreset done stays set, and the return must not grow
             ended.logical_and_(~self._over)
             reward.masked_fill_(self._over, 0.0)
         self.returns.add_(reward)
-        # on a GPU, reading the mask would wait for the device
+        # on a GPU, do not read the mask, which would wait for the device
         if self.asynchronous or ended.any():
             self._note_ends(ended)
         values = [
@@ -198,7 +199,7 @@ class Live:
         self._times.append(self._clock * env.timestep)
 
     def _note_ends(self, ended: torch.Tensor) -> None:
-        """Save ends of episodes and faults, without waiting for the device."""
+        """Store ends of episodes and faults, without waiting for the device."""
         env, reason = self.env, self.env.done_reason
         made = torch.full_like(self.returns, self.made)
         end = torch.stack([made, reason.double(), self.returns, self._length + 1.0, env.success.double()], dim=1)
@@ -206,7 +207,7 @@ class Live:
         if env.autoreset:
             self.returns.masked_fill_(ended, 0.0)
         fault = ended & ((reason & int(FAULTS)) != 0)
-        # indexing with a tensor would wait for the device
+        # gather does not wait for the device, unlike indexing with a tensor
         first = torch.argmax(fault.to(torch.int8)).view(1)
         count = self._fault[3:] + fault.sum()
         now = torch.cat([made[:1], reason.gather(0, first).double(), first.double(), count])
@@ -221,7 +222,7 @@ class Live:
             Number of steps that were taken back, at most ``past.behind``.
         """
         past = self.past
-        if not past.ahead and past.behind:  # the current state is not in the history yet
+        if not past.ahead and past.behind:  # the history does not contain the current state yet
             past.put(self.env.get_state(out=self._state), self.returns, self.pushed)
         steps = min(steps, past.behind)
         if steps > 0:
@@ -229,7 +230,7 @@ class Live:
         return steps
 
     def forward(self, steps: int) -> None:
-        """Restore all worlds to a state that was taken back."""
+        """Restore all worlds to a later state, after steps were taken back."""
         if steps := min(steps, self.past.ahead):
             self._move(steps)
 
@@ -244,7 +245,7 @@ class Live:
         if steps < 0:
             self._times.clear()
 
-    # changes requested by the user
+    # changes that the user requests
 
     def reset(self, *, random: bool) -> None:
         """Start a new episode of the shown world."""
@@ -263,8 +264,8 @@ class Live:
 
         Args:
             state: (state_space.size,) float64, on any device.
-            new_episode: Whether its return starts from 0.
-            world: Its index; by default the shown world.
+            new_episode: Whether the world's return starts from 0.
+            world: The index of the world; by default the shown world.
         """
         world = self.world if world is None else world
         mask = self._number == world
@@ -279,7 +280,7 @@ class Live:
         """Push bodies of the shown world, until ``end_push``.
 
         Args:
-            forces: (nbody, 6): force (N) and torque (Nm) in world coordinates.
+            forces: Forces (N) and torques (Nm) on all bodies in world coordinates, (nbody, 6).
         """
         if self.pushed != self.world:
             self.end_push()
@@ -295,11 +296,11 @@ class Live:
             self.set_row(state, world=world)
 
     def row(self) -> torch.Tensor:
-        """The state of the shown world, (state_space.size,) float64, on its device."""
+        """Return the state of the shown world, (state_space.size,) float64, on the world's device."""
         return self.env.get_state()[self.world]
 
     def write(self, **parts: np.ndarray) -> None:
-        """Change parts of the shown world's state, by their names in ``env.state_space``."""
+        """Change parts of the shown world's state, which are named as in ``env.state_space``."""
         state = self.row()
         for name, value in parts.items():
             where = self.env.state_space.parts[name]
@@ -309,7 +310,7 @@ class Live:
     # worlds to show
 
     def choose(self, choice: int | str) -> int:
-        """Find the index of a world. "best" and "worst" wait for the device.
+        """Find the index of a world. The choices "best" and "worst" wait for the device.
 
         Args:
             choice: An index; "next" or "previous"; "best" or "worst" by the return of the episode so far.
@@ -320,14 +321,14 @@ class Live:
             return (self.world + (1 if choice == "next" else -1)) % self.env.nworld
         return int(self.returns.argmax() if choice == "best" else self.returns.argmin())
 
-    # rows for the window
+    # the rows of frames
 
     def request(self, worlds: Sequence[int] = (), burst: int = 0) -> None:
         """Start copying the rows of a frame to the host, unless a copy is already in progress.
 
         Args:
-            worlds: Worlds to copy beside the shown one.
-            burst: Number of earlier states of the shown world.
+            worlds: The worlds to copy in addition to the shown world.
+            burst: The number of earlier states of the shown world.
         """
         if self._reading is not None:
             return
@@ -346,7 +347,7 @@ class Live:
             self._event.record()
 
     def take(self) -> Rows | None:
-        """Wait for the requested rows, and return them; None without a request."""
+        """Wait for the requested rows, and return them, or None if there was no request."""
         if self._reading is None:
             return None
         (worlds, times, parts), self._reading = self._reading, None
@@ -365,7 +366,7 @@ def _index(numbers: Sequence[int], device: torch.device) -> torch.Tensor:
 
 
 def _to_host(part: torch.Tensor) -> torch.Tensor:
-    """Copy to the host, asynchronously from a GPU."""
+    """Copy a tensor to the host; a copy from a GPU is asynchronous."""
     if part.device.type == "cpu":
         return part.clone()
     host = torch.empty(part.shape, dtype=part.dtype, pin_memory=True)
@@ -376,8 +377,8 @@ def pose(state: np.ndarray, parts: Mapping[str, slice], nmocap: int) -> Pose:
     """Extract the pose from a state.
 
     Args:
-        state: (state_space.size,).
-        parts: Slices of the state by name.
+        state: The state, (state_space.size,).
+        parts: The slices of the state by name.
         nmocap: Number of mocap bodies.
     """
     none = slice(0, 0)

@@ -7,14 +7,14 @@ from lyceum_warp.algos.planner import Planner
 from lyceum_warp.env import Env
 
 _SETTINGS = ("noise", "temperature", "horizon", "samples")
-_OF_THE_PLANNER = ("nworld", "autoreset", "horizon", "seed", "first_world")  # options that it chooses for its worlds
+_OF_THE_PLANNER = ("nworld", "autoreset", "horizon", "seed", "first_world")  # a planner sets these options
 
 Numbers = tuple[tuple[str, float], ...]
 """Names and values."""
 
 
 def planner_numbers(controller: Any) -> Numbers:
-    """The settings of a planner that can be changed; none for other controllers."""
+    """Return the settings of a planner that the user can change; other controllers have none."""
     if not isinstance(controller, Planner):
         return ()
     found = ((name, getattr(controller.config, name)) for name in _SETTINGS)
@@ -22,13 +22,13 @@ def planner_numbers(controller: Any) -> Numbers:
 
 
 def task_numbers(env: Env) -> Numbers:
-    """The parameters of a task that are floats, including the weights of its reward."""
+    """Return the parameters of a task that are floats, including the weights of the reward."""
     known = env.task.params
     return tuple((n, v) for n, v in known.items() if isinstance(v, float) and n not in ("dt", "substep_dt"))
 
 
 def rebuilt_planner(planner: Planner, name: str, value: float) -> Planner:
-    """A new planner with another setting, because sizes and settings are part of a planner's graphs.
+    """Make a planner with another value of a setting, because a planner's graphs contain its settings.
 
     Raises:
         ValueError: The value is not valid.

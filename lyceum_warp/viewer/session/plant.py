@@ -11,11 +11,11 @@ from lyceum_warp.viewer.session.drivers import ControllerError, WorldControl
 from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
 
 POLL = 0.005
-"""Seconds between two polls of the window's commands."""
+"""The seconds between two polls of the window's commands."""
 
-_RESERVE = 0.0015  # seconds before a plant's step in which the session starts no work
-_PART = 10_000  # maximum steps of a run, whose states are all kept
-_WARM_UP = 3  # first calls of a controller, which may capture graphs; no other work may run meanwhile
+_RESERVE = 0.0015  # no work starts within these seconds before a step
+_PART = 10_000  # maximum steps of a run, because all states are stored
+_WARM_UP = 3  # first calls of a controller, without other work, because they may capture graphs
 
 
 class InterruptedByCommand(BaseException):
@@ -23,7 +23,7 @@ class InterruptedByCommand(BaseException):
 
 
 def make_plant(main: Live) -> Live:
-    """Make the plant: one world on the CPU, whose steps do not wait for a planner's GPU."""
+    """Make the plant, a single world on the CPU, so that its steps do not wait for a planner's GPU."""
     env, plant = main.env, main
     if env.nworld > 1 or env.autoreset or env.device.is_cuda:
         options = options_for_plant(env.options.engine, env.device)
@@ -43,14 +43,15 @@ def run_plant(
     work: Callable[[], None],
     on_step: Callable[[ControlProgress], None],
 ) -> None:
-    """Run the plant by the clock until its episode ends.
+    """Run the plant in real time until its episode ends.
 
     Args:
         live: The plant.
         control: Its controller.
         speed: Simulated seconds per second.
-        work: Called while the plant waits for its next step; it may raise ``InterruptedByCommand`` to end the run.
-        on_step: Called after each step.
+        work: A function that is called while the plant waits for its next step; it may raise ``InterruptedByCommand``
+            to end the run.
+        on_step: A function that is called after each step.
 
     Raises:
         ControllerError: The controller raised an exception, or its actions are invalid.
@@ -66,15 +67,15 @@ def run_plant(
     except ValueError as error:  # from invalid actions
         raise ControllerError(control.name, error) from error
     finally:
-        control.new_run()  # calls that are left of this run fail
+        control.new_run()  # remaining calls of this run fail
 
 
 class _WorkingClock(Clock):
-    """A wall clock that works while the plant waits.
+    """A wall clock that calls ``work`` while the plant waits.
 
     Args:
-        work: Called while the plant waits for its next step.
-        warm: Whether to work before the first plan, too.
+        work: A function that is called while the plant waits for its next step.
+        warm: Whether to call ``work`` even before the first plan.
     """
 
     def __init__(self, work: Callable[[], None], *, warm: bool) -> None:

@@ -1,4 +1,4 @@
-"""Play back episodes: states in order, with rewards if these are known."""
+"""Play back episodes: sequences of states, with rewards if they are known."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -17,17 +17,17 @@ from lyceum_warp.support.validate import described
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Episode:
-    """States of one world."""
+    """The states of one world in an episode."""
 
     name: str
     states: np.ndarray
-    """(steps + 1, state_space.size) float64."""
+    """The states, (steps + 1, state_space.size) float64."""
     rewards: np.ndarray
-    """(steps,), NaN if unknown."""
+    """The rewards, (steps,), NaN if unknown."""
     evals: np.ndarray
-    """(steps,), NaN if unknown."""
+    """The evaluations, (steps,), NaN if unknown."""
     end: str = ""
-    """Why the episode ended; empty if it did not end, or if this is unknown."""
+    """The reason for the end of the episode; empty if the episode did not end or the reason is unknown."""
 
     @property
     def steps(self) -> int:
@@ -45,11 +45,11 @@ def episodes_of(given: Any, env: Env) -> list[Episode]:
 
     Args:
         given: The episodes; see ``lw.view``.
-        env: An environment of their task.
+        env: An environment of the episodes' task.
 
     Raises:
         FileNotFoundError: A file is missing.
-        ValueError: An episode belongs to another task, or is not an episode.
+        ValueError: An episode belongs to another task, or has the wrong type.
     """
     if isinstance(given, Mapping):
         return [_episode(name, each, env) for name, each in given.items()]
@@ -68,7 +68,8 @@ def _episode(name: str | None, given: Any, env: Env, number: int = 0) -> Episode
     size = env.state_space.size
     if not isinstance(given, torch.Tensor) or given.ndim != 2 or given.shape[1] != size or not len(given):
         raise ValueError(
-            f"an episode of {env.task.name!r} must be a Trajectory, a file of one, or states of shape (steps, {size}) "
+            f"an episode of {env.task.name!r} must be a Trajectory, a file of a Trajectory, or states of shape (steps, "
+            f"{size}) "
             f"as env.get_state() returns them, not {described(given)}"
         )
     unknown = np.full(len(given) - 1, np.nan)
@@ -84,7 +85,7 @@ def _of_trajectory(name: str, trajectory: Trajectory, env: Env) -> Episode:
 
 
 class Playback:
-    """The episodes, and the shown step of one of them."""
+    """Holds episodes, and the shown step of one episode."""
 
     def __init__(self, episodes: Sequence[Episode]) -> None:
         self.episodes = list(episodes)
@@ -102,11 +103,11 @@ class Playback:
 
     @property
     def next_step(self) -> int:
-        """The next step in the direction of the playback, which repeats the episode."""
+        """Return the next step in the playback's direction; at its end the episode is repeated."""
         return (self.step + (-1 if self.backwards else 1)) % (self.episode.steps + 1)
 
     def choose(self, index: int) -> None:
-        """Show another episode, at the same step or at its last step if it is shorter."""
+        """Show another episode, at the same step, or at the last step of a shorter episode."""
         self.index = index
         self.seek(self.step)
 
@@ -115,7 +116,7 @@ class Playback:
         self.step = min(max(step, 0), self.episode.steps)
 
     def around(self, count: int) -> list[int]:
-        """At most ``count`` evenly spaced steps of the episode, without the shown step."""
+        """Return at most ``count`` evenly spaced steps of the episode, without the shown step."""
         last = self.episode.steps
         steps = {round(i * last / max(count - 1, 1)) for i in range(count)}
         return sorted(steps - {self.step})

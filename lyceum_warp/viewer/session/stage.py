@@ -25,14 +25,14 @@ from lyceum_warp.viewer.session.playback import Playback, episodes_of
 from lyceum_warp.viewer.session.traces import TraceRollouts, Traces, TraceThread
 from lyceum_warp.viewer.session.videos import VideoTaker
 
-_OLD = 1.0  # seconds after which traces are no longer shown
+_OLD = 1.0  # seconds after which traces disappear
 
 
 class Stage:
-    """The worlds, controllers and episodes of a session.
+    """Holds the worlds, controllers and episodes of a session.
 
     Policies act in all worlds. A controller of one world, such as a planner, acts in the plant, a copy of the shown
-    world, while the other worlds wait. The arguments are explained in ``lw.view``.
+    world, while the other worlds wait. ``lw.view`` explains the arguments.
 
     Raises:
         ValueError: An argument is invalid.
@@ -63,7 +63,7 @@ class Stage:
         self.dragging = False
         """Whether the user is pushing a body."""
         self.changed = False
-        """Whether anything has changed since the last frame."""
+        """Whether the display has changed since the last frame."""
         self.driving = Driving(env)
         modes: list[Mode] = ["playback"] if self.playback.episodes else []
         modes += ["controller"] if self.controllers else []
@@ -79,14 +79,14 @@ class Stage:
         self.shown: Frame | None = None
         """The last frame."""
         self.steps = 0
-        """Steps since the session began, for the measured speed."""
+        """The number of steps since the session began, for the measured speed."""
         self.progress: deque[tuple[float, int]] = deque(maxlen=64)
-        """For each recent frame, its time and the total number of steps at that time."""
+        """The time of each recent frame, and the total number of steps at that time."""
         self.select(modes[0], next(iter(self.controllers), None))
 
     @property
     def live(self) -> Live:
-        """The worlds that are stepped: the plant under a controller of one world, the environment otherwise."""
+        """The stepped worlds: the plant if a controller of one world is in use, otherwise the environment."""
         return self._plant if self._plant is not None and isinstance(self.control, WorldControl) else self.main
 
     @property
@@ -95,7 +95,7 @@ class Stage:
         return self.controllers[self.controller] if self.mode == "controller" and self.controller else None
 
     def close(self) -> None:
-        """End the threads. A second call does nothing."""
+        """End the threads. A second call has no effect."""
         while self._threads:
             self._threads.popitem()[1].close()
 
@@ -137,7 +137,7 @@ class Stage:
         self.live.stepped()
 
     def begin_due_episode(self) -> None:
-        """Start a new episode of the plant and its controller if the last episode is over."""
+        """Start a new episode of the plant and its controller if the last episode has ended."""
         if self.live.env.done.item():
             self.reset(random=True)
 
@@ -157,7 +157,7 @@ class Stage:
         """Take steps back."""
         done = self.live.back(steps)
         if done < steps:
-            self.frames.say(f"the past ends here: it keeps at most {max(self.live.past.length - 1, 0)} steps")
+            self.frames.say(f"the history ends here: it has at most {max(self.live.past.length - 1, 0)} steps")
 
     def seek_episode(self, step: int) -> None:
         """Show a step of the playback."""
@@ -193,20 +193,20 @@ class Stage:
         self._trace()
 
     def _trace(self) -> None:
-        """Start to draw the plans of the controller in use."""
+        """Begin to draw the plans of the controller in use."""
         current = self.control
         if isinstance(current, WorldControl) and current.plans and current.name not in self._threads:
             self._threads[current.name] = TraceThread(TraceRollouts(current.controller, self.live.env))
 
     def set_number(self, of: str, name: str, value: float) -> None:
-        """Change a setting of the planner in use, which is rebuilt, or a parameter of the task in all worlds.
+        """Change a setting of the planner in use, and rebuild the planner, or change a task parameter in all worlds.
 
         Raises:
             ValueError: The value is not valid.
         """
         planners = [each for each in self.controllers.values() if isinstance(each, WorldControl)]
         if of == "planner":
-            if not isinstance(self.control, WorldControl):  # the mode has changed meanwhile
+            if not isinstance(self.control, WorldControl):  # the mode has changed since the command
                 raise ValueError(f"{name} was not changed: no planner is in use")
             planners = [self.control]
             self.control.controller = rebuilt_planner(self.control.controller, name, value)
@@ -262,17 +262,17 @@ class Stage:
         frame = self.frames.of_worlds(self.live, self.main, self._traces(), self._status, paused=self.paused)
         wanted, command, live = self.driving.wanted, frame.status.command, self.live
         if wanted and command and not live.past.ahead and not np.allclose(command, wanted, atol=1e-6):
-            self.driving.apply(live)  # a new episode or another world has its own command
+            self.driving.apply(live)  # a new episode or another world has a different command
             live.expect_steps()
         return frame
 
     def _traces(self) -> Traces | None:
-        """The newest traces, if they are shown; requests new ones."""
+        """Return the newest traces, if traces are shown, and request new traces."""
         thread, current = self._threads.get(str(self.controller)), self.control
         if not self.frames.ghosts.plan or thread is None or not isinstance(current, WorldControl):
             return None
         if thread.error is not None:
-            self.frames.say(f"no paths of samples: {thread.error}")
+            self.frames.say(f"the paths of samples cannot be drawn: {thread.error}")
             thread.error = None
         if (view := current.look()) is not None:
             thread.give(view)

@@ -1,8 +1,8 @@
 """Roll out a planner's plan and samples again to get their paths, in a thread.
 
-A planner stores no positions. This module rolls out the actions of some samples from the plan's initial state, in
-worlds of the planner's own task, model and time step. These worlds have other random streams than the planner, so if
-the task draws random numbers during an episode, the planner evaluated other paths.
+A planner does not store positions. This module rolls out the actions of some samples from the plan's initial state, in
+worlds with the planner's task, model and time step. The random streams of these worlds differ from the planner's, so
+the paths differ if the task draws random numbers during an episode.
 """
 
 import dataclasses
@@ -22,27 +22,27 @@ from lyceum_warp.viewer.session.drivers import MOST_SAMPLES, PlanView
 from lyceum_warp.viewer.session.live import pose
 
 SHARE = 0.15
-"""Maximum share of a core: after t seconds of CPU time, the thread sleeps for t / SHARE."""
+"""The maximum share of a core for the thread, which sleeps t / SHARE after t seconds of CPU time."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TracePoint:
-    """The point of a robot whose path is drawn."""
+    """The point of a robot for which paths are drawn."""
 
     field: str
-    """Field with its position: "site_xpos", "xpos", "xipos" or "subtree_com"."""
+    """The field with the point's position: "site_xpos", "xpos", "xipos" or "subtree_com"."""
     index: int
 
 
 def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
-    """Choose the point of a robot whose path is drawn.
+    """Choose the point of a robot for which paths are drawn.
 
-    The default is the centre of mass of a robot with an unactuated base (a hopper, a humanoid). For an arm, the default
-    is the end of the longest chain of actuated bodies: its first site, or its centre of mass.
+    For a robot with an unactuated base, such as a hopper or a humanoid, the default is the centre of mass. For an arm,
+    the default is the end of the longest chain of actuated bodies: its first site, or its centre of mass.
 
     Args:
         model: The model.
-        name: Name of a site or a body instead.
+        name: The name of a site or a body that replaces the default.
 
     Raises:
         ValueError: The model has no site and no body of this name.
@@ -62,7 +62,7 @@ def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
     moving = model.body_jntnum > 0
     if not driven[(moving & (model.body_rootid == root)).argmax()]:
         return TracePoint("subtree_com", root)
-    depth = np.zeros(model.nbody, dtype=int)  # number of moving bodies between the world and a body
+    depth = np.zeros(model.nbody, dtype=int)  # the number of moving bodies between the world and a body
     for body in range(1, model.nbody):
         parent = model.body_parentid[body]
         driven[body] |= driven[parent]
@@ -73,7 +73,7 @@ def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
 
 
 def _driven_bodies(model: mujoco.MjModel) -> np.ndarray:
-    """Find the bodies with actuated joints, directly, by tendons or at sites; (nbody,) bool."""
+    """Find the bodies that actuators move at joints, by tendons or at sites; (nbody,) bool."""
     data, moment = mujoco.MjData(model), np.zeros((model.nu, model.nv))
     mujoco.mj_fwdPosition(model, data)
     if model.nu:
@@ -87,16 +87,16 @@ def _driven_bodies(model: mujoco.MjModel) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Traces:
-    """Paths of a plan and its samples."""
+    """The paths of a plan and its samples."""
 
     paths: np.ndarray
-    """(samples + 1, points, 3), metres: the samples, then the plan."""
+    """The paths, (samples + 1, points, 3), metres; the plan comes last."""
     best: int | None
-    """Index of the best sample."""
+    """The index of the best sample."""
     final: Pose
-    """Final pose of the plan."""
+    """The final pose of the plan."""
     made: float
-    """Time of the rollout (``time.perf_counter``)."""
+    """The time of the rollout, from ``time.perf_counter``."""
 
 
 class TraceRollouts:
@@ -119,7 +119,7 @@ class TraceRollouts:
         self._parts = env.state_space.parts
         self._states = self.env.get_state()
         self._positions = self.env.field(point.field)
-        for _ in range(3):  # captures the graphs, which must not happen in the thread
+        for _ in range(3):  # capture the graphs here, because the thread must not
             self.env.set_state(self._states, check=False)
             self.env.step()
             self.env.get_state(out=self._states)
@@ -131,7 +131,7 @@ class TraceRollouts:
         """Roll out a plan."""
         env, count = self.env, view.samples.shape[1]
         self._put(view.state)
-        actions = view.actions[:, None].repeat(1, MOST_SAMPLES + 1, 1)  # worlds without a sample follow the plan
+        actions = view.actions[:, None].repeat(1, MOST_SAMPLES + 1, 1)  # all worlds without a sample follow the plan
         actions[:, :count] = view.samples
         actions = actions.to(env.action.device)
         env.set_state(self._states, check=False)
@@ -145,7 +145,7 @@ class TraceRollouts:
         return Traces(paths, view.best, ended, time.perf_counter())
 
     def _put(self, state: torch.Tensor) -> None:
-        """Copy the parts of the planner's state into every row; the rows may have parts for additional fields."""
+        """Copy the parts of the planner's state into every row; rows may also have parts for additional fields."""
         parts = self.env.state_space.parts
         state = state.to(self._states.device)
         for name, part in self._parts.items():
@@ -158,10 +158,10 @@ class TraceRollouts:
 
 
 class TraceThread:
-    """A thread that rolls out the newest plan, and sleeps in between.
+    """A thread that rolls out the newest plan, and sleeps between rollouts.
 
     Args:
-        rollouts: Used only by the thread from then on.
+        rollouts: Makes the rollouts; used only by the thread after this call.
     """
 
     def __init__(self, rollouts: TraceRollouts) -> None:
@@ -174,7 +174,7 @@ class TraceThread:
         self._thread.start()
 
     def give(self, view: PlanView) -> None:
-        """Roll out this plan next, unless a newer plan comes first."""
+        """Roll out the given plan next, unless a newer plan comes first."""
         self._view = view
         self._wake.set()
 
@@ -183,13 +183,13 @@ class TraceThread:
         return self._newest
 
     def forget(self) -> None:
-        """Drop the traces, after waiting for a rollout in progress."""
+        """Wait for any rollout in progress, and drop the traces."""
         self._view = None
         with self._working:
             self._newest = None
 
     def close(self) -> None:
-        """End the thread after the rollout in progress."""
+        """End the thread after any rollout in progress."""
         self._ending = True
         self._wake.set()
         self._thread.join()
@@ -204,7 +204,7 @@ class TraceThread:
                 view, self._view = self._view, None
                 if view is None:
                     continue
-                begun = time.thread_time()  # on a busy machine the wall clock would count other work
+                begun = time.thread_time()  # CPU time, because on a busy machine the wall clock would count other work
                 with self._working:
                     self._newest = self._rollouts(view)
                 self._rest((time.thread_time() - begun) / SHARE)

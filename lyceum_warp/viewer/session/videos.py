@@ -1,4 +1,4 @@
-"""Record the viewer: videos and pictures, drawn in subprocesses, and pages that play in a browser."""
+"""Make videos and pictures of the viewer in subprocesses, and pages that play in a browser."""
 
 import contextlib
 import datetime
@@ -24,17 +24,17 @@ from lyceum_warp.viz.video import Recorder
 FPS = 30
 _PICTURE_SIZE = (1280, 960)
 _WIDTH = 2.0  # of lines, pixels
-_MOST_WAITING = 4 * FPS  # poses that wait for the drawing process, which starts slowly
-_PATIENCE = 120.0  # seconds to finish drawing when the viewer ends; a signal discards the videos
+_MOST_WAITING = 4 * FPS  # poses that may wait for the slow start of the rendering subprocess
+_PATIENCE = 120.0  # seconds to finish videos when the viewer ends, unless a signal discards them
 
 
 class VideoTaker:
-    """Makes one video at a time; earlier videos may still be drawn.
+    """Makes one video at a time, while earlier videos may still be in work.
 
     Args:
         model: The model.
-        title: Prefix of the file names.
-        folder: Folder of the files.
+        title: The prefix of the file names.
+        folder: The folder of the files.
     """
 
     def __init__(self, model: mujoco.MjModel, title: str, folder: Path | None = None) -> None:
@@ -45,13 +45,13 @@ class VideoTaker:
         self._poses: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         self._camera = mujoco.MjvCamera()
         self._pictures: list[threading.Thread] = []
-        self._done: list[str] = []  # messages of pictures and pages
+        self._done: list[str] = []  # messages about pictures and pages
         self.files: list[Path] = []
-        """Complete files, which the next frame reports to the window."""
+        """The complete files, which the next frame reports to the window."""
 
     @property
     def name(self) -> str | None:
-        """Name of the current video; None without one."""
+        """The name of the current video; None if there is none."""
         return None if self._running is None else self._running.out.name
 
     @property
@@ -60,10 +60,10 @@ class VideoTaker:
         return self._running is not None and (time.perf_counter() - self._start) * FPS >= self._running.added
 
     def begin(self, camera: dict[str, Any]) -> None:
-        """Start a video, after ending the one before.
+        """End the current video, and start another video.
 
         Args:
-            camera: Attributes of the ``mujoco.MjvCamera``.
+            camera: The attributes of the ``mujoco.MjvCamera``.
 
         Raises:
             NoVideoError: A package for videos is not installed.
@@ -101,14 +101,14 @@ class VideoTaker:
         self._pictures[-1].start()
 
     def _file(self, ending: str) -> Path:
-        title = re.sub(r"[^\w.-]+", "-", self._title, flags=re.ASCII)  # the title may be a path
+        title = re.sub(r"[^\w.-]+", "-", self._title, flags=re.ASCII)  # the title may be a task's path
         return self._folder / f"{title}-{datetime.datetime.now():%Y%m%d-%H%M%S-%f}{ending}"
 
     def add(self, frame: Frame) -> None:
-        """Add a frame, which lasts until now.
+        """Extend the last frame until the present time, and add a frame.
 
         Raises:
-            NoVideoError: The drawing has failed.
+            NoVideoError: The rendering subprocess has failed.
         """
         video = self._running
         if video is None or (count := int((time.perf_counter() - self._start) * FPS) + 1 - video.added) <= 0:
@@ -117,7 +117,7 @@ class VideoTaker:
         video.add(_shot(frame, count))
 
     def end(self) -> None:
-        """End the video, which is completed in the background, and write the page beside it."""
+        """End the video, complete it in the background, and write the page beside it."""
         if self._running is not None:
             self._running.end()
             page = self._running.out.with_suffix(".html")
@@ -133,7 +133,7 @@ class VideoTaker:
             self._running = None
 
     def completed(self) -> list[str]:
-        """Messages about videos that are complete or have failed."""
+        """Return messages about videos that are complete or have failed."""
         done = [video for video in self._drawing if video.finished]
         self._drawing = [video for video in self._drawing if video not in done]
         lines, self._done = [*self._done, *map(_completed, done)], []
@@ -148,12 +148,12 @@ class VideoTaker:
 
     @contextlib.contextmanager
     def finishing(self, show: Callable[[str], object]) -> Iterator[None]:
-        """Finish all videos at the end of a ``with`` block, also after an exception, such as Ctrl-C.
+        """Finish all videos at the end of a ``with`` block, even after an exception, such as Ctrl-C.
 
         A video that is incomplete after two minutes, or at a second Ctrl-C, is discarded.
 
         Args:
-            show: Called with a line about each video.
+            show: A function that is called with a line about each video.
         """
         try:
             yield
@@ -178,7 +178,7 @@ def _numbers(pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _shot(frame: Frame, count: int) -> Shot:
-    """The content of ``count`` frames of a video."""
+    """Return the content of ``count`` frames of a video."""
     paths = () if frame.traces is None else frame.traces
     lines = [(path, BEST_COLOUR if i == frame.best else TRACE_COLOUR, _WIDTH) for i, path in enumerate(paths)]
     lines += [(np.stack([arrow.start, arrow.end]), arrow.colour, 2 * _WIDTH) for arrow in frame.arrows]
@@ -197,7 +197,7 @@ def _camera(values: dict[str, Any]) -> mujoco.MjvCamera:
 
 
 def _completed(video: Recorder) -> str:
-    """Format a line about a video that has ended."""
+    """Format a line about an ended video."""
     try:
         line = f"video: {video.close()}"
     except (NoVideoError, OSError) as error:

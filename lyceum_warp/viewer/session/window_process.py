@@ -18,11 +18,11 @@ from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import Command, Failed, Frame, Opened, Scene
 
 FRAME_TIME = 1 / 60
-"""Minimum seconds between two frames."""
+"""The minimum seconds between two frames."""
 OPENING_TIME = 60.0
-"""Seconds in which the process must report that the window is open."""
+"""The maximum seconds until the process must report that the window is open."""
 CLOSING_TIME = 5.0
-"""Seconds in which the process must end."""
+"""The maximum seconds that the process may take to end."""
 
 _PROGRAM = """
 import sys
@@ -33,19 +33,19 @@ main(int(sys.argv[1]))
 
 
 class NoWindowError(OSError):
-    """The window cannot be opened, or ended with an error. The message gives the reason."""
+    """Raised if the window cannot be opened, or ended with an error. The error's message gives the reason."""
 
 
 class Window:
-    """Show frames in a window process, and collect the user's commands.
+    """Shows frames in a window process, and collects the user's commands.
 
     The window process is not a fork and does not import the caller's program, so the caller needs no ``__main__``
     guard. The window process ends when this process ends, even by SIGKILL. Ctrl-C does not reach the window process.
 
     Args:
-        scene: The constant part of the display.
-        host: Address to serve the page on; see ``lw.view``.
-        port: Port of the page; see ``lw.view``.
+        scene: The part of the display that never changes.
+        host: The address on which the page is served; see ``lw.view``.
+        port: The port of the page; see ``lw.view``.
 
     Raises:
         ValueError: The port is out of range or in use, or the address is not an address of this machine.
@@ -66,13 +66,13 @@ class Window:
         self._connection = Connection(os.dup(self._socket.fileno()))
         with theirs:
             self._process = subprocess.Popen(
-                # -P: the current folder is not searched for modules
+                # with -P, Python does not search the current folder for modules
                 [sys.executable, "-P", "-c", _PROGRAM, str(theirs.fileno()), str(Path(__file__).parents[3])],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
                 stderr=self._log,
-                process_group=0,  # the terminal sends Ctrl-C to its own group only
+                process_group=0,  # a separate group, because the terminal sends Ctrl-C to its own group
             )
         self.error: str | None = None
         """The error that ended the window, if there was one."""
@@ -94,7 +94,7 @@ class Window:
         self.address = reply.address
         """The page's address with its token."""
         self.instructions = reply.instructions
-        """Lines to print: the page's address, and the ssh command for other machines."""
+        """The lines to print: the page's address, and the ssh command for other machines."""
         for target in (self._send, self._receive):
             self._threads.append(threading.Thread(target=target, daemon=True, name="lyceum-viewer"))
             self._threads[-1].start()
@@ -102,7 +102,7 @@ class Window:
     def show(self, frame: Frame) -> None:
         """Send a frame, without waiting for the window.
 
-        If the previous frame has not been sent yet, it is skipped; its curve points and messages are kept.
+        A previous frame that has not been sent is skipped, and the new frame takes over its curve points and messages.
         """
         with self._lock:
             self._pending = protocol.latest(self._pending, frame)
@@ -110,14 +110,14 @@ class Window:
 
     @property
     def wants_frame(self) -> bool:
-        """Whether the window can draw another frame now; until then the caller need not make one.
+        """Whether the window can draw another frame; the caller need not make a frame before.
 
-        While a page is open the window draws about 60 frames per second, otherwise four.
+        The window draws about 60 frames per second while a page is open, and otherwise four.
         """
         return self._pending is None and time.monotonic() >= self._next and not self._ended
 
     def commands(self) -> list[Command]:
-        """The commands since the last call, in order."""
+        """Return the commands since the last call, in order."""
         return [self._commands.popleft() for _ in range(len(self._commands))]
 
     def is_open(self) -> bool:
@@ -127,7 +127,7 @@ class Window:
     def close(self) -> None:
         """End the window process. A second call does nothing."""
         self._end()
-        with contextlib.suppress(OSError):  # wakes both threads and the process
+        with contextlib.suppress(OSError):  # closing wakes both threads and the process
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
         try:
@@ -135,7 +135,7 @@ class Window:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        for thread in self._threads:  # a thread must not read from a closed connection
+        for thread in self._threads:  # end the threads first, because they must not read from a closed connection
             thread.join(CLOSING_TIME)
         self._connection.close()
         self._log.close()
@@ -152,7 +152,7 @@ class Window:
         self._taken.release()
 
     def _last_words(self) -> str:
-        """The signal that ended the process, or its last line of output."""
+        """Return the signal that ended the process, or the process's last line of output."""
         code = self._process.returncode
         if code is None:
             return "its process closed the connection"

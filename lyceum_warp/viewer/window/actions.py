@@ -13,43 +13,43 @@ from lyceum_warp.viewer.window.scene import ViewCameras
 from lyceum_warp.viewer.window.studio import imgui, inputs, ux
 
 SPEEDS = tuple(2.0**power for power in range(-4, 5))
-"""Available speeds, simulated seconds per second."""
+"""The available speeds, in simulated seconds per second."""
 MANY_STEPS = 50
-"""Steps of the arrow keys with Shift."""
+"""The number of steps for the arrow keys with Shift."""
 
-_DRIVING = tuple(getattr(imgui.Key, name) for name in "WSADQE")  # ahead, back, left, right, turn left, turn right
+_DRIVING = tuple(getattr(imgui.Key, name) for name in "WSADQE")  # forward, back, left, right, turn left, turn right
 
 KEY_NAMES = {"Right": "RightArrow", "Left": "LeftArrow", "Up": "UpArrow", "Down": "DownArrow"}
-"""Studio's names of keys that the panel names differently."""
+"""The names in studio of keys that have other names in the panel."""
 
 
 class Actions:
-    """The user's choices, and the commands that they cause.
+    """Stores the user's choices, and sends the commands that follow from them.
 
     Args:
-        scene: The constant part of the display.
-        do: Sends a command to the session.
+        scene: The part of the display that never changes.
+        do: A function that sends a command to the session.
     """
 
     def __init__(self, scene: Scene, do: Callable[[Command], None]) -> None:
         self.scene, self.do = scene, do
         self.frame: Frame | None = None
-        """The shown frame; None before the first one."""
+        """The shown frame; None before the first frame."""
         self.viewer: Any
-        """Studio's viewer; set when the window starts."""
+        """Studio's viewer, which is set when the window starts."""
         self.cameras: ViewCameras
-        """Set when the window starts."""
+        """The cameras of the view, which are set when the window starts."""
         self.windows = {"messages", *(["curves"] if scene.curves else [])}
-        """Titles of the open windows."""
+        """The titles of the open windows."""
         self.messages: deque[str] = deque(maxlen=200)
         self.scroll_down = False
-        """Whether there is a message that has not been drawn yet."""
+        """Whether a message has not been drawn yet."""
         self._keys = key_table()
-        self._steering = (0.0, 0.0, 0.0)  # the last command by keys
+        self._steering = (0.0, 0.0, 0.0)  # the last command from keys
 
     @property
     def status(self) -> Status:
-        """The session's status, from the first frame on."""
+        """The session's status; available after the first frame."""
         assert self.frame is not None
         return self.frame.status
 
@@ -87,7 +87,7 @@ class Actions:
             self.do(protocol.Drive(command))
 
     def toggle_driving(self) -> None:
-        """Start driving from a standstill, or return to commands that the task draws."""
+        """Let the user drive, beginning with a velocity of 0, or let the task draw commands again."""
         if self.scene.speeds is not None:
             self.do(protocol.Drive(None if self.status.driven else (0.0, 0.0, 0.0)))
 
@@ -117,11 +117,11 @@ class Actions:
         self.do(protocol.SetSpeed(SPEEDS[min(max(now + by, 0), len(SPEEDS) - 1)]))
 
     def set_ghosts(self, **changes: Any) -> None:
-        """Change which ghosts are drawn."""
+        """Change the ghosts to draw."""
         self.do(dataclasses.replace(self.status.ghosts, **changes))
 
     def toggle_video(self) -> None:
-        """Start a video from the view's camera, or end it."""
+        """Start a video from the view's camera, or end the video."""
         self.do(protocol.SetVideo(self.cameras.view() if self.status.video is None else None))
 
     def take_picture(self) -> None:
@@ -145,23 +145,23 @@ class Key:
 
     @property
     def code(self) -> Any:
-        """Studio's code of the key, without Ctrl and Shift."""
+        """The key's code in studio, without Ctrl and Shift."""
         last = self.name.rpartition("+")[2]
         return getattr(imgui.Key, KEY_NAMES.get(last, last))
 
     @property
     def ctrl(self) -> bool:
-        """Whether it needs Ctrl."""
+        """Whether the action needs Ctrl."""
         return "Ctrl+" in self.name
 
     @property
     def shift(self) -> bool:
-        """Whether it needs Shift."""
+        """Whether the action needs Shift."""
         return "Shift+" in self.name
 
 
 def key_table() -> list[Key]:
-    """The keys of the panel. A browser passes all of them to the page."""
+    """The keys of the panel. Browsers pass all these keys to the page."""
     return [
         Key("F1", "show or hide this table", lambda p: p.toggle_window("keys")),
         Key("F2", "messages", lambda p: p.toggle_window("messages")),
@@ -200,4 +200,4 @@ OTHER_KEYS = (
     ("Ctrl + drag right, left", "push or twist that body; while paused, place it"),
     ("double-click right", "look at a point, with Ctrl follow the body"),
 )
-"""Keys and mouse actions that studio handles."""
+"""The keys and mouse actions that studio handles."""

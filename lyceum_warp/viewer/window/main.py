@@ -1,7 +1,7 @@
 """Run the window process: receive frames, draw them with studio, and send commands.
 
-The process imports mujoco and NumPy, and of this package only ``viewer/window`` and ``viewer/protocol.py``: torch and
-Warp would cost seconds and hundreds of megabytes.
+The process imports mujoco, NumPy, ``viewer/window`` and ``viewer/protocol.py``. Importing torch and Warp would cost
+seconds and hundreds of megabytes.
 """
 
 import contextlib
@@ -20,15 +20,18 @@ from lyceum_warp.viewer.window.proxy import Proxy
 from lyceum_warp.viewer.window.sockets import private_socket
 
 IDLE_TIME = 0.25
-"""Seconds between two frames while no page is open."""
+"""The seconds between two frames while no page is open."""
 NICE = 5
-"""Niceness of the process: drawing gives way to the session, whose planner may need every core."""
+"""The niceness of the window process, because the session's planner may need every core."""
 END_TIME = 3.0
-"""Seconds in which studio must end."""
+"""The maximum seconds that studio may take to end."""
 
 
 class WindowEnd:
-    """The window's end of the connection. One thread receives frames, and the drawing thread takes the latest one."""
+    """The window's end of the connection to the session.
+
+    One thread receives frames, and the drawing thread takes the latest frame.
+    """
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -38,12 +41,12 @@ class WindowEnd:
         self._parent = os.getppid()
 
     def send(self, reply: Reply) -> None:
-        """Send to the session; no effect after it has ended."""
+        """Send a message to the session, unless the session has ended."""
         with self._lock, contextlib.suppress(OSError):
             self._connection.send(reply)
 
     def take(self) -> Frame | None:
-        """The latest frame that was not taken yet."""
+        """Return the latest frame, unless it was returned before."""
         self._looked = time.monotonic()
         with self._lock:
             frame, self._frame = self._frame, None
@@ -68,7 +71,7 @@ class WindowEnd:
 
 
 def main(descriptor: int) -> None:
-    """Draw until the session or the user ends it; ``descriptor`` is the connection to the session."""
+    """Draw until the session or the user ends the window; ``descriptor`` is the connection to the session."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session handles Ctrl-C, and ends the window
     if hasattr(os, "nice"):  # not on Windows
         os.nice(NICE)
@@ -92,7 +95,7 @@ def run(opening: Opening, end: WindowEnd) -> None:
             return end.send(Failed(str(error), refused=True))
         sock = private_socket()
         model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": opening.scene.model})
-        model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] = 0.0  # drawn as endless as they are
+        model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] = 0.0  # studio then draws planes as endless
         screen = studio.Screen()
         opened = Opened(proxy.address, tuple(proxy.instructions))
         panel = Panel(opening.scene, model, end.send, end.take, screen, opened, proxy.offer)

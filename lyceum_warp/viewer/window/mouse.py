@@ -1,4 +1,4 @@
-"""Push the body that the mouse drags, or place it while paused."""
+"""Push the body that the mouse drags, or move the body while paused."""
 
 import threading
 from collections.abc import Callable
@@ -14,7 +14,7 @@ class Mouse:
     """Converts drags of the selected body to commands.
 
     Args:
-        do: Sends a command to the session.
+        do: A function that sends a command to the session.
     """
 
     def __init__(self, do: Callable[[Perturb], None]) -> None:
@@ -24,7 +24,7 @@ class Mouse:
         self._lock = threading.Lock()
 
     def drag(self, viewer: Any, *, paused: bool) -> None:
-        """Push the selected body while it is dragged; while paused, place it.
+        """Push the selected body while the mouse drags it, or move it if the session is paused.
 
         Args:
             viewer: Studio's viewer.
@@ -43,9 +43,9 @@ class Mouse:
                 self._end()
 
     def let_go(self) -> None:
-        """End a push, because the browser has gone. Any thread may call this."""
+        """End a push after the browser has disconnected. Any thread may call this."""
         with self._lock:
-            self._left = True  # without a browser, studio does not see that the button is released
+            self._left = True  # without a browser, studio does not notice the release of the button
             self._end()
 
     def _end(self) -> None:
@@ -56,7 +56,7 @@ class Mouse:
 
 
 def _perturbation(model: mujoco.MjModel, data: mujoco.MjData, perturb: mujoco.MjvPerturb, paused: bool) -> Perturb:
-    """The force or the new position of a drag."""
+    """Compute the force or the new position from a drag."""
     data.xfrc_applied[:] = 0
     mujoco.mjv_applyPerturbPose(model, data, perturb, int(paused))
     if not paused:
@@ -71,5 +71,5 @@ def _perturbation(model: mujoco.MjModel, data: mujoco.MjData, perturb: mujoco.Mj
 
 
 def _rounded(push: Perturb) -> list[Any]:
-    """The parts of a command without rounding errors."""
+    """Round the parts of a command, so that equal commands compare equal."""
     return [None if part is None else (part.round(9) + 0.0).tolist() for part in vars(push).values()]

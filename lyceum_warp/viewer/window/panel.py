@@ -15,21 +15,21 @@ from lyceum_warp.viewer.window.studio import inputs, ux
 from lyceum_warp.viewer.window.windows import Windows
 
 SWAP_TIME = 0.5
-"""Minimum seconds between two models that are sent to the browser."""
+"""The minimum seconds between two models that are sent to the browser."""
 
 
 class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
     """A plugin of studio that shows frames and sends commands.
 
     Args:
-        scene: The constant part of the display.
+        scene: The part of the display that never changes.
         model: The scene's model.
-        send: Sends a message to the session.
-        newest: Returns the latest frame that was not shown yet.
-        screen: The viewer that runs the plugin.
-        opened: Sent to the session when the window is open.
-        offer: Offers a file for download.
-        limit: Maximum number of geoms of ghosts and traces.
+        send: A function that sends a message to the session.
+        newest: A function that returns the latest frame if it was not shown yet.
+        screen: The screen that runs the plugin.
+        opened: The message that is sent to the session when the window is open.
+        offer: A function that offers a file for download.
+        limit: The maximum number of geoms for ghosts and traces.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
             self._offer(file)
         if frame.messages:
             self.actions.say(*frame.messages)
-        # the session reports other states as faults; the last good pose stays
+        # keep the last finite pose; the session reports other states as faults
         if np.isfinite(frame.state).all():
             mujoco.mj_setState(model, data, frame.state, mujoco.mjtState.mjSTATE_INTEGRATION)
             mujoco.mj_forward(model, data)
@@ -107,7 +107,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         )
 
     def _show_model(self, frame: Frame) -> None:
-        """Set the world's values in the drawn model."""
+        """Write the world's model fields into the drawn model."""
         changed, visible = self.values.set(frame.model_fields)
         if visible:
             self._model_due = True

@@ -3,16 +3,17 @@
 Studio's own server has no password. The server listens on a private socket (``sockets.py``), which refuses other
 processes. The proxy forwards a request only if
 
-- its ``Host`` is an address or a name of this machine (against DNS rebinding);
-- its ``Origin`` and ``Sec-Fetch-*`` headers show that no page of another site sent it;
-- it has the cookie and the secret path, which the token of the printed address is exchanged for;
-- it is a GET without a body, or opens studio's WebSocket ``/ui`` or ``/state`` (not ``/drop``, which loads models).
+- the ``Host`` header is an address or a name of this machine (against DNS rebinding);
+- the ``Origin`` and ``Sec-Fetch-*`` headers show that no page of another site sent the request;
+- the request has the cookie and the secret path, which a browser gets for the token in the printed address;
+- the request is a GET without a body, or opens studio's WebSocket ``/ui`` or ``/state`` (not ``/drop``, which loads
+  models).
 
-Browsers send a cookie to every port of its host, and so to other users' servers on the loopback address. The cookie is
-therefore limited to a random path (``Path=/RANDOM/``), below which the page is served. Studio's page requests addresses
-from the root of the host; a script that the proxy inserts prefixes them with the path.
+Browsers send a cookie to all ports of a host, including the servers of other users on the loopback address. The cookie
+is therefore limited to a random path (``Path=/RANDOM/``), below which the page is served. Studio's page requests
+addresses from the root of the host; a script from the proxy prefixes these addresses with the path.
 
-aiohttp parses the requests and limits their heads (8 KiB per line, 128 lines). The proxy runs in a thread.
+aiohttp parses requests, and limits their headers to 128 lines of 8 KiB. The proxy runs in a thread.
 """
 
 import asyncio
@@ -37,26 +38,27 @@ from yarl import URL
 from lyceum_warp.viewer.window.sockets import public_sockets
 
 HEAD_SECONDS = 10.0
-"""Timeout for the head of a request, and for idle connections."""
+"""The timeout for a request's headers, and for idle connections, in seconds."""
 WRITE_SECONDS = 60.0
-"""Timeout for a client that does not read."""
+"""The timeout for a client that does not read, in seconds."""
 UNCHECKED = 128
-"""Maximum number of connections that have not sent the secret; the oldest ones are closed first."""
+"""The maximum number of connections that have not sent the secret; the oldest connections are closed first."""
 MESSAGE_BYTES = 2**20
-"""Maximum size of a WebSocket message from a browser."""
+"""The maximum size of a WebSocket message from a browser, in bytes."""
 QUIET_SECONDS = 2.0
-"""Seconds without input after which the controlling page counts as closed or hidden: it sends input every frame."""
+"""The seconds without input after which the controlling page counts as closed or hidden. An open page sends input every
+frame."""
 PROTECTION = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Content-Security-Policy": "frame-ancestors http://localhost:* http://127.0.0.1:*",  # notebooks
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Embedder-Policy": "require-corp",  # needed for memory shared between threads
-    "Document-Isolation-Policy": "isolate-and-require-corp",  # the same within a notebook; Chromium's family only
+    "Cross-Origin-Embedder-Policy": "require-corp",  # browsers require this for memory that threads share
+    "Document-Isolation-Policy": "isolate-and-require-corp",  # the same for a notebook's frames, in Chromium
 }
-"""Headers of every response: other sites can neither read nor embed it, and never get its address. Pages of this
-machine may embed it if they know the token, as a notebook does."""
+"""The headers of every response, which stop other sites from reading or embedding it, and from getting its address.
+Pages of this machine that know the token may embed a response, as a notebook does."""
 SCRIPT = """<script>
 (() => {
   const path = location.pathname.slice(0, location.pathname.indexOf("/", 1));
@@ -107,27 +109,29 @@ SCRIPT = """<script>
   } catch {}
 })();
 </script>"""
-"""Completes studio's page: it prefixes the addresses that the page requests with its secret path; the visible tab takes
-control, and another one waits for it; the first theme is the browser's; links to new files appear; the title stays."""
+"""The script that the proxy inserts into studio's page. It prefixes requested addresses with the secret path, gives
+control to the visible tab while other tabs wait, starts with the browser's theme, shows links to new files, and keeps
+the title."""
 
 _PATH = re.compile(r"(/[A-Za-z0-9_~!$&'()*+,;=:@\[\]-][A-Za-z0-9._~!$&'()*+,;=:@\[\]-]*)+|/")
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?")
 _COOKIE = "lyceum-warp"
 _WHERE = "Open the address that was printed where the viewer was started; it ends in ?token=..."
 _ENDED = "The viewer has ended.\n"
-_HEARTBEAT = 30.0  # seconds between pings, which detect a browser that has gone
+_HEARTBEAT = 30.0  # seconds between pings, which detect a lost browser
 _SocketEnd = web.WebSocketResponse | aiohttp.ClientWebSocketResponse
 
 
 class Proxy:
     """A reverse proxy that forwards requests with the secret to studio's server.
 
-    Construction opens the port, ``start`` begins to answer, and ``close`` or the end of a ``with`` block closes it.
+    The constructor opens the port, ``start`` begins to answer, and ``close`` or the end of a ``with`` block closes the
+    port.
 
     Args:
-        host: Address or name to listen on; see ``lw.view``.
-        port: Port to listen on; by default the first free port from 8080.
-        title: Title of the browser's tab.
+        host: The address or the name on which to listen; see ``lw.view``.
+        port: The port on which to listen; by default the first free port from 8080.
+        title: The title of the browser's tab.
 
     Raises:
         ValueError: The port is out of range or in use, or the address is not an address of this machine.
@@ -144,7 +148,7 @@ class Proxy:
         self._token, self._cookie, self._path = (secrets.token_urlsafe(32) for _ in range(3))
         machine = socket.gethostname().lower()
         self._names = {"localhost", machine, machine.partition(".")[0], host.lower()}
-        ssh = os.environ.get("SSH_CONNECTION", "").split()  # the client's address and port, then this machine's
+        ssh = os.environ.get("SSH_CONNECTION", "").split()  # addresses and ports of the client and of this machine
         self._ssh = (ssh[2], ssh[3]) if len(ssh) == 4 else (socket.gethostname(), "22")
         everywhere = any(address.is_unspecified for address in addresses)
         self._host = "127.0.0.1" if self.local or everywhere else host
@@ -154,27 +158,27 @@ class Proxy:
         self._stop: asyncio.Event
         self._server: _Server
         self._client: aiohttp.ClientSession
-        self._files: dict[str, str] = {}  # paths of files for download, by name
+        self._files: dict[str, str] = {}  # paths of the files for download, by name
         self._pages: set[web.WebSocketResponse] = set()
         self._silence: asyncio.TimerHandle | None = None
 
     @property
     def address(self) -> str:
-        """The address to open in a browser, with the token."""
+        """The page's address with the token, for a browser."""
         return self._address(self._shown_host)
 
     @property
     def ssh_line(self) -> str:
-        """The ssh command that forwards the port to another machine."""
+        """The ssh command by which another machine forwards the port."""
         host, port = self._ssh
-        with contextlib.suppress(KeyError, OSError):  # a user without a name, as in some containers
+        with contextlib.suppress(KeyError, OSError):  # in some containers the user has no name
             host = f"{getpass.getuser()}@{host}"
         target = f"-p {port} {host}" if port != "22" else host
         return f"ssh -C -N -L {self.port}:{_bracketed(self._host)}:{self.port} {target}"
 
     @property
     def instructions(self) -> list[str]:
-        """Lines to print: the address, the ssh command, and a warning if other machines can connect."""
+        """The lines to print: the address, the ssh command, and a warning if other machines can connect."""
         lines, ssh = [f"viewer: {self.address}"], f"from another machine: {self.ssh_line}"
         if self.local:
             return [*lines, ssh]
@@ -188,8 +192,8 @@ class Proxy:
         """Begin to answer, in a thread.
 
         Args:
-            upstream: Host and port of studio's server.
-            on_quiet: Called in that thread when the controlling page has been closed or hidden.
+            upstream: The host and the port of studio's server.
+            on_quiet: A function that this thread calls after the controlling page was closed or hidden.
         """
         self._upstream, self._on_quiet = "http://{}:{}".format(*upstream), on_quiet
         ready = threading.Event()
@@ -204,7 +208,7 @@ class Proxy:
     def close(self) -> None:
         """Close the port and all connections. A second call does nothing."""
         if self._thread is not None and self._thread.is_alive():
-            with contextlib.suppress(RuntimeError):  # the loop has just ended
+            with contextlib.suppress(RuntimeError):  # the event loop has just ended
                 self._loop.call_soon_threadsafe(self._stop.set)
             self._thread.join(timeout=5.0)
         for opened in self._sockets:
@@ -252,21 +256,21 @@ class Proxy:
             raise
 
     def _check_sender(self, request: web.BaseRequest) -> None:
-        """Refuse foreign hosts, requests from pages of other sites, and requests other than a plain GET."""
+        """Refuse unknown hosts, requests from pages of other sites, and all requests except a plain GET."""
         host = request.headers.get("Host", "").lower()
         match = _HOST.fullmatch(host)
         if match is None:
             raise web.HTTPBadRequest(text="the Host header is missing or malformed\n")
         name = match[1].strip("[]")
         try:
-            ipaddress.ip_address(name)  # an IP address cannot be rebound
+            ipaddress.ip_address(name)  # DNS rebinding cannot change an IP address
         except ValueError:
             if name not in self._names:
                 text = f"{name} is not a name of this machine; use its address instead\n"
                 raise web.HTTPMisdirectedRequest(text=text) from None
         own = (f"http://{host}", f"https://{host}")
         foreign = any(origin.lower() not in own for origin in request.headers.getall("Origin", []))
-        # links on other pages, and frames on pages of this host name, are allowed; they need the token
+        # allow links on other pages and frames on pages of this host name, because both need the token
         site, mode, use = (request.headers.get(f"Sec-Fetch-{name}") for name in ("Site", "Mode", "Dest"))
         linked = mode == "navigate" and (use == "document" or (site == "same-site" and use == "iframe"))
         if foreign or (_is_cross_site(request) and not linked):
@@ -292,7 +296,7 @@ class Proxy:
         if not _is_cross_site(request):
             return web.Response(status=303, headers={**headers, "Location": target})
         # If the user follows a link on another site, browsers do not send a SameSite=Strict cookie, not even after a
-        # redirect. They send it after this page, which belongs to the proxy's site.
+        # redirect. Browsers send the cookie after this page, which belongs to the proxy's site.
         page = f'<!doctype html><meta http-equiv="refresh" content="0; url={target}">'
         return web.Response(text=page, content_type="text/html", headers=headers)
 
@@ -312,7 +316,7 @@ class Proxy:
         return f"/{below}{question}{query}"
 
     async def _fetch(self, request: web.BaseRequest, target: str) -> web.StreamResponse:
-        """Forward studio's response: type, length, caching and body; or send a file for download."""
+        """Forward the type, length, caching and body of studio's response, or send a file for download."""
         if target.startswith("/saved/"):
             if (file := self._files.get(target.removeprefix("/saved/"))) is None or not os.path.isfile(file):
                 raise web.HTTPNotFound(text="no such file\n")
@@ -377,7 +381,7 @@ class _Server(web.Server):
     def __init__(self, handler: Any) -> None:
         super().__init__(
             handler, handler_cancellation=True, keepalive_timeout=HEAD_SECONDS, lingering_time=1.0, access_log=None,
-            logger=logging.Logger("viewer-proxy", logging.CRITICAL),  # no log of malformed requests
+            logger=logging.Logger("viewer-proxy", logging.CRITICAL),  # do not log malformed requests
         )  # fmt: skip
         self.unchecked: dict[web.RequestHandler, None] = {}
 
@@ -398,10 +402,10 @@ async def _relay(source: _SocketEnd, sink: _SocketEnd, heard: Callable[[], None]
     Args:
         source: The receiving end.
         sink: The sending end.
-        heard: Called for each message.
+        heard: A function that is called for each message.
     """
     code, reason = int(aiohttp.WSCloseCode.GOING_AWAY), ""
-    with contextlib.suppress(ConnectionError):  # the sink is gone
+    with contextlib.suppress(ConnectionError):  # the sink is already closed
         while True:
             message = await source.receive()
             if heard is not None:
@@ -418,7 +422,7 @@ async def _relay(source: _SocketEnd, sink: _SocketEnd, heard: Callable[[], None]
 
 
 def _same(given: str, secret: str) -> bool:
-    """Compare in constant time."""
+    """Compare two strings in constant time."""
     return hmac.compare_digest(given.encode(errors="replace"), secret.encode())
 
 

@@ -15,15 +15,16 @@ LINE_WIDTH = 3.0  # pixels
 SHRUNK = 0.98
 ARROW_WIDTH, SHORTEST_ARROW = 0.015, 0.01  # m
 MAX_LINES = 160
-"""Maximum number of lines of all traces. All geoms are sent to the browser 60 times a second, about 600 bytes each."""
+"""The maximum number of lines of all traces. A limit is necessary, because all geoms are sent to the browser 60 times a
+second, with about 600 bytes each."""
 FEWEST_SEGMENTS = 4
-"""Minimum number of lines of a trace with more points."""
+"""The minimum number of lines to which a trace is reduced."""
 VISIBLE = (
     "geom_size", "geom_pos", "geom_quat", "geom_rgba", "geom_matid", "geom_dataid", "geom_group", "site_", "body_pos",
     "body_quat", "jnt_pos", "jnt_axis", "qpos0", "mat_", "tendon_rgba", "tendon_width", "cam_", "light_", "hfield_",
     "mesh_", "skin_", "flex_",
 )  # fmt: skip
-"""Prefixes of the model fields that change the drawing."""
+"""The prefixes of the model fields that change the drawing."""
 
 
 # ghosts and traces
@@ -34,14 +35,14 @@ class ExtraGeoms:
 
     Args:
         model: The model.
-        limit: Maximum number of geoms.
+        limit: The maximum number of geoms.
     """
 
     def __init__(self, model: mujoco.MjModel, limit: int) -> None:
         self.model, self.limit = model, limit
         self._data = mujoco.MjData(model)
         self._options, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
-        # beyond the limit, there is room for one more ghost
+        # leave room for one more ghost beyond the limit
         self._scene = mujoco.MjvScene(model, limit + 2 * (model.ngeom + model.nsite) + 10)
 
     def draw(
@@ -58,10 +59,10 @@ class ExtraGeoms:
         Args:
             pose: The pose of the shown world.
             ghosts: Further poses.
-            traces: (samples, points, 3), metres.
-            best: Index of the best sample.
+            traces: The paths of samples, (samples, points, 3), metres.
+            best: The index of the best sample.
             arrows: Arrows.
-            groups: (6,) which groups of geoms are visible; by default as before.
+            groups: Whether each group of geoms is visible, (6,); by default unchanged.
         """
         if groups is not None:
             self._options.geomgroup = groups
@@ -74,7 +75,7 @@ class ExtraGeoms:
         return [*bodies, *lines, *_lines(paths, TRACE_COLOUR, left)]
 
     def _ghosts(self, pose: Pose, ghosts: Sequence[Ghost], limit: int) -> list[mujoco.MjvGeom]:
-        """Draw the first ghosts that fit."""
+        """Draw as many ghosts as fit, beginning with the first."""
         data, scene, geoms = self._data, self._scene, []
         self._place(pose)
         positions, axes = data.geom_xpos.copy(), data.geom_xmat.copy()
@@ -90,8 +91,8 @@ class ExtraGeoms:
             same = (near.max(1, initial=0.0) < 1e-3) & (turned.max(1, initial=0.0) < 1e-2)
             for geom in scene.geoms[begin : scene.ngeom]:
                 if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and same[geom.objid] and not beside:
-                    continue  # two coincident surfaces flicker
-                geom.size *= SHRUNK  # the same for a geom that has only turned about its own axis
+                    continue  # two surfaces in the same place would flicker
+                geom.size *= SHRUNK  # turned about its own axis, a geom would flicker, too
                 geom.pos[:2] += ghost.shift
                 if colour is not None:
                     geom.rgba = colour
@@ -111,7 +112,7 @@ class ExtraGeoms:
 
 
 def _lines(paths: Sequence[np.ndarray], colour: Sequence[float], limit: int) -> list[mujoco.MjvGeom]:
-    """Draw paths with at most ``limit`` lines: first with fewer points, then fewer paths."""
+    """Draw paths with at most ``limit`` lines; drop points first, then whole paths."""
     if not paths:
         return []
     segments = min(len(paths[0]) - 1, max(limit // len(paths), FEWEST_SEGMENTS))
@@ -123,14 +124,14 @@ def _lines(paths: Sequence[np.ndarray], colour: Sequence[float], limit: int) -> 
             line = mujoco.MjvGeom()
             kind, rgba = mujoco.mjtGeom.mjGEOM_LINE, np.array(colour, dtype=np.float32)
             mujoco.mjv_initGeom(line, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), rgba)
-            line.emission = 1.0  # visible in the dark
+            line.emission = 1.0  # make lines visible in the dark
             mujoco.mjv_connector(line, kind, LINE_WIDTH, start, end)
             lines.append(line)
     return lines
 
 
 def _arrows(arrows: Sequence[Arrow]) -> list[mujoco.MjvGeom]:
-    """Draw arrows, except those without length."""
+    """Draw all arrows that have a length."""
     geoms, kind = [], mujoco.mjtGeom.mjGEOM_ARROW
     for arrow in arrows:
         if np.linalg.norm(arrow.end - arrow.start) > SHORTEST_ARROW:
@@ -146,7 +147,7 @@ def _arrows(arrows: Sequence[Arrow]) -> list[mujoco.MjvGeom]:
 
 
 class ModelValues:
-    """The model with the values of one world.
+    """Holds a copy of the model with the values of one world.
 
     Args:
         nominal: The model, which is copied.
@@ -159,7 +160,7 @@ class ModelValues:
         """The model with the current values."""
 
     def set(self, values: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
-        """Set a world's values; return whether any has changed, and whether a visible one has."""
+        """Set a world's values; return whether any value has changed, and whether the change is visible."""
         changed = [
             name for name in {*values, *self._values}
             if name not in values or name not in self._values or not np.array_equal(values[name], self._values[name])
@@ -178,7 +179,7 @@ class ModelValues:
 
 
 def field(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """A field of a model or of its options, as a writable array."""
+    """Return a field of a model or of its options as a writable array."""
     owner = model if hasattr(model, name) else model.opt
     return np.atleast_1d(getattr(owner, name))
 
@@ -187,7 +188,7 @@ def field(model: mujoco.MjModel, name: str) -> np.ndarray:
 
 
 class ViewCameras:
-    """The camera of the view.
+    """Chooses the camera of the view.
 
     Args:
         viewer: Studio's viewer.
@@ -197,14 +198,14 @@ class ViewCameras:
     def __init__(self, viewer: Any, values: ModelValues) -> None:
         self.viewer, self.values = viewer, values
         self.state = ux.UxState()
-        """Studio's own state of the choice."""
+        """The choice of the camera as studio stores it."""
 
     def choose(self, index: int) -> None:
         """Choose studio's free, flying or tracking camera, or a camera of the model."""
         self.state.camera_index = ux.set_camera(self.values.model, self.viewer.camera, index)
 
     def reset(self) -> None:
-        """Look at the whole model; track the body that a camera of the model tracks."""
+        """Look at the whole model, and track a body if a camera of the model tracks it."""
         model = self.values.model
         mujoco.mjv_defaultFreeCamera(model, self.viewer.camera)
         self.state.camera_index = ux.TUMBLE_CAMERA_IDX
@@ -222,6 +223,6 @@ class ViewCameras:
         self.viewer.camera.fixedcamid = -1
 
     def view(self) -> dict[str, Any]:
-        """Attributes of the camera."""
+        """The attributes of the camera."""
         names = ("type", "trackbodyid", "fixedcamid", "lookat", "distance", "azimuth", "elevation")
         return {name: copy.copy(getattr(self.viewer.camera, name)) for name in names}

@@ -8,7 +8,7 @@ import stat
 from typing import Any
 
 FIRST_PORT, PORTS = 8080, 20
-"""Ports to try by default, before any free port."""
+"""The ports that are tried by default, before any free port."""
 
 _LOOPBACK = ("127.0.0.1", "::1")
 
@@ -20,14 +20,15 @@ class _PrivateSocket(socket.socket):
         connection, address = super().accept()
         if not _is_own(connection):
             connection.close()
-            raise ConnectionAbortedError("a connection of another process")  # event loops ignore it
+            raise ConnectionAbortedError("another process tried to connect")  # event loops ignore this error
         return connection, address
 
 
 def private_socket() -> socket.socket:
     """Listen on a free port of 127.0.0.1, and accept connections from this process only.
 
-    All users of the machine can connect to the loopback address. The socket closes their connections unread.
+    All users of a machine can connect to its loopback address. The socket closes connections from other processes
+    without reading.
     """
     private = _PrivateSocket(socket.AF_INET, socket.SOCK_STREAM)
     private.bind(("127.0.0.1", 0))
@@ -39,10 +40,10 @@ def _is_own(connection: socket.socket) -> bool:
     """Whether the peer of a connection is a socket of this process."""
     try:
         ends = connection.getpeername(), connection.getsockname()
-    except OSError:  # closed by the peer
+    except OSError:  # the peer has closed the connection
         return False
     for name in os.listdir("/proc/self/fd" if os.path.isdir("/proc/self/fd") else "/dev/fd"):
-        with contextlib.suppress(OSError):  # closed meanwhile, or not connected
+        with contextlib.suppress(OSError):  # the connection may be closed by now, or the socket not connected
             if stat.S_ISSOCK(os.fstat(int(name)).st_mode):
                 peer = socket.socket(fileno=int(name))
                 try:
@@ -54,7 +55,7 @@ def _is_own(connection: socket.socket) -> bool:
 
 
 def public_sockets(host: str, port: int | None) -> list[socket.socket]:
-    """Listen on all addresses of a host, on the same port.
+    """Listen on the same port of all addresses of a host.
 
     Raises:
         ValueError: The port is out of range or in use, or the address is not an address of this machine.
@@ -81,7 +82,7 @@ def public_sockets(host: str, port: int | None) -> list[socket.socket]:
 
 
 def _listen(host: str, port: int) -> list[socket.socket]:
-    # both loopback addresses: another program that listens on one of them could pose as the viewer
+    # listen on both loopback addresses, because another program on one of them could pose as the viewer
     names = _LOOPBACK if host in ("", "localhost", *_LOOPBACK) else ("0.0.0.0", "::") if host == "::" else (host,)
     opened: list[socket.socket] = []
     with contextlib.ExitStack() as failed:

@@ -1,8 +1,8 @@
-"""Wrap mujoco.studio, whose interface may still change: no other module imports it.
+"""Wrap mujoco.studio, which no other module imports, because its interface may still change.
 
-Studio draws a scene and a panel in a browser, and handles keys and the mouse. ``Screen.run`` opens it
-with a plugin: an object derived from ``Plugin`` with handlers of ``Started``, ``Update`` and ``Gui``. The simulation is
-in another process, so studio's own stepping, history and model loading are not used.
+Studio draws a scene and a panel in a browser, and handles keys and the mouse. ``Screen.run`` opens studio with a
+plugin: an object derived from ``Plugin`` with handlers for ``Started``, ``Update`` and ``Gui``. The simulation is in
+another process, so studio's own stepping, history and model loading are not used.
 """
 
 import socket
@@ -23,13 +23,13 @@ __all__ = [
 ]  # fmt: skip
 
 MAX_GEOMS: int = state_payload.MAX_EXTRA_GEOMS
-"""Maximum number of geoms that a browser draws in addition to the model's."""
+"""The maximum number of geoms that a browser draws in addition to the model's geoms."""
 
 Plugin: Any = plugin.ViewerPlugin
-"""Base class of plugins: ``self.viewer`` is the viewer from ``Started`` on."""
+"""The base class of plugins; after ``Started``, ``self.viewer`` is the viewer."""
 
 handler: Any = messages.handler
-"""Decorator for a plugin's method that handles the message in its annotation."""
+"""Decorator for a plugin's method, which handles the type of message in its annotation."""
 
 Started: Any = plugin.ViewerInitEvent
 Update: Any = messages.UpdateEvent
@@ -43,7 +43,7 @@ class Screen:
         self._viewer_end, self._own_end = launch_thread.make_thread_endpoints()
 
     def show_model(self, model: mujoco.MjModel) -> None:
-        """Draw another model, which is copied."""
+        """Draw a copy of another model."""
         self._own_end.send_to_viewer(messages.ModelEvent(model=model))
 
     def close(self) -> None:
@@ -55,8 +55,8 @@ class Screen:
 
         Args:
             own: The plugin.
-            title: Title of the page.
-            sock: Bound socket that serves the page to a browser.
+            title: The title of the page.
+            sock: A bound socket that serves the page to a browser.
 
         Raises:
             RuntimeError: Studio did not take ``sock``, and would listen on another socket.
@@ -68,14 +68,14 @@ class Screen:
             taken.append(True)
             return sock
 
-        # studio would listen on every address, and on a loopback port that other processes can connect to
+        # studio would listen on every address, and on a loopback port to which other processes can connect
         web_server.bind_public_socket = bound
         web_server.bind_loopback_socket = lambda port=0: private_socket()
         launch_web.run_web_viewer(config, self._viewer_end, plugins=[_Guard(taken), own])
 
 
 class _Guard(Plugin):  # type: ignore[misc]  # studio has no types
-    """Raises an error if studio did not take the given socket: it would listen on all addresses."""
+    """Raise an error if studio did not take the given socket, because studio would listen on all addresses."""
 
     def __init__(self, taken: list[bool]) -> None:
         self.taken = taken

@@ -11,17 +11,17 @@ from lyceum_warp.viewer.window.actions import MANY_STEPS, OTHER_KEYS, SPEEDS, Ac
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS, PLOT_SECONDS = 200, 20.0
-"""Maximum number of points of a plotted curve, and its length in seconds. Every frame sends all points to the
-browser."""
+"""The maximum number of points of a plotted curve, and the length of a curve in seconds. Points are limited, because
+every frame sends all points to the browser."""
 NARROW = 1100
-"""Width, in pixels, below which the first windows would cover the robot, as in a notebook."""
+"""The width in pixels below which the initial windows would cover the robot, for example in a notebook."""
 FEW_CURVES = 2
-"""Curves that are shown first: the reward and the evaluation."""
+"""The curves that are shown first: the reward and the evaluation."""
 WINDOWS = ("messages", "curves", "view", "keys")
 
 
 class Windows:
-    """The windows of the panel.
+    """Draws the windows of the panel.
 
     Args:
         actions: The user's choices.
@@ -39,7 +39,7 @@ class Windows:
         """Draw every open window."""
         size = imgui.GetIO().DisplaySize
         width, height = size.x, size.y
-        # a moved window stays in its place until the size of the browser's window changes
+        # a moved window keeps its place until the size of the browser's window changes
         self._size, resized = (width, height), (width, height) != self._size
         cond = int(imgui.Cond.Always if resized else imgui.Cond.FirstUseEver)
         if resized and width < NARROW:
@@ -54,13 +54,13 @@ class Windows:
     def _window(
         self, title: str, place: tuple[float, float, float, float], cond: int, content: Callable[[], None]
     ) -> None:
-        """Draw a window, unless it is closed. The main window folds instead.
+        """Draw a window, unless it is closed. The main window can only be folded.
 
         Args:
             title: Its title.
-            place: Left, top, width and height, in pixels.
-            cond: When the place is set, as ``ImGuiCond``.
-            content: Draws the inside.
+            place: The left edge, the top edge, the width and the height in pixels.
+            cond: The condition under which the place is set, an ``ImGuiCond``.
+            content: A function that draws the content.
         """
         left, top, width, height = place
         first = title == self._scene.title
@@ -194,7 +194,7 @@ class Windows:
                 self._actions.do(protocol.Drive((command[0], command[1], command[2])))
 
     def _numbers(self) -> None:
-        """Change the planner's settings and the task's parameters; a value is sent when its field is left."""
+        """Let the user change the planner's settings and the task's parameters; leaving a field sends its value."""
         status = self._actions.status
         parts: tuple[tuple[Literal["planner", "task"], Any], ...] = ("planner", status.planner), ("task", status.params)
         for of, numbers in parts:
@@ -225,12 +225,12 @@ class Windows:
         )
 
     def _metrics(self) -> None:
-        """Show the last values of the curves that are not part of the status."""
+        """Show the last value of each curve that is not part of the status."""
         if (values := self._last_values()[FEW_CURVES:]) and imgui.CollapsingHeader("metrics"):
             two_columns("##metrics", values)
 
     def _last_values(self) -> list[tuple[str, str]]:
-        """The last value of each curve."""
+        """Return the last value of each curve."""
         rows = self.curves.rows
         values = rows[-1, 2:].tolist() if len(rows) else []
         return [(name, f"{value:.4g}") for name, value in zip(self._scene.curves, values, strict=False)]
@@ -247,12 +247,12 @@ class Windows:
         ):
             if most > 0:
                 changed, count = imgui.SliderInt(name, getattr(ghosts, name), 0, most)
-                if changed:  # a typed number may be beyond the ends of the slider
+                if changed:  # a typed number may be outside the slider's range
                     self._actions.set_ghosts(**{name: min(max(count, 0), most)})
                 imgui.SetItemTooltip(what)
         if self._scene.nworld > 1:
             changed, grid = imgui.Checkbox("grid: worlds beside each other", ghosts.grid)
-            if changed:  # show as many worlds as a browser can draw
+            if changed:  # limit the worlds to the number that a browser can draw
                 self._actions.set_ghosts(grid=grid, worlds=ghosts.worlds or min(self._scene.nworld - 1, MOST_GHOSTS))
         changed, plan = imgui.Checkbox("plan", ghosts.plan)
         if changed:
@@ -310,7 +310,7 @@ class Windows:
             if name in self._plotted and implot.BeginPlot(name, imgui.Vec2(-1, 130), flags):
                 implot.SetupAxes("simulated seconds", name, fit, fit)
                 bounds = np.array([low[:, i], high[:, i]])
-                if np.isfinite(bounds).any():  # the order determines the colours
+                if np.isfinite(bounds).any():  # the order of the curves determines their colours
                     implot.PlotShaded("range", times, *bounds)
                     implot.PlotLine("mean", times, mean[:, i], skip)
                     for end in ends:
@@ -338,7 +338,7 @@ class Windows:
             ux.watch_gui(viewer.model, viewer.data, self._actions.cameras.state)
 
     def _joints(self) -> None:
-        """Show the joints; while paused, move them."""
+        """Show the joints, and let the user move them while paused."""
         viewer, frame = self._actions.viewer, self._actions.frame
         paused = frame is not None and frame.status.paused
         imgui.TextDisabled("drag a joint to move it" if paused else "pause to move joints")
@@ -358,11 +358,11 @@ class Windows:
             imgui.EndTable()
 
 
-# small parts of the panel
+# helpers for parts of the panel
 
 
 def highlighted_button(label: str, on: bool) -> bool:
-    """Draw a button that is highlighted while it is on; return whether it was pressed."""
+    """Draw a button, highlighted if ``on`` is true, and return whether it was pressed."""
     if on:
         imgui.PushStyleColor(int(imgui.Col.Button), imgui.Vec4(0.2, 0.55, 0.9, 1.0))
     pressed = imgui.Button(label)
@@ -394,25 +394,25 @@ def speed_name(speed: float) -> str:
 
 
 class Curves:
-    """The newest points of curves with common times.
+    """Holds the newest points of several curves with common times.
 
     Args:
-        number: Number of curves.
+        number: The number of curves.
     """
 
     def __init__(self, number: int) -> None:
         self.rows = np.empty((0, 2 + number))
-        """(points, 2 + number): times in seconds, whether an episode ended, then a value per curve."""
+        """The points, (points, 2 + number): the time in seconds, whether an episode ended, and a value per curve."""
 
     def add(self, rows: np.ndarray) -> None:
-        """Append points. If time decreases, as after steps back, points of later times are dropped."""
+        """Append points. If time decreases, for example after steps back, points of later times are dropped."""
         for part in np.split(rows, np.flatnonzero(np.diff(rows[:, 0]) < 0) + 1):
             if len(part):
                 kept = self.rows[: np.searchsorted(self.rows[:, 0], part[0, 0])]
                 self.rows = np.concatenate([kept, part])[-MAX_POINTS:]
 
     def thinned(self, points: int, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Thin the last ``seconds`` to at most ``points`` rows: minimum, mean and maximum of successive rows."""
+        """Reduce the last ``seconds`` to at most ``points`` rows, by minimum, mean and maximum of successive rows."""
         rows = self.rows[np.searchsorted(self.rows[:, 0], self.rows[-1:, 0].sum() - seconds) :]
         if len(rows) <= points:
             return rows, rows, rows
