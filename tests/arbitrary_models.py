@@ -139,7 +139,7 @@ SENSING = {
 """Models for the rules that check the sensors."""
 
 PLUGINS = {
-    "it cannot evaluate SDF plugins": text(
+    "SDF plugins need a registered distance function": text(
         '<body pos="0 0 .3"><freejoint/><geom type="sdf" mesh="torus"><plugin instance="torus"/></geom></body>' + ARM,
         '<extension><plugin plugin="mujoco.sdf.torus"><instance name="torus"><config key="radius1" value=".3"/>'
         '<config key="radius2" value=".1"/></instance></plugin></extension>'

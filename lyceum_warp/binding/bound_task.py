@@ -295,8 +295,8 @@ class BoundTask:
         drawn_constants = [field.name for field in self.dynamics if field.constants]
         if drawn_constants and (stale := [field.name for field in self.constants if field.follows]):
             raise ValueError(
-                f"the task {self.name!r} reads {stale[0]!r}, which MuJoCo computes from {drawn_constants[0]!r}, so "
-                "that it differs between worlds: read the fields that it is computed from"
+                f"the task {self.name!r} reads {stale[0]!r}, which differs between worlds, because MuJoCo "
+                f"computes it from {drawn_constants[0]!r}: read the fields from which it is computed"
             )
 
     def change_params(self, params: Mapping[str, Any]) -> None:
@@ -354,11 +354,13 @@ class BoundTask:
         name = f"success_steps of the task {self.name!r}"
         steps = whole_number(name, task.success_steps, low=1, high=_MOST_SUCCESS_STEPS)
         if steps > 1 and self.functions["success"] is None:
-            raise ValueError(f"{name} is {steps}, but the task has no {FUNCTIONS['success'].signature}: add it")
+            raise ValueError(
+                f"{name} is {steps}, but the task has no {FUNCTIONS['success'].signature}: add this function"
+            )
         if steps > task.horizon > 0:
             raise ValueError(
                 f"{name} is {steps}, but its episodes have {task.horizon} steps, so no episode can succeed: lower "
-                f"it, or raise horizon"
+                "success_steps, or raise horizon"
             )
 
     def _check_metrics(self) -> None:

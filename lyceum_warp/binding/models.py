@@ -25,8 +25,7 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
 
     Args:
         source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec, which is copied. A relative
-            path starts at the folder of the class that declares it, ``owner`` or a base class, or without an owner at
-            the current folder.
+            path is relative to the file of the task class that declares it, or without an owner to the current folder.
         owner: The task class that declares the model.
 
     Raises:
@@ -166,5 +165,9 @@ def _remove_repeated_pairs(spec: mujoco.MjSpec) -> None:
         geoms = frozenset((pair.geomname1, pair.geomname2))
         if geoms in known:
             spec.delete(pair)
-            log.info("%s lists a pair of %s twice: the second is dropped", spec.modelname, " and ".join(sorted(geoms)))
+            log.info(
+                "%s lists a pair of %s twice: the second entry is dropped",
+                spec.modelname,
+                " and ".join(sorted(geoms)),
+            )
         known.add(geoms)

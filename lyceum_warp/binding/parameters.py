@@ -83,7 +83,9 @@ class Parameters:
         return {name: v for name, v in self.values.items() if isinstance(v, np.ndarray) and name not in self.tables}
 
     def changed(self, given: Mapping[str, Any]) -> "Parameters":
-        """Return a copy with some values replaced, each converted to its field's type. The copy shares the arrays.
+        """Return a copy with some values replaced, each converted to its field's type.
+
+        The copy and the original share arrays.
 
         Raises:
             ValueError: A name is unknown, or a value is missing or does not fit its field.

@@ -192,7 +192,7 @@ def _run(path: Path, name: str, source: bytes) -> None:
     before = sys.modules.get(name)
     sys.modules[name] = module
     try:
-        code = compile(source, file, "exec")  # stale bytecode may have the same time in whole seconds
+        code = compile(source, file, "exec")  # bytecode with the same time stamp may be stale
         # Warp reads the source of functions from linecache, where later changes of the file do not appear
         text = importlib.util.decode_source(source)
         linecache.cache[file] = (len(text), None, list(io.StringIO(text)), file)

@@ -142,7 +142,7 @@ class _Reader:
         places: For each argument, the part of the analysed function's arguments to which it refers, or None.
         arguments: Names of the arguments of the analysed function.
         writes: The dict to which writes are added.
-        seen: The functions that were read, with their places.
+        seen: The functions that were already read, with the places of their arguments.
     """
 
     def __init__(

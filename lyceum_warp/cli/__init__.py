@@ -86,7 +86,7 @@ def _run(argv: list[str]) -> int:
         commands: Any = {name: type(name, (), {"__doc__": line}) for name, (*_, line) in _COMMANDS.items()}
         tyro.extras.subcommand_cli_from_dict(commands, prog="lyceum-warp", description=_DESCRIPTION, args=["--help"])
     if not argv:
-        raise ValueError(f"which command? There are {', '.join(_COMMANDS)}; lyceum-warp --help describes them")
+        raise ValueError(f"which command? The commands are {', '.join(_COMMANDS)}; lyceum-warp --help describes them")
     name, *words = argv
     if name not in _COMMANDS:
         close = difflib.get_close_matches(name, _COMMANDS, 1)

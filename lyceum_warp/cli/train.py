@@ -107,8 +107,8 @@ class Train:
     minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Time limit in minutes: training ends after the iteration that exceeds it. --resume continues the run."""
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Iterations between two saved policies with numbers; 0 saves none. The last and the best policy are always
-    saved."""
+    """The number of iterations after which another numbered policy is saved; 0 saves none. The last and the best policy
+    are always saved."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Iterations between two saves of the policy and the complete state, from which a killed run resumes. 0 saves every
     30 s, or more often if that takes at most 1 % of the time."""
@@ -129,10 +129,10 @@ class Train:
     none."""
     camera: CameraWords = ()
     transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
-    """Whether to test at the end whether the policy performs equally on the other engine, and write transfer.json. By
-    default only two cheap comparisons run: the C engine after training on a GPU, and the task's own physics if the run
-    has other physics. With --transfer a policy trained on CPU cores is also tested on the Warp engine, whose kernels
-    may take minutes to compile, and under each physics of the task."""
+    """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default only two
+    cheap comparisons run: the C engine after training on a GPU, and the task's own physics if the run has other
+    physics. With --transfer a policy trained on CPU cores is also tested on the Warp engine, whose kernels may take
+    minutes to compile, and under each physics of the task."""
     trust: Trust = False
     take_over: bool = False
     """Continue a run that another process has locked, on this or another host. The other process ends at its next

@@ -32,7 +32,7 @@ def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: 
     if free is not None and nworld > _most(bytes_per_world, free + held):
         gc.collect()  # collect garbage, to free environments that are no longer used
         if device.is_cuda:
-            torch.cuda.empty_cache()  # torch caches free memory, which this releases
+            torch.cuda.empty_cache()  # release free memory that torch has cached
         free = free_memory(device)
     if free is None or nworld <= (most := _most(bytes_per_world, free + held)):
         return

@@ -96,7 +96,7 @@ def check_task(
         >>> print(check_task("hopper", engine="mujoco"))
     """
     if nworld < 2:
-        raise ValueError(f"the checks compare worlds: nworld must be at least 2, not {nworld}")
+        raise ValueError(f"the checks compare worlds with one another: nworld must be at least 2, not {nworld}")
     steps = whole_number("steps", steps, low=1)
     if str(device or "").startswith("cuda"):
         options = {"deterministic": True} | options

@@ -26,7 +26,7 @@ MAX_POINTS, MAX_MESSAGES = 20_000, 200
 """The maximum numbers of curve points and of messages that a frame takes over from skipped frames."""
 
 
-# messages from the session to the window
+# messages to the window
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,7 +179,7 @@ def latest(older: Frame | None, newer: Frame) -> Frame:
     )
 
 
-# commands from the window to the session
+# commands
 
 
 @dataclasses.dataclass(frozen=True)
@@ -304,7 +304,7 @@ Command: TypeAlias = (
 )  # fmt: skip
 
 
-# messages about the start and the end of the window process
+# start and end
 
 
 @dataclasses.dataclass(frozen=True)

@@ -91,7 +91,7 @@ class DrawingProcess:
             if code > 0 and code != CANNOT_DRAW:  # no other graphics library would help
                 raise NoVideoError(f"{self.product} could not be written ({reason})")
         raise NoVideoError(
-            f"this machine cannot render off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "
+            f"this machine cannot draw off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "
             "libegl1 and libgl1-mesa-dri) or OSMesa (libosmesa6), or set MUJOCO_GL to a library that works"
         )
 

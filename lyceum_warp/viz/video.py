@@ -127,11 +127,11 @@ class Recorder:
         self.added = 0
         """The number of frames so far."""
         self.dropped = 0
-        """The number of frames that show an earlier shot, because theirs was dropped."""
+        """The number of frames for which the shot was dropped."""
         self._drawing = Drawing(model, out, camera=camera, size=size, fps=fps, background=True)
         self._most = most_waiting
         self._shots: deque[Shot] = deque()
-        self._changed = threading.Condition()  # this lock also guards the queue
+        self._changed = threading.Condition()  # the lock of the condition also guards the queue
         self._ended = self._cancelled = False
         self._error: NoVideoError | OSError | None = None
         # in Python 3.11, a join that a signal interrupts would mark the thread as stopped

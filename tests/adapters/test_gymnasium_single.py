@@ -112,7 +112,7 @@ def test_step_before_a_reset_raises_an_error() -> None:
     env = GymnasiumEnv("hopper")
     with pytest.raises(ResetNeeded, match="there was no reset before this step: call reset"):
         env.step(np.zeros(3, dtype=np.float32))
-    with pytest.raises(ValueError, match="reset has no option 'reset_mask': omit options"):
+    with pytest.raises(ValueError, match="reset has no option 'reset_mask': call it without options"):
         env.reset(options={"reset_mask": [True]})
 
 

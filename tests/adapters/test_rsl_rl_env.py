@@ -119,7 +119,7 @@ def test_log_excludes_old_episodes(shared_env: SharedEnv) -> None:
 def test_unsuitable_environments_and_actions_raise_an_error(env: lw.Env, shared_env: SharedEnv) -> None:
     with pytest.raises(ValueError, match="the environment has autoreset=False: make it with autoreset=True"):
         RslRlVecEnv(shared_env(Metered, nworld=4, autoreset=False))
-    with pytest.raises(ValueError, match="nworld= does not belong to an adapter: num_envs decides"):
+    with pytest.raises(ValueError, match="nworld= is not an argument of an adapter: use num_envs"):
         RslRlVecEnv(Metered, nworld=4)
     with pytest.raises(ValueError, match=r"action must be a float32 tensor of shape \(4, 1\), not a float32 tensor of"):
         RslRlVecEnv(env).step(torch.zeros(4, 2))

@@ -132,7 +132,7 @@ def test_get_attr_set_attr_and_env_method_reach_the_worlds() -> None:
     assert torch.equal(env.env_method("get_eval", indices=2)[0], env.env.eval[2])
     assert env.env_is_wrapped(Monitor) == [True] * N
     assert env.env_is_wrapped(gymnasium.Wrapper, indices=[0]) == [False]
-    with pytest.raises(ValueError, match="'ctrl_cost_weight' belongs to all worlds together: omit indices"):
+    with pytest.raises(ValueError, match="'ctrl_cost_weight' is shared by all worlds: call set_attr without indices"):
         env.set_attr("ctrl_cost_weight", 1.0, indices=[1])
 
 
@@ -183,5 +183,5 @@ def test_step_before_a_reset_and_unknown_options_raise_errors(full: StableBaseli
     with pytest.raises(RuntimeError, match="there was no reset before this step: call reset"):
         env.step(np.zeros((N, 3), dtype=np.float32))
     env.set_options({"mask": 1})
-    with pytest.raises(ValueError, match="reset has no option 'mask': omit set_options"):
+    with pytest.raises(ValueError, match="reset has no option 'mask': do not call set_options"):
         env.reset()

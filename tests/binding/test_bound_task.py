@@ -26,7 +26,7 @@ def bound(file: Path, **options: Any) -> BoundTask:
     [
         ("obs = 10", "obs of the task 'tiny' is 10: add the parts of its observation"),
         ("memory = 1", r"memory of the task 'tiny' has no names: .*, as air_time: Row\[float\] = lw\.memory\(4\)"),
-        ("del model", "the task 'tiny' has no model: add a model, as model = \"robot.xml\""),
+        ("del model", "the task 'tiny' has no model: add one to its class, such as model = \"robot.xml\""),
         ("lagged = ('qvel',)", "lagged of the task 'tiny' has 'qvel': list it in World, too"),
         ("cleared = ('qacc',)", "cleared of the task 'tiny' has 'qacc': list it in World, too"),
         ("frame_skip = 0", "frame_skip of the task 'tiny' must be a whole number from 1 to .*, not 0"),

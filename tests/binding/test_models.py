@@ -57,7 +57,7 @@ def test_current_folder_is_searched_only_for_the_option_model(tmp_path: Path, mo
     ("model", "message"),
     [
         ("/nowhere/hopper.xml", "there is no model file '/nowhere/hopper.xml'"),
-        ("robott.xml", r"no model file .*robott.xml \(did you mean robot.xml\?\), and of Gymnasium's models: "),
+        ("robott.xml", r"no model file .*robott.xml \(did you mean robot.xml\?\); among Gymnasium's models, "),
     ],
 )
 def test_error_of_a_missing_model_file_names_the_file(model: str, message: str, tmp_path: Path) -> None:

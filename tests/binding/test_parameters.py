@@ -80,12 +80,12 @@ def test_named_elements_become_model_indices(model: mujoco.MjModel) -> None:
         ({"offset": 1.0}, r"offset of 'arm' has shape \(\); it takes \(3,\), or one per world, \(2, 3\)"),
         ({"count": 2.5}, "count=2.5 of 'arm' must be a whole number"),
         ({"lively": 0.5}, "lively=0.5 of 'arm' must be a whole number"),
-        ({"tip": 1}, "tip=1 of 'arm' is an index of 'site_xpos', of which the model has 1: give an index from 0 to 0"),
-        ({"tip": -1}, "tip=-1 of 'arm' is an index of 'site_xpos', of which the model has 1"),
-        ({"tip": [0, 1]}, r"tip=\[0, 1\] of 'arm' is an index of 'site_xpos', of which the model has 1"),
+        ({"tip": 1}, "tip=1 of 'arm' is not an index of 'site_xpos': give an index from 0 to 0"),
+        ({"tip": -1}, "tip=-1 of 'arm' is not an index of 'site_xpos'"),
+        ({"tip": [0, 1]}, r"tip=\[0, 1\] of 'arm' is not an index of 'site_xpos'"),
         ({"tip": "top"}, "no site 'top'; it has: tip"),
-        ({"tip": lw.body("lower")}, "tip of 'arm' can't be an element of 'xpos': it is one of 'site_xpos'"),
-        ({"gain": lw.body("lower")}, "gain of 'arm' can't be an element of 'xpos': it is a number"),
+        ({"tip": lw.body("lower")}, "tip of 'arm' can't be an element of 'xpos': its default is one of 'site_xpos'"),
+        ({"gain": lw.body("lower")}, "gain of 'arm' can't be an element of 'xpos': its default is a number"),
     ],
 )
 def test_invalid_parameter_value_raises_an_error(given: dict[str, Any], message: str, model: mujoco.MjModel) -> None:
@@ -157,13 +157,13 @@ def test_table_is_a_read_only_copy(model: mujoco.MjModel) -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"motion": 1.0}, r"the parameter motion of 'arm' has shape \(\): it takes 2 axes, none of length 0"),
+        ({"motion": 1.0}, r"the parameter motion of 'arm' has shape \(\): it takes 2 axes, with no axis of length 0"),
         ({"motion": [1.0, 2.0]}, r"has shape \(2,\): it takes 2 axes"),
-        ({"motion": np.zeros((0, 2))}, r"has shape \(0, 2\): it takes 2 axes, none of length 0"),
+        ({"motion": np.zeros((0, 2))}, r"has shape \(0, 2\): it takes 2 axes, with no axis of length 0"),
         ({"motion": [[1.0], [2.0, 3.0]]}, "motion of 'arm' must be a table of numbers: "),
         ({"motion": [[1.0, np.nan]]}, r"motion of 'arm' has nan at \[0, 1\]: it must be a finite number of 32 bits"),
         ({"motion": [[1e60, 1.0]]}, r"motion of 'arm' has 1e\+60 at \[0, 0\]: it must be a finite number of 32 bits"),
-        ({"motion": "none.npy"}, "motion of 'arm' from 'none.npy': there is no such file"),
+        ({"motion": "none.npy"}, "motion of 'arm' from 'none.npy' cannot be read, because there is no such file"),
         ({"points": [1.0, 2.0, 3.0]}, r"points of 'arm' has shape \(3,\): it takes 2 axes, the last \(3,\)"),
         ({"points": np.ones((3, 2))}, r"points of 'arm' has shape \(3, 2\): it takes 2 axes, the last \(3,\)"),
         ({"order": [0.5]}, r"order of 'arm' has 0.5 at \[0\]: it must be a whole number of 32 bits"),
@@ -209,9 +209,9 @@ def test_table_of_named_elements_contains_their_indices(model: mujoco.MjModel) -
         (["knee"], "the model has no joint 'knee'; it has: elbow, shoulder"),
         (
             [0, 2],
-            "joints of 'arm' is an index of 'qvel', of which the model has 2: give an index from 0 to 1, or a name",
+            "joints of 'arm' is not an index of 'qvel': give an index from 0 to 1, or a name",
         ),
-        (lw.sites("tip"), "joints of 'arm' can't have an element of 'site_xpos': it has elements of 'qvel'"),
+        (lw.sites("tip"), "joints of 'arm' can't have an element of 'site_xpos': its elements belong to 'qvel'"),
     ],
 )
 def test_table_with_elements_of_another_kind_raises_an_error(

@@ -149,7 +149,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     "terms that need each other": (
         term("def a(b: float) -> float:\n    return b", 'rewards = {"a": 1.0}',
              before="@wp.func\ndef b(a: float) -> float:\n    return a\n\n"),
-        "terms of the task 'tiny' need each other: a needs b needs a",
+        "terms of the task 'tiny' need each other in a circle: a needs b needs a",
     ),
     "a term that writes": (
         term("def upright(s: World) -> float:\n    s.qpos[0] = 1.0\n    return 1.0"),
@@ -158,7 +158,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     "rewards beside reward": (
         term(f"def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:\n    return 0.0\n\n"
              f"@wp.func\n{UPRIGHT}"),
-        "the task 'tiny' has rewards and a function reward: leave one of them out",
+        "the task 'tiny' has rewards and a function reward: remove one of them",
     ),
     "names without weights": (
         term(UPRIGHT, 'rewards = ("upright",)'), r"rewards of the task 'tiny' must be a dict of names and weights",

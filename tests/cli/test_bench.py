@@ -27,4 +27,4 @@ def test_bench_without_a_checkout_prints_an_error(
 ) -> None:
     monkeypatch.setattr("lyceum_warp.cli.bench.FOLDER", tmp_path / "bench")
     assert main(["bench"]) == 2
-    assert "the experiments belong to a checkout of the repository" in capfd.readouterr().err
+    assert "the experiments need a checkout of the repository" in capfd.readouterr().err

@@ -138,4 +138,4 @@ def test_eval_compares_both_engines(trained: Path, capsys: pytest.CaptureFixture
     rows = [line.split() for line in shown.splitlines() if line.split()[:1] == ["length"]]
     assert rows[-1] == ["length", "20", "20", "+0", "+0", "to", "+0", "1", "same"]
     assert cli.main([*arguments, "--engine", "warp"]) == 2
-    refused(capsys, "--transfer plays on both engines: omit --engine")
+    refused(capsys, "--transfer plays episodes on both engines: omit --engine")

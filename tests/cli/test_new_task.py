@@ -237,7 +237,7 @@ def test_an_invalid_name_raises_a_one_line_error(
         ("gymnasium:hoper.xml", ["no model file 'hoper.xml'", "hopper.xml"]),
         ("broken.xml", ["can't read the model", "broken.xml"]),
         ("meshless.xml", ["meshless.xml: MuJoCo refuses the model", "absent.stl"]),
-        ("still.xml", ["still.xml has no actuators, so there is nothing to act on"]),
+        ("still.xml", ["still.xml has no actuators, so actions would have no effect"]),
         ("stuck.xml", ["stuck.xml has no joints"]),
     ],
 )

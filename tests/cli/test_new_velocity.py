@@ -123,7 +123,7 @@ def test_options_feet_and_joints_select_feet_and_joints(folder: Path) -> None:
     ("change", "options", "words"),
     [
         ((), ["--feet", "tow"], "sled.xml: the model has no site, geom or body 'tow': --feet takes"),
-        ((), ["--joints", "hip"], "sled.xml: the model has no joint 'hip': --joints takes names, separated"),
+        ((), ["--joints", "hip"], "sled.xml: the model has no joint 'hip': give names after --joints, separated"),
         (("<freejoint/>", ""), [], "sled.xml: the first joint of the model is not a free joint"),
         (('<geom name="floor" type="plane" size="5 5 .1"/>', ""), [], "sled.xml: the model has no floor"),
         (('<position name="left_hip" joint="left_hip" kp="40" kv="2"/>', ""), ["--joints", "left_hip"],
@@ -143,7 +143,7 @@ def test_robot_without_legs_prints_an_error(
 
 def test_option_feet_without_the_template_prints_an_error(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["new", "sled_walk", "--model", "sled.xml", "--feet", "toe"]) == 2
-    assert "--feet and --joints belong to --template velocity" in capsys.readouterr().err
+    assert "--feet and --joints have no effect without --template velocity" in capsys.readouterr().err
 
 
 @pytest.mark.quick("spot_velocity")

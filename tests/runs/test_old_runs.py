@@ -109,7 +109,7 @@ def test_ppo_continues_from_a_run_of_rsl_rl(
 ) -> None:
     out, begin = tmp_path / "new", ["train", "--from", str(rsl_rl_run), "--iterations", "1"]
     assert main(begin) == main(["train", "--resume", str(rsl_rl_run), "--iterations", "5"]) == 2
-    assert "was trained by 'rsl-rl', a learner of a program" in capsys.readouterr().err
+    assert "was trained by 'rsl-rl', which is not part of this package" in capsys.readouterr().err
     settings = ["--algorithm", "ppo", "--num-steps", "12", "--hidden", "8", "--out", str(out)]
     assert main([*begin, *settings, *QUIET]) == 0
     run = Run.open(out)

@@ -151,7 +151,7 @@ class Session:
             videos.give_up()
             stage.frames.say(str(error))
 
-    # a plant that runs in real time
+    # real time
 
     def _by_the_clock(self) -> bool:
         """Whether a controller of one world acts in its plant in real time."""

@@ -245,7 +245,7 @@ class Live:
         if steps < 0:
             self._times.clear()
 
-    # changes that the user requests
+    # user requests
 
     def reset(self, *, random: bool) -> None:
         """Start a new episode of the shown world."""

@@ -15,7 +15,7 @@ POLL = 0.005
 
 _RESERVE = 0.0015  # no work starts within these seconds before a step
 _PART = 10_000  # maximum steps of a run, because all states are stored
-_WARM_UP = 3  # first calls of a controller, without other work, because they may capture graphs
+_WARM_UP = 3  # first calls without other work, because they may capture graphs
 
 
 class InterruptedByCommand(BaseException):

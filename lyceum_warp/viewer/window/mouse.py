@@ -43,7 +43,7 @@ class Mouse:
                 self._end()
 
     def let_go(self) -> None:
-        """End a push after the browser has disconnected. Any thread may call this."""
+        """End a push after the browser has disconnected. Any thread may call this method."""
         with self._lock:
             self._left = True  # without a browser, studio does not notice the release of the button
             self._end()

@@ -202,7 +202,7 @@ class Proxy:
         ready.wait()
 
     def offer(self, file: str) -> None:
-        """Offer a file for download to the open pages. Any thread may call this."""
+        """Offer a file for download to the open pages. Any thread may call this method."""
         self._loop.call_soon_threadsafe(lambda: self._loop.create_task(self._tell(file)))
 
     def close(self) -> None:

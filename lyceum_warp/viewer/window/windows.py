@@ -358,7 +358,7 @@ class Windows:
             imgui.EndTable()
 
 
-# helpers for parts of the panel
+# helpers
 
 
 def highlighted_button(label: str, on: bool) -> bool:

@@ -48,7 +48,7 @@ def test_the_history_is_bounded_and_its_end_is_reported(shared_env: SharedEnv) -
     assert past.behind == past.length - 1
     session.obey(StepBy(-past.length - 5))
     assert past.behind == 0 and past.ahead == past.length - 1
-    assert "the past ends here" in session.stage.frame().messages[0]
+    assert "the history ends here" in session.stage.frame().messages[0]
     session.obey(protocol.Reset(random=False))
     assert past.ahead == 0
     worlds = shared_env("point_mass", nworld=3)
