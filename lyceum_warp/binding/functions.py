@@ -95,7 +95,7 @@ class TaskSource:
             name
             for name, function in functions.items()
             if name not in called and id(function) not in used
-            and tuple(map(self._kind, function.input_types.values())) in forms  # functions of other tasks differ
+            and tuple(map(self._kind, function.input_types.values())) in forms  # ignore other tasks' functions
             and (self._has_structs or not any(_may_list(task, name.removeprefix(GROUP_PREFIX)) for task in tasks))
         ]  # fmt: skip
         return [name for name in (*own, *unused) if name.startswith(GROUP_PREFIX)]

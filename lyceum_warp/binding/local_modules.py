@@ -94,7 +94,7 @@ def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
     folder, bytecode = str(file.resolve().parent), sys.dont_write_bytecode
     sys.path.insert(0, folder)
     importlib.invalidate_caches()
-    sys.dont_write_bytecode = True  # bytecode would land in run folders, and misses edits in the same second
+    sys.dont_write_bytecode = True  # do not write bytecode into run folders
     try:
         yield
     except BaseException:

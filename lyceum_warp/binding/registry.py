@@ -61,7 +61,7 @@ def register(task: type[Task]) -> type[Task]:
 
 
 def _may_replace(task: type[Task], known: type[Task]) -> bool:
-    by_path = task.__module__.startswith(_FILE) and known.__module__.startswith(_FILE)  # file names may be equal
+    by_path = task.__module__.startswith(_FILE) and known.__module__.startswith(_FILE)  # file names may coincide
     return by_path or known.__module__ == task.__module__ or _file(known) == _file(task)
 
 

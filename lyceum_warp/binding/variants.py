@@ -117,7 +117,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
         if isinstance(value, wp.Function) and hasattr(value, "replaces")
     }
     named = {*structs, *structs.values(), world, params}
-    for module in modules:  # the loop itself appends modules
+    for module in modules:  # the loop body appends to this list
         for value in _values(module, owners):
             home = sys.modules.get(_home(value)) if isinstance(value, wp.Function) else value
             if isinstance(home, types.ModuleType) and home not in modules and _names(home, named):
@@ -127,7 +127,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
     taken = {kind for f in functions for overload in overloads(f) for kind in overload.input_types.values()
              if is_struct(kind)}  # fmt: skip
     structs = {struct: new for struct, new in structs.items() if struct in taken}
-    if not structs and not replaced:  # such a task may be a robot that only changes defaults
+    if not structs and not replaced:  # for example, a task that only changes defaults
         return None
     key = (tuple(modules), tuple(functions), tuple(structs.items()), tuple(replaced.items()))
     if key not in _made:

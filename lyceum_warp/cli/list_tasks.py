@@ -59,7 +59,7 @@ class Tasks:
         console, table = make_console(), [_HEADINGS, *map(_cells, entries)]
         widths = [max(len(row[i]) for row in table) for i in range(len(_HEADINGS))]
         fits = sum(widths) + 2 * len(widths) - 2 <= console.width
-        shown = len(_HEADINGS) - (not fits)  # a long row shows the model in a line below
+        shown = len(_HEADINGS) - (not fits)  # in a narrow console, the model gets its own line
         heading, *lines = (
             "  ".join(f"{cell:{'>' if 1 <= i <= 5 else '<'}{widths[i]}}" for i, cell in enumerate(row[:shown]))
             for row in table

@@ -124,9 +124,7 @@ def _class_name(path: Path) -> str:
     if snake_case(class_name) != name:  # a task is named after its class
         raise ValueError(f"a task can't be named {name!r}: use {snake_case(class_name)!r}, for the class {class_name}")
     if class_name in _TAKEN:
-        raise ValueError(
-            f"a task can't be named {name!r}: its class {class_name} would have the name of another object in the file"
-        )
+        raise ValueError(f"a task can't be named {name!r}: its file defines {class_name} for another purpose")
     if name in package_task_names():
         raise ValueError(f"the task name {name!r} is taken by a task of the package: choose another")
     module = importlib.util.find_spec(name)

@@ -198,7 +198,7 @@ def _check_value_task(run: Path, task: str) -> None:
     try:
         config = Run.open(run.parent if run.is_file() else run).config
     except FileNotFoundError:
-        return  # there may be no configuration: load_value reports missing files, and a policy file needs no run folder
+        return  # load_value reports missing files; a policy file may have no run folder
     found = str(config.get("task"))
     names = {_stem(found), snake_case(found.partition(":")[2]), str(config.get("kept", {}).get("name"))}
     if not names & {_stem(task), task_name(find_task(task))}:
@@ -229,7 +229,7 @@ def _worlds(
     def make(setting: RealTimeSetting | None) -> MPPI:
         chosen, physics = config, {}
         if setting is not None:
-            # a longer replanning interval keeps the time between knots
+            # scale the knots with the horizon, so that the time between knots stays the same
             knots = config.knots and max(1, config.knots * setting.horizon // config.horizon)
             chosen = config.changed({"samples": setting.samples, "horizon": setting.horizon, "knots": knots})
             if setting.physics not in (None, _suggested_physics(task)):

@@ -190,7 +190,7 @@ def _episodes_env(options: View, episodes: dict[Path, Trajectory]) -> Env:
 def _task_worlds(options: View) -> Env:
     params = parameters(options.param, options)
     nworld = options.nworld or 1
-    if options.mppi and nworld == 1:  # the viewer shows such episodes in the plant
+    if options.mppi and nworld == 1:  # the planner controls this world
         return Env(options.what[0], autoreset=False, nthread=1, **params)
     return Env(options.what[0], nworld=nworld, **_words(options), **params)
 

@@ -37,7 +37,7 @@ def _call_in(process: int, function: Callable[[], object]) -> None:
 def _after_fork() -> None:
     for thing, attributes in _watched.items():
         for name in attributes:
-            _kept.append(getattr(thing, name))  # destroying it would wait for missing threads
+            _kept.append(getattr(thing, name))  # its destructor would wait forever
             setattr(thing, name, LeftInParent())
 
 

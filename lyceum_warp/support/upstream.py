@@ -29,7 +29,7 @@ def extend_structs() -> None:
     codegen: Any = wp._src.codegen
 
     def merge(cls: Any, /, **keywords: Any) -> None:
-        if not issubclass(cls, codegen.StructInstance):  # Warp's instance class is also a subclass
+        if not issubclass(cls, codegen.StructInstance):  # skip Warp's own instance class
             inherited: dict[str, Any] = {}
             for base in reversed(cls.__mro__[1:]):
                 inherited |= vars(base).get("__annotations__", {})

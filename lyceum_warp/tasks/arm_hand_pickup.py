@@ -30,14 +30,14 @@ class World:
 @wp.struct
 class Params:
     dt: float
-    far: float = 0.5  # distances are clipped to this, m
-    near: float = 0.03  # the goal counts only if palm and ball are closer than this, m
+    far: float = 0.5  # largest distance that counts, m
+    near: float = 0.03  # distance between palm and ball below which the goal counts, m
     finger_weight: float = 0.1
     success_distance: float = 0.05
     ball: int = lw.body("table/ball")
     goal: int = lw.site("table/goal")
     palm: int = lw.site("hand/pinchsite")
-    finger: int = lw.geom("hand/finger_tip_1")  # the second and third fingertip follow 2 and 4 geoms later
+    finger: int = lw.geom("hand/finger_tip_1")  # the other fingertips are finger + 2 and finger + 4
 
 
 @wp.func

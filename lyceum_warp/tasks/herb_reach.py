@@ -28,7 +28,7 @@ class Params:
     success_distance: float = 0.05
     precision_weight: float = 0.5
     ctrl_cost_weight: float = 0.01
-    target_low: wp.vec3 = wp.vec3(0.6, 0.1, 0.7)  # the left target's box; the right target's is mirrored in y
+    target_low: wp.vec3 = wp.vec3(0.6, 0.1, 0.7)  # box of the left target; mirrored in y for the right target
     target_high: wp.vec3 = wp.vec3(0.95, 0.6, 1.3)
     reset_noise_scale: float = 0.1  # largest initial joint angle of the arms, rad
     left_arm: int = lw.qpos("left/j1")

@@ -26,7 +26,7 @@ class World:
 class Params:
     dt: float
     success_distance: float = 0.03
-    reach: float = 0.4  # an episode ends if the ball is further from the origin, m
+    reach: float = 0.4  # largest distance of the ball from the origin, m
     diameter: float = 0.09
     start_range: float = 0.2  # largest initial x of ball and target, m
     heights: wp.vec2 = wp.vec2(0.15, 0.3)  # of the target, m

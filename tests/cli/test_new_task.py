@@ -209,7 +209,7 @@ def test_model_of_a_package_or_of_menagerie_is_loaded_from_its_source(
         ("größe", ["can't be named 'größe'"]),
         ("MyWalk", ["can't be named 'MyWalk'", "use 'my_walk'"]),
         ("walk_2", ["can't be named 'walk_2'", "use 'walk2'"]),
-        ("world", ["can't be named 'world'", "uses World"]),
+        ("world", ["can't be named 'world'", "defines World"]),
         ("torch", ["can't be named 'torch'", "hide the Python module"]),
         ("random", ["can't be named 'random'", "hide the Python module"]),
         ("", ["can't be named '.py'"]),

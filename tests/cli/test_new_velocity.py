@@ -122,7 +122,7 @@ def test_options_feet_and_joints_select_feet_and_joints(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "options", "words"),
     [
-        ((), ["--feet", "tow"], "sled.xml: the model has no site, geom or body 'tow': --feet takes"),
+        ((), ["--feet", "tow"], "sled.xml: the model has no site, geom or body 'tow': give names after --feet"),
         ((), ["--joints", "hip"], "sled.xml: the model has no joint 'hip': give names after --joints, separated"),
         (("<freejoint/>", ""), [], "sled.xml: the first joint of the model is not a free joint"),
         (('<geom name="floor" type="plane" size="5 5 .1"/>', ""), [], "sled.xml: the model has no floor"),

@@ -46,7 +46,7 @@ class WorldModels:
             values: The values of model fields by name, (nworld, size) float32.
             mask: The mask of the worlds; None for all worlds.
         """
-        if mask is not None and 1 not in mask.tobytes():  # usually none; faster than mask.any()
+        if mask is not None and 1 not in mask.tobytes():  # faster than mask.any()
             return
         worlds = np.arange(self.batch.nsim) if mask is None else np.flatnonzero(mask)
         derive = self._stale[worlds]

@@ -44,7 +44,7 @@ class Params:
     stiffness: wp.array[float] = [*3 * [80.0], *2 * [60.0, 60.0, 150.0, 100.0], *6 * [10.0]]  # N m / rad
     damping: wp.array[float] = [*3 * [0.0], *2 * [0.0, 0.0, 0.0, 4.0], *6 * [0.0]]  # N m s / rad
     gear: wp.array[float] = lw.from_model(lambda model, p: [float(model.actuator_gear[i, 0]) for i in p.motors])
-    # parameters of the reward terms
+    # reward terms
     forward_speed: float = 0.0  # m/s
     target_height: float = 1.22  # of the torso, m
     least_height: float = 0.8

@@ -19,8 +19,8 @@ TERRAIN = lw.Terrain(
 class World(walking.World):
     level: Row[float] = lw.lasting_memory()
     column: Row[float] = lw.lasting_memory()
-    walked: Row[float] = lw.lasting_memory()  # the distance from the patch's centre, m
-    commanded: Row[float] = lw.lasting_memory()  # an episode's distance at the present command, m
+    walked: Row[float] = lw.lasting_memory()  # distance from the patch's centre, m
+    commanded: Row[float] = lw.lasting_memory()  # commanded distance of an episode, m
 
 
 @wp.struct

@@ -18,7 +18,7 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row, terms, walkers
 
-# terms, and arguments of terms
+# terms and arguments
 from lyceum_warp.terms import (  # noqa: F401
     action_rate_l2,
     active,
@@ -68,7 +68,7 @@ class World:
 class Params:
     dt: float
     substep_dt: float
-    # parameters of the robot: joints, feet, and tables that are computed from both
+    # the robot
     joints: wp.array[int] = lw.joints()
     feet: wp.array[int] = lw.sites()
     trunk: int = lw.from_model(walkers.base)
@@ -84,16 +84,17 @@ class Params:
     foot_geoms: wp.array[int] = lw.from_model(walkers.foot_geoms)
     foot_forces: wp.array[int] = lw.from_model(walkers.foot_forces)
     soles: wp.array2d[wp.vec4] = lw.from_model(walkers.soles)
-    # parameters of the reward terms
+    # reward terms
     linear_velocity_variance: float = 0.25  # (m/s)^2
     angular_velocity_variance: float = 0.5  # (rad/s)^2
     tilt_variance: float = 0.2
     standing_pose_std: wp.array[float] = lw.from_model(lambda model, p: len(p.joints) * [0.05])  # rad
     walking_pose_std: wp.array[float] = lw.from_model(lambda model, p: len(p.joints) * [0.3])
     soft_limit: float = 0.9  # share of a joint's range
-    swing_target: float = 0.1  # desired foot height in a swing, m
-    longest_step: float = 0.4  # longest rewarded single stance, s
-    least_command: float = 0.05  # below this, gait terms are 0, and pose uses standing_pose_std
+    # desired foot height in a swing (m), longest rewarded single stance (s)
+    swing_target: float = 0.1
+    longest_step: float = 0.4
+    least_command: float = 0.05  # the robot should stand at smaller commands
     fall_angle: float = math.radians(70.0)
     least_height: float = 0.0  # of the base, m
     # actions
@@ -108,7 +109,7 @@ class Params:
     standing_share: float = 0.1
     forward_share: float = 0.2  # fraction of commands straight forward
     least_forward_velocity: float = 0.3
-    # largest uniform noise on the policy's observations
+    # bounds of the uniform noise on the policy's observations
     linear_velocity_noise: float = 0.5
     angular_velocity_noise: float = 0.2
     gravity_noise: float = 0.05
@@ -116,14 +117,14 @@ class Params:
     joint_velocity_noise: float = 1.5
     # pushes
     push_seconds: wp.vec2 = wp.vec2(1.0, 3.0)
-    push_velocity: wp.vec3 = wp.vec3(0.5, 0.5, 0.4)  # largest, in the world's axes, m/s
-    push_spin: wp.vec3 = wp.vec3(0.52, 0.52, 0.78)  # largest, in the world's axes, rad/s
+    push_velocity: wp.vec3 = wp.vec3(0.5, 0.5, 0.4)  # largest push in the world's axes, m/s
+    push_spin: wp.vec3 = wp.vec3(0.52, 0.52, 0.78)  # largest push in the world's axes, rad/s
     # differences between robots
     encoder_bias: float = 0.015  # largest, rad
     trunk_offset: wp.vec3 = wp.vec3(0.025, 0.025, 0.03)  # largest shift of the centre of mass, m
     sliding_friction: wp.vec2 = wp.vec2(0.3, 1.5)
-    spinning_friction: wp.vec2 = wp.vec2(1e-4, 2e-2)  # log-uniform, like the rolling friction
-    rolling_friction: wp.vec2 = wp.vec2(1e-5, 5e-3)
+    spinning_friction: wp.vec2 = wp.vec2(1e-4, 2e-2)  # log-uniform
+    rolling_friction: wp.vec2 = wp.vec2(1e-5, 5e-3)  # log-uniform
     # resets
     start_height: float = lw.from_model(walkers.home_height)
     start_low: wp.vec3 = wp.vec3(-0.5, -0.5, 0.01)  # offset of the base, m

@@ -30,10 +30,14 @@ from lyceum_warp.viewer.session.stage import Stage
 from lyceum_warp.viewer.session.window_process import Window
 from lyceum_warp.viz import NoVideoError
 
-_FPS = 30.0  # maximum number of frames per second
-_LAG = 0.25  # maximum seconds of lag behind the clock; more lag moves the clock
-_IDLE = 0.5  # seconds between two frames while nothing changes
-_CHECK = 0.5  # seconds between two calls of a watcher
+_FPS = 30.0
+"""The maximum number of frames per second."""
+_LAG = 0.25
+"""The maximum lag of the worlds behind the clock in seconds; a greater lag moves the clock."""
+_IDLE = 0.5
+"""The seconds between two frames while nothing changes."""
+_CHECK = 0.5
+"""The seconds between two calls of a watcher."""
 
 Watcher = Callable[[], Sequence[str]]
 """A function that returns new messages; called about twice a second."""

@@ -321,7 +321,7 @@ class Live:
             return (self.world + (1 if choice == "next" else -1)) % self.env.nworld
         return int(self.returns.argmax() if choice == "best" else self.returns.argmin())
 
-    # the rows of frames
+    # rows of frames
 
     def request(self, worlds: Sequence[int] = (), burst: int = 0) -> None:
         """Start copying the rows of a frame to the host, unless a copy is already in progress.
