@@ -1,6 +1,6 @@
 """Check array indices in the instrumented copies of a task's functions that ``check_task`` runs.
 
-``report`` is (places, 3). Each row belongs to an index in the source. It holds how often the index was out of range,
+``report`` is (places, 3). Each row belongs to an index in the source, and holds how often it was out of range,
 the first bad index, and the size of the array. Functions are not inlined, because inlining would increase compile
 times.
 """
