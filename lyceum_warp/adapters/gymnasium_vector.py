@@ -26,10 +26,10 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     - SAME_STEP resets it within the same step. The world returns the first observation of its next episode;
       ``infos["final_obs"]`` and ``infos["final_info"]`` hold the last observations and infos of ended episodes, and the
-      masks ``_final_obs`` and ``_final_info`` select their worlds. With NumPy these entries exist only if an episode
-      ended, and ``final_obs`` is an object array with None for the other worlds, as Gymnasium's wrappers expect. With
-      ``torch=True`` the entries always exist, as tensors over all worlds: a step does not wait to learn whether an
-      episode ended.
+      masks ``_final_obs`` and ``_final_info`` select their worlds. With NumPy, ``final_obs`` and ``final_info`` exist
+      only if an episode ended, and ``final_obs`` is an object array with None for the other worlds, as Gymnasium's
+      wrappers expect. With ``torch=True``, both entries always exist, as tensors over all worlds, so that a step need
+      not wait for the device.
     - DISABLED leaves resets to ``reset(options={"reset_mask": mask})``. An ended world keeps stepping until its reset,
       and its termination or truncation stays set. A world with a fault is reset at once, but returns its last valid
       observation.

@@ -116,7 +116,7 @@ def given(flags: Any) -> dict[str, Any]:
 
 NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "model", "fields", "dynamics", "physics")
 """Options of an environment that have no generated flag. Commands declare flags for nworld, seed and the model, and
-``Physics`` declares the flags of ``physics``. The other options are only for Python."""
+``Physics`` declares the flags of ``physics``. All other options without a flag are only for Python."""
 
 
 @optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"))
@@ -145,8 +145,8 @@ class Physics:
     """Physics options of the worlds. The defaults come from the run, the task or its model."""
 
     physics: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """One of the task's physics by name, as listed by lyceum-warp tasks, or exact for the task's own. The other physics
-    options are applied on top."""
+    """One of the task's physics by name, as listed by lyceum-warp tasks, or exact for the task's own. Flags of single
+    physics options override it."""
     solver: Repeated = ()
     """A limit of the constraint solver, such as iterations=4, ls_iterations=10 or noslip_iterations=0; may be repeated.
     The default limits come from the model."""

@@ -57,8 +57,8 @@ class Eval:
     which: str = "last"
     """The policy to evaluate: last, best, or the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """A task, by name or file, that replaces the run's task and its physics and defaults. This may be the current
-    version of the run's task. The observations and actions of both tasks must have the same sizes."""
+    """A task, by name or file, that replaces the run's task and its physics and defaults. The replacement may be the
+    current version of the run's task. The observations and actions of both tasks must have the same sizes."""
     param: ParamWords = ()
     episodes: int = 32
     """Number of episodes."""

@@ -95,9 +95,9 @@ class Train:
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """The run's folder, which must be new or empty; by default runs/TASK-DATE."""
     resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Continue the run in this folder exactly, with its settings, up to --iterations."""
+    """Continue the run in the given folder exactly, with its settings, up to --iterations."""
     from_run: Annotated[Path | None, tyro.conf.arg(name="from", metavar="RUN")] = None
-    """Start a new run from the policy, the value function and the normaliser of this run. The run's settings are the
+    """Start a new run from the policy, the value function and the normaliser of another run. The run's settings are the
     defaults, but a different TASK has its own parameters, and a different --algorithm its own hyperparameters."""
     which: str = "last"
     """The policy to start from with --from: last, best, or the number of a saved iteration."""
@@ -135,8 +135,8 @@ class Train:
     minutes to compile, and under each physics of the task."""
     trust: Trust = False
     take_over: bool = False
-    """Continue a run that another process has locked, on this or another host. The other process ends at its next
-    write."""
+    """Continue a run that another process has locked, on this or another host. The process that held the lock ends at
+    its next write."""
     view: bool = False
     """Whether to show the newest policy during training, like lyceum-warp view FOLDER --follow in another shell."""
     port: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None

@@ -125,7 +125,7 @@ class Engine(abc.ABC):
     ) -> int:
         """Estimate the bytes of memory per world, from the constructor's arguments.
 
-        This implementation counts a float64 state and one float32 array for each field.
+        The base class counts a float64 state and one float32 array for each field.
         """
         floats = sum(field.size for field in fields) + sum(field.size for field in dynamics)
         return 8 * _integration_size(model) + 4 * floats + 8

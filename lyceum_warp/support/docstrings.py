@@ -1,8 +1,8 @@
 """Make ``help()`` show the docstrings of attributes and of overloaded Warp functions.
 
-Python discards a string after an attribute, so ``help`` does not show it. ``document_attributes`` reads these strings
-from the source and appends them to the docstring of the class. ``document_overloads`` sets the docstring of an
-overloaded Warp function, which has none.
+Python discards a string after an attribute, so ``help`` does not show it. ``document_attributes`` reads the strings
+after attributes from the source and appends them to the docstring of the class. ``document_overloads`` sets the
+docstring of an overloaded Warp function, which has none.
 """
 
 import ast

@@ -21,7 +21,7 @@ def start_warp() -> list[str]:
 
     At its default log level, Warp prints a banner and a line for every loaded module. The level is therefore raised to
     warnings, unless the user has set a level. Without a GPU, Warp's native library prints messages about the driver to
-    stderr; these are logged instead, and all other output is printed.
+    stderr. Such messages are logged instead, and all other output is printed.
 
     Returns:
         The messages about the CUDA driver, which callers add to errors about a missing device.

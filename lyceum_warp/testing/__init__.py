@@ -1,7 +1,7 @@
 """Check the rules of an environment for any task on any engine.
 
-Each check tests one rule. A check takes the environments under test, and leaves them usable for the next check. Its
-AssertionError names the task, the engine, the rule, the values, the seed and a world's state.
+Each check tests one rule. A check takes the environments under test, and leaves them usable for the next check. The
+AssertionError of a check names the task, the engine, the rule, the values, the seed and a world's state.
 """
 
 import dataclasses

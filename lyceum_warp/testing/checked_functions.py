@@ -57,10 +57,10 @@ class Unchecked(Exception):  # noqa: N818
 class CheckedFunctions:
     """Makes checked copies of functions, and a kernel for each copy.
 
-    A kernel takes the report and, for each argument of the function, the values of all worlds. These are a ``Batch``
-    for World, (nworld,) or (1,) for Params, and (nworld, size) for a row. The report, (places, 3) int32, has a row per
-    indexing expression. A row holds how often the index was out of range, the first such index, and the size of the
-    array.
+    A kernel takes the report and, for each argument of the function, the values of all worlds. World becomes a
+    ``Batch``, Params an array (nworld,) or (1,), and a row an array (nworld, size). The report, (places, 3) int32, has
+    a row per indexing expression. A row holds how often the index was out of range, the first such index, and the size
+    of the array.
 
     Raises:
         Unchecked: A function can't be copied.

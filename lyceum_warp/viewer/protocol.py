@@ -90,7 +90,7 @@ class SetGhosts:
     worlds: int = 0
     """The number of worlds to draw as ghosts, at most ``MOST_GHOSTS``, beginning after the shown world."""
     grid: bool = False
-    """Whether to draw these worlds beside each other, in the model's colours."""
+    """Whether to draw the other worlds beside each other, in the model's colours."""
     episodes: int = 0
     """The number of episodes to draw as ghosts, at the shown step, beginning after the shown episode."""
     burst: int = 0

@@ -84,7 +84,8 @@ if (navigator.userAgentData && ["localhost", "127.0.0.1"].includes(location.host
 }}
 </script>"""
 """Return the HTML of a notebook's output: the page, and a link to the page. Only Chromium-based browsers give an
-embedded page the memory that it needs. They send the viewer's cookie only below the notebook's own host name."""
+embedded page the memory that it needs. Chromium-based browsers send the viewer's cookie only below the notebook's own
+host name."""
 
 
 class BackgroundView:

@@ -6,10 +6,10 @@
 prints "ready" once it can draw, and "frame" after each picture. EOF without None means that the parent process has
 died; the program then deletes the folder.
 
-MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. For this reason,
-``drawing.py`` starts a separate process for each graphics library that it tries. The program imports no module of the
-package. Exit code 3 means that the machine cannot draw with the chosen graphics library; the last line on stderr holds
-the reason.
+MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. Because the process
+may end, ``drawing.py`` starts a separate process for each graphics library that it tries. The program imports no module
+of the package. Exit code 3 means that the machine cannot draw with the chosen graphics library; the last line on stderr
+holds the reason.
 """
 
 import contextlib

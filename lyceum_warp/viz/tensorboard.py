@@ -29,7 +29,7 @@ _TAGS = {
     "value_loss": "Loss/value", "surrogate_loss": "Loss/surrogate", "entropy": "Loss/entropy",
     "learning_rate": "Loss/learning_rate", "total_fps": "Perf/total_fps", "time_sample": "Perf/collection_time",
     "time_update": "Perf/learning_time",
-    # these names do not follow from the columns
+    # names that do not follow from the columns
     "iteration": "time/iteration", "samples": "time/samples", "samples_per_second": "time/samples_per_second",
     "terminal_reward": "episode/terminal_reward", "eval_mean": "episode/eval",
     "success": "episode/success", "faults": "episode/faults", "outliers": "episode/outliers",

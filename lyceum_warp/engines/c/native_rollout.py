@@ -18,8 +18,8 @@ def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
 
     Each row of a native rollout holds values as ``mj_step`` leaves them. The state in a row is the new state.
     Quantities of the position and velocity stages belong to the state before the last substep, and their new values are
-    in the next row. With RK4, these quantities belong to an intermediate stage. Sensor data come from several stages,
-    so a native rollout cannot return them exactly.
+    in the next row. With RK4, quantities of the position and velocity stages belong to an intermediate stage. Sensor
+    data come from several stages, so a native rollout cannot return them exactly.
     """
     current = [field for field in fields if field.refresh > Stage.NONE]
     if any(field.snapshot for field in current):

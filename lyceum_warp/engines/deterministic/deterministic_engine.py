@@ -23,7 +23,7 @@ _TIMES_THE_MEMORY = 5
 humanoid, 6.1 on half_cheetah and 6.3 on hopper. ``prepare_capture`` later measures the memory for the given model."""
 
 _FEW = 256
-"""With fewer worlds than this, scratch memory fits on any device, and is allocated on demand."""
+"""The number of worlds below which scratch memory fits on any device, and is allocated on demand."""
 
 
 class DeterministicEngine(WarpEngine):

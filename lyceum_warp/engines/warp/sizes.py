@@ -39,9 +39,9 @@ _known: dict[str, tuple[int, int]] = {}
 def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[int, int]:
     """Measure how many contacts and constraints to allocate for each world.
 
-    The numbers are twice the peak of random rollouts, plus constraints that a task may turn on. These are inactive
-    equality constraints, friction losses if randomized, and all limits if their ranges are randomized. In the rollouts,
-    32 worlds run 500 substeps on the C engine under random controls, each held for 20 substeps. They start in the
+    The numbers are twice the peak of random rollouts, plus constraints that a task may turn on: inactive equality
+    constraints, friction losses if randomized, and all limits if their ranges are randomized. In the rollouts, 32
+    worlds run 500 substeps on the C engine under random controls, each held for 20 substeps. The worlds start in the
     model's initial state or a keyframe, half of them with random velocities. Results are cached for each model.
 
     Args:

@@ -161,7 +161,7 @@ class Key:
 
 
 def key_table() -> list[Key]:
-    """The keys of the panel. Browsers pass all these keys to the page."""
+    """The keys of the panel. Browsers pass all keys of the panel to the page."""
     return [
         Key("F1", "show or hide this table", lambda p: p.toggle_window("keys")),
         Key("F2", "messages", lambda p: p.toggle_window("messages")),

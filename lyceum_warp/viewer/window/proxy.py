@@ -109,9 +109,9 @@ SCRIPT = """<script>
   } catch {}
 })();
 </script>"""
-"""The script that the proxy inserts into studio's page. It prefixes requested addresses with the secret path, gives
-control to the visible tab while other tabs wait, starts with the browser's theme, shows links to new files, and keeps
-the title."""
+"""The script that the proxy inserts into studio's page. The script prefixes requested addresses with the secret path,
+gives control to the visible tab while other tabs wait, starts with the browser's theme, shows links to new files, and
+keeps the title."""
 
 _PATH = re.compile(r"(/[A-Za-z0-9_~!$&'()*+,;=:@\[\]-][A-Za-z0-9._~!$&'()*+,;=:@\[\]-]*)+|/")
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?")
@@ -296,7 +296,7 @@ class Proxy:
         if not _is_cross_site(request):
             return web.Response(status=303, headers={**headers, "Location": target})
         # If the user follows a link on another site, browsers do not send a SameSite=Strict cookie, not even after a
-        # redirect. Browsers send the cookie after this page, which belongs to the proxy's site.
+        # redirect. Browsers send the cookie after a page of the proxy, which belongs to the proxy's site.
         page = f'<!doctype html><meta http-equiv="refresh" content="0; url={target}">'
         return web.Response(text=page, content_type="text/html", headers=headers)
 
