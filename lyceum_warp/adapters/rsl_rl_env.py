@@ -111,14 +111,12 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             Observations (after a reset, the first observation of the new episode); rewards, (nworld,); dones, (nworld,)
             bool; and a dict:
 
-            ============= =========================================================================================
-            ``time_outs`` whether the time limit or a fault truncated the episode, (nworld,) bool. A transition with
-                          a fault has reward 0 and the last valid observation as its final one
-            ``final_obs`` a dict of observation groups after the step, before any reset
-            ``log``       means of the task's metrics over about the last 100 episodes that ended (all of this step's),
-                          ``metrics/NAME``, which are 0 before the first end; and ``faults/worlds``, worlds with a
-                          fault
-            ============= =========================================================================================
+            - ``time_outs``: whether the time limit or a fault truncated the episode, (nworld,) bool. A transition with
+              a fault has reward 0, and the last valid observation as its final observation.
+            - ``final_obs``: a dict of observation groups after the step, before any reset.
+            - ``log``: ``metrics/NAME``, means of the task's metrics over about the last 100 ended episodes, and
+              ``faults/worlds``, the number of worlds with a fault. The means are 0 before the first episode ends, and
+              cover all episodes that end in the step.
 
         Raises:
             ValueError: The actions have the wrong shape, type or device.

@@ -1,8 +1,8 @@
 """Draw plots and videos, which need the extra ``viz``, and write curves for TensorBoard."""
 
 EXTRA = "pip install 'lyceum-warp[viz]'"
-"""Command that installs the packages for plots and videos."""
+"""The command that installs the packages for plots and videos."""
 
 
 class NoVideoError(RuntimeError):
-    """Raised if the machine cannot render, or if a package for videos is missing. The message says how to fix it."""
+    """Raised if the machine cannot render, or if a package for videos is missing. The message gives the fix."""

@@ -81,7 +81,7 @@ class FrameMaker:
             rows = live.take()
             assert rows is not None
             points.append(rows.points)
-        if live.asynchronous and not paused:  # the request is for the next frame
+        if live.asynchronous and not paused:  # request rows for the next frame
             live.request(*wanted)
         state, parts = rows.states[0], live.env.state_space.parts
         self._report(rows, main.world if live is not main else None)
