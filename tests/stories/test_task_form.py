@@ -495,7 +495,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     "memory with the name of a counter": ([field("step: Row[float] = lw.memory()")], "step is already the name"),
     "memory of size 0": ([field("level: Row[float] = lw.memory(0)")], r"size of World\.level must be a whole number"),
     "memory with the size of no table": (
-        [field('level: Row[float] = lw.memory("dt")')], r"size of World\.level is 'dt', which is not a table of Params",
+        [field('level: Row[float] = lw.memory("dt")')], r"size of World\.level is 'dt', which is not a table in Params",
     ),
     "no draw": ([line("draws = 0")], "draws of the task 'tiny' must be a whole number from 1"),
     "a reward that writes": (
