@@ -1,6 +1,6 @@
 """G1Velocity: a Unitree G1 walks at a commanded velocity with its twelve leg joints; waist and arms keep their pose.
 
-Of the robot's tasks, only this one has a gait clock.
+G1Velocity is the only task of the G1 with a gait clock.
 """
 
 import mujoco

@@ -1,9 +1,9 @@
-"""Let a biped walk to a clock: both groups observe it, and the reward compares the feet with it.
+"""Let a biped step to a gait clock, which both observation groups contain and the reward compares with the feet.
 
 The clock turns at ``gait_frequency``. Each foot stands for the first ``stance_share`` of its cycle and swings for the
-rest; the feet are half a cycle apart. Without the clock, policies learn to trip at 5 to 7 steps of each foot a second.
-The clock's cycle, 0.8 s, is that of unitree_rl_gym and nanoG1. Two costs of fast motion grow with the steps of a world,
-because a robot that pays them from the start learns to stand still.
+rest; the feet are half a cycle apart. Without the clock, policies learn to make 5 to 7 short steps a second with each
+foot. The clock's cycle lasts 0.8 s, as in unitree_rl_gym and nanoG1. Two costs of fast motion grow with the steps of a
+world, because a robot that pays them from the start learns to stand still.
 """
 
 import warp as wp
@@ -25,8 +25,8 @@ class Params(walking.BipedParams):
     gait_frequency: float = 1.25  # Hz
     stance_share: float = 0.55
     foot_lift: float = 0.07  # greatest height of a swing, m
-    standing_height: float = 0.04  # of the feet's sites above the soles, m
-    growth_steps: float = 4000.0  # steps of a world until the growing costs have their full weight
+    standing_height: float = 0.04  # height of the feet's sites above the soles, m
+    growth_steps: float = 4000.0  # steps of a world after which the costs have full weight
 
 
 @wp.struct
