@@ -30,7 +30,7 @@ def store_inputs(
     index_in: wp.array[int], obs_in: wp.array2d[float], action_in: wp.array2d[float], step_in: wp.array[int],
     out: RolloutArrays,
 ):  # fmt: skip
-    """Store observation, action and step counter before a step; launched over (nworld, max(nobs, nact))."""
+    """Store the observation, the action and the step counter before a step; launched over (nworld, max(nobs, nact))."""
     w, i = wp.tid()
     t = index_in[0]
     if i < obs_in.shape[1]:
@@ -58,7 +58,7 @@ def store_outputs(
 ):
     """Store the results of a step and the episode's return so far, and count faults; launched over (nworld, nobs).
 
-    With ``first_only`` the returns of a world's later episodes are NaN.
+    With ``first_only``, returns after a world's first episode are NaN.
     """
     w, i = wp.tid()
     t = index_in[0]
@@ -92,5 +92,5 @@ def store_rows(index_in: wp.array[int], rows_in: wp.array2d[float], rows_out: wp
 
 @wp.kernel(enable_backward=False)
 def advance_index(index_inout: wp.array[int]):
-    """Advance the index by one step; launched over (1,)."""
+    """Increase the index by one; launched over (1,)."""
     index_inout[0] = index_inout[0] + 1

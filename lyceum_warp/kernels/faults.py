@@ -13,13 +13,13 @@ WARNING = wp.constant(int(Done.ENGINE_WARNING))
 
 @wp.func
 def is_out_of_range(x: float) -> bool:
-    # written so that NaN, for which every comparison is false, counts as out of range
+    # every comparison with NaN is false, so this form counts NaN as out of range
     return not (wp.abs(x) < MAX_MAGNITUDE)
 
 
 @wp.func
 def count_faults(fault: int, count_inout: wp.array[int]):
-    """Increment the counter of each fault bit that is set."""
+    """Increment the counters of the fault bits that are set."""
     for bit in range(count_inout.shape[0]):
         if ((fault >> bit) & 1) != 0:
             count_inout[bit] = count_inout[bit] + 1
@@ -37,8 +37,8 @@ def faults_of_rows(
     """Find faults of the C engine in the masked worlds; launched over (nworld,).
 
     The first ``nphysics`` columns of ``state`` are time, qpos, qvel and act. ``warning`` holds counters, (nworld, kind,
-    2), which are cleared here. The kinds are mjtWarning's: 0 inertia, 1 contacts full, 2 constraints full, 3 to 5 bad
-    qpos, qvel, qacc, 6 bad control, which counts as a bad state, as on the Warp engine.
+    2), which this kernel clears. The kinds are those of mjtWarning: 0 inertia, 1 contacts full, 2 constraints full, 3
+    to 5 bad qpos, qvel, qacc, 6 bad control. A bad control counts as a bad state, as on the Warp engine.
     """
     w = first + wp.tid()
     if not mask_in[w]:
@@ -58,7 +58,7 @@ def faults_of_rows(
                 fault = fault | NAN
             else:
                 fault = fault | WARNING
-    if (fault & NAN) != 0:  # a bad state causes more warnings, for example about the inertia matrix
+    if (fault & NAN) != 0:  # after a bad state, other warnings are side effects, for example about the inertia matrix
         fault = fault & ~WARNING
     fault_out[w] = fault
 

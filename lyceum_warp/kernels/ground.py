@@ -13,11 +13,11 @@ from lyceum_warp.kernels.rotations import quat_rotate
 
 @wp.func
 def _triangle(ground: wp.array2d[float], x: float, y: float) -> wp.vec3:
-    """The triangle under a point: its height at the point, and its slopes along x and y."""
+    """Find the triangle below a point, and return its height at the point and its slopes along x and y."""
     ny, nx = ground.shape[0] - 1, ground.shape[1] - 1
     x0, y0, x1, y1 = ground[0, 1], ground[1, 0], ground[0, nx], ground[ny, 0]
     px, py = wp.clamp(x, x0, x1), wp.clamp(y, y0, y1)
-    # clamped once more, for the last point and for not-a-number
+    # clamp again, for the last point and for NaN
     c = 1 + wp.clamp(int((px - x0) / (x1 - x0) * float(nx - 1)), 0, nx - 2)
     r = 1 + wp.clamp(int((py - y0) / (y1 - y0) * float(ny - 1)), 0, ny - 2)
     dx, dy = ground[0, c + 1] - ground[0, c], ground[r + 1, 0] - ground[r, 0]
@@ -31,9 +31,9 @@ def _triangle(ground: wp.array2d[float], x: float, y: float) -> wp.vec3:
 
 @wp.func
 def ground_height(ground: wp.array2d[float], x: float, y: float) -> float:
-    """The height of the ground at a point, m, on the triangles with which MuJoCo collides.
+    """Return the height of the ground at a point, m, on the triangles with which MuJoCo collides.
 
-    Outside the field, the height of the nearest edge point is returned, although MuJoCo has no ground there.
+    Outside the field, the height is that of the nearest edge point, although MuJoCo has no ground there.
 
     Args:
         ground: The table of ``lw.height_field``.
@@ -45,16 +45,17 @@ def ground_height(ground: wp.array2d[float], x: float, y: float) -> float:
 
 @wp.func
 def ground_normal(ground: wp.array2d[float], x: float, y: float) -> wp.vec3:
-    """The normal of the triangle of the ground at a point, of length 1, upwards; see ``ground_height``."""
+    """Return the unit normal, upwards, of the ground's triangle at a point; see ``ground_height``."""
     t = _triangle(ground, x, y)
     return wp.normalize(wp.vec3(-t[1], -t[2], 1.0))
 
 
 @wp.func
 def ground_distance(ground: wp.array2d[float], point: wp.vec3) -> float:
-    """The distance of a point from the plane of the triangle below it, m; negative below the ground.
+    """Return the distance of a point from the plane of the triangle below it, m; negative below the ground.
 
-    A sphere touches this triangle if the distance of its centre is at most its radius. Other triangles may be nearer.
+    A sphere touches the triangle if the distance of the sphere's centre is at most the radius. Another triangle may be
+    nearer.
     """
     t = _triangle(ground, point[0], point[1])
     return (point[2] - t[0]) / wp.length(wp.vec3(t[1], t[2], 1.0))
@@ -62,7 +63,10 @@ def ground_distance(ground: wp.array2d[float], point: wp.vec3) -> float:
 
 @wp.func
 def on_ground(ground: wp.array2d[float], x: float, y: float) -> bool:
-    """Whether the field covers a point. A robot that leaves the field falls."""
+    """Return whether the height field covers a point.
+
+    There is no ground outside the field, so a robot that leaves it falls.
+    """
     ny, nx = ground.shape[0] - 1, ground.shape[1] - 1
     return x >= ground[0, 1] and x <= ground[0, nx] and y >= ground[1, 0] and y <= ground[ny, 0]
 
@@ -80,7 +84,7 @@ def height_scan(
     Args:
         row: A row, such as a part of an observation, with an element for each point.
         ground: The table of ``lw.height_field``.
-        points: Points relative to the base, m, which turn with its yaw only: x forwards, y to the left.
+        points: Points relative to the base, m, x forwards and y to the left; they turn with the base's yaw only.
         base: Position of the base, m.
         orientation: Orientation of the base (w, x, y, z).
     """
@@ -94,23 +98,23 @@ def height_scan(
 
 @wp.func
 def _draw(count: int, rng: wp.array[wp.uint32]) -> int:
-    """A random whole number from 0 to ``count`` - 1."""
+    """Draw a random whole number from 0 to ``count`` - 1."""
     return wp.min(int(uniform(rng, 0.0, float(count))), count - 1)
 
 
 @wp.func
 def next_level(level: int, walked: float, commanded: float, patch: float, levels: int, rng: wp.array[wp.uint32]) -> int:
-    """Choose the terrain level of the next episode: one higher, the same or one lower, as in Rudin et al. (2021).
+    """Raise, keep or lower the terrain level for the next episode, as in Rudin et al. (2021).
 
-    The level rises if the robot walked more than half a patch. Otherwise it falls if the robot walked less than half
-    the commanded distance, but not below 0. The last level is followed by a random level. (arXiv 2109.11978, section
-    3.2.)
+    The level rises if the robot walked more than half a patch. Otherwise the level falls, but not below 0, if the robot
+    walked less than half the commanded distance. After the last level, the next level is random.
+    Source: arXiv 2109.11978, section 3.2.
 
     Args:
         level: The level of the episode that ended, from 0.
-        walked: Distance from its start to its end, m.
-        commanded: Speed of the command times the duration of a whole episode, m; 0 keeps the level.
-        patch: Side of a patch, m: ``lw.Terrain.patch``.
+        walked: Distance between the robot's positions at the start and the end of the episode, m.
+        commanded: Speed of the command times the duration of a whole episode, m; with 0 the level stays the same.
+        patch: Length of a patch's side, m: ``lw.Terrain.patch``.
         levels: Number of levels: ``lw.Terrain.levels``.
         rng: The world's random numbers.
     """
@@ -135,8 +139,8 @@ def start_on_terrain(
 ) -> wp.vec3:
     """Choose the patch of a new episode, and return its centre, m; for ``randomize``.
 
-    A world's first episode is at level 0, in a random column. The column never changes; ``next_level`` chooses later
-    levels.
+    A world's first episode is at level 0, in a random column. The column never changes, and ``next_level`` chooses
+    later levels.
 
     Args:
         level: Lasting memory of one number: the level, from 0.
@@ -144,7 +148,7 @@ def start_on_terrain(
         walked: Lasting memory of one number, written by ``follow_walk``.
         commanded: Lasting memory of one number, written by ``follow_walk``.
         origins: ``lw.Terrain.origins``, (levels, columns).
-        patch: Side of a patch, m: ``lw.Terrain.patch``.
+        patch: Length of a patch's side, m: ``lw.Terrain.patch``.
         rng: The world's random numbers.
     """
     if walked[0] == 0.0 and commanded[0] == 0.0:
@@ -164,16 +168,16 @@ def follow_walk(
     position: wp.vec3,
     distance: float,
 ):
-    """Write the distances by which ``start_on_terrain`` chooses the next level; for ``advance``.
+    """Write the distances from which ``start_on_terrain`` chooses the next level; for ``advance``.
 
     Args:
         level: The level; see ``start_on_terrain``.
         column: The column.
-        walked: Gets the horizontal distance from the centre of the patch, m.
-        commanded: Gets the commanded distance, m.
+        walked: Output, the horizontal distance from the centre of the patch, m.
+        commanded: Output, the commanded distance, m.
         origins: ``lw.Terrain.origins``.
         position: Position of the robot.
-        distance: Speed of the command times the duration of a whole episode, m; 0 keeps the level.
+        distance: Speed of the command times the duration of a whole episode, m; with 0 the level stays the same.
     """
     way = position - origins[int(level[0]), int(column[0])]
     walked[0] = wp.length(wp.vec2(way[0], way[1]))

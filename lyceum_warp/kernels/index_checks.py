@@ -15,7 +15,7 @@ MOST_ROUNDS = wp.constant(1_000_000)
 
 @wp.func(inline=False)
 def note(report: wp.array2d[int], place: int, index: int, size: int):
-    """Count an index out of range at a place, and store the first one."""
+    """Count an index out of range in its row, and store the first one."""
     if wp.atomic_add(report, place, 0, 1) == 0:
         report[place, 1] = index
         report[place, 2] = size
@@ -42,13 +42,13 @@ def from_end(report: wp.array2d[int], place: int, index: int, size: int) -> int:
 
 @wp.func
 def element(report: wp.array2d[int], place: int, values: Any, index: Any):
-    """An element of a call's result. The argument evaluates the call only once."""
+    """Return an element of a call's result. The call is an argument, so it is evaluated only once."""
     return values[at(report, place, index, len(values))]
 
 
 @wp.func
 def is_endless(report: wp.array2d[int], place: int, rounds: int) -> bool:
-    """Whether this loop, in this run or an earlier one, has exceeded ``MOST_ROUNDS``."""
+    """Return whether a loop has exceeded ``MOST_ROUNDS``, in this run or an earlier one."""
     if rounds > MOST_ROUNDS:
         note(report, place, rounds, 0)
     return report[place, 0] > 0

@@ -50,8 +50,8 @@ def interpolate(
     """Interpolate actions between knots and clip them to the bounds; launched over (horizon, nworld, nact).
 
     The worlds of a sample are consecutive, and so are the samples of a plant. Order 0 holds each knot until the next,
-    order 1 is linear. Order 3 is a cubic Hermite spline whose slope at a knot is half the difference of its neighbours
-    (Catmull and Rom 1974); it has one more knot in front of the grid.
+    and order 1 interpolates linearly. Order 3 is a cubic Hermite spline, with half the difference of a knot's
+    neighbours as its slope (Catmull and Rom 1974), and with one more knot before the grid.
     """
     t, w, i = wp.tid()
     k = w // (action_out.shape[1] // knot_in.shape[1])

@@ -23,15 +23,15 @@ tiles."""
 
 @wp.func
 def plant_of(row: int, rows: int, plants: int) -> int:
-    """The plant of a row, such as a sample or a world; the rows of a plant are consecutive."""
-    if plants == 1:  # on the CPU a division would double the time of a small kernel
+    """Return the plant of a row, such as a sample or a world; the rows of a plant are consecutive."""
+    if plants == 1:  # skip the division, which would double the time of a small kernel on the CPU
         return 0
     return row // (rows // plants)
 
 
 @wp.func
 def first_row(plant: int, rows: int, plants: int) -> int:
-    """The first row of a plant."""
+    """Return the first row of a plant."""
     if plant == 0:
         return 0
     return plant * (rows // plants)
@@ -53,7 +53,7 @@ def overwrite(row_in: wp.array2d[float], first: int, state_out: wp.array2d[wp.fl
 
 @wp.kernel(enable_backward=False)
 def overwrite_rows(rows_in: wp.array2d[wp.float64], first: int, state_out: wp.array2d[wp.float64]):
-    """Copy rows in turn into the worlds' states, starting at column ``first``; launched over (nworld, size)."""
+    """Copy row w % rows into the state of world w, starting at column ``first``; launched over (nworld, size)."""
     w, i = wp.tid()
     state_out[w, first + i] = rows_in[w % rows_in.shape[0], i]
 
@@ -68,7 +68,7 @@ def controls(
 ):
     """Map actions to controls, clipped to their ranges; launched over (steps, nworld).
 
-    An action that is not finite becomes zero, and is a fault of its world.
+    An action that is not finite becomes zero, and causes a fault in its world.
     """
     t, w = wp.tid()
     fault = int(0)
@@ -86,14 +86,14 @@ def controls(
 
 @wp.kernel(enable_backward=False)
 def repeat_columns(columns_in: wp.array2d[wp.float64], rows_out: wp.array3d[float]):
-    """Copy columns of states into the rows of every step; launched over (steps, nworld, columns)."""
+    """Copy columns of states into a buffer, once for each step; launched over (steps, nworld, columns)."""
     t, w, i = wp.tid()
     rows_out[t, w, i] = float(columns_in[w, i])
 
 
 @wp.kernel(enable_backward=False)
 def add_to(number: int, count_inout: wp.array[int]):
-    """Add a number to counters; launched over their size."""
+    """Add a number to counters; launched over the number of counters."""
     w = wp.tid()
     count_inout[w] = count_inout[w] + number
 
@@ -138,7 +138,7 @@ def draw_noise(seed_in: wp.array[int], count_in: wp.array[int], noise_out: wp.ar
 def draw_keys(seed_in: wp.array[int], count_in: wp.array[int], key_out: wp.array[wp.uint32]):
     """Make the samples' stream keys from (seed, sample, count); launched over (nworld,).
 
-    They differ from the plant's own keys, so no sample can foresee the plant's random numbers.
+    The samples' keys differ from the plant's keys, so no sample can foresee the plant's random numbers.
     """
     w = wp.tid()
     worlds, plants = key_out.shape[0], seed_in.shape[0]
@@ -194,7 +194,7 @@ def perturb_adapted(
     high_in: wp.array[float],
     action_out: wp.array3d[float],
 ):
-    """As ``perturb``, with smoothed standard normal noise scaled by a standard deviation per element of the plan."""
+    """Add noise as ``perturb`` does, but with a standard deviation for each element of the plan."""
     k, i = wp.tid()
     nsample, plants = noise_in.shape[1], nominal_in.shape[1]
     p = plant_of(k, nsample, plants)
@@ -246,9 +246,9 @@ def add_up(
 
 @wp.kernel(enable_backward=False)
 def combine_models(world_return_in: wp.array[float], worst: bool, return_out: wp.array[float]):
-    """The mean or the minimum of each sample's returns over several models; launched over (nsample,).
+    """Compute the mean or the minimum of each sample's returns over several models; launched over (nsample,).
 
-    The worlds of a sample are consecutive. A sample that fails in one model fails.
+    The worlds of a sample are consecutive. If a sample fails in one model, its result is a failure.
     """
     k = wp.tid()
     models = world_return_in.shape[0] // return_out.shape[0]
@@ -264,7 +264,7 @@ def combine_models(world_return_in: wp.array[float], worst: bool, return_out: wp
 def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[float], summary_out: wp.array2d[float]):
     """Weigh samples by w = exp((R - max R) / temperature), divided by the sum; launched as one block per plant.
 
-    If every sample failed, all weights are zero. The summary is the best return, the mean return, the effective sample
+    If all samples failed, all weights are zero. The summary is the best return, the mean return, the effective sample
     size 1 / sum w^2, and the number of failed samples.
     """
     p, lane = wp.tid()
@@ -299,7 +299,10 @@ def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[f
 
 @wp.kernel(enable_backward=False)
 def rank(return_in: wp.array[float], samples: int, rank_out: wp.array[int]):
-    """Rank the samples of each plant, from 0 for the best; ties go to the lower index. Launched over (nsample,)."""
+    """Rank the samples of each plant, with rank 0 for the best; of equal samples the lower index ranks first.
+
+    Launched over (nsample,).
+    """
     k = wp.tid()
     own = return_in[k]
     better = int(0)
@@ -320,7 +323,8 @@ def weigh_elites(
 ):
     """Weigh the best samples equally and the others by zero; launched as one block per plant.
 
-    The summary is as in ``weigh``. Failed samples have zero weight, even if fewer than ``elites`` samples remain.
+    The summary has the same entries as in ``weigh``. Failed samples have zero weight, even if fewer than ``elites``
+    samples remain.
     """
     p, lane = wp.tid()
     n = return_in.shape[0] // summary_out.shape[0]
@@ -357,8 +361,9 @@ def fit_deviation(
 ):
     """Fit the standard deviation of the noise to the weighted samples; launched as one block per element of the plans.
 
-    It is the samples' deviation from their mean, the plan, divided by the standard deviation ``spread`` of smoothed
-    standard normal noise in this step, and at least ``smallest``. If every sample failed, it does not change.
+    The fit is the standard deviation of the samples from the plan, their mean, divided by ``spread``, the standard
+    deviation of smoothed standard normal noise in this step. The result is at least ``smallest``. If all samples
+    failed, the standard deviation does not change.
     """
     number, lane = wp.tid()
     nsample, plants, nact = weight_in.shape[0], plan_in.shape[1], plan_in.shape[2]
@@ -386,7 +391,7 @@ def average(
 ):
     """Average the samples' actions by their weights; launched as one block per element of the plans.
 
-    If every sample failed, the plan does not change.
+    If all samples failed, the plan does not change.
     """
     number, lane = wp.tid()
     nsample, plants, nact = weight_in.shape[0], plan_out.shape[1], plan_out.shape[2]

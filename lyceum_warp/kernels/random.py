@@ -11,27 +11,28 @@ from lyceum_warp.support.docstrings import document_overloads
 
 @wp.func
 def world_key(seed: int, world: int) -> wp.uint32:
-    """Key of one world's streams."""
+    """Return the key of a world's streams."""
     return wp.rand_init(seed, world)
 
 
 @wp.func
 def stream(key: wp.uint32, episode: int, step: int) -> wp.uint32:
-    """Start of the stream of one step in one episode; step 0 is the reset."""
+    """Return the start of the stream of a step in an episode; step 0 is the reset."""
     return wp.rand_init(int(wp.rand_init(int(key), episode)), step)
 
 
 @wp.func
 def substream(base: wp.uint32, number: int) -> wp.uint32:
-    """Start of one of several independent streams derived from ``base``."""
+    """Return the start of one of several independent streams that are derived from ``base``."""
     return wp.rand_init(int(base), number)
 
 
 @wp.func
 def uniform(rng: wp.array[wp.uint32], low: float, high: float) -> float:
-    """Draw from U(low, high) and advance the stream. With vectors, each element is drawn from its own range.
+    """Draw from U(low, high) and advance the stream. Each element of a vector is drawn from its own range.
 
-    The stream is a row of one element, because Warp passes numbers by value and could not advance the caller's.
+    The stream is a row with one element, because Warp passes numbers by value, so the function could not advance a
+    number.
     """
     state = rng[0]
     value = wp.randf(state, low, high)
@@ -74,7 +75,7 @@ def seed_worlds(
 ):
     """Seed the streams of the masked worlds, before their first episode; launched over (nworld,).
 
-    ``first`` is the number of world 0.
+    ``first`` is added to the worlds' numbers.
     """
     w = wp.tid()
     if mask_in[w]:

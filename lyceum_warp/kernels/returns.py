@@ -19,7 +19,8 @@ def advantages(
 
     Advantages are generalised advantage estimates (Schulman et al. 2016, "High-dimensional continuous control using
     generalized advantage estimation", eq. 16). ``next_value`` is the value of the state after a step, before any reset.
-    Episodes that are truncated by a time limit or the end of the rollout bootstrap from it; terminated episodes do not.
+    Episodes that the time limit or the end of the rollout truncates bootstrap from ``next_value``; terminated episodes
+    do not.
     """
     w = wp.tid()
     last = reward_in.shape[0] - 1

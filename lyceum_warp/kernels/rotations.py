@@ -26,7 +26,7 @@ def quat_mul(a: wp.vec4, b: wp.vec4) -> wp.vec4:
 
 @wp.func
 def quat_inverse(q: wp.vec4) -> wp.vec4:
-    """Invert a rotation: the conjugate (w, -x, -y, -z), as mju_negQuat."""
+    """Invert a rotation: return the conjugate (w, -x, -y, -z), as mju_negQuat does."""
     return wp.vec4(q[0], -q[1], -q[2], -q[3])
 
 
@@ -34,7 +34,7 @@ def quat_inverse(q: wp.vec4) -> wp.vec4:
 def quat_rotate(q: wp.vec4, v: wp.vec3) -> wp.vec3:
     """Rotate a vector from the frame with orientation q into the world frame.
 
-    v + 2 u x (w v + u x v) for q = (w, u), as mju_rotVecQuat.
+    The result is v + 2 u x (w v + u x v) for q = (w, u), as from mju_rotVecQuat.
     """
     u = wp.vec3(q[1], q[2], q[3])
     return v + 2.0 * wp.cross(u, q[0] * v + wp.cross(u, v))
@@ -44,7 +44,7 @@ def quat_rotate(q: wp.vec4, v: wp.vec3) -> wp.vec3:
 def quat_rotate_inverse(q: wp.vec4, v: wp.vec3) -> wp.vec3:
     """Rotate a vector from the world frame into the frame with orientation q, such as a body's own frame.
 
-    v - 2 u x (w v - u x v) for q = (w, u), as mju_rotVecQuat with the inverse.
+    The result is v - 2 u x (w v - u x v) for q = (w, u), as from mju_rotVecQuat with the inverse.
     """
     u = wp.vec3(q[1], q[2], q[3])
     return v - 2.0 * wp.cross(u, q[0] * v - wp.cross(u, v))
@@ -54,7 +54,7 @@ def quat_rotate_inverse(q: wp.vec4, v: wp.vec3) -> wp.vec3:
 def quat_from_axis_angle(axis: wp.vec3, angle: float) -> wp.vec4:
     """Make the rotation by an angle, in rad, about a unit axis.
 
-    (cos(angle / 2), sin(angle / 2) axis), as mju_axisAngle2Quat.
+    The result is (cos(angle / 2), sin(angle / 2) axis), as from mju_axisAngle2Quat.
     """
     s = wp.sin(0.5 * angle)
     return wp.vec4(wp.cos(0.5 * angle), s * axis[0], s * axis[1], s * axis[2])
@@ -64,7 +64,7 @@ def quat_from_axis_angle(axis: wp.vec3, angle: float) -> wp.vec4:
 def quat_from_rotvec(r: wp.vec3) -> wp.vec4:
     """Make the rotation by |r| rad about r, for example an angular velocity times a duration."""
     angle = wp.length(r)
-    scale = float(0.5)  # the limit of sin(angle / 2) / angle
+    scale = float(0.5)  # use the limit of sin(angle / 2) / angle
     if angle > 0.0:
         scale = wp.sin(0.5 * angle) / angle
     return wp.vec4(wp.cos(0.5 * angle), scale * r[0], scale * r[1], scale * r[2])
@@ -74,7 +74,8 @@ def quat_from_rotvec(r: wp.vec3) -> wp.vec4:
 def quat_to_rotvec(q: wp.vec4) -> wp.vec3:
     """Convert a rotation to its rotation vector: axis times angle, at most pi rad.
 
-    2 atan2(|u|, w) u / |u| for q = (w, u) with w >= 0, else for the equal rotation -q; as mju_quat2Vel with dt = 1.
+    The result is 2 atan2(|u|, w) u / |u| for q = (w, u) with w >= 0, or for -q, the same rotation, with w < 0.
+    With dt = 1, mju_quat2Vel computes the same result.
     """
     u = wp.vec3(q[1], q[2], q[3])
     w = q[0]
@@ -82,7 +83,7 @@ def quat_to_rotvec(q: wp.vec4) -> wp.vec3:
         u = -u
         w = -w
     sine = wp.length(u)
-    scale = float(2.0)  # the limit of 2 atan2(|u|, w) / |u|
+    scale = float(2.0)  # use the limit of 2 atan2(|u|, w) / |u|
     if sine > 0.0:
         scale = 2.0 * wp.atan2(sine, w) / sine
     return scale * u
@@ -90,19 +91,19 @@ def quat_to_rotvec(q: wp.vec4) -> wp.vec3:
 
 @wp.func
 def quat_difference(a: wp.vec4, b: wp.vec4) -> wp.vec3:
-    """The rotation vector r, in the frame of b, from b to a: a = b quat_from_rotvec(r); as mju_subQuat."""
+    """Return the rotation vector r from b to a, in the frame of b, as mju_subQuat: a = b quat_from_rotvec(r)."""
     return quat_to_rotvec(quat_mul(quat_inverse(b), a))
 
 
 @wp.func
 def quat_angle(a: wp.vec4, b: wp.vec4) -> float:
-    """The angle between two orientations, from 0 to pi rad."""
+    """Return the angle between two orientations, from 0 to pi rad."""
     return wp.length(quat_difference(a, b))
 
 
 @wp.func
 def quat_to_mat(q: wp.vec4) -> wp.mat33:
-    """Convert a rotation to its matrix, with the rotated axes as columns; as mju_quat2Mat."""
+    """Convert a rotation to its matrix, with the rotated axes as columns, as mju_quat2Mat."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     return wp.mat33(
         w * w + x * x - y * y - z * z, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
@@ -113,7 +114,7 @@ def quat_to_mat(q: wp.vec4) -> wp.mat33:
 
 @wp.func
 def quat_from_mat(m: wp.mat33) -> wp.vec4:
-    """Convert a rotation matrix, such as a row of ``site_xmat``, to a quaternion; as mju_mat2Quat up to the sign.
+    """Convert a rotation matrix, such as a row of ``site_xmat``, to a quaternion, as mju_mat2Quat up to the sign.
 
     The trace and the diagonal show which of w, x, y, z is large enough to divide by (Shepperd 1978,
     "Quaternion from rotation matrix").
@@ -146,7 +147,7 @@ def quat_from_mat(m: wp.mat33) -> wp.vec4:
 def quat_from_euler(angles: wp.vec3) -> wp.vec4:
     """Make the rotation by three angles, in rad: about x, then about the new y, then about the new z.
 
-    As mju_euler2Quat with the sequence "xyz", and as ``euler`` in MJCF with the default ``eulerseq``.
+    The result equals mju_euler2Quat with the sequence "xyz", and ``euler`` in MJCF with the default ``eulerseq``.
     """
     h = 0.5 * angles
     x = wp.vec4(wp.cos(h[0]), wp.sin(h[0]), 0.0, 0.0)
@@ -159,8 +160,9 @@ def quat_from_euler(angles: wp.vec3) -> wp.vec4:
 def quat_to_euler(q: wp.vec4) -> wp.vec3:
     """Convert a rotation to the angles of ``quat_from_euler``, in rad; the second is from -pi / 2 to pi / 2.
 
-    With the matrix R: atan2(-R12, R22), atan2(R02, sqrt(R12^2 + R22^2)), atan2(-R01, R00). If the second angle is a
-    right angle, only the sum or difference of the others is defined, and the first is set to 0.
+    The angles of the matrix R are atan2(-R12, R22), atan2(R02, sqrt(R12^2 + R22^2)) and atan2(-R01, R00). If the second
+    angle is a right angle, only the sum or the difference of the first and the third is defined, and the first is set
+    to 0.
     """
     m = quat_to_mat(q)
     cosine = wp.sqrt(m[1, 2] * m[1, 2] + m[2, 2] * m[2, 2])
@@ -174,8 +176,8 @@ def quat_to_euler(q: wp.vec4) -> wp.vec3:
 def quat_random(rng: wp.array[wp.uint32]) -> wp.vec4:
     """Draw a rotation from the uniform distribution, and advance the stream.
 
-    (a sin t, a cos t, b sin s, b cos s) for a^2 = 1 - b^2 from U(0, 1) and angles t, s from U(0, 2 pi) (Shoemake 1992,
-    "Uniform random rotations").
+    The result is (a sin t, a cos t, b sin s, b cos s), with a^2 = 1 - b^2 from U(0, 1) and angles t, s from U(0, 2 pi)
+    (Shoemake 1992, "Uniform random rotations").
     """
     u = uniform(rng, 0.0, 1.0)
     t = uniform(rng, 0.0, 2.0 * wp.pi)

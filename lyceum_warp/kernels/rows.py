@@ -5,7 +5,7 @@ import warp as wp
 
 @wp.func
 def finite_row(row: wp.array[float], lane: int, lanes: int) -> bool:
-    """Whether every element of a lane is finite."""
+    """Return whether every element of a lane is finite."""
     for i in range(lane, row.shape[0], lanes):  # noqa: SIM110 (Warp has no all())
         if not wp.isfinite(row[i]):
             return False
@@ -14,7 +14,7 @@ def finite_row(row: wp.array[float], lane: int, lanes: int) -> bool:
 
 @wp.func
 def restored_row(before: wp.array[float], after: wp.array[float], lane: int, lanes: int) -> bool:
-    """Restore the elements of a lane that are not finite from ``before``; returns whether all were finite."""
+    """Replace elements of a lane that are not finite by those of ``before``; return whether all were finite."""
     finite = bool(True)
     for i in range(lane, after.shape[0], lanes):
         if not wp.isfinite(after[i]):

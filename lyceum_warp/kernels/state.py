@@ -12,7 +12,7 @@ import warp as wp
 def widen(
     mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[wp.float64], lanes: int, first: int
 ):
-    """Copy the masked rows of float32 into float64; launched over (nworld, lanes)."""
+    """Copy the masked rows of a float32 array into a float64 array; launched over (nworld, lanes)."""
     k, lane = wp.tid()
     w = first + k
     if mask_in[w]:
@@ -24,7 +24,7 @@ def widen(
 def narrow(
     mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[float], lanes: int, first: int
 ):
-    """Round the masked rows of float64 to float32; launched over (nworld, lanes)."""
+    """Round the masked rows of a float64 array to float32; launched over (nworld, lanes)."""
     k, lane = wp.tid()
     w = first + k
     if mask_in[w]:
@@ -57,7 +57,7 @@ def narrow_four(
     target3_out: wp.array2d[float],
     first: int,
 ):
-    """Round the masked rows of four arrays of float64 to float32; launched over (nworld,) on the CPU."""
+    """Round the masked rows of four float64 arrays to float32; launched over (nworld,) on the CPU."""
     w = first + wp.tid()
     if mask_in[w]:
         narrow_row(source0_in, target0_out, w)
@@ -79,7 +79,7 @@ def widen_four(
     target3_out: wp.array2d[wp.float64],
     first: int,
 ):
-    """Copy the masked rows of four arrays of float32 into float64; launched over (nworld,) on the CPU."""
+    """Copy the masked rows of four float32 arrays into float64 arrays; launched over (nworld,) on the CPU."""
     w = first + wp.tid()
     if mask_in[w]:
         widen_row(source0_in, target0_out, w)
@@ -116,7 +116,7 @@ def narrow_bool(
 def copy_rows(
     mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[float], lanes: int, first: int
 ):
-    """Copy the masked rows of float32; launched over (nworld, lanes)."""
+    """Copy the masked rows of a float32 array; launched over (nworld, lanes)."""
     k, lane = wp.tid()
     w = first + k
     if mask_in[w]:
@@ -150,7 +150,7 @@ def copy_rows64(
     lanes: int,
     first: int,
 ):
-    """Copy the masked rows of float64; launched over (nworld, lanes)."""
+    """Copy the masked rows of a float64 array; launched over (nworld, lanes)."""
     k, lane = wp.tid()
     w = first + k
     if mask_in[w]:
@@ -162,7 +162,7 @@ def copy_rows64(
 def fill_rows64(
     mask_in: wp.array[bool], source_in: wp.array[wp.float64], target_out: wp.array2d[wp.float64], lanes: int, first: int
 ):
-    """Copy one row of float64 into the masked rows; launched over (nworld, lanes)."""
+    """Copy one float64 row into all masked rows; launched over (nworld, lanes)."""
     k, lane = wp.tid()
     w = first + k
     if mask_in[w]:
@@ -174,7 +174,7 @@ def fill_rows64(
 def fill_rows(
     mask_in: wp.array[bool], source_in: wp.array[float], target_out: wp.array2d[float], lanes: int, first: int
 ):
-    """Copy one row of float32 into the masked rows; launched over (nworld, lanes)."""
+    """Copy one float32 row into all masked rows; launched over (nworld, lanes)."""
     k, lane = wp.tid()
     w = first + k
     if mask_in[w]:
@@ -190,7 +190,7 @@ def pack_counters(
     done_reason_in: wp.array[int],
     state_out: wp.array2d[wp.float64],
 ):
-    """Write step, stream key, episode and done reason into four columns, which is exact; launched over (nworld,)."""
+    """Write step, stream key, episode and done reason exactly into four columns; launched over (nworld,)."""
     w = wp.tid()
     state_out[w, 0] = wp.float64(step_in[w])
     state_out[w, 1] = wp.float64(key_in[w])
@@ -207,7 +207,7 @@ def unpack_counters(
     episode_out: wp.array[int],
     done_reason_out: wp.array[int],
 ):
-    """Read the columns of ``pack_counters`` in the masked worlds; launched over (nworld,)."""
+    """Read the columns that ``pack_counters`` writes, in the masked worlds; launched over (nworld,)."""
     w = wp.tid()
     if mask_in[w]:
         step_out[w] = int(state_in[w, 0])

@@ -174,9 +174,9 @@ def begin_kernels(task: TaskCode) -> BeginKernels:
         counters: Counters,
         first: int,
     ):
-        """Begin an episode in the masked worlds, or draw its initial state again; launched over (nworld,).
+        """Begin an episode in the masked worlds, or draw another initial state; launched over (nworld,).
 
-        The engine has already reset these worlds to the fixed initial state. A repeated draw continues the stream.
+        The engine has already reset these worlds to the fixed initial state. Another draw continues the world's stream.
         """
         w = first + wp.tid()
         if not mask_in[w]:
@@ -219,7 +219,7 @@ def begin_kernels(task: TaskCode) -> BeginKernels:
         outdated_out: wp.array[bool],
         first: int,
     ):
-        """Run the events of the worlds that do not restart, ``continuing_out``; launched over (nworld,)."""
+        """Run the events of the worlds that do not restart and set ``continuing_out``; launched over (nworld,)."""
         w = first + wp.tid()
         continuing_out[w] = not restarting_in[w]
         physics_changed_out[w] = False
@@ -262,7 +262,7 @@ def shared_kernels(task: TaskCode) -> SharedKernels:
         sum_inout: wp.array[wp.int64],
         first: int,
     ):
-        """Add each world's share of a transition without a fault to the sums; launched over (nworld,)."""
+        """Add the tally of each world's transition, if it has no fault, to the sums; launched over (nworld,)."""
         w = first + wp.tid()
         for i in range(share_out.shape[1]):
             share_out[w, i] = 0.0
@@ -281,7 +281,7 @@ def shared_kernels(task: TaskCode) -> SharedKernels:
         shared_inout: wp.array2d[float],
         first: int,
     ):
-        """Update the shared memory from the sums, and clear these; launched over (1,)."""
+        """Update the shared memory from the sums, and clear the sums; launched over (1,)."""
         for i in range(sum_inout.shape[0]):
             sum_row_out[0, i] = float(wp.float64(sum_inout[i]) / wp.float64(UNIT))
             sum_inout[i] = wp.int64(0)

@@ -24,11 +24,11 @@ class Sigmoid(enum.IntEnum):
 
 @wp.func
 def put(row: wp.array[float], at: int, value: float) -> int:
-    """Write a value into a row, starting at the index ``at``; returns the next index.
+    """Write a value into a row, starting at the index ``at``, and return the next index.
 
-    The value is a number, a bool, a vector, a matrix (row by row), or a row of any of these. For a row, ``first`` and
-    ``last`` select the elements with first <= i < last. Chain calls to write an observation: ``k = lw.put(obs, 0,
-    s.qpos)``, then ``k = lw.put(obs, k, s.qvel)``.
+    The value is a number, a bool, a vector, a matrix (row by row), or a row of any of these. If the value is a row,
+    ``first`` and ``last`` select its elements with first <= i < last. Chain calls to write an observation: ``k =
+    lw.put(obs, 0, s.qpos)``, then ``k = lw.put(obs, k, s.qvel)``.
     """
     row[at] = value
     return at + 1
@@ -87,7 +87,7 @@ def put(row: wp.array[float], at: int, value: Any) -> int:
 
 @wp.func
 def put_upright(qpos: wp.array[float], at: int, position: wp.vec3, yaw: float) -> int:
-    """Write the pose of an upright body into the coordinates of its free joint; returns the next index.
+    """Write the pose of an upright body into the coordinates of its free joint, and return the next index.
 
     Args:
         qpos: The coordinates of a world.
@@ -101,7 +101,7 @@ def put_upright(qpos: wp.array[float], at: int, position: wp.vec3, yaw: float) -
 
 @wp.func
 def sum_squares(row: wp.array[float], first: int, last: int) -> float:
-    """Sum the squares of a row's elements, numbers or vectors, with first <= i < last (by default of all elements)."""
+    """Sum the squares of a row's elements, numbers or vectors, with first <= i < last; by default of all elements."""
     total = float(0.0)
     for i in range(first, last):
         total += row[i] * row[i]
@@ -128,13 +128,13 @@ def sum_squares(row: wp.array[Any]) -> float:
 
 @wp.func
 def inside(x: float, bounds: wp.vec2) -> bool:
-    """Whether a number lies strictly between two bounds, (low, high); False for NaN."""
+    """Return whether a number is strictly between two bounds, (low, high); False for NaN."""
     return bounds[0] < x and x < bounds[1]
 
 
 @wp.func
 def all_inside(row: wp.array[float], first: int, last: int, bounds: wp.vec2) -> bool:
-    """Whether every element of a row with first <= i < last lies strictly between two bounds, (low, high)."""
+    """Return whether all elements of a row with first <= i < last are strictly between two bounds, (low, high)."""
     ok = bool(True)
     for i in range(first, last):
         ok = ok and inside(row[i], bounds)
@@ -143,19 +143,19 @@ def all_inside(row: wp.array[float], first: int, last: int, bounds: wp.vec2) -> 
 
 @wp.func
 def angle_between(a: wp.vec3, b: wp.vec3) -> float:
-    """The angle between two vectors that are not zero, from 0 to pi rad: atan2(|a x b|, a . b)."""
+    """Return the angle between two vectors that are not zero, from 0 to pi rad: atan2(|a x b|, a . b)."""
     return wp.atan2(wp.length(wp.cross(a, b)), wp.dot(a, b))
 
 
 @wp.func
 def body_velocity(cvel: wp.spatial_vector, com: wp.vec3, point: wp.vec3) -> wp.spatial_vector:
-    """The velocity of a body at a point, as (angular, linear) in the world's axes, in rad/s and m/s.
+    """Return the velocity of a body at a point, as (angular, linear) in the world's axes, in rad/s and m/s.
 
-    w, v + w x (point - com) for cvel = (w, v); as mj_objectVelocity in the world's axes.
+    The result is (w, v + w x (point - com)) for cvel = (w, v), as from mj_objectVelocity in the world's axes.
 
     Args:
         cvel: The body's row of ``cvel``, (angular, linear), at the centre of mass of its kinematic tree.
-        com: That centre of mass: the row of ``subtree_com`` of the tree's root body.
+        com: The centre of mass of the kinematic tree: the root body's row of ``subtree_com``.
         point: A point of the body, in the world's frame, such as the body's row of ``xpos`` or ``xipos``.
     """
     w = wp.spatial_top(cvel)
@@ -164,7 +164,7 @@ def body_velocity(cvel: wp.spatial_vector, com: wp.vec3, point: wp.vec3) -> wp.s
 
 @wp.func
 def local_velocity(cvel: wp.spatial_vector, com: wp.vec3, point: wp.vec3, quat: wp.vec4) -> wp.spatial_vector:
-    """The velocity of a body at a point, as (angular, linear) in the axes of a frame; as mj_objectVelocity, flg_local.
+    """Return a body's velocity at a point, (angular, linear), in a frame's axes, as mj_objectVelocity with flg_local.
 
     Args:
         cvel: See ``body_velocity``.
@@ -186,9 +186,9 @@ def tolerance(
     sigmoid: int = int(Sigmoid.GAUSSIAN),
     value_at_margin: float = 0.1,
 ) -> float:
-    """1 if a number lies within bounds; outside it falls towards 0, as dm_control's ``tolerance``.
+    """Return 1 within bounds, and a number that falls towards 0 outside them, as dm_control's ``tolerance``.
 
-    With d, the distance from the nearer bound divided by the margin, and v, the value at the margin:
+    The number depends on d, the distance from the nearer bound divided by the margin, and v, the value at the margin:
 
     ============  =======================================  =================
     GAUSSIAN      exp(-(d s)^2 / 2), s = sqrt(-2 log v)    0 < v < 1
@@ -204,9 +204,9 @@ def tolerance(
     Args:
         x: The number.
         bounds: The lowest and the highest number with value 1; both may be infinite.
-        margin: The distance from the bounds at which the value is ``value_at_margin``; with 0 the value falls to 0 at
-            the bounds.
-        sigmoid: The shape, an ``lw.Sigmoid``.
+        margin: The distance from the bounds at which the value is ``value_at_margin``; with a margin of 0 the value
+            outside the bounds is 0.
+        sigmoid: The shape of the fall, an ``lw.Sigmoid``.
         value_at_margin: The value at the margin.
     """
     outside = wp.max(bounds[0] - x, x - bounds[1])
@@ -239,15 +239,15 @@ def tolerance(
 
 @wp.func
 def grasp_terms(distance: float, finger: float, closed: float) -> tuple[float, float, float]:
-    """Reward terms for grasping with two fingers, each from 0 to 1: ``near, reach, grasp``.
+    """Return the reward terms ``near, reach, grasp`` for grasping with two fingers, each from 0 to 1.
 
-    ``near`` is 1 up to 1 cm from the target and 0.1 at 2 cm; ``reach`` falls slowly, to 0.2 at 10.5 cm. ``grasp``
-    rewards open fingers on the way and closed fingers at the target: 0.5 if far and open, 1 if near and closed, else 0.
+    ``near`` is 1 up to 1 cm from the target and 0.1 at 2 cm; ``reach`` falls slowly, to 0.2 at 10.5 cm. ``grasp`` is
+    0.5 if the fingers are far from the target and open, 1 if they are near and closed, and otherwise 0.
 
     Args:
         distance: Distance from the point between the fingers to the target, m.
-        finger: Position of a finger, m; 0 if the fingers meet.
-        closed: Position up to which the fingers count as closed, m; from 2 cm above it they count as open.
+        finger: Position of a finger, m; it is 0 if the fingers meet.
+        closed: Largest position at which the fingers count as closed, m; they count as open from 2 cm more.
     """
     near = tolerance(distance, wp.vec2(0.0, 0.01), 0.01)
     reach = tolerance(distance, wp.vec2(0.0, 0.005), 0.1, int(Sigmoid.RECIPROCAL), 0.2)

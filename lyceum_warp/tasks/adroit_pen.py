@@ -60,7 +60,7 @@ def observe(s: World, p: Params, obs: Row[float]):
 
 
 @wp.func
-def evaluate(s: World, p: Params) -> float:  # the cosine between the axes
+def evaluate(s: World, p: Params) -> float:  # the cosine of the angle between the pen's axis and the target's
     return wp.dot(axis(s, p.pen_top, p.pen_bottom), axis(s, p.target_top, p.target_bottom))
 
 

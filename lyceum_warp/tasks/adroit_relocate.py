@@ -84,7 +84,7 @@ def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[fl
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    lw.put(s.qpos, p.ball_x, lw.uniform(rng, p.ball_low, p.ball_high))  # relative to the body's position above (0, 0)
+    lw.put(s.qpos, p.ball_x, lw.uniform(rng, p.ball_low, p.ball_high))  # the model places the body above (0, 0)
     s.mocap_pos[p.target] = lw.uniform(rng, p.target_low, p.target_high)
 
 

@@ -49,14 +49,14 @@ def observe(s: World, p: Params, obs: Row[float]):
 
 
 @wp.func
-def evaluate(s: World, p: Params) -> float:  # height of the pot above the table
+def evaluate(s: World, p: Params) -> float:  # the height of the pot above the table
     return s.xpos[p.pot][2] - p.rest_height
 
 
 @wp.func
 def arm(s: World, grip: int, handle: int, finger: int) -> wp.vec4:
     near, reach, grasp = lw.grasp_terms(wp.length(s.site_xpos[grip] - s.site_xpos[handle]), s.qpos[finger], 0.015)
-    # best if the fingers' sliding axis (y of the gripper) is perpendicular to the handle's bar (x of the pot)
+    # the grip is best if the fingers slide (y of the gripper) perpendicularly to the handle's bar (x of the pot)
     orient = 1.0 - wp.abs(wp.dot(s.site_xmat[grip][:, 1], s.site_xmat[handle][:, 0]))
     return wp.vec4(reach, orient, grasp, near)
 
@@ -87,7 +87,7 @@ def success(s: World, p: Params) -> bool:
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     d = lw.uniform(rng, -p.place, p.place)
-    lw.put_upright(s.qpos, 16, wp.vec3(d[0], d[1], p.rest_height), 0.5 * wp.pi + d[2])  # a handle for each arm
+    lw.put_upright(s.qpos, 16, wp.vec3(d[0], d[1], p.rest_height), 0.5 * wp.pi + d[2])  # each arm faces a handle
 
 
 @lw.register

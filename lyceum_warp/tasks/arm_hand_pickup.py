@@ -41,7 +41,7 @@ class Params:
 
 
 @wp.func
-# distances from the ball: to the palm, to the goal, and the sum of those to the fingertips
+# the ball's distances from the palm and from the goal, and the sum of its distances from the fingertips
 def distances(s: World, p: Params) -> wp.vec3:
     d = wp.vec3(wp.length(s.site_xpos[p.palm] - s.xpos[p.ball]), wp.length(s.site_xpos[p.goal] - s.xpos[p.ball]), 0.0)
     d = wp.min(d, wp.vec3(p.far))

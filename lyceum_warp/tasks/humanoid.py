@@ -67,7 +67,7 @@ def contact_cost(s: World, p: Params) -> float:
 
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    # the subtree of the world body is the whole robot
+    # the world body's subtree contains the whole robot
     forward = p.forward_reward_weight * (s1.subtree_com[0][0] - s0.subtree_com[0][0]) / p.dt
     alive = wp.where(healthy(s1, p), p.healthy_reward, 0.0)
     return forward + alive - p.ctrl_cost_weight * lw.sum_squares(action) - contact_cost(s1, p)

@@ -53,7 +53,7 @@ def observe(s: World, p: Params, obs: Row[float]):
 
 @wp.func
 def terms(action: Row[float], s1: World, p: Params) -> wp.vec3:
-    # as in Gymnasium: the height of the torso, not its change, divided by the duration of a substep
+    # as in Gymnasium, the torso's height, not its change, is divided by the duration of a substep
     height = p.uph_cost_weight * s1.qpos[2] / p.substep_dt
     impact = p.impact_cost_weight * lw.sum_squares(s1.cfrc_ext)
     impact = wp.clamp(impact, p.impact_cost_range[0], p.impact_cost_range[1])

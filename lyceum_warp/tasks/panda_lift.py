@@ -49,16 +49,16 @@ def observe(s: World, p: Params, obs: Row[float]):
 
 
 @wp.func
-def evaluate(s: World, p: Params) -> float:  # height of the cube above the table
+def evaluate(s: World, p: Params) -> float:  # the height of the cube above the table
     return s.xpos[p.cube][2] - p.half_size
 
 
 @wp.func
 def terms(s: World, p: Params) -> wp.vec4:
-    grip = s.site_xmat[p.grip]  # z points out of the hand, the fingers slide along y
+    grip = s.site_xmat[p.grip]  # z points out of the hand, and the fingers slide along y
     distance = wp.length(s.xpos[p.cube] - s.site_xpos[p.grip])
     near, reach, grasp = lw.grasp_terms(distance, s.qpos[p.finger], p.half_size)
-    # the gripper points down, and the fingers slide along an edge of the cube
+    # the grip is best if the gripper points down, and the fingers slide along an edge of the cube
     orient = wp.clamp(-grip[2, 2], 0.0, 1.0) * wp.max(wp.abs(wp.transpose(s.xmat[p.cube]) * grip[:, 1]))
     lift = near * orient * wp.clamp(evaluate(s, p) / (1.5 * p.goal_height), 0.0, 1.0)
     return wp.vec4(reach, orient, grasp, lift)
@@ -82,7 +82,7 @@ def success(s: World, p: Params) -> bool:
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     x, y = lw.uniform(rng, p.area[0], p.area[1]), lw.uniform(rng, p.area[2], p.area[3])
-    place = wp.vec3(x, y, p.half_size - 1e-4)  # at rest, its weight presses it slightly into the table
+    place = wp.vec3(x, y, p.half_size - 1e-4)  # the resting cube's weight presses it slightly into the table
     lw.put_upright(s.qpos, p.cube_qpos, place, lw.uniform(rng, -wp.pi, wp.pi))
 
 

@@ -73,7 +73,7 @@ def success(s: World, p: Params) -> bool:
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     offset = wp.vec2(0.0, 0.0)
-    while wp.length(offset) <= 0.17:  # not near the goal
+    while wp.length(offset) <= 0.17:  # the cylinder does not start near the goal
         offset = lw.uniform(rng, wp.vec2(-0.3, -0.2), wp.vec2(0.0, 0.2))
     lw.put(s.qpos, 7, offset)
     for i in range(7):

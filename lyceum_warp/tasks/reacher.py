@@ -74,7 +74,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
         s.qpos[i] += lw.uniform(rng, -0.1, 0.1)
         s.qvel[i] += lw.uniform(rng, -0.005, 0.005)
     goal = wp.vec2(0.2, 0.2)
-    while wp.length(goal) >= 0.2:  # anywhere within the arm's length
+    while wp.length(goal) >= 0.2:  # the target is anywhere within the arm's length
         goal = lw.uniform(rng, wp.vec2(-0.2), wp.vec2(0.2))
     lw.put(s.qpos, 2, goal)
 

@@ -17,7 +17,7 @@ from lyceum_warp.task import Row
 def action_rate_l2(action: Row[float], previous_action: Row[float]) -> float:
     """The sum of (a_t - a_{t-1})^2.
 
-    mjlab 1.6.0, ``action_rate_l2``.
+    Source: mjlab 1.6.0, ``action_rate_l2``.
     """
     total = float(0.0)
     for i in range(action.shape[0]):
@@ -30,7 +30,7 @@ def action_rate_l2(action: Row[float], previous_action: Row[float]) -> float:
 def action_acceleration_l2(action: Row[float], previous_action: Row[float], earlier_action: Row[float]) -> float:
     """The sum of (a_t - 2 a_{t-1} + a_{t-2})^2.
 
-    mjlab 1.6.0, ``action_acc_l2``.
+    Source: mjlab 1.6.0, ``action_acc_l2``.
     """
     total = float(0.0)
     for i in range(action.shape[0]):

@@ -12,76 +12,77 @@ from lyceum_warp.task import Row
 
 @wp.func
 def orientation(qpos: Row[float]) -> wp.vec4:
-    """The orientation of the base, a quaternion w, x, y, z."""
+    """Return the orientation of the base, a quaternion (w, x, y, z)."""
     return wp.vec4(qpos[3], qpos[4], qpos[5], qpos[6])
 
 
 @wp.func
 def gravity(qpos: Row[float]) -> wp.vec3:
-    """The direction of gravity in the base's axes, a unit vector; (0, 0, -1) if the base is upright."""
+    """Return the direction of gravity in the base's axes, a unit vector, which is (0, 0, -1) for an upright base."""
     return quat_rotate_inverse(orientation(qpos), wp.vec3(0.0, 0.0, -1.0))
 
 
 @wp.func
 def linear_velocity(qpos: Row[float], qvel: Row[float]) -> wp.vec3:
-    """The velocity of the base's origin in the base's axes, m/s."""
+    """Return the velocity of the base's origin in the base's axes, m/s."""
     return quat_rotate_inverse(orientation(qpos), wp.vec3(qvel[0], qvel[1], qvel[2]))
 
 
 @wp.func
 def angular_velocity(qvel: Row[float]) -> wp.vec3:
-    """The angular velocity of the base in the base's axes, rad/s."""
+    """Return the angular velocity of the base in the base's axes, rad/s."""
     return wp.vec3(qvel[3], qvel[4], qvel[5])
 
 
 @wp.func
 def base_height(qpos: Row[float]) -> float:
-    """The height of the base's origin in the world, m."""
+    """Return the height of the base's origin in the world, m."""
     return qpos[2]
 
 
 @wp.func
 def heading(qpos: Row[float]) -> float:
-    """The angle from the world's x axis to the horizontal projection of the base's x axis, rad."""
+    """Return the angle from the world's x axis to the horizontal projection of the base's x axis, rad."""
     forward = quat_rotate(orientation(qpos), wp.vec3(1.0, 0.0, 0.0))
     return wp.atan2(forward[1], forward[0])
 
 
 @wp.func
 def track_linear_velocity(command: wp.vec3, linear_velocity: wp.vec3, linear_velocity_variance: float) -> float:
-    """exp(-(|c_xy - v_xy|^2 + v_z^2) / variance): follow the commanded velocity without bouncing.
+    """Reward following the commanded velocity without bouncing: exp(-(|c_xy - v_xy|^2 + v_z^2) / variance).
 
-    mjlab 1.6.0, ``track_linear_velocity``, with variance = std^2.
+    Source: mjlab 1.6.0, ``track_linear_velocity``, with variance = std^2.
     """
     return wp.exp(-wp.length_sq(wp.vec3(command[0], command[1], 0.0) - linear_velocity) / linear_velocity_variance)
 
 
 @wp.func
 def track_angular_velocity(command: wp.vec3, angular_velocity: wp.vec3, angular_velocity_variance: float) -> float:
-    """exp(-((c_yaw - w_z)^2 + w_x^2 + w_y^2) / variance): follow the commanded yaw rate without rolling and pitching.
+    """Reward following the yaw rate without roll and pitch rates: exp(-((c_yaw - w_z)^2 + w_x^2 + w_y^2) / variance).
 
-    mjlab 1.6.0, ``track_angular_velocity``, with variance = std^2.
+    Source: mjlab 1.6.0, ``track_angular_velocity``, with variance = std^2.
     """
     return wp.exp(-wp.length_sq(wp.vec3(0.0, 0.0, command[2]) - angular_velocity) / angular_velocity_variance)
 
 
 @wp.func
 def velocity_error(command: wp.vec3, linear_velocity: wp.vec3) -> float:
-    """|c_xy - v_xy|: the distance of the horizontal velocity from its command, m/s."""
+    """Return the difference between the horizontal velocity and its command, |c_xy - v_xy|, m/s."""
     return wp.length(wp.vec2(command[0] - linear_velocity[0], command[1] - linear_velocity[1]))
 
 
 @wp.func
 def yaw_rate_error(command: wp.vec3, angular_velocity: wp.vec3) -> float:
-    """|c_yaw - w_z|: the distance of the yaw rate from its command, rad/s."""
+    """Return the difference between the yaw rate and its command, |c_yaw - w_z|, rad/s."""
     return wp.abs(command[2] - angular_velocity[2])
 
 
 @wp.func
 def track_planar_velocity(command: wp.vec3, linear_velocity: wp.vec3, linear_velocity_variance: float) -> float:
-    """exp(-|c_xy - v_xy|^2 / variance): follow the commanded horizontal velocity.
+    """Reward following the commanded horizontal velocity: exp(-|c_xy - v_xy|^2 / variance).
 
-    legged_gym (Rudin et al. 2022, "Learning to walk in minutes using massively parallel deep reinforcement learning").
+    Source: legged_gym (Rudin et al. 2022, "Learning to walk in minutes using massively parallel deep reinforcement
+    learning").
     """
     error = velocity_error(command, linear_velocity)
     return wp.exp(-error * error / linear_velocity_variance)
@@ -89,9 +90,9 @@ def track_planar_velocity(command: wp.vec3, linear_velocity: wp.vec3, linear_vel
 
 @wp.func
 def track_yaw_rate(command: wp.vec3, angular_velocity: wp.vec3, angular_velocity_variance: float) -> float:
-    """exp(-(c_yaw - w_z)^2 / variance): follow the commanded yaw rate.
+    """Reward following the commanded yaw rate: exp(-(c_yaw - w_z)^2 / variance).
 
-    legged_gym (Rudin et al. 2022).
+    Source: legged_gym (Rudin et al. 2022).
     """
     error = yaw_rate_error(command, angular_velocity)
     return wp.exp(-error * error / angular_velocity_variance)
@@ -101,7 +102,7 @@ def track_yaw_rate(command: wp.vec3, angular_velocity: wp.vec3, angular_velocity
 def vertical_velocity_l2(linear_velocity: wp.vec3) -> float:
     """v_z^2, (m/s)^2.
 
-    legged_gym (Rudin et al. 2022).
+    Source: legged_gym (Rudin et al. 2022).
     """
     return linear_velocity[2] * linear_velocity[2]
 
@@ -110,25 +111,25 @@ def vertical_velocity_l2(linear_velocity: wp.vec3) -> float:
 def roll_pitch_rate_l2(angular_velocity: wp.vec3) -> float:
     """w_x^2 + w_y^2, (rad/s)^2.
 
-    legged_gym (Rudin et al. 2022); mjlab 1.6.0, ``body_angular_velocity_penalty``.
+    Sources: legged_gym (Rudin et al. 2022), and mjlab 1.6.0, ``body_angular_velocity_penalty``.
     """
     return angular_velocity[0] * angular_velocity[0] + angular_velocity[1] * angular_velocity[1]
 
 
 @wp.func
 def angular_momentum_l2(subtree_angmom: Row[wp.vec3], base: int) -> float:
-    """|L|^2 of the whole robot about its centre of mass, (kg m^2/s)^2.
+    """Return the squared angular momentum of the whole robot about its centre of mass, |L|^2, (kg m^2/s)^2.
 
-    mjlab 1.6.0, ``angular_momentum_penalty``.
+    Source: mjlab 1.6.0, ``angular_momentum_penalty``.
     """
     return wp.length_sq(subtree_angmom[base])
 
 
 @wp.func
 def tilt_l2(gravity: wp.vec3) -> float:
-    """g_x^2 + g_y^2: the squared sine of the tilt, from 0 to 1.
+    """Return the squared sine of the base's tilt, g_x^2 + g_y^2, from 0 to 1.
 
-    mjlab 1.6.0, ``flat_orientation_l2``.
+    Source: mjlab 1.6.0, ``flat_orientation_l2``.
     """
     return gravity[0] * gravity[0] + gravity[1] * gravity[1]
 
@@ -137,7 +138,7 @@ def tilt_l2(gravity: wp.vec3) -> float:
 def upright(gravity: wp.vec3, tilt_variance: float) -> float:
     """exp(-(g_x^2 + g_y^2) / variance).
 
-    mjlab 1.6.0, ``upright``, with variance = std^2.
+    Source: mjlab 1.6.0, ``upright``, with variance = std^2.
     """
     return wp.exp(-tilt_l2(gravity) / tilt_variance)
 
@@ -150,23 +151,23 @@ def base_height_l2(base_height: float, target_height: float) -> float:
 
 @wp.func
 def alive() -> float:
-    """1 in every step, also in the last of an episode."""
+    """Return 1 in every step, including the last step of an episode."""
     return 1.0
 
 
 @wp.func
 def fell_over(gravity: wp.vec3, fall_angle: float) -> bool:
-    """Whether the base is tilted by more than an angle: arccos(-g_z) > angle; for a termination.
+    """Return whether the base is tilted by more than an angle, arccos(-g_z) > angle; for a termination.
 
-    mjlab 1.6.0, ``bad_orientation``.
+    Source: mjlab 1.6.0, ``bad_orientation``.
     """
     return wp.acos(wp.clamp(-gravity[2], -1.0, 1.0)) > fall_angle
 
 
 @wp.func
 def too_low(base_height: float, least_height: float) -> bool:
-    """Whether the base is below a height; for a termination.
+    """Return whether the base is below a height; for a termination.
 
-    mjlab 1.6.0, ``root_height_below_minimum``.
+    Source: mjlab 1.6.0, ``root_height_below_minimum``.
     """
     return base_height < least_height

@@ -13,7 +13,7 @@ from lyceum_warp.task import Row
 
 @wp.func
 def log_uniform(rng: Row[wp.uint32], low: float, high: float) -> float:
-    """Draw exp(U(log low, log high)): each order of magnitude is as likely as any other."""
+    """Draw exp(U(log low, log high)), so that all orders of magnitude are equally likely."""
     return wp.exp(uniform(rng, wp.log(low), wp.log(high)))
 
 
@@ -38,13 +38,13 @@ def draw_row(row: Row[float], low: float, high: float, rng: Row[wp.uint32]):
 
 @wp.func
 def draw_delay(delay: Row[float], least: int, most: int, rng: Row[wp.uint32]):
-    """Draw a whole number of steps, least <= n <= most; ``delayed_action`` applies it."""
+    """Draw a delay of a whole number of steps, least <= n <= most, for ``delayed_action``."""
     delay[0] = float(uniform_int(rng, least, most))
 
 
 @wp.func
 def scale_elements(row: Row[float], indices: wp.array[int], scale: wp.vec2, rng: Row[wp.uint32]):
-    """Multiply each listed element by a factor of its own from U(scale[0], scale[1]), such as ``dof_armature``."""
+    """Multiply each listed element, for example of ``dof_armature``, by its own factor from U(scale[0], scale[1])."""
     for i in range(indices.shape[0]):
         row[indices[i]] = row[indices[i]] * uniform(rng, scale[0], scale[1])
 
@@ -58,7 +58,7 @@ def draw_friction(
     rolling_friction: wp.vec2,
     rng: Row[wp.uint32],
 ):
-    """Draw one friction for all listed geoms: sliding uniform, spinning and rolling ``log_uniform``."""
+    """Draw one friction for all listed geoms: ``uniform`` for sliding, ``log_uniform`` for spinning and rolling."""
     sliding = uniform(rng, sliding_friction[0], sliding_friction[1])
     spinning = log_uniform(rng, spinning_friction[0], spinning_friction[1])
     rolling = log_uniform(rng, rolling_friction[0], rolling_friction[1])
@@ -70,7 +70,7 @@ def draw_friction(
 def scale_mass(
     body_mass: Row[float], body_inertia: Row[wp.vec3], bodies: wp.array[int], scale: wp.vec2, rng: Row[wp.uint32]
 ):
-    """Multiply mass and inertia of each listed body by a factor of its own from U(scale[0], scale[1])."""
+    """Multiply the mass and the inertia of each listed body by a factor from U(scale[0], scale[1])."""
     for i in range(bodies.shape[0]):
         factor = uniform(rng, scale[0], scale[1])
         body_mass[bodies[i]] = factor * body_mass[bodies[i]]
@@ -79,7 +79,7 @@ def scale_mass(
 
 @wp.func
 def shift_center_of_mass(body_ipos: Row[wp.vec3], body: int, offset: wp.vec3, rng: Row[wp.uint32]):
-    """Add U(-offset, offset) to the centre of mass of a body, in the body's axes, m."""
+    """Add U(-offset, offset) to a body's centre of mass, in the body's axes, m."""
     body_ipos[body] = body_ipos[body] + uniform(rng, -offset, offset)
 
 
@@ -92,7 +92,7 @@ def scale_gains(
     kd_scale: wp.vec2,
     rng: Row[wp.uint32],
 ):
-    """Multiply kp and kd of each listed position servo by factors of its own, from the two ranges."""
+    """Multiply kp and kd of each listed position servo by two factors, each from its own range."""
     for i in range(actuators.shape[0]):
         kp = uniform(rng, kp_scale[0], kp_scale[1])
         kd = uniform(rng, kd_scale[0], kd_scale[1])

@@ -14,21 +14,22 @@ from lyceum_warp.task import Row
 
 @wp.func
 def sensor_vector(sensordata: Row[float], at: int) -> wp.vec3:
-    """The three numbers of a sensor that start at an index, from ``lw.sensor``."""
+    """Return the three numbers of a sensor; ``lw.sensor`` gives the index of the first."""
     return wp.vec3(sensordata[at], sensordata[at + 1], sensordata[at + 2])
 
 
 @wp.func
 def ground_speed(velocity: wp.vec3) -> float:
-    """The horizontal speed |v_xy|, m/s."""
+    """Return the horizontal speed |v_xy|, m/s."""
     return wp.length(wp.vec2(velocity[0], velocity[1]))
 
 
 @wp.func
 def run_clocks(foot: int, touching: bool, contact_time: Row[float], air_time: Row[float], substep_dt: float):
-    """Let a substep pass on the clocks of a foot: one runs, the other is 0.
+    """Advance a foot's contact time or air time by a substep, and set the other to 0.
 
-    With ``swing_time``, a landing writes the seconds of the swing that it ends. mjlab 1.6.0, ``ContactSensor``.
+    With ``swing_time``, a landing stores the duration of the swing that it ends. Source: mjlab 1.6.0,
+    ``ContactSensor``.
     """
     contact_time[foot] = wp.where(touching, contact_time[foot] + substep_dt, 0.0)
     air_time[foot] = wp.where(touching, 0.0, air_time[foot] + substep_dt)
@@ -51,16 +52,16 @@ def run_contact_clocks(
     air_time: Row[float],
     substep_dt: float,
 ):
-    """``run_clocks`` of every foot, which touches if its contact or touch sensor is above 0."""
+    """Call ``run_clocks`` for every foot; a foot touches the ground if its contact or touch sensor is above 0."""
     for foot in range(foot_contacts.shape[0]):
         run_clocks(foot, sensordata[foot_contacts[foot]] > 0.0, contact_time, air_time, substep_dt)
 
 
 @wp.func
 def landed(contact_seconds: float, dt: float) -> bool:
-    """Whether a contact began in the last step: 0 < seconds < dt, up to 1e-6 s.
+    """Return whether a contact began in the last step: 0 < seconds < dt, with a tolerance of 1e-6 s.
 
-    mjlab 1.6.0, ``compute_first_contact``.
+    Source: mjlab 1.6.0, ``compute_first_contact``.
     """
     return contact_seconds > 0.0 and contact_seconds < dt + 1e-6
 
@@ -74,7 +75,7 @@ def follow_swing(
     swing_height: Row[float],
     dt: float,
 ):
-    """Keep the greatest height of a foot in its swing; a landing moves it from ``peak_height`` to ``swing_height``."""
+    """Track a swing's greatest height in ``peak_height``, and move it to ``swing_height`` when the foot lands."""
     if landed(contact_time[foot], dt):
         swing_height[foot] = peak_height[foot]
         peak_height[foot] = 0.0
@@ -84,7 +85,7 @@ def follow_swing(
 
 @wp.func
 def clearance(foot_height: float, foot_velocity: wp.vec3, swing_target: float) -> float:
-    """|height - target| |v_xy| of one foot: the faster a foot moves, the nearer to its target height it should be."""
+    """Return |height - target| |v_xy| of one foot: a fast foot should be near its target height."""
     return wp.abs(foot_height - swing_target) * ground_speed(foot_velocity)
 
 
@@ -97,9 +98,9 @@ def foot_clearance(
     swing_target: float,
     active: float,
 ) -> float:
-    """The sum of ``clearance`` over the feet, times ``active``, m^2/s.
+    """Return the sum of ``clearance`` over the feet, times ``active``, m^2/s.
 
-    mjlab 1.6.0, ``feet_clearance``.
+    Source: mjlab 1.6.0, ``feet_clearance``.
     """
     total = float(0.0)
     for foot in range(feet.shape[0]):
@@ -110,9 +111,9 @@ def foot_clearance(
 
 @wp.func
 def foot_slip(sensordata: Row[float], foot_velocities: wp.array[int], contact_time: Row[float], active: float) -> float:
-    """The sum of |v_xy|^2 over the feet in contact, times ``active``, (m/s)^2.
+    """Return the sum of |v_xy|^2 over the feet in contact, times ``active``, (m/s)^2.
 
-    mjlab 1.6.0, ``feet_slip``.
+    Source: mjlab 1.6.0, ``feet_slip``.
     """
     total = float(0.0)
     for foot in range(foot_velocities.shape[0]):
@@ -126,9 +127,9 @@ def foot_slip(sensordata: Row[float], foot_velocities: wp.array[int], contact_ti
 def foot_swing_height(
     contact_time: Row[float], swing_height: Row[float], swing_target: float, dt: float, active: float
 ) -> float:
-    """The sum of (height / target - 1)^2 over the feet that ``landed``, times ``active``.
+    """Return the sum of (height / target - 1)^2 over the feet that have ``landed``, times ``active``.
 
-    The heights are those of the swings that ended. mjlab 1.6.0, ``feet_swing_height``.
+    The height is the greatest height of the swing that ended. Source: mjlab 1.6.0, ``feet_swing_height``.
     """
     total = float(0.0)
     for foot in range(contact_time.shape[0]):
@@ -147,10 +148,10 @@ def soft_landing(
     substep_dt: float,
     active: float,
 ) -> float:
-    """The sum of |force| in N over the feet with ``landed`` true one substep ago, times ``active``.
+    """Return the sum of |force| over the feet that had ``landed`` one substep ago, times ``active``, N.
 
-    The forces are from the beginning of the last substep, when a contact was one substep younger. mjlab 1.6.0,
-    ``soft_landing``.
+    The forces belong to the start of the last substep, when each contact was shorter by one substep. Source: mjlab
+    1.6.0, ``soft_landing``.
     """
     total = float(0.0)
     for foot in range(foot_forces.shape[0]):
@@ -161,9 +162,9 @@ def soft_landing(
 
 @wp.func
 def feet_in_air(air_time: Row[float], least_air_time: float, most_air_time: float, active: float) -> float:
-    """The number of feet with least < air time < most, times ``active``.
+    """Return the number of feet with least < air time < most, times ``active``.
 
-    mjlab 1.6.0, ``feet_air_time``.
+    Source: mjlab 1.6.0, ``feet_air_time``.
     """
     total = float(0.0)
     for foot in range(air_time.shape[0]):
@@ -176,9 +177,9 @@ def feet_in_air(air_time: Row[float], least_air_time: float, most_air_time: floa
 def long_swings(
     contact_time: Row[float], swing_time: Row[float], wanted_air_time: float, dt: float, active: float
 ) -> float:
-    """The sum of (swing time - wanted) over the feet that ``landed``, times ``active``, s.
+    """Return the sum of (swing time - wanted) over the feet that have ``landed``, times ``active``, s.
 
-    legged_gym (Rudin et al. 2022), ``feet_air_time``.
+    Source: legged_gym (Rudin et al. 2022), ``feet_air_time``.
     """
     total = float(0.0)
     for foot in range(contact_time.shape[0]):

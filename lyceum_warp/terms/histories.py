@@ -11,28 +11,27 @@ from lyceum_warp.task import Row
 
 @wp.func
 def history_length(history: Row[float], width: int) -> int:
-    """The number of values that a history can hold."""
+    """Return the number of values that a history can hold."""
     return (history.shape[0] - 1) // width
 
 
 @wp.func
 def push_history(history: Row[float], value: Row[float]):
-    """Append a value, in place of the oldest if the history is full."""
+    """Append a value; a full history loses its oldest value."""
     width = value.shape[0]
     length = history_length(history, width)
     pushes = int(history[0])
     for i in range(width):
         history[1 + pushes % length * width + i] = value[i]
-    # counts up to 2 n - 1, so that the number of values is known and the float is exact
+    # the counter stays below 2 n, so that it is exact as a float and still gives the number of values
     history[0] = float(wp.where(pushes + 1 < 2 * length, pushes + 1, length))
 
 
 @wp.func
 def read_history(history: Row[float], width: int, age: int, i: int) -> float:
-    """Get element i of a value in the history.
+    """Get element i of a value in a history.
 
-    ``age`` counts back from the last value. If the history is shorter, the first value is used; if it is empty, the
-    result is 0.
+    ``age`` counts back from the last value. A shorter history gives its first value, and an empty history gives 0.
     """
     pushes = int(history[0])
     if pushes == 0:

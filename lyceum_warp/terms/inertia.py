@@ -15,13 +15,14 @@ from lyceum_warp.task import Row
 
 @wp.func
 def symmetric_eigenvectors(matrix: wp.mat33) -> wp.mat33:
-    """The eigenvectors of a symmetric matrix, the columns of a rotation, by Jacobi's method.
+    """Compute the eigenvectors of a symmetric matrix, as the columns of a rotation, by Jacobi's method.
 
-    Golub and Van Loan, "Matrix computations", 8.5. For a nearly diagonal matrix the result is close to the identity.
+    Source: Golub and Van Loan, "Matrix computations", section 8.5. For a nearly diagonal matrix the result is close to
+    the identity.
     """
     a = matrix
     vectors = wp.identity(n=3, dtype=float)
-    for turn in range(int(15)):  # five sweeps over three planes converge to float32's precision
+    for turn in range(int(15)):  # five sweeps over three planes converge to the precision of float32
         i = turn % 3
         k = (i + 1) % 3
         difference = a[i, i] - a[k, k]
@@ -51,15 +52,15 @@ def change_inertia(
 ):
     """Map the mass of a body by x -> D x + t in the body's frame, and multiply it by exp(2 density).
 
-    D = [[exp d1, s12, s13], [0, exp d2, s23], [0, 0, exp d3]] with (d1, d2, d3) = stretch, (s12, s13, s23) = shear and
-    t = shift; zeros leave the body unchanged. Rucker and Wensing 2022; the parameters of mjlab 1.6.0's
-    ``pseudo_inertia``, with density = alpha.
+    The matrix D is [[exp d1, s12, s13], [0, exp d2, s23], [0, 0, exp d3]], with (d1, d2, d3) = stretch, (s12, s13, s23)
+    = shear and t = shift. With all parameters zero, the body does not change. Sources: Rucker and Wensing 2022, and
+    mjlab 1.6.0, ``pseudo_inertia``, with density = alpha.
     """
     d = wp.mat33(
         wp.exp(stretch[0]), shear[0], shear[1], 0.0, wp.exp(stretch[1]), shear[2], 0.0, 0.0, wp.exp(stretch[2])
     )
     factor = wp.exp(2.0 * density)
-    # second moments about the centre of mass, in the principal axes, where D = frame^T D frame
+    # compute second moments about the centre of mass in the principal axes, in which D becomes frame^T D frame
     inertia = body_inertia[body]
     moments = wp.vec3(0.5 * (inertia[0] + inertia[1] + inertia[2])) - inertia
     frame = quat_to_mat(body_iquat[body])
@@ -86,7 +87,7 @@ def draw_inertia(
     shift: wp.vec3,
     rng: Row[wp.uint32],
 ):
-    """``change_inertia`` by parameters from U(-density, density), U(-stretch, stretch), and so on."""
+    """Call ``change_inertia`` with parameters from U(-density, density), U(-stretch, stretch), and so on."""
     change_inertia(
         body_mass,
         body_ipos,

@@ -14,9 +14,9 @@ from lyceum_warp.terms.velocity_commands import command_size
 def posture(
     qpos: Row[float], joint_qpos: wp.array[int], default_pose: wp.array[float], pose_std: wp.array[float]
 ) -> float:
-    """exp(-mean(((q - q_0) / std)^2)) over the joints.
+    """Reward joints near the default pose: exp(-mean(((q - q_0) / std)^2)) over the joints.
 
-    mjlab 1.6.0, ``posture``.
+    Source: mjlab 1.6.0, ``posture``.
     """
     total = float(0.0)
     for j in range(joint_qpos.shape[0]):
@@ -35,10 +35,10 @@ def pose(
     walking_pose_std: wp.array[float],
     least_command: float,
 ) -> float:
-    """``posture`` with one standard deviation of each joint for standing and one for walking.
+    """Compute ``posture`` with separate standard deviations of each joint for standing and for walking.
 
-    Standing is a ``command_size`` below the least. mjlab 1.6.0, ``variable_posture``, with the same values for walking
-    and running.
+    The robot stands if ``command_size`` is below ``least_command``. Source: mjlab 1.6.0, ``variable_posture``, with the
+    same values for walking and running.
     """
     if command_size(command) < least_command:
         return posture(qpos, joint_qpos, default_pose, standing_pose_std)
@@ -57,9 +57,9 @@ def gait_pose(
     least_command: float,
     running_command: float,
 ) -> float:
-    """``pose`` with separate standard deviations for running: a ``command_size`` of ``running_command`` or more.
+    """Compute ``pose`` with additional standard deviations for running, at a ``command_size`` from ``running_command``.
 
-    mjlab 1.6.0, ``variable_posture``.
+    Source: mjlab 1.6.0, ``variable_posture``.
     """
     if command_size(command) >= running_command:
         return posture(qpos, joint_qpos, default_pose, running_pose_std)
@@ -68,7 +68,7 @@ def gait_pose(
 
 @wp.func
 def pose_l1(qpos: Row[float], joint_qpos: wp.array[int], default_pose: wp.array[float]) -> float:
-    """The sum of |q - q_0| over the joints, rad."""
+    """Return the sum of |q - q_0| over the joints, rad."""
     total = float(0.0)
     for j in range(joint_qpos.shape[0]):
         total += wp.abs(qpos[joint_qpos[j]] - default_pose[j])
@@ -79,9 +79,9 @@ def pose_l1(qpos: Row[float], joint_qpos: wp.array[int], default_pose: wp.array[
 def joint_limits(
     qpos: Row[float], joint_qpos: wp.array[int], jnt_range: Row[wp.vec2], joints: wp.array[int], soft_limit: float
 ) -> float:
-    """The sum of max(|q - middle| - soft_limit * half range, 0): the distances of the joints outside soft limits, rad.
+    """Sum the distances of the joints beyond soft limits, max(|q - middle| - soft_limit * half range, 0), rad.
 
-    mjlab 1.6.0, ``joint_pos_limits``.
+    Source: mjlab 1.6.0, ``joint_pos_limits``.
     """
     outside = float(0.0)
     for j in range(joint_qpos.shape[0]):
@@ -93,7 +93,7 @@ def joint_limits(
 
 @wp.func
 def sum_squares_at(row: Row[float], indices: wp.array[int]) -> float:
-    """The sum of x^2 over the listed elements of a row."""
+    """Return the sum of x^2 over the listed elements of a row."""
     total = float(0.0)
     for j in range(indices.shape[0]):
         total += row[indices[j]] * row[indices[j]]
@@ -102,27 +102,27 @@ def sum_squares_at(row: Row[float], indices: wp.array[int]) -> float:
 
 @wp.func
 def joint_velocity_l2(qvel: Row[float], joint_dof: wp.array[int]) -> float:
-    """The sum of qdot^2 over the joints, (rad/s)^2."""
+    """Return the sum of qdot^2 over the joints, (rad/s)^2."""
     return sum_squares_at(qvel, joint_dof)
 
 
 @wp.func
 def joint_acceleration_l2(qacc: Row[float], joint_dof: wp.array[int]) -> float:
-    """The sum of qddot^2 over the joints, (rad/s^2)^2."""
+    """Return the sum of qddot^2 over the joints, (rad/s^2)^2."""
     return sum_squares_at(qacc, joint_dof)
 
 
 @wp.func
 def torque_l2(qfrc_actuator: Row[float], joint_dof: wp.array[int]) -> float:
-    """The sum of torque^2 over the joints, (N m)^2."""
+    """Return the sum of torque^2 over the joints, (N m)^2."""
     return sum_squares_at(qfrc_actuator, joint_dof)
 
 
 @wp.func
 def power(qfrc_actuator: Row[float], qvel: Row[float], joint_dof: wp.array[int]) -> float:
-    """The sum of max(torque qdot, 0) over the joints: mechanical power without recovery, W.
+    """Return the mechanical power without energy recovery: the sum of max(torque qdot, 0) over the joints, W.
 
-    mjlab 1.6.0, ``electrical_power_cost``.
+    Source: mjlab 1.6.0, ``electrical_power_cost``.
     """
     total = float(0.0)
     for j in range(joint_dof.shape[0]):
@@ -132,9 +132,9 @@ def power(qfrc_actuator: Row[float], qvel: Row[float], joint_dof: wp.array[int])
 
 @wp.func
 def absolute_power(qfrc_actuator: Row[float], qvel: Row[float], joint_dof: wp.array[int]) -> float:
-    """The sum of |torque qdot| over the joints: mechanical power if braking costs as much as driving, W.
+    """Return the mechanical power if braking costs as much as driving: the sum of |torque qdot| over the joints, W.
 
-    Fu et al. 2021, "Minimizing energy consumption leads to the emergence of gaits in legged robots".
+    Source: Fu et al. 2021, "Minimizing energy consumption leads to the emergence of gaits in legged robots".
     """
     total = float(0.0)
     for j in range(joint_dof.shape[0]):

@@ -8,7 +8,7 @@ import warp as wp
 
 @wp.func
 def servo_torque(joint_target: float, joint_position: float, joint_velocity: float, kp: float, kd: float) -> float:
-    """The torque of a servo, kp (target - q) - kd qdot, N m."""
+    """Return the torque of a servo, kp (target - q) - kd qdot, N m."""
     return kp * (joint_target - joint_position) - kd * joint_velocity
 
 
@@ -16,10 +16,11 @@ def servo_torque(joint_target: float, joint_position: float, joint_velocity: flo
 def dc_motor_torque(
     torque: float, joint_velocity: float, saturation_torque: float, velocity_limit: float, effort_limit: float
 ) -> float:
-    """Clip a torque to what a DC motor can produce at a velocity.
+    """Clip a torque to the range of a DC motor at a velocity.
 
-    max(sat (-1 - qdot / limit), -effort) <= torque <= min(sat (1 - qdot / limit), effort), with qdot clipped to
-    +-limit (1 + effort / sat). Above its no-load speed, the limit, the motor brakes. mjlab 1.6.0, ``dc_motor_clip``.
+    The range is max(sat (-1 - qdot / limit), -effort) <= torque <= min(sat (1 - qdot / limit), effort), with qdot
+    clipped to +-limit (1 + effort / sat). Above the limit, its no-load speed, the motor brakes. Source: mjlab 1.6.0,
+    ``dc_motor_clip``.
     """
     corner = velocity_limit * (1.0 + effort_limit / saturation_torque)
     slope = wp.clamp(joint_velocity, -corner, corner) / velocity_limit

@@ -9,7 +9,7 @@ from lyceum_warp.task import Row
 
 @wp.func
 def gather(target: Row[float], source: Row[float], indices: wp.array[int]):
-    """Copy listed elements, target[i] = source[indices[i]], such as the velocities of joints."""
+    """Copy the listed elements, such as the velocities of joints: target[i] = source[indices[i]]."""
     for i in range(indices.shape[0]):
         target[i] = source[indices[i]]
 
@@ -22,9 +22,9 @@ def gather_positions(
     default_pose: wp.array[float],
     encoder_bias: Row[float],
 ):
-    """The positions of joints relative to the default pose, as encoders measure them: q + bias - q_0.
+    """Write joint positions relative to the default pose, as encoders measure them: q + bias - q_0.
 
-    Without ``encoder_bias``, q - q_0. mjlab 1.6.0, ``joint_pos_rel``.
+    The bias is 0 without ``encoder_bias``. Source: mjlab 1.6.0, ``joint_pos_rel``.
     """
     for j in range(joint_qpos.shape[0]):
         target[j] = qpos[joint_qpos[j]] + encoder_bias[j] - default_pose[j]
@@ -38,7 +38,7 @@ def gather_positions(target: Row[float], qpos: Row[float], joint_qpos: wp.array[
 
 @wp.func
 def add_uniform_noise(row: Row[float], noise: float, rng: Row[wp.uint32]):
-    """Add U(-noise, noise) to every number of a row of numbers or vectors."""
+    """Add U(-noise, noise) to every element of a row, of numbers or of vectors."""
     for i in range(row.shape[0]):
         row[i] = row[i] + uniform(rng, -noise, noise)
 
@@ -51,7 +51,7 @@ def add_uniform_noise(row: Row[wp.vec3], noise: float, rng: Row[wp.uint32]):
 
 @wp.func
 def add_normal_noise(row: Row[float], noise: float, rng: Row[wp.uint32]):
-    """Add N(0, noise^2) to every number of a row of numbers or vectors."""
+    """Add N(0, noise^2) to every element of a row, of numbers or of vectors."""
     for i in range(row.shape[0]):
         row[i] = row[i] + noise * normal(rng)
 

@@ -21,25 +21,25 @@ from lyceum_warp.terms.draws import chosen
 
 @wp.func
 def draw_timer(timer: Row[float], seconds: wp.vec2, rng: Row[wp.uint32]):
-    """Set a timer to U(seconds[0], seconds[1])."""
+    """Set a timer to a random duration, U(seconds[0], seconds[1])."""
     timer[0] = uniform(rng, seconds[0], seconds[1])
 
 
 @wp.func
 def run_timer(timer: Row[float], dt: float):
-    """Count a timer down by dt seconds; call this in ``advance``."""
+    """Decrease a timer by dt seconds; for ``advance``."""
     timer[0] = timer[0] - dt
 
 
 @wp.func
 def is_due(timer: Row[float]) -> bool:
-    """Whether a timer has run out, up to 1e-6 s; for ``event``."""
+    """Return whether a timer has run out, with a tolerance of 1e-6 s; for ``event``."""
     return timer[0] < 1e-6
 
 
 @wp.func
 def draw_flag(flag: Row[float], share: float, rng: Row[wp.uint32]):
-    """Set a flag to 1 with a probability, else to 0."""
+    """Set a flag to 1 with a probability, and otherwise to 0."""
     flag[0] = wp.where(chosen(rng, share), 1.0, 0.0)
 
 
@@ -51,7 +51,7 @@ def draw_velocity(drawn_velocity: Row[wp.vec3], command_low: wp.vec3, command_hi
 
 @wp.func
 def draw_heading(heading_target: Row[float], heading_controlled: Row[float], heading_share: float, rng: Row[wp.uint32]):
-    """Draw a heading from U(-pi, pi), and whether the yaw rate follows it."""
+    """Draw a heading from U(-pi, pi), and draw whether the yaw rate follows the heading."""
     heading_target[0] = uniform(rng, -wp.pi, wp.pi)
     draw_flag(heading_controlled, heading_share, rng)
 
@@ -60,14 +60,14 @@ def draw_heading(heading_target: Row[float], heading_controlled: Row[float], hea
 def draw_forward_only(
     drawn_velocity: Row[wp.vec3], forward_share: float, least_forward_velocity: float, rng: Row[wp.uint32]
 ):
-    """With a probability, turn a drawn velocity into (max(|v_x|, least), 0, 0)."""
+    """With a probability, replace a drawn velocity by (max(|v_x|, least), 0, 0)."""
     if chosen(rng, forward_share):
         drawn_velocity[0] = wp.vec3(wp.max(wp.abs(drawn_velocity[0][0]), least_forward_velocity), 0.0, 0.0)
 
 
 @wp.func
 def heading_yaw_rate(target_heading: float, heading: float, heading_gain: float, fastest_yaw_rate: float) -> float:
-    """clip(gain * (target - heading), -fastest, fastest) with the difference within -pi and pi, rad/s."""
+    """Return clip(gain * (target - heading), -fastest, fastest), rad/s, with a difference from -pi to pi."""
     error = target_heading - heading
     return wp.clamp(heading_gain * wp.atan2(wp.sin(error), wp.cos(error)), -fastest_yaw_rate, fastest_yaw_rate)
 
@@ -82,9 +82,9 @@ def velocity_command(
     heading_gain: float,
     fastest_yaw_rate: float,
 ) -> wp.vec3:
-    """The command: 0 for standing, else the drawn velocity, with the yaw rate towards the heading if that controls it.
+    """Compute the command: 0 for standing, otherwise the drawn velocity, with a yaw rate that may follow the heading.
 
-    mjlab 1.6.0, ``UniformVelocityCommand``.
+    Source: mjlab 1.6.0, ``UniformVelocityCommand``.
     """
     if standing[0] > 0.0:
         return wp.vec3(0.0)
@@ -96,11 +96,11 @@ def velocity_command(
 
 @wp.func
 def command_size(command: wp.vec3) -> float:
-    """|c_xy| + |c_yaw|, which mjlab 1.6.0 compares with its thresholds."""
+    """Return |c_xy| + |c_yaw|, which mjlab 1.6.0 compares with its thresholds."""
     return wp.length(wp.vec2(command[0], command[1])) + wp.abs(command[2])
 
 
 @wp.func
 def active(command: wp.vec3, least_command: float) -> float:
-    """1 if the command is to move, a ``command_size`` above the least; else 0."""
+    """Return 1 if the robot should move, at a ``command_size`` above ``least_command``, and 0 otherwise."""
     return wp.where(command_size(command) > least_command, 1.0, 0.0)

@@ -42,7 +42,8 @@ def contact_keys(
 ):
     """Compute the contacts' keys for sorting; launched over (naconmax,).
 
-    A key has 24 bits for the world, 14 for each geom, and 11 for the index within the pair. Unused slots come last.
+    A key has 24 bits for the world, 14 for each geom, and 11 for the index within the pair. Unused contact slots come
+    last in the order.
     """
     c = wp.tid()
     place_out[c] = c
@@ -66,7 +67,7 @@ def _move(source: wp.array2d[int], i: int, target: wp.array2d[int], j: int):
 def gather_contacts(
     ncontact_in: wp.array[int], place_in: wp.array[int], sort: bool, nmax: int, source: Contacts, target: Contacts
 ):
-    """Copy contacts into their new order, or unchanged without ``sort``; launched over (naconmax,)."""
+    """Copy contacts in their new order, or unsorted if ``sort`` is false; launched over (naconmax,)."""
     c = wp.tid()
     if c >= wp.min(ncontact_in[0], nmax):
         return
@@ -116,7 +117,7 @@ class Rows:
 
 @wp.func
 def _kind(rows: Rows, w: int, r: int):
-    # all contact types count as one, so that the rows of a contact stay together
+    # all types of contact rows have the same key, so that the rows of a contact stay together
     return wp.min(rows.type[w, r], _FIRST_CONTACT)
 
 
@@ -160,7 +161,7 @@ def move_rows(
     source: Rows,
     target: Rows,
 ):
-    """Copy rows to their new indices, or unchanged without ``sort``; launched over (nworld, njmax, lanes)."""
+    """Copy rows to their new indices, or unsorted if ``sort`` is false; launched over (nworld, njmax, lanes)."""
     w, r, lane = wp.tid()
     if r >= int(wp.min(nrow_in[w], rank_in.shape[1])):
         return
@@ -180,7 +181,7 @@ def move_rows(
     target.vel[w, to] = source.vel[w, r]
     target.aref[w, to] = source.aref[w, r]
     target.frictionloss[w, to] = source.frictionloss[w, r]
-    if sparse:  # the entries are not moved
+    if sparse:  # this kernel does not move the entries of a sparse Jacobian
         target.J_rownnz[w, to] = source.J_rownnz[w, r]
         target.J_rowadr[w, to] = source.J_rowadr[w, r]
         if source.jtdaj_adr.shape[1] > 0 and r < source.jtdaj_nblock[w]:

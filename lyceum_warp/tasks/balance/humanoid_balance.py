@@ -71,7 +71,7 @@ def observe(s: World, p: Params, obs: Row[float]):
 
 
 @wp.func
-def velocity(s0: World, s1: World, p: Params) -> wp.vec2:  # height of the centre of mass, relative to the target height
+def velocity(s0: World, s1: World, p: Params) -> wp.vec2:  # velocity of the centre of mass, minus the desired velocity
     moved = (s1.subtree_com[0] - s0.subtree_com[0]) / p.dt
     return wp.vec2(moved[0] - p.forward_speed, moved[1])
 
@@ -101,9 +101,9 @@ def velocity_l2(velocity: wp.vec2) -> float:
 
 @wp.func
 def capture_l2(velocity: wp.vec2, s1: World, p: Params) -> float:
-    """The squared distance of the capture point from the line between the feet, without its ends, at most 1 m^2."""
+    """Return the capture point's squared distance from the line between the feet, without its ends, at most 1 m^2."""
     com, a, b = s1.subtree_com[0], s1.geom_xpos[p.right_foot], s1.geom_xpos[p.left_foot]
-    seconds = wp.sqrt(wp.max(com[2], 0.1) / 9.81)  # of a linear inverted pendulum
+    seconds = wp.sqrt(wp.max(com[2], 0.1) / 9.81)  # the time constant of a linear inverted pendulum
     point = wp.vec2(com[0] - a[0], com[1] - a[1]) + seconds * velocity
     line = wp.vec2(b[0] - a[0], b[1] - a[1])
     share = wp.clamp(wp.dot(point, line) / (wp.length_sq(line) + 1e-6), 0.2, 0.8)
@@ -209,7 +209,7 @@ def lie_down(s: World, p: Params):
 
 @wp.func
 def turn_over(s: World, p: Params, rng: Row[wp.uint32]):
-    """Lie on the back or on the front."""
+    """Start on the back or on the front."""
     angle = wp.where(lw.uniform(rng, 0.0, 1.0) < 0.5, -0.5 * wp.pi, 0.5 * wp.pi)
     lw.put(s.qpos, 3, lw.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), angle + lw.uniform(rng, -0.1, 0.1)))
     for j in range(p.joint_qpos.shape[0]):

@@ -32,7 +32,7 @@ class Params(suite.RandomJoints):
 
 
 @wp.func
-def relative(s: World, p: Params, point: wp.vec3) -> wp.vec2:  # x and z of a point from the hinge
+def relative(s: World, p: Params, point: wp.vec3) -> wp.vec2:  # x and z of a point, relative to the hinge
     v = point - s.xpos[p.spinner]
     return wp.vec2(v[0], v[2])
 
@@ -97,7 +97,7 @@ class TurnParams(Params):
 
 
 @wp.func
-def distance_to_target(s: TurnWorld, p: TurnParams) -> float:  # from the target's surface, negative inside
+def distance_to_target(s: TurnWorld, p: TurnParams) -> float:  # negative inside the target
     v = s.mocap_pos[p.target] - s.site_xpos[p.tip]
     return wp.length(wp.vec2(v[0], v[2])) - p.target_size
 

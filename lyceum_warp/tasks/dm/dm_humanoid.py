@@ -57,7 +57,7 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     suite.draw_joints(s.qpos, p.drawn_joints, p.drawn_range, rng)
-    # dm_control keeps this non-uniform distribution of rotations, so that benchmarks stay comparable
+    # dm_control keeps this non-uniform distribution of rotations for comparable benchmarks
     quat = wp.vec4()
     for i in range(4):
         quat[i] = lw.uniform(rng, 0.0, 1.0)

@@ -53,7 +53,7 @@ class Params:
 
 
 @wp.func
-def pose(s: World, body: int) -> wp.vec4:  # x, z, and the quaternion's w and y
+def pose(s: World, body: int) -> wp.vec4:  # x, z, and w, y of the quaternion
     return wp.vec4(s.xpos[body][0], s.xpos[body][2], s.xquat[body][0], s.xquat[body][2])
 
 
@@ -84,7 +84,7 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     for j in range(p.arm.shape[0]):
         s.qpos[p.arm[j]] = lw.uniform(rng, p.arm_range[j][0], p.arm_range[j][1])
-    s.qpos[p.arm[4]] = s.qpos[p.arm[6]]  # finger and thumb are symmetric
+    s.qpos[p.arm[4]] = s.qpos[p.arm[6]]  # the finger mirrors the thumb
     x, z = lw.uniform(rng, -0.4, 0.4), lw.uniform(rng, 0.1, 0.4)
     angle = lw.uniform(rng, -wp.pi, wp.pi)
     s.mocap_pos[p.target][0] = x

@@ -88,11 +88,11 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    """Start in a random orientation, at the lowest height, in steps of 1 cm, at which no geom touches the floor."""
+    """Start in a random orientation, just above the floor: at the lowest multiple of 1 cm without contact."""
     quat = lw.quat_random(rng)
     lw.put(s.qpos, 3, quat)
     down = lw.quat_rotate_inverse(quat, wp.vec3(0.0, 0.0, -1.0))
-    depth = float(0.0)  # of the lowest point below the torso
+    depth = float(0.0)  # the lowest point's distance below the torso
     for i in range(p.geoms.shape[0]):
         d, r = down * p.geom_axes[i], p.geom_radii[i]
         reach = wp.length(wp.vec3(r[0] * d[0], r[1] * d[1], r[2] * d[2])) + r[3] * wp.abs(d[2])

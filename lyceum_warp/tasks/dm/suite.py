@@ -54,7 +54,7 @@ class RandomJoints:
 
 @wp.func
 def draw_joints(qpos: Row[float], drawn_joints: Row[int], drawn_range: Row[wp.vec2], rng: Row[wp.uint32]):
-    """Draw positions of joints, as dm_control's randomize_limited_and_rotational_joints."""
+    """Draw positions of joints, as dm_control's randomize_limited_and_rotational_joints does."""
     for j in range(drawn_joints.shape[0]):
         qpos[drawn_joints[j]] = lw.uniform(rng, drawn_range[j][0], drawn_range[j][1])
 
@@ -70,5 +70,5 @@ def small_control(action: Row[float]) -> float:
 
 @wp.func
 def log1p(x: float) -> float:
-    """log(1 + x), the scale of touch sensors."""
+    """Return log(1 + x), the scale of touch sensors."""
     return wp.log(1.0 + x)

@@ -46,7 +46,7 @@ def phase_clock(cycles: float) -> wp.vec2:
 
 @wp.func
 def swing(clock: Row[wp.vec2], foot: int, stance_share: float) -> float:
-    """The progress of a foot's swing, from 0 to 1; negative while the foot should stand."""
+    """Return the progress of a foot's swing, from 0 to 1; negative while the foot should stand."""
     cycles = wp.atan2(clock[0][0], clock[0][1]) / (2.0 * wp.pi) + 0.5 * float(foot)
     return (cycles - wp.floor(cycles) - stance_share) / (1.0 - stance_share)
 
@@ -85,7 +85,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 @wp.func
 def gait_clock(clock: Row[wp.vec2], contact_time: Row[float], stance_share: float, active: float) -> float:
-    """The share of the feet that stand or swing as the clock says."""
+    """Return the share of the feet that stand or swing as the clock requires."""
     right = float(0.0)
     for foot in range(contact_time.shape[0]):
         stands = swing(clock, foot, stance_share) < 0.0
@@ -95,7 +95,7 @@ def gait_clock(clock: Row[wp.vec2], contact_time: Row[float], stance_share: floa
 
 @wp.func
 def foot_lift_l2(active: float, s: World, p: Params) -> float:
-    """The sum over the feet of ((height - half a sine wave in the swing) / ``foot_lift``)^2."""
+    """Return the sum over the feet of ((height - half a sine wave in the swing) / ``foot_lift``)^2."""
     total = float(0.0)
     for foot in range(p.feet.shape[0]):
         x, _ = walking.foot_motion(s, p, foot)

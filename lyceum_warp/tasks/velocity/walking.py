@@ -156,19 +156,19 @@ class Critic(Policy):
 
 @wp.func
 def ground(x: wp.vec3, s: World, p: Params) -> float:
-    """The height of the ground under a point of the world."""
+    """Return the height of the ground below a point in the world."""
     return 0.0
 
 
 @wp.func
 def distance(x: wp.vec3, s: World, p: Params) -> float:
-    """The distance of a point of the world from the ground."""
+    """Return the distance of a point in the world from the ground."""
     return x[2] - ground(x, s, p)
 
 
 @wp.func
 def last_joint(s: World, p: Params, foot: int) -> tuple[wp.vec3, lw.quat, wp.vec3, wp.vec3]:
-    """The last joint before a foot: position, rotation from the base's axes at rest, velocity, angular velocity."""
+    """Return the position, the rotation, the velocity and the angular velocity of the last joint before a foot."""
     turn = terms.orientation(s.qpos)
     x, v = wp.vec3(s.qpos[0], s.qpos[1], s.qpos[2]), wp.vec3(s.qvel[0], s.qvel[1], s.qvel[2])
     w = lw.quat_rotate(turn, terms.angular_velocity(s.qvel))
@@ -184,20 +184,20 @@ def last_joint(s: World, p: Params, foot: int) -> tuple[wp.vec3, lw.quat, wp.vec
 
 @wp.func
 def foot_motion(s: World, p: Params, foot: int) -> tuple[wp.vec3, wp.vec3]:
-    """Position and velocity of a foot's site in the world."""
+    """Return the position and the velocity of a foot's site in the world."""
     x, turn, v, w = last_joint(s, p, foot)
     step = lw.quat_rotate(turn, p.foot_offsets[foot])
     return x + step, v + wp.cross(w, step)
 
 
 @wp.func
-def height(x: wp.vec3, s: World, p: Params) -> float:  # above the ground; clipped at 1 m, the range of mjlab's rays
+def height(x: wp.vec3, s: World, p: Params) -> float:  # clipped at 1 m, the range of mjlab's rays
     return wp.clamp(x[2] - ground(x, s, p), 0.0, 1.0)
 
 
 @wp.func
 def sole_touches(x: wp.vec3, turn: lw.quat, s: World, p: Params, foot: int) -> bool:
-    """Whether a foot touches the ground, from the position and rotation of its last joint."""
+    """Return whether a foot touches the ground, given the position and the rotation of its last joint."""
     touching = bool(False)
     for i in range(p.soles.shape[1]):
         sphere = p.soles[foot, i]
@@ -228,7 +228,7 @@ def stage(s: World, p: Params) -> int:  # of the curriculum
 
 @wp.func
 def command(s0: World, p: Params) -> wp.vec3:
-    """Commanded forward and lateral velocity, m/s, and yaw rate, rad/s, in the base's axes."""
+    """Return the commanded forward and lateral velocity, m/s, and yaw rate, rad/s, in the base's axes."""
     return terms.velocity_command(
         s0.drawn_velocity, s0.heading_target, s0.heading_controlled, s0.standing, terms.heading(s0.qpos),
         p.heading_gain, p.stages[stage(s0, p), 3],
@@ -257,7 +257,7 @@ def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
 
 @wp.func
 def observe_robot(s: World, p: Params, obs: Any):
-    """Write what both groups have, except the joints' positions."""
+    """Write the parts that both observation groups have, except the positions of the joints."""
     obs.angular_velocity[0] = terms.angular_velocity(s.qvel)
     obs.linear_velocity[0] = terms.linear_velocity(s.qpos, s.qvel) + wp.cross(obs.angular_velocity[0], p.imu)
     obs.gravity[0] = terms.gravity(s.qpos)
@@ -346,7 +346,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 @wp.func
 def foot_clearance_and_slip(active: float, s: World, p: Params) -> wp.vec2:
-    """Both terms in one function, so that positions and velocities of the feet are computed once."""
+    """Return the terms foot_clearance and foot_slip, so that the motion of the feet is computed once."""
     clearance, slip = float(0.0), float(0.0)
     for foot in range(p.feet.shape[0]):
         x, v = foot_motion(s, p, foot)
@@ -368,9 +368,9 @@ def foot_slip(foot_clearance_and_slip: wp.vec2) -> float:
 
 @wp.func
 def single_stance(contact_time: Row[float], air_time: Row[float], longest_step: float, active: float) -> float:
-    """The least contact or air time of the feet, at most ``longest_step``, while exactly one foot is in contact, s.
+    """Return the least contact or air time of the feet, s, at most ``longest_step``; 0 unless one foot is in contact.
 
-    Isaac Lab, ``feet_air_time_positive_biped``.
+    Source: Isaac Lab, ``feet_air_time_positive_biped``.
     """
     down, least = int(0), float(longest_step)
     for foot in range(contact_time.shape[0]):
