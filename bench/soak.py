@@ -43,7 +43,7 @@ from experiment import Experiment, Row, Skipped, Table
 
 import lyceum_warp as lw
 from lyceum_warp.binding.functions import TaskSource
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding.registry import file_name, find_task
 from lyceum_warp.done import FAULTS, Done
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.validate import whole_number
@@ -79,39 +79,40 @@ SHORT_TRAINING = "--algorithm ppo --iterations 60 --nworld 8 --nthread 1 --hidde
 VARIANT = """
 
 @wp.func
-def soak_control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
+def soak_control(s: {world}, action: Row[float], p: {params}, ctrl: Row[float]):
     {control}
     s.userdata[0] = action[action.shape[0] - 1]
 
 
 @wp.func
-def soak_observe(s: World, p: Params, obs: Row[float]{rng_argument}):
-    observe(s, p, obs{rng})
+def soak_observe(s: {world}, p: {params}, obs: Row[float]{rng_argument}):
+    {observe}(s, p, obs{rng})
     if s.userdata[0] == 5.0:
         obs[0] = wp.nan
 
 
 @wp.func
-def soak_reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+def soak_reward(s0: {world}, action: Row[float], s1: {world}, p: {params}) -> float:
     if s1.userdata[0] == 4.0:
         return wp.nan
-    return reward(s0, action, s1, p)
+    return {reward}(s0, action, s1, p)
 
 
 @wp.func
-def soak_randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    randomize(s, p, rng)
+def soak_randomize(s: {world}, p: {params}, rng: Row[wp.uint32]):
+    {randomize}
     s.body_mass[1] = s.body_mass[1] * lw.uniform(rng, 0.95, 1.05)
 
 
 @wp.func
-def soak_event(s: World, p: Params, rng: Row[wp.uint32]):
+def soak_event(s: {world}, p: {params}, rng: Row[wp.uint32]):
     {event}
     if s.userdata[0] == 6.0:
         s.body_mass[1] = -1.0
 
 
 class Soak({parent}):
+    World, Params = {task_structs}
     control, observe, reward = soak_control, soak_observe, soak_reward
     randomize, event = soak_randomize, soak_event
     actions, action_range = {{"action": {nact}, "fault": 1}}, None
@@ -158,7 +159,8 @@ class Faults:
 
     def state(self, work: Path, chunk: int) -> Path:
         """Return the path of the state before a chunk."""
-        run = f"{self.task}-{self.engine}-{self.device.partition(':')[0]}-{self.nworld}-{self.steps}-{self.seed}"
+        where = f"{self.engine}-{self.device.partition(':')[0]}"
+        run = f"{file_name(self.task)}-{where}-{self.nworld}-{self.steps}-{self.seed}"
         return work / f"{run}{'-same-bits' if self.compared else ''}-{chunk}.pt"
 
 
@@ -261,14 +263,19 @@ def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
     fields = [f"    {name}: Row[float]\n" for name in ("userdata", "body_mass") if name not in own.world.vars]
     source = source.replace("class World:\n", "".join(["class World:\n", *fields]), 1)
     noisy = functions["observe"] is not None and len(functions["observe"].input_types) > 3
+    # a task of a module with several tasks has functions and structs with other names
+    names = {name: function.func.__name__ for name, function in functions.items() if function and function.func}
+    world, params = (struct.cls.__name__ for struct in list(functions["observe"].func.__annotations__.values())[:2])
     copy = "for i in range(ctrl.shape[0]):\n        ctrl[i] = action[i]"
     source += VARIANT.format(
-        parent=parent.__name__, nact=nact, rng=", rng" if noisy else "",
-        rng_argument=", rng: Row[wp.uint32]" if noisy else "",
-        control="control(s, action, p, ctrl)" if functions["control"] else copy,
-        event="event(s, p, rng)" if functions["event"] else "pass",
+        parent=parent.__name__, task_structs=f"{own.world.cls.__name__}, {own.defaults.__name__}", nact=nact,
+        world=world, params=params, rng=", rng" if noisy else "",
+        rng_argument=", rng: Row[wp.uint32]" if noisy else "", observe=names["observe"], reward=names["reward"],
+        control=f"{names['control']}(s, action, p, ctrl)" if functions["control"] else copy,
+        randomize=f"{names['randomize']}(s, p, rng)" if functions["randomize"] else "pass",
+        event=f"{names['event']}(s, p, rng)" if functions["event"] else "pass",
     )  # fmt: skip
-    path = work / f"soak_{task}.py"
+    path = work / f"soak_{file_name(task).replace('-', '_')}.py"
     if not path.exists() or path.read_text() != source:
         path.write_text(source)
     space, limited = plain.action_space, plain.model.actuator_ctrllimited[:, None].astype(bool)

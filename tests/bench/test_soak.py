@@ -9,6 +9,8 @@ import soak
 import torch
 
 import lyceum_warp as lw
+from lyceum_warp.binding.functions import TaskSource
+from lyceum_warp.binding.registry import find_task
 
 FAULTS = ("--short", "--parts", "faults", "--threads", "1", "--nworld", "16")
 
@@ -39,6 +41,16 @@ def test_every_injected_fault_is_found_and_counted(
         assert result["compared"] > 16 * 600 / 4 - 1 and result["different"] == 0
         assert len(result["memory"]) == soak.SAMPLES
     assert re.search(r"\| point_mass, cpu \| 16 \| 1.92e\+04 \|", capsys.readouterr().out)
+
+
+def test_a_task_of_a_module_with_several_has_a_variant(tmp_path: Path) -> None:
+    file, _, _ = soak.variant("dm/finger_turn_hard", tmp_path)
+    own = TaskSource(find_task(file), "soak")
+    observe = own.functions["observe"]
+    assert own.world.cls.__name__ == "TurnWorld" and observe and observe.func.__name__ == "soak_observe"
+    assert (
+        soak.Faults("dm/finger_turn_hard", 0, 8, 8, "auto", "cpu", False, 0.0, 0).state(tmp_path, 1).parent == tmp_path
+    )
 
 
 def test_soak_chunks_equal_an_uninterrupted_run_bit_for_bit(work: Path, tmp_path: Path) -> None:
