@@ -219,3 +219,20 @@ def test_initial_states_have_the_distribution_of_dm_control(shared_env: SharedEn
 def test_margin_of_point_mass_is_the_size_of_its_target() -> None:
     env = lw.make("dm/point_mass_easy", target_size=0.1)
     assert env.task.params["margin"] == env.task.params["target_size"] == pytest.approx(0.1)
+
+
+def test_planners_of_acrobot_are_rewarded_for_its_energy(shared_env: SharedEnv) -> None:
+    env = shared_env("dm/acrobot_swingup", nworld=3, autoreset=False, energy_weight=2.0)
+    state = env.get_state()
+    parts = env.state_space.split(state)
+    parts["qpos"].copy_(torch.tensor([[0.0, 0.0], [torch.pi, 0.0], [torch.pi, 0.0]]))
+    parts["qvel"].copy_(torch.tensor([[0.0, 0.0], [0.0, 0.0], [3.85, 0.0]]))  # 20 J
+    rewards = env.get_reward(state, env.action, state)
+    np.testing.assert_allclose(rewards, [3.0, 0.0, 1.0], atol=0.1)
+
+
+def test_planners_of_finger_spin_are_rewarded_below_its_velocity(shared_env: SharedEnv) -> None:
+    env = shared_env("dm/finger_spin", nworld=3, autoreset=False, spin_margin=30.0)
+    state = env.get_state()
+    env.state_space.split(state)["qvel"][:, 2] = torch.tensor([-16.0, 0.0, 15.0])
+    np.testing.assert_allclose(env.get_reward(state, env.action, state), [1.0, 0.5, 0.0], atol=1e-6)
