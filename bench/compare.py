@@ -70,7 +70,7 @@ class Options:
     engines: tuple[Literal["mujoco", "warp"], ...] = ENGINES
     """Engines."""
     device: str = "cpu"
-    """Device of the Warp engine, for example cuda. On a GPU the engine is deterministic."""
+    """Device of the Warp engine, for example cuda. On a GPU, the engine is deterministic."""
     parts: tuple[Part, ...] = PARTS
     """Parts to compare; by default all. The part env compares models, resets, steps, getters, a fault and a rollout.
     The part plans compares plans of all planners, and episodes under lw.control. The part learners compares NPG and

@@ -14,7 +14,7 @@ def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
     The test permutes whole curves, and compares each point's Welch statistic with the largest statistic over all points
     (Westfall and Young 1993, single step). The probability of a false positive at any point is therefore at most the
-    level, for any dependence between points. With few curves the p-values cannot be small: five against five have 252
+    level, for any dependence between points. With few curves, the p-values cannot be small: five against five have 252
     splits.
 
     Args:

@@ -133,7 +133,7 @@ class Experiment:
     parallel: bool = False
     """Whether cases run in subprocesses if there are several jobs."""
     pooled: bool = False
-    """Whether results do not depend on the machine, so that the tables combine all machines."""
+    """Whether results are independent of the machine; the tables then combine all machines."""
 
 
 def load(name: str) -> Experiment:
@@ -282,7 +282,7 @@ def key(case: Mapping[str, Any]) -> str:
 
 
 def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[float]]:
-    """Return each contestant's ratios of a quantity to the reference contestant, within the same repeat.
+    """Divide each contestant's values of a quantity by the reference contestant's value in the same repeat.
 
     Args:
         rows: Rows whose cases differ only in contestant and ``repeat``.

@@ -5,10 +5,10 @@
 Worlds of both engines start in the same float32 states and get the same random actions. The C engine (float64) is
 compared with the Warp engine (float32), with itself when its state is rounded to float32 after every step, and with
 itself from an initial state perturbed by float32 rounding. Chaos separates any two trajectories, so the last two
-comparisons are the scale: if the Warp engine does not diverge earlier, it is as accurate as float32 allows. The
-difference between two states of a world is the largest difference of their observations, relative to the larger of 1
-and the value. Contact forces are excluded, because a solver is accurate only to its tolerance. Worlds continue after
-the end of an episode, and are dropped at a fault.
+comparisons set the scale: if the Warp engine does not diverge earlier than they do, it is as accurate as float32
+allows. Two states of a world are compared by their observations: each difference is divided by max(1, |value|), and the
+largest quotient counts. Contact forces are excluded, because a solver is accurate only to its tolerance. Worlds
+continue after the end of an episode, and are dropped at a fault.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ SHOWN = (1, 10, 100)
 """Steps at which differences are stored; the last step is always stored."""
 
 SETTLING = 20
-"""Number of steps before the trajectories start, which bring robots into contact with the ground."""
+"""Number of steps before the trajectories start. These steps bring robots into contact with the ground."""
 
 ROUNDING = 2.0**-24
 """Largest relative rounding error of float32."""
@@ -84,7 +84,7 @@ def rounded(env: lw.Env, state: torch.Tensor) -> torch.Tensor:
 
 
 def moved(env: lw.Env, state: torch.Tensor, seed: int) -> torch.Tensor:
-    """Perturb positions and velocities by at most ``EPSILON`` times the larger of 1 and the value."""
+    """Perturb each position and velocity x by at most ``EPSILON`` max(1, |x|)."""
     generator, near = torch.Generator().manual_seed(seed), state.clone()
     for name in ("qpos", "qvel"):
         values = near[:, env.state_space.parts[name]]

@@ -36,7 +36,8 @@ STEPS = 1000
 BATTERY = ((0.8, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.3, 0.0, 1.0), (0.3, 0.0, -1.0), (0.0, 0.4, 0.0), (0.0, 0.0, 0.0))
 """nanoG1's commands: forward and lateral velocity, m/s, and yaw rate, rad/s."""
 GAIT = (0.5, 0.0, 0.0)
-"""The command for nanoG1's measurement of the gait, which takes twice as many steps."""
+"""The command for nanoG1's measurement of the gait. This measurement takes twice as many steps as the commands
+above."""
 COMMANDS = (
     (1.0, 0.0, 0.0), (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0),
     (0.5, 0.0, 0.5), (0.5, 0.0, -0.5), (0.5, 0.3, 0.0), (0.0, 0.0, 0.0),
@@ -77,7 +78,7 @@ class Options(experiment.Options):
     which: str = "last"
     """Policy of each run: last, best, or the number of a saved iteration."""
     task: str | None = None
-    """Velocity task that replaces the run's task, with its own parameters."""
+    """Velocity task to play instead of the run's task. It has its own parameters, not the run's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,7 +159,7 @@ def worlds(folder: Path, nworld: int, options: Options, **params: Any) -> lw.Env
 
 
 def calm(env: lw.Env) -> dict[str, Any]:
-    """Return parameters without noise, pushes and differences between robots, with the model's own friction."""
+    """Return parameters that turn off noise, pushes and differences between robots. The friction is the model's own."""
     slide, spin, roll = env.model.geom_friction[env.task.params["foot_geoms"][0]].tolist()
     return dict.fromkeys(NOISES, 0.0) | {
         "encoder_bias": 0.0, "trunk_offset": [0.0, 0.0, 0.0], "push_seconds": [NEVER, NEVER],

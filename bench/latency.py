@@ -6,9 +6,9 @@
 
 Each case is one cell of the table: a task, the physics of the planner's worlds, a number of samples, a horizon, an
 engine and its device. Episodes run in real time (``lw.control_async``) until their steps take ``--seconds``: the plant
-keeps its rate, and the planner plans as often as it can. A plan meets its deadline if it takes at most a step of the
-plant. Run this on idle cores, because other processes delay plans. Without --samples and --horizons, cells whose plans
-take long on two cores are omitted. With --own, each task has one cell, with the samples and the horizon that it
+keeps its rate, and the planner plans as often as it can. A plan meets its deadline if it takes no longer than one step
+of the plant. Run this on idle cores, because other processes delay plans. Without --samples and --horizons, cells whose
+plans take long on two cores are omitted. With --own, each task has one cell, with the samples and the horizon that it
 suggests for planners.
 """
 
@@ -31,7 +31,8 @@ COST = {
     ("point_mass", "own"): 2.0, ("reach", "own"): 6.0, ("cartpole_swingup", "own"): 2.0, ("half_cheetah", "own"): 15.0,
     ("humanoid", "fast"): 9.0, ("humanoid", "exact"): 120.0, ("adroit_pen", "own"): 95.0,
 }  # fmt: skip
-"""Microseconds per step of a sample on two cores, by task and planning physics; its keys are the default tasks."""
+"""Microseconds per step of a sample on two cores, by task and planning physics. The tasks in the keys are the default
+tasks."""
 LONGEST = 0.2
 """Maximum expected duration of a plan, in seconds; cells with longer plans run only if samples or horizons are
 given."""

@@ -1,7 +1,7 @@
 """Plan with MPPI in Python, with single Gymnasium environments in subprocesses.
 
 ``PythonMPPI`` does not use this package's worlds. Each subprocess has an environment and gets one message per plan, and
-NumPy computes noise and weights. It has the settings of an ``lw.MPPI`` and controls the same plant.
+NumPy computes noise and weights. ``PythonMPPI`` takes its settings from an ``lw.MPPI`` and controls the same plant.
 """
 
 import multiprocessing
@@ -41,12 +41,13 @@ class ReachEnv:
 
 
 class GymnasiumEnv:
-    """Let an environment of Gymnasium or Gymnasium-Robotics be set to a state of this package's task.
+    """An environment of Gymnasium or Gymnasium-Robotics that can be set to a state of this package's task.
 
     Args:
         name: Gymnasium's name.
         model: The model of this package's task, which defines the states.
-        target: Name of a body with a constant orientation in Gymnasium's model, which is a mocap body in ``model``.
+        target: Name of a mocap body of ``model``. Gymnasium's model has a body with this name and a constant
+            orientation.
     """
 
     def __init__(self, name: str, model: mujoco.MjModel, target: str | None = None) -> None:
@@ -83,7 +84,7 @@ ENVS: dict[str, Callable[[mujoco.MjModel], Any]] = {
 
 
 def smoothed(noise: np.ndarray, smoothing: tuple[float, float, float]) -> np.ndarray:
-    """Smooth noise, (samples, horizon, nact), over time in place; the first two steps stay unchanged."""
+    """Smooth noise of shape (samples, horizon, nact) over time, in place. The first two steps stay unchanged."""
     for t in range(2, noise.shape[1]):
         noise[:, t] = smoothing[0] * noise[:, t] + smoothing[1] * noise[:, t - 1] + smoothing[2] * noise[:, t - 2]
     return noise
@@ -94,7 +95,7 @@ class PythonMPPI:
 
     Args:
         task: A name in ``ENVS``.
-        plan: Planner of this package, whose settings are used.
+        plan: Planner of this package that provides the settings.
         count: Number of subprocesses.
     """
 

@@ -1,4 +1,4 @@
-"""Compare two measures of a planner's coarser physics: the rank correlation of its samples, and the loss of return.
+"""Measure how coarser physics affect a planner: the rank correlation of its samples, and the loss of return.
 
     lyceum-warp bench rank_loss half_cheetah hopper
 

@@ -4,7 +4,7 @@
     lyceum-warp bench records --tasks hopper --cache cold
 
 The clock starts before the command, so the seconds include imports, compilation and graph captures. The clock stops
-when the run's config.json says that the target is reached. With a cold cache all kernels are compiled. Before a
+when the run's config.json says that the target is reached. With a cold cache, all kernels are compiled. Before a
 measurement with a warm cache, the same command trains for one iteration while the clock is stopped. A run that lasts
 longer than --seconds is stopped. The same command continues the run; the seconds of all calls are summed, and include
 every start of the process.

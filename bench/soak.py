@@ -51,10 +51,12 @@ from lyceum_warp.support.validate import whole_number
 PARTS = ("faults", "random", "memory", "kills")
 KINDS = {"state": Done.NAN, "speed": Done.NAN, "action": Done.ACTION, "reward": Done.REWARD,
          "observation": Done.OBSERVATION, "model": Done.MODEL}  # fmt: skip
-"""Kinds of faults by where they are injected, numbered from 1, with the reasons that must be reported."""
+"""Kinds of faults, numbered from 1. A kind is named after the place of the injection, and has the reason that must be
+reported."""
 NBIT = len(Done)
 EVERY = 16
-"""Number of steps between writes of invalid states; each write affects more worlds by the same factor."""
+"""Number of steps between writes of invalid states. Each write affects this factor times as many worlds as a write in
+every step would."""
 SAMPLES = 5
 """Memory samples per chunk."""
 TASKS = {
@@ -251,8 +253,8 @@ def measure(case: Any, options: Options) -> dict[str, Any]:
 
 
 def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
-    """Write a variant of a task whose last action number requests a fault; return the variant and the range of the
-    other actions."""
+    """Write a variant of a task. It has one action more than the task, and this action requests a fault. Return the
+    variant, and the range of the other actions."""
     parent, plain = find_task(task), lw.make(task, nworld=1, engine="mujoco")
     own = TaskSource(parent, task)
     functions, nact = own.functions, plain.action.shape[1]
@@ -465,7 +467,7 @@ def memory(device: torch.device) -> tuple[int, int]:
 
 
 def slope(samples: Sequence[Sequence[int]], column: int) -> float:
-    """Return the growth of the memory per step, or per environment, from the second sample on."""
+    """Return the growth of the memory per step, or per environment. The first sample is ignored."""
     points = np.array(samples[1:], dtype=float)
     return float(np.polyfit(points[:, 0], points[:, column], 1)[0])
 

@@ -2,8 +2,8 @@
 
 compare.py runs this program once per checkout, with the checkout first on the path. The first answer lists the
 checkout's tasks and learners. Each further line on stdin is a unit (the keyword arguments of a function in PARTS as
-JSON), and each line on stdout is an answer. The arrays of a unit are written to the file that the program's argument
-names, in the order of their computation.
+JSON), and each line on stdout is an answer. The arrays of a unit are written in the order of their computation, to the
+file given as the program's argument.
 
 The program uses only public names of the package: the two checkouts may differ in everything else.
 """

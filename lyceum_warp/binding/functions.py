@@ -83,7 +83,7 @@ class TaskSource:
         return {group: list(function.input_types.values())[2] for group, function in functions.items()}
 
     def _observers(self, owner: type[Task]) -> list[str]:
-        """Return the names of a class's functions that write groups, and of its module's if no other code uses them."""
+        """Return the names of functions that write groups: all in the class, and all unused ones in its module."""
         module = vars(sys.modules[owner.__module__])
         functions = {name: self._seen(value) for name, value in module.items() if isinstance(value, wp.Function)}
         tasks = [kind for kind in (owner, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
@@ -137,9 +137,10 @@ class TaskSource:
         return struct
 
     def _with_functions(self, own: Any) -> Any:
-        """Return the parameter struct that functions take: a base task's if the task's own differs only in defaults.
+        """Return the parameter struct that functions take.
 
-        Tasks that differ only in defaults then share functions and kernels.
+        If the task's struct differs from a base task's only in defaults, functions take the base task's struct. Tasks
+        that differ only in defaults then share functions and kernels.
         """
         fields = {name: wp.types.type_repr(field.type) for name, field in own.vars.items()}
         for owner in reversed(self._owners):
@@ -272,7 +273,7 @@ def _may_list(task: type[Task], group: str) -> bool:
 
 
 def _origin(struct: Any) -> str:
-    """Return the file that defines a struct, or the name of its module if there is no file."""
+    """Return the file that defines a struct. If there is no file, return the name of the struct's module."""
     module = struct.cls.__module__
     return str(getattr(sys.modules.get(module), "__file__", None) or module)
 

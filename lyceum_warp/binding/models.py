@@ -25,7 +25,8 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
 
     Args:
         source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec, which is copied. A relative
-            path is relative to the file of the task class that declares it, or without an owner to the current folder.
+            path starts at the folder of the task class that declares it. Without an owner, it starts at the current
+            folder.
         owner: The task class that declares the model.
 
     Raises:

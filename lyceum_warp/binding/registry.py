@@ -25,7 +25,8 @@ from lyceum_warp.task import Task
 _tasks: dict[str, type[Task]] = {}
 
 _loaded: dict[str, Stamps] = {}
-"""The stamps of each task module's file, and of the modules beside it, from when they were last run."""
+"""Stamps of each task module's file and of the modules beside it, as of their last run. A stamp is a modification time
+and a size."""
 
 _LOADING = threading.RLock()
 """Held while a file is loaded, because imports and linecache are global to the process."""

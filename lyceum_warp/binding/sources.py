@@ -143,7 +143,10 @@ _module_names: set[str] = set()
 
 
 def free_module_name(name: str) -> str:
-    """Return a free name for a Warp module, the same in every process, so that Warp finds it in its cache."""
+    """Return an unused name for a Warp module.
+
+    The name is the same in every process, so that Warp finds the module in its cache.
+    """
     free = name = re.sub(r"[^\w.]", "_", name)
     number = 0
     while free in _module_names:

@@ -16,10 +16,10 @@ from lyceum_warp.binding.sources import FunctionSource, is_struct, overloads, ru
 from lyceum_warp.task import Row, Task
 
 _STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
-"""Names of a transition's parts in reward terms and metrics, with the names in the generated text."""
+"""The parts of a transition: their names in reward terms and metrics, mapped to their names in the generated text."""
 
 _STATE = {"s": "s", "s1": "s", "p": "p"}
-"""Names of the state and the parameters in terminations, with the names in the generated text."""
+"""The state and the parameters: their names in terminations, mapped to their names in the generated text."""
 
 _OWN = ("weights", "metrics", "total")
 """Other names in the generated text."""

@@ -45,7 +45,7 @@ class Engine(abc.ABC):
     name: str
     """The engine's name, as in ``make(engine=...)``."""
     launch_threads: int = 1
-    """The number of threads that divide the worlds in kernel launches around a step.
+    """The number of threads that launch kernels before and after a step, each for a part of the worlds.
 
     An engine with several threads must launch kernels only through ``lyceum_warp.support.arrays``.
     """

@@ -120,10 +120,10 @@ def bytes_per_world(
 
 
 def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
-    """Return the options to change for an environment with few worlds, such as for an evaluation.
+    """Return the options to change for an environment with few worlds, such as the environment of an evaluation.
 
-    On a GPU a step of a few worlds takes nearly as long as a step of thousands. With engine="auto", few worlds
-    therefore run on the C engine, on CPU cores and in double precision.
+    On a GPU, a step of a few worlds takes nearly as long as a step of thousands of worlds. With engine="auto", few
+    worlds therefore run on the C engine, on CPU cores and in double precision.
     """
     return options_on_cores() if engine == "auto" and engine_name(engine, device) == "warp" else {}
 
@@ -131,7 +131,8 @@ def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device 
 def options_for_plant(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
     """Return the options to change for a world that a planner controls in real time.
 
-    On a GPU the world's steps would wait for the planner's launches, so the world runs on the C engine, on a CPU core.
+    On a GPU, the world's steps would wait for the planner's launches. The world therefore runs on the C engine, on a
+    CPU core.
     """
     name = device.alias if isinstance(device, wp.Device) else device
     on_gpu = engine in ("auto", "warp") and find_device(name).is_cuda

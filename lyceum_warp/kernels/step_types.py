@@ -9,7 +9,7 @@ import warp as wp
 
 @wp.struct
 class Counters:
-    """Counters and random streams of the worlds; every array is (nworld,) unless noted."""
+    """Counters and random streams of the worlds. Arrays have the shape (nworld,) unless noted."""
 
     step: wp.array[int]
     """Steps since the reset."""
@@ -18,13 +18,13 @@ class Counters:
     episode: wp.array[int]
     """Index of the episode."""
     rng: wp.array2d[wp.uint32]
-    """Stream that a task's function draws from, (observation groups * nworld, 1), with one row per drawing thread.
-    Every kernel resets it to its start."""
+    """Streams from which a task's functions draw, (observation groups * nworld, 1): one row per thread that draws.
+    Every kernel resets the streams to their start."""
 
 
 @wp.struct
 class Outcome:
-    """The outcome of a step in each world; every array is (nworld,), metrics are (nworld, nmetrics)."""
+    """The outcome of a step in each world. Arrays have the shape (nworld,), and metrics (nworld, nmetrics)."""
 
     reward: wp.array[float]
     eval: wp.array[float]
@@ -39,7 +39,7 @@ class Outcome:
 
 @wp.struct
 class Findings:
-    """Results of ``judge``, before it is known whether a world has a fault; every array is (nworld,)."""
+    """Results of ``judge``, before it is known whether a world has a fault. Arrays have the shape (nworld,)."""
 
     reward: wp.array[float]
     eval: wp.array[float]
@@ -58,7 +58,7 @@ OUTCOMES = {
     "done": wp.bool,
     "done_reason": wp.int32,
 }
-"""Types of the fields of Outcome that are (nworld,)."""
+"""Types of the fields of Outcome with the shape (nworld,)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -295,8 +295,8 @@ class Kernels(ActKernels, JudgeKernels, BeginKernels, RolloutKernels, SharedKern
     """The kernels of a step, and the structs of their arrays. Kernels that the task does not need are None."""
 
     views: Mapping[Any, wp.Function]
-    """The function that makes each struct of the task: World from a batch and a world's index, observation structs from
-    a row."""
+    """Functions by the struct that they make: World from a batch and a world's index, and observation structs from a
+    row."""
     terms: Mapping[str, wp.Function]
     """The generated functions of a task with terms: ``reward``, ``score`` and ``terminated``."""
     Batch: Any

@@ -1,8 +1,8 @@
 """Measure environment steps per second of other libraries, as a worker of bench/venvs.py.
 
 The program reads a JSON object (contestant, task, envs, threads, seconds, warm, seed) and prints a JSON object. Actions
-are uniform within their bounds and drawn before the clock starts. An episode restarts within its last step if the
-library supports it.
+are uniform within their bounds and drawn before the clock starts. If the library supports it, an episode restarts
+within its last step.
 """
 
 import json
@@ -203,7 +203,7 @@ def timed(
     """Return the number of steps and the seconds that they took.
 
     Args:
-        step: Function that takes a step with the actions of an index below ``period``.
+        step: Function that takes a step. Its argument, from 0 to ``period`` - 1, selects the actions.
         period: Number of steps after which the actions repeat.
         warm: Number of steps before the clock starts.
         seconds: Duration of the measurement.

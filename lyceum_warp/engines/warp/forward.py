@@ -218,7 +218,7 @@ class PartialForward:
         data: MuJoCo Warp's data of all worlds.
         group: MuJoCo Warp's data of the group.
         states: A buffer for the integration states of all worlds, (nworld, integration size), float32.
-        static: Geoms whose poses the forward pass does not compute.
+        static: Computes the poses of static geoms, which a forward pass does not compute.
     """
 
     def __init__(self, rows: ModelRows, data: mjw.Data, group: mjw.Data, states: wp.array, static: StaticGeoms) -> None:

@@ -44,14 +44,17 @@ def aligned(size: int) -> int:
 
 
 def group_size(nworld: int, device: wp.Device) -> int:
-    """Return the number of worlds in a group: more than usually restart in a step, but few for a cheap forward pass."""
+    """Return the number of worlds in a group.
+
+    A group has room for the worlds that usually restart in a step, and is small enough for a cheap forward pass.
+    """
     return min(nworld, max(1 if device.is_cpu else 64, nworld // 16))
 
 
 class Turns:
     """Copies the masked worlds into a group and back, one group at a time, by Warp launches only.
 
-    An empty mask takes no turn.
+    With an empty mask, nothing runs.
 
     Args:
         nworld: Number of worlds.

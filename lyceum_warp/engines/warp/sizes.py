@@ -26,7 +26,7 @@ _LEAST, _LEAST_WITH_FLEX = (8, 8), (256, 512)
 pressed into a flex touches up to 50 of its elements. The capacities with a flex are MuJoCo Warp's defaults."""
 
 _FIRST = 32
-"""The maximum number of worlds of which the initial states are checked."""
+"""The maximum number of worlds whose initial states are checked."""
 
 _FRICTION = {"dof_frictionloss", "tendon_frictionloss"}
 _LIMITS = {"jnt_range", "jnt_margin", "tendon_range", "tendon_margin", "qpos0"}
@@ -174,13 +174,13 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 _TEMPORARIES = 1.25
-"""The factor from the memory of MuJoCo Warp's Data to the memory of a world. In measurements a step's temporary arrays
+"""The memory of a world, divided by the memory of MuJoCo Warp's Data. In measurements, a step's temporary arrays
 took 1 to 9 %; the rest is for graphs and for the group of a partial forward pass. CPU graphs keep all temporary arrays
 alive and take up to three times as much."""
 
 _TEMPORARIES_CONVEX = 3.5
-"""The factor for models with convex collisions or the noslip solver. On adroit_pen the temporary arrays take 1.5 to 2.4
-times the memory of the Data."""
+"""The factor for models with convex collisions or the noslip solver. On adroit_pen, the temporary arrays take 1.5 to
+2.4 times the memory of the Data."""
 
 _CONVEX = {mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_MESH,
            mujoco.mjtGeom.mjGEOM_HFIELD}  # fmt: skip
@@ -209,7 +209,7 @@ def _bytes_of(data: Any) -> int:
 
 
 def _margin(model: mujoco.MjModel) -> float:
-    """Return the factor from the memory of MuJoCo Warp's Data to the memory of a world."""
+    """Return the memory of a world, divided by the memory of MuJoCo Warp's Data."""
     collides = (model.geom_contype | model.geom_conaffinity) != 0
     kinds = [int(kind) for kind in model.geom_type[collides]]
     convex = not _CONVEX.isdisjoint(kinds) or kinds.count(int(mujoco.mjtGeom.mjGEOM_BOX)) > 1
