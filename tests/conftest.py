@@ -92,8 +92,8 @@ def settle() -> None:
     """Exempt all live objects from garbage collection, because scanning a million objects of imports and kernels is
     slow.
 
-    Objects that are created later are collected and counted as usual. Do not call this function while an object is
-    alive that a test must free.
+    Objects that are created later are collected and counted as usual. Do not call this function while an object that a
+    test must free is alive.
     """
     gc.collect()
     gc.freeze()
@@ -127,7 +127,7 @@ def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
 
 @pytest.hookimpl(tryfirst=True)  # this hook must run before pytest deselects tests by marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark cases ``long`` that the mark ``quick`` omits, and skip tests whose GPU or models are missing."""
+    """Mark cases as ``long`` if the mark ``quick`` omits them. Skip tests if their GPU or models are missing."""
     _mark_long(items)
     for item in items:
         if (missing := _missing_model(_task(item))) is not None:
@@ -142,7 +142,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _mark_long(items: list[pytest.Item]) -> None:
-    """Mark the cases ``long`` that their test's mark ``quick`` does not name, by their id or by a part of it."""
+    """Mark cases as ``long`` if the mark ``quick`` of their test contains neither their id nor a part of it."""
     cases: dict[tuple[str, ...], set[str]] = {}
     for item in items:
         if (mark := item.get_closest_marker("quick")) is not None:

@@ -185,7 +185,8 @@ def count_steps(s0: PracticedWorld, action: Row[float], s1: PracticedWorld, p: P
 
 
 class Practiced(lw.Task):
-    """A task in which the puck's initial distance grows with the practice of its world, which is observed."""
+    """A task in which the puck's initial distance grows with ``practice``, a number in lasting memory that is
+    observed."""
 
     model = Drawn.model
     frame_skip = 3
@@ -202,7 +203,7 @@ def draw_practice(s: PracticedWorld, p: PuckParams, rng: Row[wp.uint32]):
 
 
 class Gifted(Practiced):
-    """``Practiced`` with a randomized initial practice in each world; all worlds share the model."""
+    """``Practiced`` with a random initial value of ``practice`` in each world. All worlds share the model."""
 
     World = PracticedWorld
     Params = PuckParams

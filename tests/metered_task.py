@@ -1,5 +1,4 @@
-"""Define a task with metrics and observation groups: a ball on a rail, whose episode ends if the ball leaves the
-rail."""
+"""Define a task with metrics and observation groups: a ball on a rail. An episode ends if the ball leaves the rail."""
 
 import warp as wp
 from rail_task import rail

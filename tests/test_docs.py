@@ -182,7 +182,7 @@ def test_tasks_in_own_task_md_pass_check_task(empty_folder: Path, monkeypatch: p
 
 
 def generated(folder: str, kind: str) -> list[str]:
-    """Return the words in those comments of a folder's pages that docs/conf.py replaces by generated sections."""
+    """Return the words in comments of a folder's pages. docs/conf.py replaces these comments by generated sections."""
     pages = sorted((ROOT / "docs" / folder).glob("*.md"))
     return [word for page in pages for word in words_of(page, kind)]
 

@@ -34,7 +34,7 @@ def numbers(pattern: str, lines: list[str]) -> list[float]:
     return [float(match[1]) for line in lines if (match := re.search(pattern, line))]
 
 
-def test_train_improves_and_saves_the_policy(run, tmp_path: Path) -> None:
+def test_example_train_improves_and_saves_the_policy(run, tmp_path: Path) -> None:
     lines = run("train.py", "--iterations", "5", "--samples", "2000")
     returns = numbers(r"return +(-?[\d.]+)", lines)
     assert len(returns) == 6  # one number for each of five iterations, and one for the mean policy
@@ -44,7 +44,7 @@ def test_train_improves_and_saves_the_policy(run, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_own_policy_improves(run) -> None:
+def test_example_own_policy_improves_its_policy(run) -> None:
     lines = run("own_policy.py", "--iterations", "8")
     returns = numbers(r"return +(-?[\d.]+)", lines)
     assert len(returns) == 9  # one number for each of eight iterations, and one for the mean policy
@@ -53,7 +53,7 @@ def test_own_policy_improves(run) -> None:
 
 
 @pytest.mark.long
-def test_random_search_writes_a_complete_run_folder(run, tmp_path: Path) -> None:
+def test_example_random_search_writes_a_complete_run_folder(run, tmp_path: Path) -> None:
     """The run has a folder, resumes bit for bit, and can be evaluated and exported."""
     once = numbers(r"return (-?[\d.]+)", run("random_search.py", "--out", "once", "--iterations", "6"))
     assert max(once) == 200.0 > 1.5 * once[0]  # the robot gets a reward in every step
@@ -69,7 +69,7 @@ def test_random_search_writes_a_complete_run_folder(run, tmp_path: Path) -> None
 
 
 @pytest.mark.long  # tests of SAC and of random_search.py cover the parts of TD3
-def test_td3_learns_and_resumes_with_its_replay_buffer(run, tmp_path: Path) -> None:
+def test_example_td3_learns_and_resumes_with_its_replay_buffer(run, tmp_path: Path) -> None:
     ended = numbers(r": (\d+) episodes", run("td3.py", "--out", "once", "--iterations", "4"))
     assert ended[0] > 50 > 25 > ended[-1]  # the trained policy keeps the pole up for longer
     run("td3.py", "--out", "twice", "--iterations", "2")
@@ -78,7 +78,7 @@ def test_td3_learns_and_resumes_with_its_replay_buffer(run, tmp_path: Path) -> N
     assert Run.open(tmp_path / "once").rows() == Run.open(tmp_path / "twice").rows()
 
 
-def test_plan_reaches_the_target_in_each_episode(run) -> None:
+def test_example_plan_reaches_the_target_in_each_episode(run) -> None:
     lines = run("plan.py", "--episodes", "2")
     assert sum("success after" in line for line in lines) == 2
     assert "success: 100% of 2 episodes" in lines
@@ -86,7 +86,7 @@ def test_plan_reaches_the_target_in_each_episode(run) -> None:
 
 
 @pytest.mark.long
-def test_own_task_follows_the_rules_and_runs() -> None:
+def test_example_own_task_follows_the_rules_and_runs() -> None:
     # this runs in a subprocess, because the task is registered and its module is __main__
     command = [sys.executable, str(EXAMPLES / "own_task.py")]
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
@@ -100,7 +100,7 @@ def test_own_task_follows_the_rules_and_runs() -> None:
 
 
 @pytest.mark.long
-def test_commanded_speed_follows_the_rules_on_both_engines() -> None:
+def test_example_commanded_speed_follows_the_rules_on_both_engines() -> None:
     command = [sys.executable, str(EXAMPLES / "commanded_speed.py")]
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=900)
@@ -114,7 +114,7 @@ def test_commanded_speed_follows_the_rules_on_both_engines() -> None:
 
 
 @pytest.mark.long
-def test_commanded_speed_trains_and_records_its_terms(tmp_path: Path) -> None:
+def test_example_commanded_speed_trains_and_records_its_terms(tmp_path: Path) -> None:
     options = ["--iterations", "2", "--samples", "8000", "--nworld", "16"]
     assert train(tmp_path / "run", *options, task=str(EXAMPLES / "commanded_speed.py")) == 0
     for row in Run.open(tmp_path / "run").rows():
@@ -123,7 +123,7 @@ def test_commanded_speed_trains_and_records_its_terms(tmp_path: Path) -> None:
         assert 0 < terms[0] < 20 and 0 < terms[1] < 6 and terms[2] < 0 and terms[3] <= 0
 
 
-def test_torch_loop_learns_to_approach_the_target(run) -> None:
+def test_example_torch_loop_learns_to_approach_the_target(run) -> None:
     lines = run("torch_loop.py", "--iterations", "24")
     distances = numbers(r"256 episodes ended ([\d.]+) m", lines)
     assert len(distances) == 6  # an episode of 128 steps ends in every fourth iteration of 32 steps

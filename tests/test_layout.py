@@ -254,7 +254,7 @@ def test_importing_the_package_does_not_import_torch_warp_or_mujoco() -> None:
 
 @pytest.mark.long
 def test_warp_prints_nothing_if_a_task_file_imports_it_first() -> None:
-    """In the tests of ``tests/support/test_warp_log.py`` the package is imported before Warp."""
+    """In the tests of ``tests/support/test_warp_log.py``, the package is imported before Warp."""
     program = """
         import warp as wp
         import lyceum_warp as lw

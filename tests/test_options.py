@@ -71,7 +71,7 @@ FAST = PhysicsOptions(integrator="implicitfast", timestep=0.004, frame_skip=2)
 Fast = type("Fast", (find_task("hopper"),), {"physics": {"fast": FAST}})
 
 
-def test_other_arguments_override_the_options_of_named_physics() -> None:
+def test_keyword_arguments_override_the_options_of_named_physics() -> None:
     env = lw.make(Fast, physics="fast")
     assert env.options.physics == FAST and env.options.given() == FAST.given() and env.timestep == 0.008
     assert env.model.opt.timestep == 0.004 and env.replicate(physics="exact").options.physics == PhysicsOptions()

@@ -95,7 +95,8 @@ class ArmHandPickup(lw.Task):
     keyframe, frame_skip, horizon, success_steps = "home", 4, 300, 10
     obs = {"joints": 9, "velocity": 9, "ball_velocity": 3, "ball": 3, "palm": 3, "goal": 3, "fingers": 9}
     metrics, action_range = ("palm_distance", "goal_distance", "finger_distances"), (-1.0, 1.0)
-    planning = lw.Planning(  # the planner's reward has a longer range, and weighs closing the hand more
+    # for planners, the distance "far" and the weight of closing the hand are larger than in the task
+    planning = lw.Planning(
         settings=dict(horizon=32, samples=64, temperature=0.1, noise=0.8, fill="repeat", include_plan=False),
         params={"far": 1.0, "finger_weight": 2.0},
     )

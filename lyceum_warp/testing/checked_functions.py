@@ -1,6 +1,6 @@
 """Copy a task's functions with a bounds check for every index, and make kernels that run the copies.
 
-In a copy each index of a row, a vector or a matrix goes through a function that compares it with the size, and each
+In a copy, each index of a row, a vector or a matrix goes through a function that compares it with the size, and each
 ``while`` loop counts its iterations. A copy is otherwise unchanged, so it computes the same numbers. Native functions
 (``wp.func_native``) are C++ and cannot be checked.
 """

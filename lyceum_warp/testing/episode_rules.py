@@ -22,7 +22,7 @@ def _check_flags(ctx: Context, env: Env) -> None:
 
 
 def check_truncation(ctx: Context) -> None:
-    """At the horizon an episode is truncated.
+    """At the horizon, an episode is truncated.
 
     ``final_obs`` is the last observation of the episode, and ``obs`` the first observation of the next one.
 

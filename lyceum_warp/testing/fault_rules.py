@@ -96,7 +96,7 @@ def check_bad_warmstart(ctx: Context) -> None:
 def check_not_finite(ctx: Context) -> None:
     """A reward or an observation that is not finite is a fault of its world, and changes no other world.
 
-    The check makes each parameter of the task infinite in one world, one parameter after the other.
+    The check makes the task's parameters infinite in one world, one parameter after the other.
     """
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
     others, actions = ~ctx.mask(bad), ctx.actions(2)

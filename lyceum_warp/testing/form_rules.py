@@ -90,7 +90,8 @@ def check_success_steps(ctx: Context) -> None:
 
     The count of such steps belongs to the state, and a reset clears it.
 
-    The check finds whether a state meets the goal by setting the state with a full count and reading ``success``.
+    To find out whether a state meets the goal, the check sets the count to its maximum, sets the state, and reads
+    ``success``.
     """
     a, b, needed = ctx.a, ctx.b, int(ctx.a.task.task.success_steps)
     if needed == 1:

@@ -1,6 +1,6 @@
 """Check the effects of inputs and of model fields that differ between worlds.
 
-An engine's result must be nearer to the result of ``mj_step`` than to a simulation without inputs or fields.
+An engine's result must be nearer to the result of ``mj_step`` than to the result without these inputs and fields.
 """
 
 import copy
@@ -23,7 +23,7 @@ def predicted(
     env: Env, before: torch.Tensor, after: torch.Tensor | None = None, *, nstep: int, dynamics: bool = True,
     inputs: bool = True,
 ) -> np.ndarray:  # fmt: skip
-    """Compute the coordinates of every world after ``mj_step`` by MuJoCo itself, (nworld, nq).
+    """Step every world by ``mj_step``, and return its coordinates, (nworld, nq).
 
     Args:
         env: The environment to which the states belong.
@@ -60,7 +60,7 @@ def predicted(
 def closer(
     ctx: Context, state: torch.Tensor, wanted: np.ndarray, without: np.ndarray, mask: torch.Tensor, what: str
 ) -> None:
-    """Fail if coordinates of masked worlds are not closer to ``wanted`` than to ``without``."""
+    """Fail unless the coordinates of masked worlds are closer to ``wanted`` than to ``without``."""
     found = state[:, ctx.a.state_space.parts["qpos"]].cpu().numpy()
     effect = np.abs(wanted - without).max(axis=1)
     error = np.abs(found - wanted).max(axis=1)

@@ -30,7 +30,7 @@ def check_keyframe(ctx: Context) -> None:
 
 
 def check_rejection(ctx: Context) -> None:
-    """No episode starts in a rejected state before the maximum number of draws; worlds draw independently."""
+    """An episode starts in a rejected state only after the maximum number of draws. Worlds draw independently."""
     a, b = ctx.a, ctx.b
     reject = a.task.kernels.reject_worlds
     if reject is None:

@@ -65,7 +65,7 @@ def check_masked_restoring(ctx: Context) -> None:
 
 
 def check_set_state_shows(ctx: Context) -> None:
-    """After ``set_state`` every getter returns values of the new state."""
+    """After ``set_state``, every getter returns values of the new state."""
     a, b = ctx.a, ctx.b
     has_evaluate = a.task.functions["evaluate"] is not None
     with ctx.changed(a, b, autoreset=False, horizon=0):

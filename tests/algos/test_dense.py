@@ -95,7 +95,7 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("kind", OTHERS)
-def test_other_networks_use_autograd(kind: str) -> None:
+def test_networks_other_than_the_default_use_autograd(kind: str) -> None:
     assert DensePasses.of(OTHERS[kind]()) is None
     if kind != "shared layer":
         assert DensePolicy.of(lw.GaussianPolicy(5, 2, network=OTHERS[kind]())) is None

@@ -175,7 +175,7 @@ def test_gpu_two_processes_end_when_torchrun_is_interrupted(tmp_path: Path) -> N
         if "iteration    2/" in line:
             process.send_signal(signal.SIGTERM)
             break
-    rest, error = process.communicate(timeout=25)  # after 30 s torchrun would kill the processes
+    rest, error = process.communicate(timeout=25)  # after 30 s, torchrun would kill the processes
     rows = table(run)
     assert f"interrupted by SIGTERM after {len(rows)} of 100000 iterations" in output + rest, (output, rest, error)
     assert Run.open(run).read()["iteration"] == len(rows) >= 2

@@ -361,7 +361,7 @@ def on_gpu(**changes: object) -> lw.NPG:
 
 @pytest.mark.gpu
 def test_gpu_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The test makes all synchronizing calls except for one raise an error."""
+    """In this test, every synchronizing call raises an error, except for one call."""
     npg = on_gpu(normalize=True, min_restarts=2.0)
     copies = []
 

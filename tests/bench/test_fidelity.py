@@ -31,7 +31,7 @@ def test_short_fidelity_run_compares_trajectories(tmp_path: Path, capsys: pytest
     assert f"| {TASK} | 3 |" in capsys.readouterr().out
 
 
-def test_different_dynamics_diverge(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trajectories_with_different_dynamics_diverge(monkeypatch: pytest.MonkeyPatch) -> None:
     make = fidelity.lw.make
 
     def replaced(task: str, **words: Any) -> lw.Env:

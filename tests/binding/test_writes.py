@@ -205,7 +205,7 @@ def reads_only(s: World, p: Params, obs: Row[float]):
     obs[2] = own[0] + vec7()[0] + wp.max(float(int(s.qpos[0])), 1.0)
 
 
-def test_changing_a_copy_of_an_argument_counts_as_no_write() -> None:
+def test_changing_a_copy_of_an_argument_is_not_a_write() -> None:
     assert {write.target for write in find_writes(reads_only)} == {"obs"}
 
 

@@ -28,7 +28,9 @@ def plan(out: Path, *options: str, task: str = "point_mass") -> int:
     return cli.main(["plan", task, "--out", str(out), *SMALL, *options])
 
 
-def test_plan_starts_no_episode_after_the_time_limit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_plan_starts_no_episode_after_the_time_limit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "run"
     assert plan(out, *QUIET, "--steps", "3", "--episodes", "3", "--minutes", "1e-9") == 0
     assert "1e-09 minutes are over after 1 of 3 episodes" in capsys.readouterr().out
@@ -41,7 +43,7 @@ def test_folder_name_may_contain_rich_markup(tmp_path: Path, capsys: pytest.Capt
     assert f"files in {out}" in capsys.readouterr().out
 
 
-def test_plan_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_plan_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     assert plan(out, "--episodes", "2", "--seed", "3", "--no-video") == 0
     shown = capsys.readouterr().out
@@ -86,7 +88,7 @@ def test_planner_uses_the_suggested_physics_by_default(tmp_path: Path, capsys: p
 
 
 @pytest.mark.long
-def test_plan_makes_a_video_of_the_first_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_plan_makes_a_video_of_the_first_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(tmp_path / "run", "--no-plot", "--steps", "12", "--camera", "azimuth=20", "--camera", "track=1") == 0
     lines = capsys.readouterr().out.splitlines()
     video = next(line for line in lines if line.startswith("video:")).split(maxsplit=1)[1]
@@ -317,7 +319,7 @@ def test_interrupted_episode_is_saved(
 @pytest.mark.parametrize(
     ("words", "fill"), [(["-0.5"], -0.5), (["-0.5", "0.25"], [-0.5, 0.25]), (["repeat"], "repeat")]
 )
-def test_fill_accepts_a_word_a_number_or_an_action(words: list[str], fill: object, tmp_path: Path) -> None:
+def test_option_fill_accepts_a_word_a_number_or_an_action(words: list[str], fill: object, tmp_path: Path) -> None:
     assert plan(tmp_path / "run", *QUIET, "--steps", "1", "--fill", *words) == 0
     assert json.loads((tmp_path / "run" / "config.json").read_text())["planner"]["fill"] == fill
 

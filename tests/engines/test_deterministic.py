@@ -32,7 +32,7 @@ def without_allocators(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("without_allocators")
 def test_deterministic_engine_takes_the_same_steps_as_the_warp_engine() -> None:
-    """On the CPU the two engines differ only in the order of sums."""
+    """On the CPU, the two engines differ only in the order of sums."""
     envs = [lw.make("hopper", engine=engine, nworld=3, horizon=3) for engine in (DeterministicEngine, WarpEngine)]
     ordered, plain = envs
     for _ in range(4):
@@ -69,7 +69,8 @@ def test_scratch_memory_is_reserved_before_graphs_are_captured(monkeypatch: pyte
     assert 100_010 <= block.size < 100_010 + 512
 
 
-# on a GPU the order of contacts and rows is random; these tests shuffle them, and check that sorting restores the order
+# on a GPU, the order of contacts and rows is random; these tests shuffle them, and check that sorting restores the
+# order
 
 
 @pytest.fixture(scope="module", params=["dense", "sparse"])

@@ -161,7 +161,9 @@ CHANGES: Mapping[str, float] = {
 )  # fmt: skip
 @pytest.mark.parametrize("name", CHANGES)
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
-def test_model_field_of_zero_can_be_nonzero_in_a_single_world(engine: type[Engine], name: str) -> None:
+def test_model_field_that_is_zero_in_the_model_can_be_nonzero_in_a_single_world(
+    engine: type[Engine], name: str
+) -> None:
     model = copy.copy(MODEL)
     if name == "wind":
         model.opt.density = 100.0
@@ -228,7 +230,7 @@ def test_model_with_restored_nominal_values_gives_the_original_steps(engine: typ
     draw(made)
     for name, nominal in made.nominal.items():
         made.arrays[name].numpy()[:] = nominal.numpy()
-    for _ in range(2):  # in the second pass the model is nominal
+    for _ in range(2):  # in the second pass, the model is nominal
         made.apply_model(worlds())
     np.testing.assert_array_equal(run(made), run(untouched))
 
@@ -254,7 +256,7 @@ def test_rollout_uses_the_model_fields_of_each_state(
     controls = wp.array(np.full((4, N, MODEL.nu), 0.3), dtype=float)
     names = ("qpos", "qvel", "body_mass", *current)
     buffers = {name: wp.zeros((5, *source.arrays[name].shape), dtype=source.arrays[name].dtype) for name in names}
-    for _ in range(2):  # in the second pass no model field changes
+    for _ in range(2):  # in the second pass, no model field changes
         planner.rollout(state, controls, 2, buffers)
         for t in range(4):
             for name, buffer in buffers.items():

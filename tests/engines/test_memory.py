@@ -14,7 +14,7 @@ from lyceum_warp.engines.memory import check_fit
 CPU = wp.get_device("cpu")
 
 
-def test_check_fit_names_the_largest_number_of_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_of_too_many_worlds_contains_the_largest_number_that_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "free_memory", lambda device: 10_000_000)
     check_fit(1000, 9000, CPU)
     message = r"^9001 worlds need about 0.009 GB \(1 kB each\), and cpu has 0.01 GB free: use nworld=9000 at most$"

@@ -126,7 +126,7 @@ def test_a_plant_moves_from_a_gpu_to_a_cpu_core(gpu: Any) -> None:
         assert options_for_plant(engine, device) == {}
 
 
-def test_place_samples_chooses_an_engine_by_the_number_of_samples(gpu: Any) -> None:
+def test_engine_of_a_planner_depends_on_the_number_of_samples(gpu: Any) -> None:
     """Only engine="auto" chooses a device; an explicit engine is used unchanged."""
 
     def chosen(

@@ -164,7 +164,7 @@ OF_ANOTHER_MODEL = {
     "tendon_solref_fri": {"tendons": "friction"}, "tendon_solimp_fri": {"tendons": "friction"},
     "pair_solreffriction": {"cone": "elliptic"},
 }  # fmt: skip
-"""Levels that give a field an effect, in addition to ``DRAWN``, by field."""
+"""For some fields: levels with which the field has an effect, in addition to those in ``DRAWN``."""
 
 
 def touching(model: mujoco.MjModel) -> np.ndarray:

@@ -227,7 +227,7 @@ def test_restarting_worlds_get_the_fields_of_a_full_forward_pass(deterministic: 
     assert seen > 0
 
 
-def test_fault_of_one_of_a_few_humanoids_does_not_change_the_others() -> None:
+def test_fault_of_one_humanoid_does_not_change_a_few_others() -> None:
     """The contact buffer has room for a world with excessive contacts even if there are only a few worlds."""
     from lyceum_warp.testing import CHECKS
 
@@ -235,7 +235,7 @@ def test_fault_of_one_of_a_few_humanoids_does_not_change_the_others() -> None:
     check_task("humanoid", engine="warp", device=CUDA, nworld=4, deterministic=True, steps=50, checks=checks)
 
 
-def test_few_worlds_of_an_evaluation_step_on_the_cpu() -> None:
+def test_evaluation_with_few_worlds_runs_on_the_cpu() -> None:
     env = lw.make("hopper", nworld=8, device=CUDA, deterministic=True, nconmax=16, integrator="euler")
     few = env.replicate_few(2, autoreset=False)
     assert (few.engine.name, few.device.is_cpu, few.nworld, few.autoreset) == ("mujoco", True, 2, False)

@@ -23,7 +23,7 @@ CHOSEN = [0, 3, *range(50, 150)]  # the number of worlds exceeds the size of a r
 
 
 def draws(model: mujoco.MjModel, turn: int) -> dict[str, np.ndarray]:
-    """Return factors for the model fields of each world; in a few worlds the factors change in every turn."""
+    """Return factors for the model fields of each world. In the worlds ``CHOSEN``, the factors depend on ``turn``."""
     found = {}
     for name in DRAWN:
         size = describe_model_field(model, name).size

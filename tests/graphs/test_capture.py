@@ -177,7 +177,7 @@ def test_phases_are_called_directly_if_graphs_are_disabled() -> None:
     assert calls == tuple(phase.run for phase in phases)
 
 
-def test_changed_launches_are_captured_again_after_forget() -> None:
+def test_changed_launches_are_captured_again_after_calling_forget() -> None:
     digits, made = Digits(), graphs()
     digit = [1]
     calls = made.sequence([Phase("digit", lambda: wp.launch(append, 1, [digit[0], digits.number], device="cpu"))])

@@ -66,7 +66,7 @@ def test_random_vector_equals_separate_draws_of_its_elements() -> None:
 
 
 def test_different_counters_give_different_draws() -> None:
-    """Even counters with equal sums give different draws."""
+    """Counters with equal sums also give different draws."""
     counters = np.array(list(itertools.product(range(6), range(6), range(6), range(6))))
     found = draws(counters)
     assert len(np.unique(found[:, 0])) > 0.999 * len(counters)
@@ -82,7 +82,7 @@ def test_draws_are_independent_along_every_counter(counter: str) -> None:
     check_uniform(np.stack([values[:-1, 0], values[1:, 0]], axis=1))
 
 
-def test_seed_worlds_seeds_only_masked_worlds_and_adds_the_index_of_the_first_world() -> None:
+def test_kernel_seed_worlds_seeds_masked_worlds_by_their_index_plus_an_offset() -> None:
     mask = wp.array([True, False, True], dtype=bool, device="cpu")
     seed = wp.array([5], dtype=int, device="cpu")
     keys, episodes = [], []

@@ -5,8 +5,8 @@ dm_control 1.0.50 does not run on MuJoCo 4, so run this script in a separate vir
     python -m venv dm && dm/bin/pip install dm-control==1.0.50 mujoco==3.17.0
     MUJOCO_GL=disable dm/bin/python tests/oracles/store_dm_control.py tests/data/dm_control [DOMAIN ...]
 
-An episode has segments of 40 steps with one random action each. At the beginning of a segment the state is rounded to
-float32 and the warm start is 0, so that the stored state is exactly the state from which dm_control continued.
+An episode has segments of 40 steps with one random action each. At the beginning of a segment, the state is rounded to
+float32 and the warm start is set to 0. The stored state is therefore exactly the state from which dm_control continued.
 """
 
 import sys

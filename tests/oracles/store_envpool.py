@@ -6,7 +6,7 @@ virtual environment:
     python -m venv pool && pool/bin/pip install envpool==1.2.5
     pool/bin/python tests/oracles/store_envpool.py tests/data/envpool_suite.npz
 
-The tasks are those whose states follow from their observations.
+A task is included if its states can be computed from its observations.
 """
 
 import sys

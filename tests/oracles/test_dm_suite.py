@@ -22,7 +22,7 @@ from lyceum_warp.tasks.dm import TASKS
 
 DATA = Path(__file__).parent.parent / "data" / "dm_control"
 LAST_SUBSTEP = ("touch", "imu", "force_torque")
-"""Parts of observations that the last substep computes, so that they are not functions of the state."""
+"""Parts of observations that the last substep computes; they are not functions of the state."""
 RESETS = 512
 quick = pytest.mark.quick("dm/cartpole_swingup", "dm/finger_turn_hard", "dm/manipulator_bring_ball", "dm/walker_walk")
 
@@ -231,7 +231,7 @@ def test_planners_of_acrobot_are_rewarded_for_its_energy(shared_env: SharedEnv) 
     np.testing.assert_allclose(rewards, [3.0, 0.0, 1.0], atol=0.1)
 
 
-def test_planners_of_finger_spin_are_rewarded_below_its_velocity(shared_env: SharedEnv) -> None:
+def test_planners_of_finger_spin_are_rewarded_below_the_target_velocity(shared_env: SharedEnv) -> None:
     env = shared_env("dm/finger_spin", nworld=3, autoreset=False, spin_margin=30.0)
     state = env.get_state()
     env.state_space.split(state)["qvel"][:, 2] = torch.tensor([-16.0, 0.0, 15.0])

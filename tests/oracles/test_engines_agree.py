@@ -61,7 +61,7 @@ class Bounds:
 ONE_STEP = {  #                         measured: median and 95 % quantile of qpos, then of qvel
     "adroit_door": Bounds(1.5e-7, 7e-7, 2e-5, 3.5e-4),  # 4.1e-8, 1.9e-7; 6.2e-6, 9.6e-5
     "adroit_hammer": Bounds(6e-7, 8e-7, 3e-4, 4e-4),  # 1.6e-7, 2.2e-7; 8.0e-5, 1.1e-4
-    # in the worst 5 % the pen lies on the boxes of the palm
+    # in the worst 5 % of the states, the pen lies on the boxes of the palm
     "adroit_pen": Bounds(1.5e-7, 4e-6, 5e-6, 2e-3),  # 4.1e-8, 1.2e-6; 1.4e-6, 5.8e-4
     "aloha_lift": Bounds(2e-7, 2e-7, 1.5e-6, 4e-6),  # 5.2e-8, 5.9e-8; 4.3e-7, 9.2e-7
     "adroit_relocate": Bounds(2e-7, 4.5e-7, 8e-5, 2.5e-4),  # 5.1e-8, 1.2e-7; 2.0e-5, 6.2e-5
@@ -184,7 +184,7 @@ def outcome(env: lw.Env) -> Outcome:
 
 
 def relative_error(a: torch.Tensor, b: torch.Tensor) -> float:
-    """Return the largest difference, relative to the larger of 1 and the value."""
+    """Return the largest |a - b| / max(1, |b|)."""
     return ((a - b).abs() / b.abs().clamp(min=1.0)).max().item() if a.numel() else 0.0
 
 

@@ -71,7 +71,8 @@ QPOS: Mapping[str, Callable[[Parts], np.ndarray]] = {
     "acrobot": acrobot, "cartpole": cartpole, "cheetah": without_x, "finger": finger, "hopper": without_x,
     "pendulum": pendulum, "walker": walker,
 }  # fmt: skip
-"""Functions from parts of observations to positions; elsewhere a part has the positions."""
+"""By domain: a function that computes positions from parts of observations. In other domains, the part "position" is
+used."""
 
 
 def set_states(env: lw.Env, domain: str, observation: np.ndarray) -> None:
@@ -88,7 +89,7 @@ def set_states(env: lw.Env, domain: str, observation: np.ndarray) -> None:
         fields["mocap_pos"][:, ::2] = torch.from_numpy(parts["target_position"] + hinge[::2])
     if "to_target" in parts:
         fields["mocap_pos"].zero_()
-        finger = -env.get_obs(state)[:, env.obs_space.parts["to_target"]]  # with the target at the origin
+        finger = -env.get_obs(state)[:, env.obs_space.parts["to_target"]]  # of a target at the origin
         fields["mocap_pos"][:, :2] = finger + torch.from_numpy(parts["to_target"])
     env.set_state(state)
 
@@ -105,7 +106,7 @@ def test_a_step_has_envpools_observations_and_rewards(shared_env: SharedEnv, tas
     columns = np.delete(np.arange(env.obs_space.size), touch)  # the last substep computed the touch
     np.testing.assert_allclose(env.get_obs()[:, columns], before[:, columns], rtol=1e-6, atol=1e-6)
     env.action.copy_(torch.from_numpy(action))
-    if domain == "finger":  # MuJoCo 3.6 computes its contacts, with solimp[0] = 0, otherwise than MuJoCo 3.17 and 4.0
+    if domain == "finger":  # MuJoCo 3.6 computes contacts with solimp[0] = 0 in another way than later releases
         set_states(env, domain, after.astype(float))
         found, rewards = env.get_obs(), env.get_reward(env.get_state(), env.action, env.get_state())
     else:

@@ -47,8 +47,8 @@ WITH_FORCES = [task for task in TASKS if "cfrc_ext" in fields(task)]
 
 
 class SensorStage:
-    """A mixin for Gymnasium environments, which uses the Newton solver and the contact forces of the last substep's
-    sensor stage.
+    """A mixin that makes Gymnasium environments use the Newton solver, and contact forces of the last substep's sensor
+    stage.
 
     Gymnasium computes ``cfrc_ext`` again after the last substep. With the mixin, a sensor makes MuJoCo compute this
     field, as in lyceum_warp.
@@ -132,8 +132,8 @@ class Pair:
         self.held = self.action()
 
     def put(self, change: Callable[[mujoco.MjData], None] = lambda data: None) -> None:
-        """Reset Gymnasium's environment, apply a change, and copy its state, rounded to float32, and a warm start to
-        both."""
+        """Reset Gymnasium's environment, apply a change, and round its state to float32. Put both environments into
+        this state, with the same warm start."""
         data = self.theirs.data
         mujoco.mj_resetData(self.theirs.model, data)
         self.theirs.reset_model()
@@ -176,7 +176,8 @@ class Pair:
         )
 
     def run(self, nstep: int, restart: int = 200) -> list[Step]:
-        """Step both from a shared state; after a termination or ``restart`` steps, restart from a new state."""
+        """Step both environments from the same state. After a termination, or after ``restart`` steps, restart from a
+        new state."""
         steps: list[Step] = []
         since = restart
         for _ in range(nstep):
@@ -518,7 +519,8 @@ def test_every_gymnasium_parameter_exists_with_the_same_default(task: str) -> No
 def test_parameter_has_the_same_effect_as_in_gymnasium(task: str, name: str, variant: Any) -> None:
     """Compare the effect on results and on the size of the observation.
 
-    Worlds reset automatically, because some ranges exclude the initial state, which Gymnasium checks only after a step.
+    Some ranges exclude the initial state, but Gymnasium checks a state only after a step. Worlds therefore reset
+    automatically.
     """
     value = narrowed(task, name, variant) if variant in ("low", "high") else variant
     default, changed = default_numbers(task), numbers(task, **{name: value})

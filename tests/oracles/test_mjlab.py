@@ -73,7 +73,8 @@ def stored(name: str) -> torch.Tensor:
 
 
 def mjlabs_states(env: lw.Env, *, heading: bool) -> torch.Tensor:
-    """Return the stored states with their commands or, with ``heading``, with headings that determine the commands."""
+    """Return the stored states. With ``heading``, they contain headings that determine the commands; otherwise they
+    contain the commands."""
     state = env.get_state()
     parts = env.state_space.split(state)
     parts["qpos"].copy_(stored("qpos"))
@@ -112,7 +113,7 @@ def test_reward_terms_equal_those_of_mjlab(env: lw.Env, term: str) -> None:
     """Each term is compared alone, with mjlab's weight; all other weights are zero."""
     after = mjlabs_states(env, heading=False)
     before = after.clone()
-    if term == "soft_landing":  # mjlab's forces are current, and those of this package are one substep old
+    if term == "soft_landing":  # mjlab's forces are current, and this package's forces are one substep old
         times = env.state_space.split(after)["contact_time"]
         times += 0.005 * (times > 0)
     weight = float(STORED[f"weight/{term}"])

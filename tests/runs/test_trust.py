@@ -193,7 +193,7 @@ def test_link_out_of_the_run_folder_raises_an_error(link: str, made: Path, witne
     assert not witness.exists()
 
 
-def test_own_runs_stay_trusted_after_a_move_and_a_task_edit(made: Path, tmp_path: Path) -> None:
+def test_runs_of_this_user_stay_trusted_after_a_move_and_a_task_edit(made: Path, tmp_path: Path) -> None:
     folder, file = tmp_path / "moved", made / "told.py"
     shutil.copytree(made / "own", folder)
     assert cli.main(["eval", str(folder), "--episodes", "1"]) == 0
@@ -229,6 +229,6 @@ def test_training_continues_with_a_message_if_the_run_cannot_be_added_to_trusted
     assert f"need --trust for the run in {tmp_path / 'run'}" in line
 
 
-def test_trust_without_a_run_prints_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_trust_without_a_run_prints_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["train", "point_mass", "--trust", "--out", str(tmp_path / "run")]) == 2
     refused(capsys, "--trust has no effect without --resume or --from")

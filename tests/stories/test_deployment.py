@@ -90,7 +90,7 @@ def test_control_loop_in_the_documentation_walks_for_the_given_time(page: dict[s
     assert data.time == pytest.approx(0.5)
 
 
-def test_onnx_metadata_name_the_joints_and_observations_of_the_robot(page: dict[str, Any], tmp_path: Path) -> None:
+def test_onnx_metadata_contain_the_names_of_joints_and_observations(page: dict[str, Any], tmp_path: Path) -> None:
     env = lw.make("go1_velocity")
     policy = walking_policy(env)
     meta = page["Policy"](str(lw.export_policy(policy, tmp_path / "policy.onnx", env=env)), env.model).meta

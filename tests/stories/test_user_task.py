@@ -1,4 +1,4 @@
-"""Test on both engines a user's task file that uses every feature of tasks."""
+"""Test a user's task file that uses every feature of tasks, on both engines."""
 
 import importlib.util
 import sys

@@ -57,6 +57,6 @@ def test_tensor_must_have_the_shape_and_type_of_the_buffer() -> None:
         check_tensor(torch.ones(2, 3, device="meta"), "action", buffer)
 
 
-def test_described_names_the_type() -> None:
+def test_description_of_a_value_contains_its_type() -> None:
     assert described(3) == "int 3"
     assert described(torch.zeros(2)) == "a float32 tensor of shape (2,)"

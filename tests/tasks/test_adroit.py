@@ -36,7 +36,8 @@ def test_sum_of_the_metrics_equals_the_reward(shared_env: SharedEnv, task: str) 
 
 
 def test_palm_weight_determines_the_sign_of_the_first_reward_term(shared_env: SharedEnv, task: str) -> None:
-    """The settings for planners reward a near palm, and the task itself, like the original, rewards a distant palm."""
+    """With the settings for planners, the reward rises as the palm approaches. In the task itself, it rises with the
+    palm's distance, as in the original."""
     env, turned = (shared_env(task, nworld=4, nthread=1, palm_weight=weight) for weight in (0.1, -0.1))
     assert lw.MPPI(task, horizon=2, samples=2, nthread=1).env.task.params["palm_weight"] == -1.0
     for each in (env, turned):
@@ -50,7 +51,7 @@ def test_palm_weight_determines_the_sign_of_the_first_reward_term(shared_env: Sh
 
 
 def test_task_succeeds_if_a_distance_is_below_its_threshold(task: str) -> None:
-    """The thresholds are above the distances of some worlds and below those of others."""
+    """Each threshold is above the distance in some worlds, and below the distance in others."""
     env = lw.make(task, engine="mujoco", nworld=4, nthread=1)
     steps(env)
     assert not env.success.any()

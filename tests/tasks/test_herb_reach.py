@@ -12,7 +12,8 @@ import lyceum_warp as lw
 NWORLD = 64
 SIDES = ("left", "right")
 
-# masses in kg; the arm's are from Barrett D1005 AC-02, and those of the BH280 hand from Barrett's mass properties
+# masses in kg; Barrett D1005 AC-02 gives the arm's masses, and Barrett's mass properties give the masses of the BH280
+# hand
 MASSES = {
     "wam_base": 9.97059584,
     "wam1": 10.76768767,

@@ -81,7 +81,7 @@ def test_new_row_starts_on_a_new_line_after_an_incomplete_line(tmp_path: Path, m
     lw.tune("point_mass", out=out, **QUICK)
     assert len(out.read_text().splitlines()) > 1
     monkeypatch.undo()
-    lw.tune("point_mass", out=out, **QUICK)  # every line is read to get a row
+    lw.tune("point_mass", out=out, **QUICK)  # every line of the file must be a valid result
 
 
 @pytest.fixture(scope="module")

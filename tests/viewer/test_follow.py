@@ -21,7 +21,7 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.viewer.follow import Follower, wait_for_run
 
 
-def test_follower_loads_the_newest_policy(tmp_path: Path) -> None:
+def test_viewer_of_a_run_loads_the_newest_policy(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     npg = lw.NPG(lw.make("point_mass", nworld=2), config=lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,)))
     followers: list[Follower] = []
@@ -42,7 +42,7 @@ def test_follower_loads_the_newest_policy(tmp_path: Path) -> None:
         assert torch.equal(followers[0](obs), npg.policy(obs))
 
 
-def test_follower_reports_an_unreadable_policy_as_a_message(tmp_path: Path) -> None:
+def test_viewer_of_a_run_reports_an_unreadable_policy_as_a_message(tmp_path: Path) -> None:
     assert train(tmp_path / "run", "--iterations", "1") == 0
     follower = Follower(Run.open(tmp_path / "run"))
     (tmp_path / "run" / "policy.pt").write_bytes(b"half a file")

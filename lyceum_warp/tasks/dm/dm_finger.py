@@ -64,7 +64,7 @@ def reject(s: World, p: Params) -> bool:
 class FingerSpin(lw.Task):
     model, frame_skip = suite.model("finger"), 2
     obs = {"position": 4, "velocity": 3, "touch": 2}
-    # the planner's reward rises with the speed; each torque lasts two steps
+    # planners get a reward that rises with the speed, and hold each torque for two steps
     planning = lw.Planning(
         settings={"horizon": 16, "samples": 32, "knots": 8, "spline": "zero", "noise": 1.0},
         params={"spin_margin": 30.0},

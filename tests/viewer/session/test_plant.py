@@ -147,7 +147,7 @@ def test_failing_controller_is_reported_and_stopped(
 
 
 @pytest.mark.parametrize("speed", [4.0, 16.0])
-def test_frames_of_a_plant_without_waiting_times_are_shown(shared_env: SharedEnv, speed: float) -> None:
+def test_frames_are_shown_even_if_the_plant_never_waits(shared_env: SharedEnv, speed: float) -> None:
     env = shared_env("point_mass", autoreset=False, horizon=0)
     session = Session(env, controllers={"none": lambda state, obs: torch.zeros(2)}, seed=0)
     session.obey(protocol.SetSpeed(speed))

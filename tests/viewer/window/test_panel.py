@@ -110,7 +110,7 @@ def test_every_key_is_accepted_in_every_mode(bench: Bench, mode: str) -> None:
 # cameras and videos
 
 
-def test_default_camera_tracks_the_body_of_a_tracking_camera_also_in_videos(bench: Bench) -> None:
+def test_default_camera_of_window_and_videos_tracks_the_body_of_a_tracking_camera(bench: Bench) -> None:
     ball = bench.model.body("ball").id
     (command,) = pressed(bench, "Ctrl+V")
     assert isinstance(command, SetVideo) and command.camera is not None

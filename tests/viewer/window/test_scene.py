@@ -28,7 +28,7 @@ def test_ghost_has_the_moving_geoms_of_the_model_in_its_colour() -> None:
     assert geoms[0].transparent
 
 
-def test_hidden_groups_have_no_ghosts() -> None:
+def test_geom_groups_that_are_hidden_have_no_ghosts() -> None:
     groups = np.zeros(6, np.uint8)
     assert ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(2.0)], groups=groups) == []
 
@@ -44,7 +44,7 @@ def test_traces_are_thinned_before_some_are_omitted(limit: int, number: int, bes
     traces = np.random.default_rng(0).normal(size=(number, 33, 3))
     scene = ExtraGeoms(MODEL, limit)
     geoms = scene.draw(pose(0), traces=traces, best=best)
-    assert len(geoms) <= min(limit, 160)  # most geoms remain for the ghosts
+    assert len(geoms) <= min(limit, 160)  # traces take few of the geoms, so that ghosts can take the others
     assert (len(geoms) >= 4 * number) == (limit >= 100 and number == 10)  # a trace has at least 4 lines
     assert len(scene.draw(pose(0), [ghost(i) for i in range(20)], traces, best)) <= limit
 
