@@ -143,7 +143,8 @@ def load(name: str) -> Experiment:
 
 
 def choose(given: Sequence[str], known: Iterable[str], default: Sequence[str] = (), *, what: str) -> tuple[str, ...]:
-    """Return the given names; if none are given, the default names, or all known names.
+    """Return the given names. If there are none, return the default names; if there are none either, return all known
+    names.
 
     Raises:
         ValueError: A name is unknown.

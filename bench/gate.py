@@ -5,7 +5,7 @@
 
 The mean policy plays on the C engine under the task's exact physics. A Unitree G1 must pass nanoG1's gate
 (kingjulio8238/nanoG1, eval.py). The gate has six commands of 20 s, from four noisy starts each, and 2,000 steps at 0.5
-m/s in which it measures the gait. The gate plays without noise, pushes and differences between robots. In nanoG1,
+m/s in which it measures the gait. The gate has no noise, no pushes and no differences between robots. In nanoG1,
 actions are clipped to 1 and multiplied by 0.25 rad. Here the change of a servo's target, divided by 0.25 rad, counts as
 the change of the action. Other robots play 100 episodes of 20 s, with noise and with differences between robots as in
 training. These robots get ten commands from ten starts each, once without and once with pushes. After a fall, a world
@@ -71,7 +71,7 @@ BESIDE = {
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Judge whether a robot walks: fixed commands, with limits."""
+    """Judge whether a robot walks under fixed commands, by limits."""
 
     policy: tuple[Path, ...] = ()
     """Folders of runs on a velocity task, for example g1_velocity."""

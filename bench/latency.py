@@ -51,8 +51,8 @@ class Options(experiment.Options):
     own: bool = False
     """Whether to use the samples and the horizon that each task suggests."""
     physics: tuple[str, ...] = ()
-    """Names of the planner's physics: exact, or a name that the task defines. The default is the physics that the task
-    suggests; if the suggestion has a name, exact physics also runs."""
+    """Names of the planner's physics: exact, or a name that the task defines. By default, the physics that the task
+    suggests; if the suggestion has a name, also exact."""
     seconds: float = 10.0
     """Seconds of a case; the 99.9 % quantile needs a thousand plans."""
 

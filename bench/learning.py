@@ -50,7 +50,7 @@ class Options(experiment.Options):
     """Time until NPG or PPO reaches a target return."""
 
     algorithm: Literal["npg", "ppo"] | None = None
-    """Algorithm; by default each task has its own."""
+    """Algorithm; by default, each task has its own algorithm."""
     settings: tuple[str, ...] = ("default",)
     """Names of the settings to run: default, or "desired_kl 0.01" (PPO only)."""
     seconds: float = 300.0

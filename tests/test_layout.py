@@ -239,8 +239,8 @@ def in_new_process(program: str) -> str:
 
 
 def test_no_submodule_has_a_public_name() -> None:
-    """An import of such a submodule would set an attribute of the package, which would hide the function with the same
-    name."""
+    """An import of such a submodule would set an attribute of the package. This attribute would hide the function with
+    the same name."""
     assert not {room(name) for name in MODULES} & set(lw.__all__)
 
 

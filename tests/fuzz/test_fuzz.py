@@ -38,7 +38,7 @@ MINIMAL: dict[str, Mapping[str, Any]] = {
 
 
 def each(names: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """Return every program with each of its names."""
+    """Return all pairs of a program and one of its names."""
     return [(program, name) for program in names for name in names[program]]
 
 

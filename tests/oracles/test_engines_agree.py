@@ -47,8 +47,8 @@ limits, because the engines agree up to rounding only if the solver converges.""
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """Bounds on the difference between the engines after one substep: quantiles over worlds of the maximum over
-    coordinates."""
+    """Bounds on the difference between the engines after one substep: the maximum over coordinates, as quantiles over
+    worlds."""
 
     qpos_median: float
     qpos_p95: float
@@ -138,7 +138,10 @@ class Engines:
 def random_action(env: lw.Env, rng: np.random.Generator, reach: float) -> torch.Tensor:
     low, high = env.action_space.low, env.action_space.high
     assert low is not None and high is not None
-    low, high = np.nan_to_num(low, neginf=-1.0), np.nan_to_num(high, posinf=1.0)  # unbounded actions are limited
+    low, high = (
+        np.nan_to_num(low, neginf=-1.0),
+        np.nan_to_num(high, posinf=1.0),
+    )  # unbounded actions get the bounds -1 and 1
     values = (low + high) / 2 + reach * (high - low) / 2 * rng.uniform(-1.0, 1.0, env.action.shape)
     return torch.from_numpy(values.astype(np.float32))
 

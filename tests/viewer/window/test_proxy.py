@@ -147,7 +147,8 @@ def test_token_is_exchanged_for_a_cookie_and_removed_from_the_address(proxy: Pro
 
 
 class Jar(http.cookiejar.CookieJar):
-    """A cookie jar that behaves like a browser: it sends a host's cookies to all its ports, below the cookies' path."""
+    """A cookie jar that behaves like a browser: it sends cookies to every port of their host, for addresses below their
+    path."""
 
     def sent_to(self, address: str) -> str | None:
         asked = urllib.request.Request(address)
@@ -354,8 +355,8 @@ def test_connection_of_a_client_that_does_not_read_is_closed(monkeypatch: pytest
 
 @pytest.fixture
 def echo() -> Iterator[tuple[Proxy, list[ServerConnection], list[float]]]:
-    """Run a proxy in front of a WebSocket server of Studio's library; yield the proxy, open connections and times of
-    silence."""
+    """Run a proxy in front of a WebSocket server of Studio's library; yield the proxy, the open connections, and the
+    times at which silence was reported."""
     opened: list[ServerConnection] = []
     quiet: list[float] = []
 
