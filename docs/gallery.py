@@ -52,11 +52,22 @@ class Show:
 
 
 SHOWS = {
-    "adroit_door": Show(seconds=2.0, replan_every=2),
-    "adroit_hammer": Show(seconds=2.0, replan_every=2),
+    "adroit_door": Show(
+        seconds=1.2, replan_every=2,
+        camera=FreeCamera(lookat=(0.1, 0.0, 0.2), distance=1.6, azimuth=120.0, elevation=-25.0),
+    ),
+    "adroit_hammer": Show(
+        seconds=1.2, replan_every=2,
+        camera=FreeCamera(lookat=(0.0, 0.0, 0.15), distance=1.1, azimuth=60.0, elevation=-25.0),
+    ),
     "adroit_pen": Show(seconds=1.5, replan_every=2),
-    "adroit_relocate": Show(seconds=2.0, replan_every=2),
-    "aloha_lift": Show(replan_every=2),
+    "adroit_relocate": Show(
+        seconds=2.0, replan_every=2,
+        camera=FreeCamera(lookat=(0.0, 0.0, 0.2), distance=1.2, azimuth=90.0, elevation=-30.0),
+    ),
+    "aloha_lift": Show(
+        start=1.6, seconds=2.4, replan_every=2, camera=FreeCamera(lookat=(0.0, 0.0, 0.15), distance=1.3)
+    ),
     "ant": Show({"noise": 0.6}, start=1.0, seconds=3.0),
     "arm_hand_pickup": Show(replan_every=2),
     "dm/acrobot_swingup": Show({"horizon": 150, "noise": 1.0}, start=2.0, replan_every=2),
