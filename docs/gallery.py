@@ -21,6 +21,7 @@ from PIL import Image
 
 import lyceum_warp as lw
 from lyceum_warp.binding.registry import file_name
+from lyceum_warp.runs.configuration import ALGORITHMS
 from lyceum_warp.viz.cameras import CameraChoice, FreeCamera, camera_values, find_camera
 from lyceum_warp.viz.render import Painter
 from lyceum_warp.viz.video import shots
@@ -74,7 +75,7 @@ SHOWS = {
     "dm/ball_in_cup_catch": Show(seconds=2.5),
     "dm/cartpole_balance": Show(seconds=2.5),
     "dm/cheetah_run": Show({"horizon": 40}, start=1.0, seconds=2.5, replan_every=2),
-    "dm/fish_upright": Show(seconds=3.0),
+    "dm/fish_upright": Show(seconds=3.0, camera=FreeCamera(track=1, distance=0.6, elevation=-30.0)),
     "dm/hopper_hop": Show({"horizon": 50}, start=1.0, seconds=3.0, replan_every=2),
     "dm/hopper_stand": Show({"horizon": 50}, seconds=3.0, replan_every=2),
     "dm/humanoid_stand": Show(seconds=3.0, replan_every=2),
@@ -117,8 +118,7 @@ def draw(name: str, run: Path | None) -> dict[str, str]:
     if run is None:
         states, result = planned(env, show, steps)
         flags = show.settings | ({"replan-every": show.replan_every} if show.replan_every > 1 else {})
-        words = " ".join(f"--{flag} {value}" for flag, value in flags.items())
-        command = f"lyceum-warp plan {name} {words}".rstrip()
+        command = f"lyceum-warp plan {name}{written(flags)}"
     else:
         policy = lw.load(run)
         states = acted(env, policy, show, steps)
@@ -128,12 +128,32 @@ def draw(name: str, run: Path | None) -> dict[str, str]:
         else:
             mean = lw.evaluate(lw.make(name, nworld=16), policy, 16, seed=0).returns.mean().item()
         result = f"{config['algorithm'].upper()}: return {number(mean)}"
-        command = f"lyceum-warp train {name} --algorithm {config['algorithm']}"
-        command += " --device cuda" if config["device"].startswith("cuda") else ""
-        if run.parent == PRETRAINED:
-            command = f"lyceum-warp view {name} --pretrained"
+        command = f"lyceum-warp view {name} --pretrained" if run.parent == PRETRAINED else training(name, run, config)
     save(pictures(env, states[round(show.start / env.timestep) :], show), FOLDER / f"{file_name(name)}.webp")
     return {"command": command, "result": result}
+
+
+def training(name: str, run: Path, config: dict[str, Any]) -> str:
+    """The command that repeats a run: all that changed its policy and is no default."""
+    algorithm = config["algorithm"]
+    rows = (run / "metrics.csv").read_text().splitlines()
+    flags = {"algorithm": algorithm} | ({"device": "cuda"} if config["device"].startswith("cuda") else {})
+    flags |= {"iterations": rows[-1].partition(",")[0]} | ({"seed": config["seed"]} if config["seed"] else {})
+    defaults = json.loads(json.dumps(vars(ALGORITHMS[algorithm][1]())))
+    flags |= {
+        flag: value for flag, value in config[algorithm].items()
+        if flag != "mean_every" and defaults[flag] not in (None, value)
+    }  # fmt: skip
+    return f"lyceum-warp train {name}{written(flags)}"
+
+
+def written(flags: dict[str, Any]) -> str:
+    """Flags as words of a command, each after a space."""
+    words = ""
+    for name, value in flags.items():
+        flag = name.replace("_", "-")
+        words += f" --{'no-' * (value is False)}{flag}" if isinstance(value, bool) else f" --{flag} {value}"
+    return words
 
 
 def planned(env: lw.Env, show: Show, steps: int) -> tuple[torch.Tensor, str]:
