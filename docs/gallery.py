@@ -88,10 +88,17 @@ SHOWS = {
     "dm/walker_walk": Show(start=1.0, seconds=3.0),
     "half_cheetah": Show(start=0.5, seconds=3.0),
     "hopper": Show(start=1.0, seconds=2.5, replan_every=4),
-    "humanoid": Show({"noise": 0.2}, seconds=2.0, replan_every=2),
+    "humanoid": Show(
+        {"horizon": 48, "knots": 6, "noise": 0.25, "temperature": 1.0}, start=1.0, seconds=3.0,
+        camera=FreeCamera(lookat=(3.2, 0.0, 0.9), distance=4.8, azimuth=90.0, elevation=-8.0),
+    ),
     "humanoid_get_up": Show(seconds=3.0),
     "humanoid_stand": Show(seconds=3.0),
-    "humanoid_standup": Show({"noise": 0.3}, seconds=2.0, replan_every=2),
+    "humanoid_standup": Show(
+        {"horizon": 40, "knots": 5, "noise": 0.3, "temperature": 20.0, "integrator": "implicitfast", "timestep": 0.015,
+         "frame_skip": 1}, seconds=3.0, replan_every=2,
+        camera=FreeCamera(lookat=(1.0, 0.0, 0.7), distance=4.2, azimuth=90.0, elevation=-10.0),
+    ),
     "humanoid_walk": Show(seconds=3.0),
     "inverted_pendulum": Show({"noise": 1.0}, seconds=2.5),
     "inverted_double_pendulum": Show(
