@@ -42,6 +42,8 @@ class Show:
 
     settings: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Settings of MPPI and options of its worlds that differ from the task's."""
+    params: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Parameters of the task for MPPI only."""
     replan_every: int = 1
     """Number of steps from one MPPI plan to the next."""
     seconds: float = 4.0
@@ -51,6 +53,8 @@ class Show:
     seed: int = 0
     camera: CameraChoice = None
 
+
+QUADRUPED = FreeCamera(track=1, distance=5.0, azimuth=135.0, elevation=-20.0)
 
 SHOWS = {
     "adroit_door": Show(
@@ -81,6 +85,10 @@ SHOWS = {
     "dm/humanoid_stand": Show(seconds=3.0, replan_every=2),
     "dm/pendulum_swingup": Show({"horizon": 60}),
     "dm/point_mass_easy": Show(seconds=3.0),
+    "dm/quadruped_run": Show(
+        {"horizon": 40, "knots": 6, "noise": 0.5, "temperature": 0.1}, replan_every=2, camera=QUADRUPED
+    ),
+    "dm/quadruped_walk": Show(camera=QUADRUPED),
     "dm/reacher_easy": Show(seconds=2.0, camera=FreeCamera(lookat=(0.0, 0.0, 0.0), distance=0.8, elevation=-90.0)),
     "dm/reacher_hard": Show(seconds=2.0, camera=FreeCamera(lookat=(0.0, 0.0, 0.0), distance=0.8, elevation=-90.0)),
     "dm/walker_run": Show(start=2.0, seconds=3.0),
@@ -106,7 +114,10 @@ SHOWS = {
     ),
     "panda_lift": Show(replan_every=2),
     "point_mass": Show(seconds=3.0),
-    "soft_ball": Show({"samples": 32}, seconds=3.0, replan_every=4),
+    "soft_ball": Show(
+        {"samples": 128, "horizon": 40, "knots": 5, "noise": 0.6, "temperature": 0.3}, start=0.6, seconds=2.4,
+        replan_every=2,
+    ),
     "swimmer": Show({"horizon": 48}, start=1.0, seconds=3.0),
     "walker2d": Show(start=1.0, seconds=2.5),
     **{f"{robot}_velocity": Show(start=1.0, seconds=3.2, camera=FreeCamera(track=1, distance=distance, azimuth=135.0,
@@ -126,6 +137,7 @@ def draw(name: str, run: Path | None) -> dict[str, str]:
         states, result = planned(env, show, steps)
         flags = show.settings | ({"replan-every": show.replan_every} if show.replan_every > 1 else {})
         command = f"lyceum-warp plan {name}{written(flags)}"
+        command += "".join(f" --planner-param {param}={value}" for param, value in show.params.items())
     else:
         policy = lw.load(run)
         states = acted(env, policy, show, steps)
@@ -165,7 +177,7 @@ def written(flags: dict[str, Any]) -> str:
 
 def planned(env: lw.Env, show: Show, steps: int) -> tuple[torch.Tensor, str]:
     """Control an episode by MPPI, and return its states and its result."""
-    plan = lw.MPPI(env.task.name, seed=show.seed, **show.settings)
+    plan = lw.MPPI(env.task.name, seed=show.seed, params=show.params, **show.settings)
     trajectory = lw.control(env, plan, steps=steps, seed=show.seed, replan_every=show.replan_every)
     seconds = trajectory.steps * env.timestep
     if trajectory.succeeded:
