@@ -83,7 +83,9 @@ SHOWS = {
     "dm/hopper_hop": Show({"horizon": 50}, start=1.0, seconds=3.0, replan_every=2),
     "dm/hopper_stand": Show({"horizon": 50}, seconds=3.0, replan_every=2),
     "dm/humanoid_stand": Show(seconds=3.0, replan_every=2),
-    "dm/pendulum_swingup": Show({"horizon": 60}),
+    "dm/pendulum_swingup": Show(
+        {"horizon": 150, "knots": 12, "noise": 1.0, "temperature": 1.0}, {"largest_angle": 130}, start=5.0, seconds=6.0
+    ),
     "dm/point_mass_easy": Show(seconds=3.0),
     "dm/quadruped_run": Show(
         {"horizon": 40, "knots": 6, "noise": 0.5, "temperature": 0.1}, replan_every=2, camera=QUADRUPED
@@ -91,6 +93,11 @@ SHOWS = {
     "dm/quadruped_walk": Show(camera=QUADRUPED),
     "dm/reacher_easy": Show(seconds=2.0, camera=FreeCamera(lookat=(0.0, 0.0, 0.0), distance=0.8, elevation=-90.0)),
     "dm/reacher_hard": Show(seconds=2.0, camera=FreeCamera(lookat=(0.0, 0.0, 0.0), distance=0.8, elevation=-90.0)),
+    "dm/swimmer_swimmer15": Show(
+        {"horizon": 50, "knots": 8, "noise": 0.7, "temperature": 0.02, "timestep": 0.01, "frame_skip": 3},
+        {"target_size": 1.0}, start=3.0, seconds=5.0, replan_every=2,
+        camera=FreeCamera(lookat=(0.5, -0.7, 0.0), distance=2.6, azimuth=90.0, elevation=-89.0),
+    ),
     "dm/walker_run": Show(start=2.0, seconds=3.0),
     "dm/walker_stand": Show(seconds=3.0),
     "dm/walker_walk": Show(start=1.0, seconds=3.0),
