@@ -73,7 +73,10 @@ SHOWS = {
     "aloha_lift": Show(
         start=1.6, seconds=2.4, replan_every=2, camera=FreeCamera(lookat=(0.0, 0.0, 0.15), distance=1.3)
     ),
-    "ant": Show({"noise": 0.6}, start=1.0, seconds=3.0),
+    "ant": Show(
+        {"horizon": 40, "knots": 6, "noise": 0.4, "temperature": 1.0}, start=1.5, seconds=2.5,
+        camera=FreeCamera(track=1, distance=3.5, azimuth=90.0, elevation=-8.0),
+    ),
     "arm_hand_pickup": Show(replan_every=2),
     "dm/acrobot_swingup": Show({"horizon": 150, "noise": 1.0}, start=2.0, replan_every=2),
     "dm/ball_in_cup_catch": Show(seconds=2.5),
@@ -81,7 +84,7 @@ SHOWS = {
     "dm/cheetah_run": Show({"horizon": 40}, start=1.0, seconds=2.5, replan_every=2),
     "dm/fish_upright": Show(seconds=3.0, camera=FreeCamera(track=1, distance=0.6, elevation=-30.0)),
     "dm/hopper_hop": Show({"horizon": 50}, start=1.0, seconds=3.0, replan_every=2),
-    "dm/hopper_stand": Show({"horizon": 50}, seconds=3.0, replan_every=2),
+    "dm/hopper_stand": Show({"horizon": 50, "knots": 6, "noise": 0.7, "temperature": 0.05}),
     "dm/humanoid_stand": Show(seconds=3.0, replan_every=2),
     "dm/pendulum_swingup": Show(
         {"horizon": 150, "knots": 12, "noise": 1.0, "temperature": 1.0}, {"largest_angle": 130}, start=5.0, seconds=6.0
