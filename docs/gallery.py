@@ -81,9 +81,12 @@ SHOWS = {
     "dm/acrobot_swingup": Show({"horizon": 150, "noise": 1.0}, start=2.0, replan_every=2),
     "dm/ball_in_cup_catch": Show(seconds=2.5),
     "dm/cartpole_balance": Show(seconds=2.5),
+    "dm/cartpole_swingup_sparse": Show(
+        {"horizon": 100, "knots": 12, "noise": 0.5, "temperature": 0.5}, {"sparse": False}, start=1.0, seconds=4.0
+    ),
     "dm/cheetah_run": Show({"horizon": 40}, start=1.0, seconds=2.5, replan_every=2),
     "dm/fish_upright": Show(seconds=3.0, camera=FreeCamera(track=1, distance=0.6, elevation=-30.0)),
-    "dm/hopper_hop": Show({"horizon": 50}, start=1.0, seconds=3.0, replan_every=2),
+    "dm/hopper_hop": Show({"horizon": 60, "knots": 8, "noise": 0.7, "temperature": 0.1}, seconds=2.4),
     "dm/hopper_stand": Show({"horizon": 50, "knots": 6, "noise": 0.7, "temperature": 0.05}),
     "dm/humanoid_stand": Show(seconds=3.0, replan_every=2),
     "dm/pendulum_swingup": Show(
@@ -146,6 +149,7 @@ def draw(name: str, run: Path | None) -> dict[str, str]:
     if run is None:
         states, result = planned(env, show, steps)
         flags = show.settings | ({"replan-every": show.replan_every} if show.replan_every > 1 else {})
+        flags |= {"seed": show.seed} if show.seed else {}
         command = f"lyceum-warp plan {name}{written(flags)}"
         command += "".join(f" --planner-param {param}={value}" for param, value in show.params.items())
     else:
