@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 
 import lyceum_warp as lw
-from lyceum_warp.binding.registry import file_name
+from lyceum_warp.binding.registry import file_name, find_task
 from lyceum_warp.runs.configuration import ALGORITHMS
 from lyceum_warp.viz.cameras import CameraChoice, FreeCamera, camera_values, find_camera
 from lyceum_warp.viz.render import Painter
@@ -167,12 +167,14 @@ def draw(name: str, run: Path | None) -> dict[str, str]:
 
 
 def training(name: str, run: Path, config: dict[str, Any]) -> str:
-    """The command that repeats a run: all that changed its policy and is no default."""
+    """Write the command that repeats a run, with every flag that changes the policy."""
     algorithm = config["algorithm"]
     rows = (run / "metrics.csv").read_text().splitlines()
     flags = {"algorithm": algorithm} | ({"device": "cuda"} if config["device"].startswith("cuda") else {})
     flags |= {"iterations": rows[-1].partition(",")[0]} | ({"seed": config["seed"]} if config["seed"] else {})
-    defaults = json.loads(json.dumps(vars(ALGORITHMS[algorithm][1]())))
+    suggested = find_task(name).training
+    settings = suggested.settings if suggested.algorithm == algorithm else {}
+    defaults = json.loads(json.dumps(vars(ALGORITHMS[algorithm][1](**settings))))
     flags |= {
         flag: value for flag, value in config[algorithm].items()
         if flag != "mean_every" and defaults[flag] not in (None, value)
@@ -181,7 +183,7 @@ def training(name: str, run: Path, config: dict[str, Any]) -> str:
 
 
 def written(flags: dict[str, Any]) -> str:
-    """Flags as words of a command, each after a space."""
+    """Write flags as words of a command, each after a space."""
     words = ""
     for name, value in flags.items():
         flag = name.replace("_", "-")
