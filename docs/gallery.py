@@ -78,7 +78,8 @@ SHOWS = {
         camera=FreeCamera(track=1, distance=3.5, azimuth=90.0, elevation=-8.0),
     ),
     "arm_hand_pickup": Show(replan_every=2),
-    "dm/acrobot_swingup": Show({"horizon": 150, "noise": 1.0}, start=2.0, replan_every=2),
+    "dm/acrobot_swingup": Show(start=6.0, seconds=3.0, replan_every=2),
+    "dm/acrobot_swingup_sparse": Show(start=6.0, seconds=3.0, replan_every=2),
     "dm/ball_in_cup_catch": Show(seconds=2.5),
     "dm/cartpole_balance": Show(seconds=2.5),
     "dm/cartpole_swingup_sparse": Show(
@@ -88,7 +89,7 @@ SHOWS = {
     "dm/fish_upright": Show(seconds=3.0, camera=FreeCamera(track=1, distance=0.6, elevation=-30.0)),
     "dm/hopper_hop": Show({"horizon": 60, "knots": 8, "noise": 0.7, "temperature": 0.1}, seconds=2.4),
     "dm/hopper_stand": Show({"horizon": 50, "knots": 6, "noise": 0.7, "temperature": 0.05}),
-    "dm/humanoid_stand": Show(seconds=3.0, replan_every=2),
+    "dm/humanoid_stand": Show({"update": "cem", "horizon": 40, "knots": 5, "noise": 0.4}, seconds=3.6),
     "dm/pendulum_swingup": Show(
         {"horizon": 150, "knots": 12, "noise": 1.0, "temperature": 1.0}, {"largest_angle": 130}, start=5.0, seconds=6.0
     ),
