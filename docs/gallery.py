@@ -90,6 +90,7 @@ SHOWS = {
     "dm/hopper_hop": Show({"horizon": 60, "knots": 8, "noise": 0.7, "temperature": 0.1}, seconds=2.4),
     "dm/hopper_stand": Show({"horizon": 50, "knots": 6, "noise": 0.7, "temperature": 0.05}),
     "dm/humanoid_stand": Show({"update": "cem", "horizon": 40, "knots": 5, "noise": 0.4}, seconds=3.6),
+    "dm/humanoid_walk": Show({"update": "cem", "horizon": 40, "knots": 5, "noise": 0.4}),
     "dm/pendulum_swingup": Show(
         {"horizon": 150, "knots": 12, "noise": 1.0, "temperature": 1.0}, {"largest_angle": 130}, start=5.0, seconds=6.0
     ),
@@ -139,6 +140,9 @@ SHOWS = {
        for robot, distance in (("go1", 1.7), ("go1_rough", 2.2), ("spot", 2.6), ("g1", 2.8), ("g1_full", 2.8),
                                ("g1_rough", 3.2), ("h1", 3.6), ("t1", 2.8))},
 }  # fmt: skip
+for _name, _noise in (("g1_full_velocity", 0.15), ("g1_rough_velocity", 0.2)):  # no policy yet: shown until they fall
+    _coarse = {"horizon": 40, "knots": 6, "noise": _noise, "temperature": 0.02, "timestep": 0.01, "frame_skip": 2}
+    SHOWS[_name] = dataclasses.replace(SHOWS[_name], settings=_coarse, start=0.0)
 """Settings of tasks that differ from the defaults of Show."""
 
 
@@ -193,13 +197,13 @@ def written(flags: dict[str, Any]) -> str:
 
 
 def planned(env: lw.Env, show: Show, steps: int) -> tuple[torch.Tensor, str]:
-    """Control an episode by MPPI, and return its states and its result."""
+    """Control an episode by a planner, and return its states and its result."""
     plan = lw.MPPI(env.task.name, seed=show.seed, params=show.params, **show.settings)
     trajectory = lw.control(env, plan, steps=steps, seed=show.seed, replan_every=show.replan_every)
-    seconds = trajectory.steps * env.timestep
+    seconds, planner = trajectory.steps * env.timestep, plan.settings["update"].upper()
     if trajectory.succeeded:
-        return trajectory.states, f"MPPI: success within {seconds:.2g} s"
-    return trajectory.states, f"MPPI: return {number(trajectory.rewards.sum().item())} in {seconds:.2g} s"
+        return trajectory.states, f"{planner}: success within {seconds:.2g} s"
+    return trajectory.states, f"{planner}: return {number(trajectory.rewards.sum().item())} in {seconds:.2g} s"
 
 
 @torch.no_grad()
