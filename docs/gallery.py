@@ -103,7 +103,7 @@ SHOWS = {
     "dm/quadruped_run": Show(
         {"horizon": 40, "knots": 6, "noise": 0.5, "temperature": 0.1}, replan_every=2, camera=QUADRUPED
     ),
-    "dm/quadruped_walk": Show(seed=1, camera=QUADRUPED),
+    "dm/quadruped_walk": Show(seed=8, camera=QUADRUPED),
     "dm/reacher_easy": Show(seconds=2.0, camera=FreeCamera(lookat=(0.0, 0.0, 0.0), distance=0.8, elevation=-90.0)),
     "dm/reacher_hard": Show(seconds=2.0, camera=FreeCamera(lookat=(0.0, 0.0, 0.0), distance=0.8, elevation=-90.0)),
     "dm/swimmer_swimmer15": Show(
