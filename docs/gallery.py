@@ -41,9 +41,9 @@ class Show:
     """Settings for the picture of a task."""
 
     settings: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Settings of MPPI and options of its worlds that differ from the task's."""
+    """Settings of the planner and options of its worlds that differ from the task's."""
     params: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Parameters of the task for MPPI only."""
+    """Parameters of the task for the planner only."""
     replan_every: int = 1
     """Number of steps from one MPPI plan to the next."""
     seconds: float = 4.0
@@ -275,7 +275,8 @@ def page(results: dict[str, dict[str, str]]) -> str:
     """Return the gallery's page."""
     lines = ["# Gallery", "", "Each picture shows a task under a policy or a planner, with the result and a command "
              "that shows or trains it. The", "return of a policy is the mean over whole episodes. The return of a "
-             "planner covers the seconds in the picture. Each name", "links to the task's details.", ""]  # fmt: skip
+             "planner counts from the start of the episode to", "the end of the picture. Each name links to the task's "
+             "details.", ""]  # fmt: skip
     for stem, (title, names) in families().items():
         cells = []
         for name in names:
