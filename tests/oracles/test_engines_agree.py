@@ -138,10 +138,8 @@ class Engines:
 def random_action(env: lw.Env, rng: np.random.Generator, reach: float) -> torch.Tensor:
     low, high = env.action_space.low, env.action_space.high
     assert low is not None and high is not None
-    low, high = (
-        np.nan_to_num(low, neginf=-1.0),
-        np.nan_to_num(high, posinf=1.0),
-    )  # unbounded actions get the bounds -1 and 1
+    # unbounded actions get the bounds -1 and 1
+    low, high = np.nan_to_num(low, neginf=-1.0), np.nan_to_num(high, posinf=1.0)
     values = (low + high) / 2 + reach * (high - low) / 2 * rng.uniform(-1.0, 1.0, env.action.shape)
     return torch.from_numpy(values.astype(np.float32))
 
