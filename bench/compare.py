@@ -66,15 +66,15 @@ class Options:
     new: tyro.conf.Positional[str] = str(ROOT)
     """The revision or folder to compare with; by default this working tree."""
     tasks: tuple[str, ...] = ()
-    """Tasks to compare; by default all. By default, learners and commands are compared on only a few tasks."""
+    """Tasks to compare; by default all. By default, the parts "learners" and "commands" run on only a few tasks."""
     engines: tuple[Literal["mujoco", "warp"], ...] = ENGINES
     """Engines."""
     device: str = "cpu"
     """Device of the Warp engine, for example cuda. On a GPU, the engine is deterministic."""
     parts: tuple[Part, ...] = PARTS
-    """Parts to compare; by default all. The part env compares models, resets, steps, getters, a fault and a rollout.
-    The part plans compares plans of all planners, and episodes under lw.control. The part learners compares NPG and
-    PPO, with their final networks. The part commands compares the metrics.csv and the policies of lyceum-warp train,
+    """Parts to compare; by default all. The part "env" compares models, resets, steps, getters, a fault and a rollout.
+    The part "plans" compares plans of all planners, and episodes under lw.control. The part "learners" compares NPG and
+    PPO, with their final networks. The part "commands" compares the metrics.csv and the policies of lyceum-warp train,
     with and without an interruption."""
     steps: int = 20
     """Number of steps of an environment."""

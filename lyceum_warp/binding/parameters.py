@@ -1,4 +1,4 @@
-"""Check the values of a task's parameters, the fields of its ``Params``, and make the array for its kernels."""
+"""Check the values of a task's parameters (the fields of ``Params``), and make the array for its kernels."""
 
 import copy
 from collections.abc import Mapping

@@ -251,7 +251,7 @@ class _Body:
                 source, text = self._terms.source_of(function, argument, self._given, (name,))
                 text = self.value(text) if source == "function" else text
                 if source == "default":
-                    named = True  # Warp requires names for the arguments after a default
+                    named = True  # after an omitted argument, Warp requires keyword arguments
                 else:
                     arguments.append(f"{argument}={text}" if named else text)
             self._lines.append(f"{name}_ = {name}({', '.join(arguments)})")

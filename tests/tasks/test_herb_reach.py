@@ -157,7 +157,8 @@ def targets(env: lw.Env) -> np.ndarray:
 
 
 def put_targets(env: lw.Env, offset: np.ndarray) -> None:
-    """Place the targets at offsets from the palms along x, (nworld, 2) in metres, and stop the arms."""
+    """Place each target at an offset from its palm along x, and stop the arms. Offsets have the shape (nworld, 2), in
+    metres."""
     state = env.get_state()
     parts = env.state_space.split(state)
     parts["qvel"][:] = 0.0
