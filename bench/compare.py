@@ -85,8 +85,8 @@ class Options:
     ignore: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="PATTERN")] = ()
     """Names to ignore, such as '*/metrics.csv/*' or 'plans/hopper/*'; may be repeated."""
     short: bool = False
-    """Compare four tasks, and plans and commands only on the C engine. With a warm kernel cache, the comparison takes
-    about three minutes on two busy cores instead of sixteen."""
+    """Compare only four tasks. The parts "plans" and "commands" run only on the C engine. With a warm kernel cache, the
+    comparison takes about three minutes on two busy cores instead of sixteen."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,7 +201,7 @@ def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
     """Provide the folder of a checkout and a text that describes it.
 
     Args:
-        given: A folder with a checkout, or a git revision, which is then unpacked.
+        given: A folder with a checkout, or a git revision. A revision is unpacked.
         folder: An empty folder for the checkout.
 
     Raises:

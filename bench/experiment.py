@@ -298,7 +298,7 @@ def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[floa
 
 
 def median_and_range(values: Sequence[float], form: str = ".2f") -> str:
-    """Format the median, with the smallest and largest value in parentheses; return "" if there are no values."""
+    """Format the median, and the smallest and largest value in parentheses. Return "" if there are no values."""
     if not values:
         return ""
     middle = format(statistics.median(values), form)
@@ -307,7 +307,7 @@ def median_and_range(values: Sequence[float], form: str = ".2f") -> str:
 
 @contextlib.contextmanager
 def cores(number: int | None) -> Iterator[None]:
-    """Limit this thread, and all threads and processes that it starts, to the first cores.
+    """Limit this thread, and all threads and processes that it starts, to the first ``number`` cores.
 
     Raises:
         Skipped: There are too few cores.

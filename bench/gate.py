@@ -7,9 +7,9 @@ The mean policy plays on the C engine under the task's exact physics. A Unitree 
 (kingjulio8238/nanoG1, eval.py). The gate has six commands of 20 s, from four noisy starts each, and 2,000 steps at 0.5
 m/s in which it measures the gait. The gate has no noise, no pushes and no differences between robots. In nanoG1,
 actions are clipped to 1 and multiplied by 0.25 rad. Here the change of a servo's target, divided by 0.25 rad, counts as
-the change of the action. Other robots play 100 episodes of 20 s, with noise and with differences between robots as in
-training. These robots get ten commands from ten starts each, once without and once with pushes. After a fall, a world
-returns to its start.
+the change of the action. Other robots play 100 episodes of 20 s. Noise and differences between robots are the same as
+in training. These robots get ten commands from ten starts each, once without and once with pushes. After a fall, a
+world returns to its start.
 """
 
 import dataclasses
@@ -59,7 +59,7 @@ LIMITS: dict[str, dict[str, tuple[str, float, str]]] = {
         "velocity_error": ("at most", 0.2, "mean velocity error, m/s"),
     },
 }
-"""The limits of each gate, with descriptions."""
+"""The limits of each gate, and their descriptions."""
 
 BESIDE = {
     "worst_perf": "perf of the worst command", "yaw_rate_error": "mean yaw rate error, rad/s",
@@ -152,7 +152,7 @@ def play(env: lw.Env, policy: Any, commands: Sequence[Sequence[float]], steps: i
 
 
 def worlds(folder: Path, nworld: int, options: Options, **params: Any) -> lw.Env:
-    """Make worlds of the run's task, with the run's parameters and without a time limit."""
+    """Make worlds of the run's task. They have the run's parameters and no time limit."""
     place = {"engine": "mujoco", "device": "cpu", "nthread": options.threads, "physics": "exact"}
     words = place | {"horizon": 0, "seed": 1000}
     return run_worlds(Run.open(folder), words, params, nworld=nworld, task=options.task, trust=False)
@@ -241,7 +241,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    """Make a table for each policy, with every number beside its limit."""
+    """Make a table for each policy. The table shows every number beside its limit."""
     made = []
     for row in rows:
         case, result = row.case, row.result

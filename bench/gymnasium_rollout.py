@@ -74,7 +74,7 @@ def vector(task: str, nworld: int, mode: str) -> VectorEnv:
     made = [functools.partial(gymnasium.make, TASKS[task], disable_env_checker=True)] * nworld
     if mode == "sync":
         return SyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP)
-    # fork is Gymnasium's default on Linux; with spawn each world would import this whole program
+    # fork is Gymnasium's default on Linux; with spawn, each world would import this whole program
     return AsyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP, context="fork")
 
 

@@ -8,7 +8,7 @@ Each case is one cell of the table: a task, the physics of the planner's worlds,
 engine and its device. Episodes run in real time (``lw.control_async``) until their steps take ``--seconds``: the plant
 keeps its rate, and the planner plans as often as it can. A plan meets its deadline if it takes no longer than one step
 of the plant. Run this on idle cores, because other processes delay plans. Without --samples and --horizons, cells whose
-plans take long on two cores are omitted. With --own, each task has one cell, with the samples and the horizon that it
+plans take long on two cores are omitted. With --own, each task has one cell: the samples and the horizon that the task
 suggests for planners.
 """
 

@@ -200,7 +200,7 @@ class Curve:
         return samples >= (self.case.samples or math.inf) or self.seconds() >= self.case.limit
 
     def due(self, samples: int) -> bool:
-        """Return whether an evaluation is due; evaluations are evenly spaced, with one at the end."""
+        """Return whether an evaluation is due. Evaluations are evenly spaced, and the last one is at the end."""
         return self.ended(samples) or self._evaluations(samples) >= self._next
 
     def _evaluations(self, samples: int) -> float:

@@ -45,7 +45,7 @@ class GymnasiumEnv:
 
     Args:
         name: Gymnasium's name.
-        model: The model of this package's task, which defines the states.
+        model: The model of this package's task; states belong to this model.
         target: Name of a mocap body of ``model``. Gymnasium's model has a body with this name and a constant
             orientation.
     """

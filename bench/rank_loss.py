@@ -67,7 +67,7 @@ STUDIES = {
 
 
 def returns(task: str, study: Study, physics: Any, *, planned: bool = True) -> np.ndarray:
-    """Return the returns of the episodes, (plants,), planned with the given physics."""
+    """Plan episodes with the given physics, and return their returns, (plants,)."""
     env = lw.make(task, nworld=study.plants, autoreset=False)
     env.rand_reset(1000)
     plan = lw.MPPI(task, plants=study.plants, seed=1000, physics=physics, **study.words)

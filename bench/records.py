@@ -31,7 +31,7 @@ from lyceum_warp.binding.registry import file_name, package_task_names
 from lyceum_warp.runs.folder import Run
 
 WALKING = ("--algorithm", "ppo", "--mean-every", "0")
-"""Flags for targets of an iteration's mean return, with exploration noise."""
+"""Flags for targets of an iteration's mean return; its episodes have exploration noise."""
 NPG = ("--algorithm", "npg", "--mean-every", "5")
 """Flags for targets of the mean policy's return in 16 episodes; the clock includes these evaluations."""
 LARGE = ("--samples", "65536")
@@ -129,7 +129,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def cache(case: Case, options: Options, folder: Path) -> Iterator[dict[str, str]]:
-    """Return the command's environment variables, which name an empty or a filled kernel cache."""
+    """Return the command's environment variables. They contain the path of an empty or of a filled kernel cache."""
     if case.cache == "warm":
         if not folder.exists():
             with tempfile.TemporaryDirectory() as spare:

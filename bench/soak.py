@@ -55,8 +55,8 @@ KINDS = {"state": Done.NAN, "speed": Done.NAN, "action": Done.ACTION, "reward": 
 reported."""
 NBIT = len(Done)
 EVERY = 16
-"""Number of steps between writes of invalid states. Each write affects this factor times as many worlds as a write in
-every step would."""
+"""Number of steps between writes of invalid states. A write affects this number of times as many worlds, so the number
+of faults does not depend on it."""
 SAMPLES = 5
 """Memory samples per chunk."""
 TASKS = {

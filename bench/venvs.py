@@ -73,7 +73,7 @@ def _made(name: str) -> tuple[Path, str]:
 
 
 def python_of(name: str) -> Path:
-    """Return the path of the Python in a library's virtual environment, which is made if it does not exist.
+    """Return the path of the Python in a library's virtual environment. Make the environment if it does not exist.
 
     Raises:
         experiment.Skipped: The environment cannot be made, for example without a network.

@@ -116,7 +116,7 @@ class Walkthrough:
 
     def command(self, words: list[str]) -> None:
         match words:
-            case ["git", "clone", address]:  # make a checkout with one robot, whose model is replaced by another one
+            case ["git", "clone", address]:  # make a checkout with one robot, and replace its model
                 robot = self.folder / Path(address).name / "unitree_go1" / "scene.xml"
                 robot.parent.mkdir(parents=True)
                 robot.write_text(lw.gymnasium_model("ant.xml").spec().to_xml())

@@ -117,7 +117,7 @@ def test_no_module_imports_itself_indirectly() -> None:
 
 
 def test_viewer_window_does_not_import_torch_warp_or_other_rooms() -> None:
-    """The window runs in a subprocess, which must start quickly and stay small."""
+    """The window runs in a subprocess. This subprocess must start quickly and stay small."""
     window = sorted(name for name in MODULES if name.startswith("lyceum_warp.viewer.window"))
     code = f"import sys, {', '.join(window)}; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()

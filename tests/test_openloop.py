@@ -180,7 +180,7 @@ def random_actions(env: lw.Env, steps: int, seed: int) -> torch.Tensor:
 
 
 def some_state(env: lw.Env, seed: int, steps: int = 7) -> torch.Tensor:
-    """Return a state after some random steps of an episode, with its done_reason cleared."""
+    """Return a state after some random steps of an episode; its done_reason is cleared."""
     env.rand_reset(seed)
     for action in random_actions(env, steps, seed):
         env.step(action)
@@ -223,7 +223,7 @@ DIFFERENT = [name for name in PACKAGE if not name.startswith("dm/") and not name
 @pytest.mark.parametrize("task, engine", [(task, engine) for task in PACKAGE for engine in ENGINES])
 def test_rollout_of_a_task_equals_steps(task: str, engine: str) -> None:
     steps = 3 if task == "humanoid" or task.startswith("adroit") else 5
-    # on the CPU a substep of the Warp engine consists of hundreds of launches, so the test uses two substeps
+    # on the CPU, a substep of the Warp engine consists of hundreds of launches, so the test uses two substeps
     options = {"frame_skip": min(2, find_task(task).frame_skip)} if engine == "warp" else {}
     env = lw.make(task, engine=engine, nworld=4, autoreset=False, **options)
     check_against_stepping(rollouts(task, steps, engine=engine, **options), env)
@@ -422,7 +422,7 @@ def test_diverging_world_has_a_fault_and_does_not_change_other_worlds(
 ) -> None:
     """Rollouts after the diverging one have no fault.
 
-    On the C engine a diverging world stops with its last finite values, and only the fault marks them as invalid.
+    On the C engine, a diverging world stops with its last finite values, and only the fault marks them as invalid.
     """
     task = PushedRunaway if how == "control" else Runaway
     model = mujoco.MjSpec.from_string(RUNAWAY.format('integrator="RK4"' if how == "rk4" else ""))
@@ -450,7 +450,7 @@ def test_diverging_world_has_a_fault_and_does_not_change_other_worlds(
 @pytest.mark.quick("PushedRunaway")
 @pytest.mark.parametrize("task", [Runaway, PushedRunaway])
 def test_fault_within_a_rollout_is_reported_at_its_end(task: type[lw.Task]) -> None:
-    """A ball is pushed into the floor, which overflows the constraint buffer, and then flies up again."""
+    """A ball is pushed into the floor, so that the constraint buffer overflows. Then the ball flies up again."""
     loop = rollouts(task, 20, engine="warp", nworld=3, nconmax=8, njmax=2)
     loop.env.reset()
     state = loop.env.get_state()[0].clone()

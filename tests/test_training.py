@@ -355,8 +355,8 @@ def test_train_command_accepts_ppo(six: Path, tmp_path: Path) -> None:
 
 
 def test_run_contains_the_transfer_verdict_of_its_policy(env: lw.Env, tmp_path: Path) -> None:
-    """By default the transfer test runs only if the physics are not exact, because compiling the other engine's kernels
-    may take minutes."""
+    """By default, the transfer test runs only if the physics are not exact, because compiling the other engine's
+    kernels may take minutes."""
     run = lw.train(algorithm(env), tmp_path / "exact", iterations=1)
     assert not run.transfer.exists()
     coarse = algorithm(lw.make("point_mass", nworld=2, frame_skip=2, horizon=20))

@@ -54,7 +54,7 @@ SETTLED: dict[str, str] = {
     r"\bone's own\b": "of your own",
     r"\bby (itself|themselves)\b": "automatically, alone",
 }
-"""Case-insensitive regular expressions of phrases, with their replacements."""
+"""Case-insensitive regular expressions of phrases, and the phrases' replacements."""
 
 ALLOWED = (
     r"event\.record\(",  # torch's name

@@ -117,7 +117,7 @@ class SimulatedPlans:
 def simulated_run(
     env: lw.Env, *, seconds: float, steps: int, horizon: int = 8, busy: dict[int, float] | None = None
 ) -> Trajectory:
-    """Run the asynchronous loop on the simulated clock, with a period of one second.
+    """Run the asynchronous loop on the simulated clock; the period is one second.
 
     Args:
         env: The plant.

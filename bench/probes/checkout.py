@@ -1,6 +1,6 @@
 """Compute numbers with a checkout's lyceum_warp, one unit of work after another, for bench/compare.py.
 
-compare.py runs this program once per checkout, with the checkout first on the path. The first answer lists the
+compare.py runs this program once per checkout, and puts the checkout first on the path. The first answer lists the
 checkout's tasks and learners. Each further line on stdin is a unit (the keyword arguments of a function in PARTS as
 JSON), and each line on stdout is an answer. The arrays of a unit are written in the order of their computation, to the
 file given as the program's argument.
@@ -81,7 +81,7 @@ class Numbers:
 
 
 def make(task: str, engine: str, device: str, **options: Any) -> Any:
-    """Make an environment on an engine; on a GPU the environment is deterministic.
+    """Make an environment on an engine; on a GPU, the environment is deterministic.
 
     Raises:
         MissingModel: The task needs an extra that is not installed.

@@ -10,7 +10,7 @@ def explained(error: Exception, task: str) -> Exception:
     text = str(error)
     if "while parsing function" not in text and not type(error).__module__.startswith("warp"):
         return error
-    # Warp's message names whichever kernel it compiled first, which may be of another task
+    # Warp's message names the kernel that it compiled first; this kernel may belong to another task
     flat = " ".join(text.split())
     # the last function in Warp's message contains the error; if that is a kernel, a function of the task returns the
     # wrong type

@@ -81,7 +81,7 @@ def stamps(files: Iterable[Path]) -> Stamps:
 
 @contextlib.contextmanager
 def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
-    """Context in which a task's file can import the modules beside it, which ``local_modules`` finds.
+    """Context in which a task's file can import the modules that ``local_modules`` has found beside it.
 
     A loaded module of the same name is replaced if it has changed or comes from another folder. If the block raises an
     error, ``sys.modules`` is restored.

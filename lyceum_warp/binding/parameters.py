@@ -130,8 +130,8 @@ class Parameters:
     def array(self, device: wp.Device) -> wp.array:
         """Make the kernels' array of ``Params``: one entry for all worlds, or one per world if any value differs.
 
-        The entries point to tables on the device, which this object keeps in memory. A changed table of the same shape
-        is copied in place.
+        The entries point to tables on the device. This object keeps the tables in memory. A changed table of the same
+        shape is copied in place.
         """
         for name, kind in self.tables.items():
             self._upload(name, kind.dtype, device)

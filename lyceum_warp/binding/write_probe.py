@@ -60,7 +60,7 @@ class GuardedRows:
 
 
 class Probe:
-    """Runs the functions of a task in the first world of a batch, whose arrays stay unchanged.
+    """Runs the functions of a task in the first world of a batch; the arrays of the batch stay unchanged.
 
     Args:
         task: The task.

@@ -113,7 +113,7 @@ class _Place:
     position: int
     field: str | None
     kind: Any
-    """A struct type, or (axes, element type) of an array, or None for an element, which is copied when it is read."""
+    """A struct type, or (axes, element type) of an array, or None for an element; reading an element copies it."""
 
     def attribute(self, name: str) -> "_Place | None":
         if is_struct(self.kind):
@@ -142,7 +142,7 @@ class _Reader:
         places: For each argument, the part of the analysed function's arguments to which it refers, or None.
         arguments: Names of the arguments of the analysed function.
         writes: The dict to which writes are added.
-        seen: The functions that were already read, with the places of their arguments.
+        seen: The functions that were already read, each together with the places of its arguments.
     """
 
     def __init__(

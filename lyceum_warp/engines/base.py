@@ -112,7 +112,7 @@ class Engine(abc.ABC):
         self._everyone = wp.full(nworld, True, dtype=bool, device=device)
 
     def _nominal_rows(self, field: ModelField, rows: int) -> wp.array:
-        """Make an array of a model field, with the model's own value in every row."""
+        """Make an array of a model field. Every row has the model's own value."""
         value = np.tile(field.value(self.model).astype(np.float32).reshape(-1), (rows, 1))
         array: wp.array = wp.zeros((rows, *field.shape), dtype=field.dtype, device=self.device)
         if value.size:

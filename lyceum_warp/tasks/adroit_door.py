@@ -2,8 +2,8 @@
 
 The hand's model needs the extra "hand". The door's frame is a mocap body, so that its position is part of the state.
 The contact pair of ring and little fingertip, which the model lists twice, is used once. As in Gymnasium-Robotics, site
-positions lag by one substep, as ``mj_step`` leaves them. The reward grows with the palm's distance from the handle.
-This is a mistake of gymnasium-robotics 1.2.1 to 1.4.2. ``palm_weight=-0.1`` corrects the mistake, as in version 1.2.0.
+positions are one substep old after ``mj_step``. The reward grows with the palm's distance from the handle. This is a
+mistake of gymnasium-robotics 1.2.1 to 1.4.2. ``palm_weight=-0.1`` corrects the mistake, as in version 1.2.0.
 """
 
 import mujoco

@@ -1,6 +1,6 @@
 """InvertedDoublePendulum: keep a pole of two links upright on a cart (Gymnasium's InvertedDoublePendulum-v5).
 
-As in Gymnasium, the tip's position and the constraint force on the cart lag by one substep, as ``mj_step`` leaves them.
+As in Gymnasium, the tip's position and the constraint force on the cart are one substep old after ``mj_step``.
 The force is zero except at the ends of the rail.
 """
 

@@ -1,6 +1,6 @@
 """Pusher: push a cylinder to a goal with a 7-joint arm (Gymnasium's Pusher-v5).
 
-As in Gymnasium, body positions lag by one substep, as ``mj_step`` leaves them. An episode succeeds if the
+As in Gymnasium, body positions are one substep old after ``mj_step``. An episode succeeds if the
 cylinder's centre is over the goal's disc; Gymnasium defines no success.
 """
 

@@ -1,6 +1,6 @@
 """Reacher: move the tip of a planar arm of two links to a target (Gymnasium's Reacher-v5).
 
-As in Gymnasium, body positions lag by one substep, as ``mj_step`` leaves them. An episode succeeds if the tip
+As in Gymnasium, body positions are one substep old after ``mj_step``. An episode succeeds if the tip
 touches the target; Gymnasium defines no success.
 """
 

@@ -198,7 +198,7 @@ def check_masked_reset(ctx: Context) -> None:
 
 
 def check_rand_reset(ctx: Context) -> None:
-    """``rand_reset(seed)`` repeats its draws and zeros actions; draws differ between resets, worlds and seeds."""
+    """``rand_reset(seed)`` repeats its draws and clears actions; draws differ between resets, worlds and seeds."""
     a, b = ctx.a, ctx.b
     ctx.run(a, ctx.actions(5))
     ctx.restart()

@@ -28,7 +28,7 @@ class Policy(GaussianMixin, Model):
 
 
 class Value(DeterministicMixin, Model):
-    """Estimate the value of the critic's observation, which skrl calls a state."""
+    """Estimate the value of the critic's observation (skrl calls this observation a state)."""
 
     def __init__(self, **spaces: Any) -> None:
         Model.__init__(self, **spaces)

@@ -143,7 +143,7 @@ def test_two_processes_make_the_same_updates_of_sac_as_one(tmp_path: Path) -> No
     assert code == 0 and "6 worlds each in 2 processes" in out, error
     assert Run.open(two).config == Run.open(one).config
     assert_equal_runs(two, one, tolerance=2e-3)
-    for run in (one, two):  # a single process continues the run of two processes, with the replay buffers of both
+    for run in (one, two):  # a single process continues the run of two processes, and loads the replay buffers of both
         assert cli.main(["train", "--resume", str(run), "--iterations", "2", *QUIET]) == 0
     assert_equal_runs(two, one, tolerance=1e-2)
 

@@ -255,7 +255,7 @@ def test_sample_counts_as_failed_if_it_fails_in_one_model() -> None:
 def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
     settings: dict[str, Any] = dict(horizon=4, samples=40, smoothing=(1, 0, 0), temperature=1.0, engine=engine)
     if how == "physics":
-        # with motors this strong, only small actions keep MuJoCo's accelerations and Warp's velocities below 1e10
+        # the motors are so strong that only small actions keep MuJoCo's accelerations and Warp's velocities below 1e10
         settings |= dict(noise=1.0, limit=1e9, model=rail({"mujoco": 1e10, "warp": 2.5e12}[engine]))
     elif how == "value":
         settings |= dict(noise=1.0, limit=1e9, value=lambda obs: torch.where(obs[:, 0] > 0, torch.nan, 1.0))

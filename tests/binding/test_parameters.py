@@ -280,7 +280,7 @@ def test_replicas_planners_and_evaluations_get_the_tables() -> None:
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("found", ["number", "nan"])
 def test_check_task_finds_an_out_of_range_read_of_a_table(task_file: Any, found: str, engine: str) -> None:
-    """The out-of-range read is reported even if it returns NaN, which ends the episode with a fault."""
+    """The out-of-range read is reported even if it returns NaN. A NaN ends the episode with a fault."""
     source = (Path(__file__).parent.parent / "table_task.py").read_text()
     wrong = source.replace("p.motion.shape[0] - 1)", "p.motion.shape[0])")
     value = {"number": "0.0", "nan": "wp.nan"}[found]

@@ -1,4 +1,4 @@
-"""Test variants of tasks, which extend the parent's structs and use its functions."""
+"""Test variants of tasks. A variant extends its parent's structs and uses its parent's functions."""
 
 import subprocess
 import sys

@@ -84,7 +84,7 @@ def observe_block(s: BlockWorld, p: BlockParams, obs: Row[float]):
 
 
 class Block(lw.Task):
-    """A red block on a rail, which a browser without a GPU renders quickly."""
+    """A red block on a rail. A browser without a GPU renders it quickly."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(MODEL))
     obs = {"x": 1}

@@ -26,7 +26,7 @@ from lyceum_warp.fields import describe
 
 @pytest.fixture
 def without_allocators(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Remove Warp's custom allocators, which exist only on CUDA devices, so that the engine runs on the CPU."""
+    """Remove Warp's custom allocators, so that the engine runs on the CPU. They exist only on CUDA devices."""
     monkeypatch.setattr(wp, "ScopedAllocator", lambda *args: contextlib.nullcontext())
 
 

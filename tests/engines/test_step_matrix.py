@@ -25,7 +25,7 @@ SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 @pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
 def device(request: pytest.FixtureRequest) -> wp.Device:
-    """Return a device on which steps are reproducible bit for bit; on a GPU the mode is deterministic."""
+    """Return a device on which steps are reproducible bit for bit; on a GPU, the mode is deterministic."""
     return wp.get_device(request.param)
 
 

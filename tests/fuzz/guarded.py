@@ -22,7 +22,7 @@ from typing import Any
 MEMORY = 512 * 2**20
 """Additional bytes of address space that a case may use after the warm-up."""
 PATIENCE = 3.0
-"""Seconds between SIGINTs, which must end a command."""
+"""Seconds between SIGINTs. A SIGINT must end a command."""
 LIMIT = 60.0
 """Seconds after which a case is killed with a traceback if it ignores SIGINT."""
 ROOT = Path(__file__).parents[2]

@@ -1,4 +1,4 @@
-"""Compare worlds with different models, in graphs on a GPU, with the C engine."""
+"""Compare graphs on a GPU with the C engine, for worlds with different models."""
 
 import mujoco
 import numpy as np

@@ -96,7 +96,8 @@ def trajectories(model: mujoco.MjModel) -> dict[str, Any]:
 
 
 def judged_states(env: ManagerBasedRlEnv) -> dict[str, Any]:
-    """Return states under random actions, and mjlab's function values in these states, with up-to-date contacts."""
+    """Return states under random actions, and the values of mjlab's functions in these states. Contacts are up to
+    date."""
     torch.manual_seed(0)
     robot, command = env.scene["robot"], env.command_manager.get_term("twist")
     feet = env.scene["feet_ground_contact"]

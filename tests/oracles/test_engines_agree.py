@@ -1,7 +1,7 @@
 """Compare the C engine with the Warp engine for every task of the package.
 
 Both engines run the same task functions on different physics: the C engine uses float64, and the Warp engine float32.
-With pyramidal friction cones MuJoCo Warp uses a different contact frame for a capsule on a plane, so trajectories
+With pyramidal friction cones, MuJoCo Warp uses a different contact frame for a capsule on a plane, so trajectories
 differ. These tests use elliptic cones, which do not depend on the contact frame.
 """
 
@@ -74,7 +74,8 @@ ONE_STEP = {  #                         measured: median and 95 % quantile of qp
     "h1_velocity": Bounds(2.4e-7, 7e-7, 1.7e-5, 1.8e-4),  # 5.9e-8, 1.7e-7; 4.3e-6, 4.5e-5
     "spot_velocity": Bounds(2.4e-7, 8e-7, 8e-6, 2e-4),  # 6.0e-8, 1.9e-7; 2.0e-6, 5.1e-5
     "t1_velocity": Bounds(2.5e-7, 1.4e-6, 4.4e-5, 3.4e-4),  # 6.2e-8, 3.5e-7; 1.1e-5, 8.6e-5
-    # on a height field the C engine creates a contact per triangle, and MuJoCo Warp at most four per pair of geoms
+    # on a height field, the C engine creates a contact per triangle, and MuJoCo Warp creates at most four per pair of
+    # geoms
     "g1_rough_velocity": Bounds(3e-4, 8e-3, 8e-2, 2.2),  # 8.5e-5, 2.2e-3; 2.1e-2, 5.6e-1
     "go1_rough_velocity": Bounds(1.2e-5, 1.4e-3, 2e-3, 3e-1),  # 3.0e-6, 3.7e-4; 5.1e-4, 7.5e-2
     "go1_velocity": Bounds(4e-7, 1.5e-6, 4e-5, 3e-4),  # 9.8e-8, 4.4e-7; 1.1e-5, 8.7e-5
@@ -267,7 +268,7 @@ def test_equal_positions_and_velocities_give_equal_observations_on_both_engines(
         results = []
         for env in (engines.c, engines.warp):
             env.set_state(state.to(env.action.device))
-            # a state includes fields of the last substep, which the reset phases recompute on each engine
+            # a state includes fields of the last substep; the reset phases recompute these fields on each engine
             for phase in env.worlds.reset_phases(randomly=False):
                 if phase.name not in ("restart", "settle"):
                     phase.run()

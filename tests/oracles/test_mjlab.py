@@ -42,7 +42,8 @@ def test_model_has_the_options_of_mjlab(shared_env: SharedEnv, name: str) -> Non
 
 @pytest.mark.parametrize("i", range(4))
 def test_trajectories_of_the_model_equal_those_of_mjlab(shared_env: SharedEnv, i: int) -> None:
-    """Run 200 substeps of a standing and of a tumbling robot under equal controls, with self-collisions."""
+    """Run 200 substeps of a standing and of a tumbling robot under equal controls. Both robots collide with
+    themselves."""
     model = shared_env("go1_velocity").model
     data, wanted = mujoco.MjData(model), STORED["trajectory/qpos"][i]
     data.qpos, data.qvel = wanted[0], STORED["trajectory/qvel0"][i]

@@ -24,7 +24,7 @@ STILL: dict[str, Any] = {**NOISELESS, "command_seconds": NEVER, "push_seconds": 
 
 
 class State:
-    """The parts of all worlds' states in float64, with MuJoCo's kinematics."""
+    """The parts of all worlds' states in float64, and MuJoCo's kinematics of these states."""
 
     def __init__(self, env: lw.Env, state: torch.Tensor | None = None) -> None:
         parts = env.state_space.split(env.get_state() if state is None else state)

@@ -159,7 +159,7 @@ class Share:
 
 
 class EnvPool:
-    """EnvPool's environments, which all step together."""
+    """EnvPool's environments; all of them step together."""
 
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
         import envpool

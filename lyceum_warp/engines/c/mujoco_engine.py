@@ -54,7 +54,7 @@ class MujocoEngine(Engine):
     Args:
         model, nworld, fields, dynamics: See ``Engine``.
         device: Must be the CPU.
-        initial: The initial state for ``reset``, which is rounded to float32; None for the model's own.
+        initial: The initial state for ``reset``; None for the model's own. The engine rounds it to float32.
         nthread: Threads of the pool; 0 for all cores.
 
     Raises:
@@ -111,7 +111,7 @@ class MujocoEngine(Engine):
         shown = [field for field in kept if field.name != "ctrl"]  # an input
         late = [field for field in shown if field not in computed or field.snapshot] if self._apart else []
         self._before_stage = [field for field in late if field.name not in STATE_FIELDS]
-        """The fields to copy before the separate call, which may use the MjData of another world."""
+        """The fields to copy before the separate call, because the call may run in the MjData of another world."""
         self._after_stage = [field for field in self._before_stage if field in computed]
         """The fields that the separate call computes only in part, such as sensors up to a stage."""
         self._last = [field for field in shown if field not in self._before_stage]

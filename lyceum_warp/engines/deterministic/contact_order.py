@@ -1,4 +1,4 @@
-"""Sort contacts and constraint rows, whose order varies between runs of MuJoCo Warp 4.0 on a GPU."""
+"""Sort contacts and constraint rows, because their order varies between runs of MuJoCo Warp 4.0 on a GPU."""
 
 import dataclasses
 from collections.abc import Callable
@@ -20,7 +20,7 @@ class CanonicalOrder:
     solved. ``order_kernels`` describes the order.
 
     Args:
-        model: MuJoCo Warp's model, whose callbacks are set.
+        model: MuJoCo Warp's model; its callbacks are set.
         data: MuJoCo Warp's data.
         between: A function that both callbacks call first.
 

@@ -22,7 +22,7 @@ Part = Callable[[mjw.Model, mjw.Data], None]
 """A part of a forward pass, for every world of a Data."""
 
 POSITION: tuple[Part, ...] = (mjw.kinematics, mjw.com_pos, mjw.camlight, mjw.flex, mjw.tendon)
-"""The first parts of substeps and forward passes, which depend only on positions."""
+"""The first parts of substeps and forward passes. These parts depend only on positions."""
 
 
 def step(model: mjw.Model, data: mjw.Data, done: Collection[Part] = ()) -> None:

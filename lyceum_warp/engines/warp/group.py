@@ -116,7 +116,7 @@ class Arena(Reserve):
     reserve. Graphs share the reserve, because they never run at the same time.
 
     Args:
-        device: The device of the launches; on the CPU nothing is reserved.
+        device: The device of the launches; on the CPU, nothing is reserved.
     """
 
     def __init__(self, device: wp.Device) -> None:
@@ -160,7 +160,7 @@ class Arena(Reserve):
 class Conditional:
     """Skips launches within a graph if a mask is empty.
 
-    Outside a graph the launches always run, because reading the mask would wait for the device.
+    Outside a graph, the launches always run, because reading the mask would wait for the device.
 
     Args:
         device: The device of the launches.

@@ -373,6 +373,6 @@ def _check_sdf_plugins(model: mujoco.MjModel) -> None:
 
 
 def _contacts_of_one_world(model: mjw.Model) -> int:
-    """Estimate the contacts of one world in which all bodies touch, which can happen just before a reset."""
+    """Estimate the contacts of a world in which all bodies touch, as can happen just before a reset."""
     pairs = len(model.nxn_geom_pair_filtered)
     return int(min(max(256, 4 * pairs), 4096))

@@ -76,7 +76,7 @@ def velocity(s0: World, s1: World, p: Params) -> wp.vec2:  # velocity of the cen
     return wp.vec2(moved[0] - p.forward_speed, moved[1])
 
 
-# reward terms, with arguments that are found by name
+# reward terms; their arguments are found by name
 
 
 @wp.func

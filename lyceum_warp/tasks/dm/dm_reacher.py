@@ -60,7 +60,7 @@ class ReacherEasy(lw.Task):
 
     @classmethod
     def edit_model(cls, spec: mujoco.MjSpec) -> None:
-        """Give each world its own target, with the task's size."""
+        """Give each world its own target of the task's size."""
         suite.free_target(spec)
         spec.geom("target").size[0] = cls.target_radius
 

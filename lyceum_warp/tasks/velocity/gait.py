@@ -1,9 +1,10 @@
-"""Let a biped step to a gait clock, which both observation groups contain and the reward compares with the feet.
+"""Make robots with two legs step in time with a gait clock.
 
-The clock turns at ``gait_frequency``. Each foot stands for the first ``stance_share`` of its cycle and swings for the
-rest; the feet are half a cycle apart. Without the clock, policies learn to make 5 to 7 short steps a second with each
-foot. The clock's cycle lasts 0.8 s, as in unitree_rl_gym and nanoG1. Two costs of fast motion grow with the steps of a
-world, because a robot that pays them from the start learns to stand still.
+Both observation groups contain the clock, and the reward compares the feet with it. The clock turns at
+``gait_frequency``. Each foot stands for the first ``stance_share`` of its cycle and swings for the rest; the feet are
+half a cycle apart. Without the clock, policies learn to make 5 to 7 short steps a second with each foot. The clock's
+cycle lasts 0.8 s, as in unitree_rl_gym and nanoG1. Two costs of fast motion grow with the steps of a world, because a
+robot that pays them from the start learns to stand still.
 """
 
 import warp as wp

@@ -389,7 +389,7 @@ def evaluate(s: World, p: Params) -> float:  # velocity error, m/s
 
 
 class Velocity(lw.Task):
-    """A robot that follows velocity commands, with any number of legs."""
+    """A robot with any number of legs that follows velocity commands."""
 
     frame_skip, horizon = 4, 1000
     training = lw.Training(algorithm="ppo", iterations=400)
@@ -421,7 +421,7 @@ class BipedParams(Params):
 
 
 class Biped(Velocity):
-    """A robot with two legs that follows velocity commands, with rewards for steps and for a calm trunk.
+    """A robot with two legs that follows velocity commands; steps and a calm trunk are rewarded.
 
     Two sites mark the feet.
     """

@@ -37,7 +37,7 @@ def test_studio_has_every_name_that_the_window_uses(name: str) -> None:
 
 
 def test_screen_does_not_listen_on_a_public_socket_of_studio(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The test simulates a later version of Studio, which no longer calls bind_public_socket."""
+    """The test simulates a later version of Studio that no longer calls bind_public_socket."""
 
     def start(config: object, endpoint: object, plugins: list[object]) -> None:
         plugin_registry.PluginRegistry(plugins).dispatch(studio.Started(viewer=None))
