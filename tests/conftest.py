@@ -17,7 +17,7 @@ import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.support.warp_log import start_warp
 
-# one torch thread suffices for the tests' small batches; on a busy machine several threads would wait for each other
+# one torch thread suffices for the tests' small batches; on a busy machine, several threads would wait for each other
 torch.set_num_threads(1)
 
 SharedEnv = Callable[..., lw.Env]

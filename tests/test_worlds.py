@@ -57,7 +57,7 @@ def outcomes_with_faults(
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_rows_computed_by_several_lanes_equal_rows_of_one_lane(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a GPU the lanes of a warp share a world's rows, and each observation group has its own threads.
+    """On a GPU, the lanes of a warp share a world's rows, and each observation group has its own threads.
 
     On the CPU, the lanes of a warp and the threads of a world run one after another.
     """

@@ -1,4 +1,4 @@
-"""Define a task whose dynamics differ between worlds: a ball with an arm on a rail. Masses and arm length are random."""
+"""Define a task whose dynamics differ between worlds: a ball with an arm on a rail. Masses and length are random."""
 
 import mujoco
 import warp as wp

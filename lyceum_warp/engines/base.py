@@ -24,7 +24,7 @@ class Engine(abc.ABC):
     An engine does not depend on a task. The fields of an engine are Warp arrays with a leading ``nworld`` axis. The
     addresses of the fields never change, so graphs that read fields are captured once.
 
-    In each step the caller writes ``ctrl`` and other inputs, calls ``step`` and ``find_faults``, and reads fields and
+    In each step, the caller writes ``ctrl`` and other inputs, calls ``step`` and ``find_faults``, and reads fields and
     ``fault``. For worlds that restart, the caller then calls ``reset``, writes state fields and model fields, and calls
     ``commit``, ``apply_model``, optionally ``settle``, and ``refresh``. A new engine holds no state: reset all worlds
     first. Model fields start at the model's values, and resets do not change them.

@@ -37,7 +37,7 @@ def settled_again() -> None:
 def options(task: str, engine: str) -> dict[str, int]:
     """Return the number of steps of the long rules; hopper takes enough steps to find a leak of one number per step.
 
-    On a CPU a step of the Warp engine takes milliseconds, so other tasks take few steps on it.
+    On a CPU, a step of the Warp engine takes milliseconds, so other tasks take few steps on this engine.
     """
     every = task in EVERY_RULE[engine]
     if engine == "mujoco":

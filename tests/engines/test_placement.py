@@ -119,7 +119,7 @@ def test_few_worlds_move_from_a_gpu_to_cpu_cores_only_with_engine_auto() -> None
 
 
 def test_a_plant_moves_from_a_gpu_to_a_cpu_core(gpu: Any) -> None:
-    """On the GPU the plant's steps would wait for the planner, so a plant with engine="warp" also moves."""
+    """On the GPU, the plant's steps would wait for the planner, so a plant with engine="warp" also moves."""
     for engine, device in (("auto", "cuda:0"), ("warp", "cuda:0")):
         assert options_for_plant(engine, device) == ON_CPU
     for engine, device in (("auto", None), ("warp", "cpu"), ("mujoco", "cpu"), (ToyEngine, "cuda:0")):

@@ -83,7 +83,7 @@ def test_velocities_of_feet_equal_those_of_mujoco(task: str, env: lw.Env) -> Non
 @pytest.mark.quick("g1_velocity")
 @pytest.mark.parametrize("task", ROBOTS)
 def test_feet_of_a_standing_robot_carry_its_weight(task: str, env: lw.Env) -> None:
-    """At rest the sum of the forces on a robot's feet is its weight, and joints without actions keep the home pose."""
+    """At rest, the sum of the forces on a robot's feet is its weight, and joints without actions keep the home pose."""
     total = []
     for _ in range(12):
         env.step(torch.zeros(env.action.shape))

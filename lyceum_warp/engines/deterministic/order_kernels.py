@@ -1,7 +1,7 @@
 """Sort contacts and constraint rows into an order that does not depend on thread timing: kernels.
 
-MuJoCo Warp assigns indices to contacts and constraint rows by atomic counters. On a GPU the order of contacts and rows
-therefore varies, sums over them are rounded differently in each run, and runs diverge. These kernels sort contacts by
+MuJoCo Warp assigns indices to contacts and constraint rows by atomic counters. On a GPU, the order of contacts and rows
+therefore varies. Sums over them are rounded differently in each run, and runs diverge. These kernels sort contacts by
 (world, geoms, index within the pair), and each world's rows by (type, object, index within the constraint).
 """
 

@@ -5,7 +5,7 @@ rate, within Gymnasium's torque limits. The feet are spheres, so the robot can o
 its body. Balance is measured by the distance of the capture point from the line between the feet. A foot at the capture
 point would stop the robot (Pratt et al. 2006, "Capture point: a step toward humanoid push recovery").
 
-At each of ``push_times`` the robot gets an impulse in a random horizontal direction: the velocities of all bodies
+At each of ``push_times``, the robot gets an impulse in a random horizontal direction: the velocities of all bodies
 change by impulse / mass. Planners do not foresee pushes.
 """
 
