@@ -3,8 +3,8 @@
     lyceum-warp bench npg --threads 2 --jobs 16
 
 Both NPGs are the same class with the same settings, number of worlds and seeds. The two NPGs differ only in the
-environments that fill the rollout buffer; Gymnasium uses the faster of its two vector modes. For twelve minutes each,
-stable-baselines3's PPO and sb3-contrib's TRPO learn with the settings that RL Baselines3 Zoo tuned for these tasks.
+environments that fill the rollout buffer; Gymnasium uses the faster of its two vector modes. stable-baselines3's PPO
+and sb3-contrib's TRPO each learn for twelve minutes, with the settings that RL Baselines3 Zoo tuned for these tasks.
 With --device cuda, lw.NPG and lw.PPO learn on the same worlds on a GPU.
 
 All policies are evaluated by their mean actions in single Gymnasium environments, from the same initial states. The

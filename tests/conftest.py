@@ -26,8 +26,8 @@ TaskFile = Callable[[str, str], Path]
 
 @pytest.fixture(scope="session", autouse=True)
 def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Store the list of trusted runs in a temporary directory instead of the user's, for this process and its
-    subprocesses."""
+    """Store the list of trusted runs in a temporary directory, for this process and its subprocesses. The user's list
+    stays unchanged."""
     with pytest.MonkeyPatch.context() as patched:
         folder = tmp_path_factory.mktemp("state")
         patched.setenv("XDG_STATE_HOME", str(folder))

@@ -104,8 +104,8 @@ def compile_model(
     - Sleep is turned off, because a saved state does not say which bodies are asleep.
     - A field that MuJoCo computes only for sensors gets a sensor after the model's own; if no field needs sensors,
       sensors are turned off. The energy is computed if a function reads it.
-    - If ``contact`` lists a pair of geoms twice, only the first entry is kept: MuJoCo would make the contact twice,
-      MuJoCo Warp once.
+    - If ``contact`` lists a pair of geoms twice, only the first entry is kept: MuJoCo would make the contact twice, and
+    MuJoCo Warp would make it once.
 
     Args:
         spec: The model; changed in place.

@@ -1,8 +1,8 @@
 """Humanoid: walk forward on two legs without falling over (Gymnasium's Humanoid-v5).
 
-Contact forces are computed in MuJoCo's sensor stage. Under RK4, the model's integrator, the sensor stage runs in the
-first of a substep's four passes; Gymnasium computes ``cfrc_ext`` again after the last pass. The contact forces differ
-while feet touch the ground; everything else is equal. The solver is Newton instead of the model's PGS.
+Contact forces are computed in MuJoCo's sensor stage. The model's integrator is RK4, under which the sensor stage runs
+only in the first of a substep's four passes. Gymnasium computes ``cfrc_ext`` again after the last pass. The contact
+forces differ while feet touch the ground; everything else is equal. The solver is Newton instead of the model's PGS.
 """
 
 import warp as wp

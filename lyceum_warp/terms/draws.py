@@ -1,6 +1,6 @@
 """Draw numbers, and model fields that differ between worlds.
 
-Functions that scale or shift a model field start from its current value. In ``startup`` and in ``randomize`` the
+Functions that scale or shift a model field start from its current value. In ``startup`` and in ``randomize``, the
 current value is the nominal value, because a reset restores the field first.
 """
 

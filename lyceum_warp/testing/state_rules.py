@@ -150,7 +150,8 @@ def _lasting_columns(env: Env) -> list[slice]:
 def check_reset(ctx: Context) -> None:
     """With zero actions, ``reset`` leads to the same state regardless of the past.
 
-    The check first makes the columns that resets preserve equal in all worlds, because the state may depend on them.
+    Resets preserve some columns, and the state may depend on them. The check therefore first sets these columns to
+    equal values in all worlds.
     """
     env = ctx.a
     lasting = _lasting_columns(env)

@@ -1,6 +1,7 @@
 """Compare MPPI with a plain implementation, and use it to control tasks.
 
-The planner computes in float32 and the plain implementation in float64, so rounding errors accumulate between them.
+The planner computes in float32, and the plain implementation computes in float64, so rounding errors accumulate between
+them.
 """
 
 from pathlib import Path

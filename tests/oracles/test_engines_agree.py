@@ -1,8 +1,8 @@
 """Compare the C engine with the Warp engine for every task of the package.
 
-Both engines run the same task functions on different physics: the C engine uses float64, and the Warp engine float32.
-With pyramidal friction cones, MuJoCo Warp uses a different contact frame for a capsule on a plane, so trajectories
-differ. These tests use elliptic cones, which do not depend on the contact frame.
+Both engines run the same task functions on different physics: the C engine uses float64, and the Warp engine uses
+float32. With pyramidal friction cones, MuJoCo Warp uses a different contact frame for a capsule on a plane, so
+trajectories differ. These tests use elliptic cones, which do not depend on the contact frame.
 """
 
 import dataclasses

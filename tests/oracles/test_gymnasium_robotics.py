@@ -90,8 +90,8 @@ class Pair:
         self._simulate, self.theirs.do_simulation = self.theirs.do_simulation, self._with_our_controls
 
     def _with_our_controls(self, ctrl: np.ndarray, frames: int) -> None:
-        # this package computes controls in float32 and Gymnasium-Robotics in float64; the difference would grow over
-        # many steps
+        # this package computes controls in float32, and Gymnasium-Robotics computes them in float64; the difference
+        # would grow over many steps
         ours = self.ours.state_space.split(self.ours.get_state())["ctrl"][0].numpy()
         np.testing.assert_allclose(ours, ctrl, atol=2e-7)
         self._simulate(ours, frames)

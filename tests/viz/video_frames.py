@@ -6,7 +6,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-# runs in a small subprocess, because imageio forks, and this process may be too large for a fork after all other tests
+# this runs in a small subprocess, because imageio forks, and this process may be too large for a fork after all other
+# tests
 PROGRAM = """
 import json, sys
 import imageio.v2 as imageio

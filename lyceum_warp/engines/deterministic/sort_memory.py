@@ -19,9 +19,9 @@ minimum size."""
 class Scratch(Reserve):
     """An allocator that places the buffers of all launches in the same memory.
 
-    By default, Warp allocates separate buffers for each launch in a graph, about a hundred times the memory of the
-    worlds. Launches can share buffers, because they run one after another and clear the buffers first. Warp also clears
-    the buffers during a capture, so no graph may run then.
+    By default, Warp allocates separate buffers for each launch in a graph. These buffers take about a hundred times as
+    much memory as the worlds. Launches can share buffers, because they run one after another and clear the buffers
+    first. Warp also clears the buffers during a capture, so no graph may run then.
 
     Args:
         device: A CUDA device.
