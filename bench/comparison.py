@@ -10,7 +10,7 @@ MOST_SPLITS = 20_000
 
 
 def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Test at every point whether the curves a and b have the same distribution, adjusted for all points.
+    """Test at every point whether the curves a and b have the same distribution; p-values are adjusted for all points.
 
     The test permutes whole curves, and compares each point's Welch statistic with the largest statistic over all points
     (Westfall and Young 1993, single step). The probability of a false positive at any point is therefore at most the

@@ -1,4 +1,4 @@
-"""Step worlds with lyceum_warp, ``mujoco.rollout`` and other libraries for the experiment throughput.
+"""Step worlds with lyceum_warp, ``mujoco.rollout`` and other libraries, for the experiment "throughput".
 
 A sample is one environment step whose observation and reward the caller has received. All contestants use the same
 model, substeps and bounds of uniformly random actions. Worlds start from random initial states, step a few times before

@@ -6,7 +6,7 @@
 The mean policy plays on the C engine under the task's exact physics. A Unitree G1 must pass nanoG1's gate
 (kingjulio8238/nanoG1, eval.py). The gate plays six commands of 20 s, each from four noisy starts. It also measures the
 gait in 2,000 steps at 0.5 m/s. The gate has no noise, no pushes and no differences between robots. In nanoG1, actions
-are clipped to 1 and multiplied by 0.25 rad. Here the change of a servo's target, divided by 0.25 rad, counts as the
+are clipped to 1 and multiplied by 0.25 rad. Here, the change of a servo's target, divided by 0.25 rad, counts as the
 change of the action. Other robots play 100 episodes of 20 s. Noise and differences between robots are the same as in
 training. These robots get ten commands from ten starts each, once without and once with pushes. After a fall, a world
 returns to its start.

@@ -377,7 +377,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def ends(found: dict[str, dict[str, list[Row]]]) -> Table:
-    """Make a table of the runs' final results, and the time until 90 % of the final return of NPG on Gymnasium."""
+    """Make a table of the runs' final results, and of the time until they reach 90 % of the final return of NPG on
+    Gymnasium."""
     lines = []
     for task, same in found.items():
         ours = {row.case["seed"]: row for row in same.get("npg", ())}

@@ -76,7 +76,7 @@ class Case:
     cache: str
     device: str
     flags: str
-    """Flags of the command, without the flags that all runs have."""
+    """Flags of the command, without the flags that all runs have in common."""
 
 
 def cases(options: Options) -> list[Case]:
@@ -176,7 +176,7 @@ def timed(
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    """Make a table with a line for each task, cache and set of flags, over the seeds."""
+    """Make a table with a line for each task, cache and set of flags. A line combines all seeds."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         kind = tuple(row.case[name] for name in ("task", "target", "device", "cache", "flags"))

@@ -39,7 +39,7 @@ def lay_down(env: lw.Env, world: int) -> None:
 
 
 def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
-    """Step an environment with a fault and one without; all other worlds must be bitwise equal."""
+    """Step an environment with a fault and one without a fault; all other worlds must be bitwise equal."""
     others, found = torch.arange(N) != BAD, Done(0)
     generator = torch.Generator().manual_seed(0)
     for i in range(steps):

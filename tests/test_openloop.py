@@ -149,7 +149,7 @@ class Servo(Forgetful):
 
 
 class Sensing(lw.Task):
-    """A task with two sensors: the velocity belongs to the state, and the acceleration to the last substep."""
+    """A task with two sensors: the velocity belongs to the state, and the acceleration belongs to the last substep."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
     frame_skip = 2

@@ -28,7 +28,7 @@ def metrics(run: Path) -> list[dict[str, str]]:
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: str) -> None:
-    """Check that the command wrote one line to stderr, which contains these words."""
+    """Check that the command wrote one line to stderr, and that the line contains these words."""
     lines = capsys.readouterr().err.splitlines()
     (error,) = [line for line in lines if not line.startswith(("compiling kernels ", "  "))]
     assert error.startswith("lyceum-warp: ")

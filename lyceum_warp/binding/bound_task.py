@@ -148,7 +148,7 @@ class BoundTask:
 
     Args:
         task: The task's class.
-        nworld: Number of worlds, which is the length of parameters that differ between worlds.
+        nworld: Number of worlds. Parameters that differ between worlds have this length.
         model: A model to use instead of the task's own.
         fields: Fields that the engine keeps in addition to those in ``World``.
         dynamics: Model fields that may differ between worlds in addition to those that the task writes.

@@ -20,7 +20,7 @@ def local_modules(file: Path) -> dict[str, Path]:
     """Find the modules beside a Python file that the file imports, directly or indirectly. The modules are not run.
 
     Returns:
-        The file of each module by the module's name; a package without ``__init__.py`` has its folder.
+        The file of each module by the module's name; for a package without ``__init__.py``, the package's folder.
     """
     folder = file.resolve().parent
     found: dict[str, Path] = {}

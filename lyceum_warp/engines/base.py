@@ -218,7 +218,7 @@ class Engine(abc.ABC):
         The state fields and ``find_faults`` then describe the final state; derived fields may be stale.
 
         Args:
-            state: States to start from, (nworld, state_size or more) float64, as from ``get_state``.
+            state: States to start from, (nworld, state_size or more) float64, such as those of ``get_state``.
             controls: Controls of each step, (steps, nworld, nu) float32.
             nstep: Substeps in a step.
             buffers: Destinations of fields and model fields, by name, (steps + 1, nworld, ...); row 0 is the initial
@@ -251,7 +251,7 @@ class Engine(abc.ABC):
     # state
 
     def get_state(self, state: wp.array, mask: wp.array | None = None) -> None:
-        """Copy the masked worlds' exact states, by default of all, into ``state``, (nworld, state_size) float64.
+        """Copy the exact states of the masked worlds, or of all worlds, into ``state``, (nworld, state_size) float64.
 
         The method consists of Warp launches.
         """
@@ -265,7 +265,7 @@ class Engine(abc.ABC):
             start += field.size
 
     def set_state(self, state: wp.array, mask: wp.array) -> None:
-        """Put the masked worlds into the given states, exactly, and update all fields."""
+        """Put the masked worlds exactly into the given states, and update all fields."""
         self._set_integration(state[:, : self.integration_size], mask)
         if self.dynamics:
             self._read_columns(state, mask, self.dynamics.values(), self.state_size - self._dynamics_size)

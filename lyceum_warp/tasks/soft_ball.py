@@ -1,4 +1,4 @@
-"""SoftBall: grip a soft ball, a flex, with two fingers and lift it to a target.
+"""SoftBall: grip a soft ball (a flex) with two fingers, and lift it to a target.
 
 Squeezing the ball costs reward, and crushing it to two thirds of its width ends the episode. The policy observes the
 mean and the extents of the ball's vertices. Success: the ball has been within 3 cm of the target for half a second.

@@ -176,8 +176,8 @@ ARGUMENTS = {
     "wanted_air_time": "least duration of a rewarded swing, s",
     "width": "number of elements in a value of a history",
 }
-"""The meanings of the functions' arguments by name. "memory" stands for a row of the task's memory, "table" for an
-array of Params."""
+"""The meanings of the functions' arguments by name. "memory" stands for a row of the task's memory, and "table" stands
+for an array of Params."""
 
 for _name in __all__:
     document_arguments(globals()[_name], ARGUMENTS)

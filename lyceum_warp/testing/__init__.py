@@ -82,7 +82,7 @@ def check_task(
         steps: Number of steps in long checks (determinism, memory).
         seed: Seed of the worlds and of the random actions.
         checks: The rules to check, a selection of ``CHECKS``.
-        options: Additional options of ``make`` and parameters of the task. On a CUDA device ``deterministic`` is True
+        options: Additional options of ``make`` and parameters of the task. On a CUDA device, ``deterministic`` is True
             by default, because the rules compare numbers bit for bit.
 
     Returns:

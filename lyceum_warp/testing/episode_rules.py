@@ -57,7 +57,7 @@ def check_truncation(ctx: Context) -> None:
 
 
 def check_no_autoreset(ctx: Context) -> None:
-    """Without automatic resets ``done`` stays set, the world keeps stepping, and ``final_obs`` equals ``obs``."""
+    """Without automatic resets, ``done`` stays set, the world keeps stepping, and ``final_obs`` equals ``obs``."""
     env, horizon = ctx.a, 3
     with ctx.changed(env, horizon=horizon, autoreset=False):
         ctx.restart()

@@ -9,7 +9,7 @@ from lyceum_warp.world_arrays import memory_columns
 
 
 def check_groups(ctx: Context) -> None:
-    """The group ``policy`` equals ``env.obs``, and after a fault every group keeps its last valid observation."""
+    """The group ``policy`` equals ``env.obs``, and after a fault, every group keeps its last valid observation."""
     a = ctx.a
     ctx.that(a.obs is a.obs_groups["policy"], "the group policy is not env.obs")
     ctx.that(a.final_obs is a.final_obs_groups["policy"], "the final group policy is not env.final_obs")

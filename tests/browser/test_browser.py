@@ -35,7 +35,7 @@ from lyceum_warp.viz.page import write_page
 pytestmark = pytest.mark.browser
 
 SECONDS = 120.0
-"""Time limit for a page, in seconds; without a GPU a browser draws only a few frames per second."""
+"""Time limit for a page, in seconds; without a GPU, a browser draws only a few frames per second."""
 INPUT_SECONDS = 6.0
 """Seconds to wait for the effect of a key or click before the test repeats it. A busy browser may lose an input."""
 VIEW = {"width": 1000, "height": 640}
@@ -299,7 +299,7 @@ def test_keys_and_buttons_pause_step_and_choose_a_controller(tab: Tab) -> None:
     tab.click_near(*LEFT, lambda: viewer.status.controller == "left")
 
 
-@pytest.mark.long  # a double click needs frames within 0.3 s, so without a GPU it needs many attempts
+@pytest.mark.long  # a double click needs frames within 0.3 s, so without a GPU, it needs many attempts
 def test_dragging_a_body_pushes_it(tab: Tab) -> None:
     viewer = tab.viewer
     middle = tab.place()

@@ -88,7 +88,7 @@ def make_theirs(task: str, **options: Any) -> Any:
 
 
 def relative_error(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Return the largest difference, relative to the larger of 1 and the value."""
+    """Return the largest difference divided by max(1, |value|)."""
     return float(np.max(np.abs(ours - theirs) / np.maximum(1.0, np.abs(theirs)), initial=0.0))
 
 

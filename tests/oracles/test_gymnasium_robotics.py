@@ -1,7 +1,7 @@
 """Compare tasks with their Gymnasium-Robotics environments on the C engine.
 
-A task names its environment in the attribute ``gymnasium``. For a new task, add states to SPECIAL that reach its
-bonuses.
+A task names its environment in the attribute ``gymnasium``. For a new task, add the states that reach its bonuses to
+SPECIAL.
 """
 
 import dataclasses

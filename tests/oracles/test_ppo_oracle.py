@@ -19,7 +19,7 @@ STEPS, N = 12, 8
 
 @pytest.fixture(autouse=True)
 def double() -> Iterator[None]:
-    """Use float64, because in float32 Adam would amplify rounding errors of tiny gradients to full steps."""
+    """Use float64, because Adam in float32 would amplify rounding errors of tiny gradients to full steps."""
     torch.set_default_dtype(torch.float64)
     yield
     torch.set_default_dtype(torch.float32)

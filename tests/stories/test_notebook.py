@@ -1,4 +1,4 @@
-"""Define tasks in a notebook, whose cells run in one module and may run repeatedly."""
+"""Define tasks in a notebook. The cells of a notebook run in one module, and may run repeatedly."""
 
 import sys
 import types

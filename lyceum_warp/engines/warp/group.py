@@ -112,8 +112,8 @@ class Turns:
 class Arena(Reserve):
     """An allocator for loops and branches of CUDA graphs, where Warp cannot allocate.
 
-    A run outside a graph allocates from the device, counts the bytes, and reserves as many. A graph allocates from the
-    reserve. Graphs share the reserve, because they never run at the same time.
+    A run outside a graph allocates from the device, counts the bytes, and reserves the same number. A graph allocates
+    from the reserve. Graphs share the reserve, because they never run at the same time.
 
     Args:
         device: The device of the launches; on the CPU, nothing is reserved.

@@ -71,7 +71,7 @@ def outputs_of(fields: Collection[ModelField]) -> list[str]:
 
 
 def owner(model: mjw.Model, name: str) -> mjw.Model | mjw.Option:
-    """Return the object with a model field as an attribute: the model or its options."""
+    """Return the object that has a model field as an attribute: the model or its options."""
     return model if hasattr(model, name) else model.opt
 
 
