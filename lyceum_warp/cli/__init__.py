@@ -18,7 +18,7 @@ _COMMANDS = {
     "tasks": ("list_tasks", "Tasks", "List the tasks of the package, their sizes and the sources of their models."),
     "new": ("new_task", "New", "Write a task file for a model."),
     "check": ("check", "Check", "Check that a task follows every rule of an environment."),
-    "train": ("train", "Train", "Train a policy on a task, with the natural policy gradient or with PPO."),
+    "train": ("train", "Train", "Train a policy on a task, with NPG, PPO or SAC."),
     "eval": ("evaluate", "Eval", "Evaluate a run's policy, and print statistics of its episodes."),
     "export": ("export", "Export", "Write a run's policy to an ONNX or .pt2 file."),
     "plan": ("plan", "Plan", "Control a task with a planner, and report rewards, success and planning times."),
