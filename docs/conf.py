@@ -21,7 +21,7 @@ import lyceum_warp as lw
 
 for each in ("lyceum_warp", "traitlets"):
     logging.getLogger(each).setLevel(logging.WARNING)
-sys.modules["lw"] = lw  # documents names as they are written: lw.make
+sys.modules["lw"] = lw  # the reference shows names as users write them: lw.make
 
 project, version, author = "lyceum_warp", lw.__version__, "The lyceum_warp authors"
 extensions = ["myst_nb", "sphinx.ext.autodoc"]

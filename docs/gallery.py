@@ -40,7 +40,7 @@ class Show:
     """Settings for the picture of a task."""
 
     settings: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Settings of MPPI and options of its worlds that differ from the task's."""
+    """Settings of MPPI, and options of its worlds, that replace the task's."""
     replan_every: int = 1
     """Number of steps from one MPPI plan to the next."""
     seconds: float = 4.0
@@ -95,7 +95,7 @@ SHOWS = {
        for robot, distance in (("go1", 1.7), ("go1_rough", 2.2), ("spot", 2.6), ("g1", 2.8), ("g1_full", 2.8),
                                ("g1_rough", 3.2), ("h1", 3.6), ("t1", 2.8))},
 }  # fmt: skip
-"""Settings of tasks that differ from the defaults of Show."""
+"""The tasks that need other settings than the defaults of Show."""
 
 
 def draw(name: str, run: Path | None) -> dict[str, str]:

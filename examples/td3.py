@@ -24,7 +24,7 @@ class TD3Config:
     num_steps: int = 125
     """Steps of each world per iteration."""
     warmup: int = 1000
-    """Number of samples with random actions, which are taken first."""
+    """Number of samples with random actions, taken before learning starts."""
     batch: int = 256
     n_step: int = 1
     gamma: float = 0.99
@@ -40,7 +40,7 @@ class TD3Config:
 
 
 class TD3(lw.Learner):
-    """A learner of a deterministic policy from a replay buffer, whose targets use the smaller of two critics."""
+    """Learns a deterministic policy from a replay buffer; its targets use the smaller of two critics' values."""
 
     algorithm = "td3"
 

@@ -15,7 +15,7 @@ _SEEDS = 2**31
 """Seeds of an environment are smaller than this number."""
 
 _OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode (in adapters that have it)"}
-"""Options of ``lw.make`` that an adapter sets, and the adapter's arguments that replace them."""
+"""Options of ``lw.make`` that adapters do not accept, each with the adapter's argument to use instead."""
 
 
 def environment_of(

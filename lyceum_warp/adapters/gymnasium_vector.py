@@ -24,7 +24,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     ``autoreset_mode`` determines when a world is reset after its episode ends:
 
-    - SAME_STEP resets it within the same step. The world returns the first observation of its next episode;
+    - SAME_STEP resets the world within that step. The world returns the first observation of its next episode;
       ``infos["final_obs"]`` and ``infos["final_info"]`` hold the last observations and infos of ended episodes, and the
       masks ``_final_obs`` and ``_final_info`` select their worlds. With NumPy, ``final_obs`` and ``final_info`` exist
       only if an episode ended, and ``final_obs`` is an object array with None for the other worlds, as Gymnasium's
@@ -33,11 +33,11 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     - DISABLED leaves resets to ``reset(options={"reset_mask": mask})``. An ended world keeps stepping until its reset,
       and its termination or truncation stays set. A world with a fault is reset at once, but returns its last valid
       observation.
-    - NEXT_STEP resets it in the next step, which ignores the world's action. With NEXT_STEP, every step has a second
-      reset phase. Some wrappers, such as ``NormalizeObservation``, require NEXT_STEP.
+    - NEXT_STEP resets the world in the next step, which ignores the world's action. With NEXT_STEP, every step has a
+      second reset phase. Some wrappers, such as ``NormalizeObservation``, require NEXT_STEP.
 
     As in Gymnasium's own environments, a first reset without a seed draws one at random, unless the constructor gets
-    ``seed=``. A seed determines the random numbers of all worlds, which differ between worlds.
+    ``seed=``. One seed determines the random numbers of all worlds, but every world has different random numbers.
 
     Args:
         task: A task, as in ``lw.make``, or an environment.

@@ -90,7 +90,7 @@ def optional_flags(
                     setattr(cls, name, field.default if default is None else None)
                 value = getattr(cls, name)
                 flag = own.pop(name, None) or hints[name]
-                if value is None and flag is hints[name]:  # the first sentence explains None, which a flag cannot have
+                if value is None and flag is hints[name]:  # flags do not accept None, which the first sentence explains
                     (kind_of_flag,) = {*(typing.get_args(flag) if isinstance(flag, _UNIONS) else [flag])} - {type(None)}
                     flag = Annotated[kind_of_flag | None, tyro.conf.DisallowNone]
                 text = default[name] if isinstance(default, Mapping) else default or ""
@@ -136,7 +136,7 @@ class EnvFlags:
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto (the default): warp on a CUDA device and mujoco on the CPU."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu (the default), or a CUDA device such as cuda:0. Without this flag a run with the engine auto is evaluated on
+    """cpu (the default), or a CUDA device such as cuda:0. Without this flag, a run with the engine auto is evaluated on
     the CPU, where a few worlds step fastest."""
 
 

@@ -113,7 +113,7 @@ _COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skippe
 columns."""
 
 _BAR_WIDTH = 36
-"""The width of the bar, the iteration number and the times in characters."""
+"""The total width, in characters, of the progress bar, the iteration number and the times."""
 
 
 def counted(number: int, what: str) -> str:
@@ -210,8 +210,8 @@ def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
 class PlanDisplay:
     """Shows the progress of a planner's episode: a live line on a terminal, and a line at the end of the episode.
 
-    With ``real_time`` the live line shows the rate of plans and the age of the action, otherwise the rate of the plant.
-    Rates are averaged over the episode so far.
+    With ``real_time``, the live line shows the rate of plans and the age of the action. Otherwise it shows the rate of
+    the plant. Rates are averaged over the episode so far.
     """
 
     def __init__(

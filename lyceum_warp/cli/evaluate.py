@@ -67,7 +67,7 @@ class Eval:
     nworld: int = 32
     """Maximum number of worlds; there are never more worlds than episodes."""
     video: bool = False
-    """Whether to write a video of one episode: eval.mp4 in the run's folder, or with --pretrained TASK.mp4."""
+    """Whether to write a video of one episode: eval.mp4 in the run's folder, or TASK.mp4 with --pretrained."""
     camera: CameraWords = ()
     transfer: bool = False
     """Whether to play the episodes on both engines, and under each of the task's physics, and to print the differences

@@ -88,12 +88,13 @@ class Plan:
     exact is the controlled world's physics.
 
     With --real-time the world keeps its rate. The command then measures planning times for a few seconds, and chooses
-    the largest number of samples that meets the deadline on this machine, or if none does, a shorter horizon or other
-    physics of the task. Values of --samples, --horizon and --physics that you give are never changed.
+    the largest number of samples that meets the deadline on this machine. If no number meets it, the command tries a
+    shorter horizon and then other physics of the task. Values of --samples, --horizon and --physics that you give are
+    never changed.
 
     The command writes config.json, versions.json, report.json, plan.png, a video of the first episode (video.mp4), and
     one file per episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy) into a
-    folder. After Ctrl-C the interrupted episode is saved too, but is not part of the report.
+    folder. After Ctrl-C, the interrupted episode is saved, too, but is not part of the report.
 
     $ lyceum-warp plan reach
     $ lyceum-warp plan reach --real-time --episodes 10
@@ -129,7 +130,7 @@ class Plan:
     final state."""
     param: ParamWords = ()
     planner_param: Repeated = ()
-    """A parameter of the planner's model that differs from the controlled world's; the flag may be repeated."""
+    """A parameter of the task that only the planner's worlds use; the flag may be repeated."""
     planner_model: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """The planner's model, if it differs from the controlled world's."""
     video: bool = True

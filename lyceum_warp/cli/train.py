@@ -131,8 +131,8 @@ class Train:
     transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default only two
     cheap comparisons run: the C engine after training on a GPU, and the task's own physics if the run has other
-    physics. With --transfer a policy trained on CPU cores is also tested on the Warp engine, whose kernels may take
-    minutes to compile, and under each physics of the task."""
+    physics. With --transfer, a policy trained on CPU cores is also tested under each physics of the task, and on the
+    Warp engine, whose kernels may take minutes to compile."""
     trust: Trust = False
     take_over: bool = False
     """Continue a run that another process has locked, on this or another host. The process that held the lock ends at
@@ -212,7 +212,7 @@ class Train:
             return self._report(run, learner, console)
 
     def _suggestion(self) -> Training:
-        """Return the task's settings for training, or only the flag's algorithm if that is another one."""
+        """Return the settings that the task suggests, or none of them if a flag gives another algorithm."""
         assert self.task is not None
         suggestion = find_task(self.task).training
         if self.algorithm in (None, suggestion.algorithm):

@@ -152,7 +152,7 @@ class Walker:
         return names
 
     def _moved(self) -> np.ndarray:
-        """Return the mask of the joints that an actuator moves, (njnt,), also through a tendon."""
+        """Return the mask, (njnt,), of the joints that an actuator moves directly or through a tendon."""
         m, d = self.model, self.data
         mujoco.mj_forward(m, d)
         moment = np.zeros((m.nu, m.nv))

@@ -40,12 +40,12 @@ _NICE = 10  # the niceness of the subprocess of `lw.RunViewer`
 
 @optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)")
 class Place:
-    """Engine and device of the shown worlds, or with --mppi of the planner's worlds."""
+    """Engine and device of the displayed worlds; with --mppi, of the planner's worlds."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu, or a CUDA device such as cuda:0. By default a run with engine auto is shown on the CPU."""
+    """cpu, or a CUDA device such as cuda:0. By default, a run with engine auto is shown on the CPU."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -203,7 +203,7 @@ def _planner(options: View, env: Env) -> MPPI:
 
 
 def _words(options: View) -> dict[str, Any]:
-    """Return the options of the worlds, or with --mppi of the planner's worlds."""
+    """Return the options of the displayed worlds; with --mppi, of the planner's worlds."""
     return given(options.place) | given(options.physics)
 
 
@@ -238,7 +238,7 @@ def attached() -> None:
 
 
 def _end_with_parent() -> None:
-    """Wait for EOF on stdin, which follows any end of the parent process, even SIGKILL; then end this process."""
+    """End this process at EOF on stdin: the parent process has ended, perhaps by SIGKILL."""
     with contextlib.suppress(OSError, ValueError):
         sys.stdin.read()
     os.kill(os.getpid(), signal.SIGTERM)

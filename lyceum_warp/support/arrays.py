@@ -37,9 +37,9 @@ def shared_rows(row: np.ndarray, dtype: type, count: int, device: wp.Device) -> 
 
 
 def with_memory(array: wp.array) -> wp.array:
-    """Return the array, or for an empty array an empty one of the same shape with memory behind it.
+    """Return the array; replace an empty array by an array of the same shape that has allocated memory.
 
-    Without memory behind the array, a task that reads an element by mistake would crash the process.
+    Without allocated memory, a task that reads an element by mistake would crash the process.
     """
     if array.size:
         return array

@@ -45,7 +45,7 @@ def extend_structs() -> None:
 def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
     """Whether a module of kernels for a block size is loaded or in Warp's cache.
 
-    The result is False if Warp's internals have changed, which only costs time.
+    The result is also False if Warp's internals have changed; this only costs time.
     """
     if (device.context, block) in module.execs:
         return True
@@ -141,8 +141,8 @@ def replaced_in_this_thread(functions: Mapping[str, Callable[..., Any]]) -> Iter
 
 
 _REMADE = ("reset_data", "get_state", "set_state")
-"""The functions of MuJoCo Warp that make their kernels again in every call. The kernels' sources depend only on their
-single free variable, whether there is a mask."""
+"""The functions of MuJoCo Warp that make their kernels again in every call. The kernels have a single
+free variable: whether there is a mask."""
 
 
 def quicken_mujoco_warp() -> None:
