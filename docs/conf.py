@@ -57,7 +57,7 @@ CONTENTS = {
     "Reference": "reference/environments reference/tasks reference/functions reference/models reference/learning "
     "reference/planning reference/runs",
 }
-"""The pages of each section, in order, relative to docs/."""
+"""The paths of each section's pages, relative to docs/, in order."""
 
 
 def contents(_: str) -> str:

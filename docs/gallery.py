@@ -1,6 +1,6 @@
 """Draw the gallery: MUJOCO_GL=egl python docs/gallery.py [--runs FOLDER] [TASK ...].
 
-If FOLDER contains a run of a task, the run's policy controls the task. MPPI controls tasks without a run. By default
+If FOLDER contains a run of a task, the run's policy controls the task. MPPI controls tasks without a run. By default,
 FOLDER contains the pretrained policies. The program writes a moving picture of each task, its command and its result
 into docs/images/gallery/, and then the page gallery.md. Without the argument TASK, the program draws all tasks.
 """

@@ -160,8 +160,7 @@ def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omi
 def curve_table(rows: list[dict[str, float | None]], console: Console) -> Table:
     """Make a table of at most 15 iterations of a run, without empty columns and columns that do not fit the console.
 
-    Iterations without an evaluation of the mean policy are omitted if at least 4 between the first and the last have
-    one.
+    Iterations that did not evaluate the mean policy are omitted if at least 4 others remain between the first and last.
     """
     known = [_known(row) for row in rows]
     between = [row for row in known[1:-1] if "mean_return" in row]

@@ -57,7 +57,7 @@ class Eval:
     which: str = "last"
     """The policy to evaluate: last, best, or the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """A task, by name or file, that replaces the run's task and its physics and defaults. The replacement may be the
+    """A task, by name or file, to use instead of the run's task, with its own physics and defaults. It may be the
     current version of the run's task. The observations and actions of both tasks must have the same sizes."""
     param: ParamWords = ()
     episodes: int = 32

@@ -87,10 +87,10 @@ class Plan:
     the planner come from the task. Physics options (--physics, --integrator, ...) apply only to the planner; --physics
     exact is the controlled world's physics.
 
-    With --real-time the world keeps its rate. The command then measures planning times for a few seconds, and chooses
-    the largest number of samples that meets the deadline on this machine. If no number meets it, the command tries a
-    shorter horizon and then other physics of the task. Values of --samples, --horizon and --physics that you give are
-    never changed.
+    With --real-time, the world does not wait for plans. The command then measures planning times for a few seconds, and
+    chooses the largest number of samples that meets the deadline on this machine. If no number meets it, the command
+    tries a shorter horizon and then other physics of the task. Values of --samples, --horizon and --physics that you
+    give are never changed.
 
     The command writes config.json, versions.json, report.json, plan.png, a video of the first episode (video.mp4), and
     one file per episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy) into a
@@ -247,8 +247,8 @@ _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
     """Choose the settings that no flag gives, from measured planning times; return None if flags give all settings.
 
-    A plan must be ready within a step of the plant. If no setting is fast enough, a plan may take a step of the
-    planner, which may be longer.
+    A plan must be ready within a step of the plant. If no setting is fast enough, a plan may take as long as a step of
+        the planner.
     """
     task, flags = plant.task.task, given(options.mppi)
     config = options.mppi.on_top_of(task_config(task))

@@ -73,7 +73,7 @@ class Train:
     $ lyceum-warp train half_cheetah --algorithm sac --iterations 1000
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
-    The processes of torchrun share the worlds, even across machines. With --device cuda each process uses the GPU of
+    The processes of torchrun share the worlds, even across machines. With --device cuda, each process uses the GPU of
     its local rank. The number of processes affects only the rounding of the results, and may change when a run is
     resumed. Rank 0 writes files and messages. After Ctrl-C or SIGTERM to torchrun or to any process, all processes
     finish the iteration and end together; torchrun waits for them for 30 s, or for its --shutdown-timeout.
@@ -98,7 +98,7 @@ class Train:
     """Continue the run in the given folder exactly, with its settings, up to --iterations."""
     from_run: Annotated[Path | None, tyro.conf.arg(name="from", metavar="RUN")] = None
     """Start a new run from the policy, the value function and the normaliser of another run. The run's settings are the
-    defaults, but a different TASK has its own parameters, and a different --algorithm its own hyperparameters."""
+    defaults, but a different TASK has its own parameters, and a different --algorithm has its own hyperparameters."""
     which: str = "last"
     """The policy to start from with --from: last, best, or the number of a saved iteration."""
     target_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None

@@ -44,8 +44,8 @@ class Tune:
     short: bool = False
     """Compare the first 100 steps of episodes, for a few seconds for each setting, instead of whole episodes."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Number of episodes of each setting. By default as many as the interval needs, within a minute (5 s with
-    --short)."""
+    """Number of episodes of each setting. By default, as many as the confidence interval needs, for at most a
+    minute (5 s with --short)."""
     planning: bool = False
     """Find physics for the task's planner: compare planning times, and test whether coarser physics rank samples as the
     task's own physics do. --nworld is then the number of samples, and --episodes the number of states of each kind."""

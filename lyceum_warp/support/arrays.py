@@ -125,7 +125,7 @@ PAIRS_A_LAUNCH = 4
 def launch_several_rows(kernel: wp.Kernel, mask: wp.array, pairs: Sequence[tuple[wp.array, wp.array]]) -> None:
     """Launch ``narrow_four`` or ``widen_four`` of ``kernels.state`` over the masked rows of sources and targets.
 
-    On the CPU a launch takes longer than copying a few short rows, so one launch copies up to four arrays.
+    On the CPU, a launch takes longer than copying a few short rows, so one launch copies up to four arrays.
 
     Args:
         kernel: The kernel.
