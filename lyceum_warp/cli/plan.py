@@ -248,7 +248,7 @@ def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) 
     """Choose the settings that no flag gives, from measured planning times; return None if flags give all settings.
 
     A plan must be ready within a step of the plant. If no setting is fast enough, a plan may take as long as a step of
-        the planner.
+    the planner.
     """
     task, flags = plant.task.task, given(options.mppi)
     config = options.mppi.on_top_of(task_config(task))
