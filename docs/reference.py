@@ -109,7 +109,7 @@ def convert(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[
 
 
 def converted(text: str) -> list[str]:
-    """Convert a docstring to lines of reStructuredText, and escape bars outside of code."""
+    """Convert a docstring to lines of reStructuredText, and escape vertical bars outside of code."""
     text = re.sub(r"``.*?``|\|", lambda found: "\\|" if found[0] == "|" else found[0], text, flags=re.DOTALL)
     return str(GoogleDocstring(text, SECTIONS)).splitlines()
 

@@ -84,7 +84,7 @@ class ResetSeeds:
 
 
 def per_world(value: Any, nworld: int) -> list[Any]:
-    """Return a list with one value per world: the rows of a tensor with ``nworld`` rows, else copies of the value."""
+    """Return a list with one value per world: the rows of a tensor with ``nworld`` rows, or copies of another value."""
     if isinstance(value, torch.Tensor) and value.ndim and len(value) == nworld:
         return list(value)
     return [value] * nworld

@@ -105,7 +105,7 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         self._pictures.close()
 
     def _rows(self, *buffers: torch.Tensor) -> list[Any]:
-        """The first row of each buffer, which belongs to the single world."""
+        """The first row of each buffer: the row of the single world."""
         return [array[0] for array in self._host.of(*buffers)]
 
 

@@ -136,7 +136,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Advance every world by one step.
 
         Args:
-            actions: (num_envs, nact), a float32 array, or with ``torch=True`` a tensor on the environment's device.
+            actions: (num_envs, nact), a float32 array; with ``torch=True``, a tensor on the environment's device.
 
         Returns:
             Observations, rewards, terminations, truncations and infos.

@@ -103,7 +103,7 @@ def optional_flags(
 
 
 def given(flags: Any) -> dict[str, Any]:
-    """Return the values of the flags that differ from their defaults, by name.
+    """Return the flags that were changed from their defaults, as a dict of values by name.
 
     Raises:
         ValueError: A limit of the solver is not of the form NAME=VALUE.

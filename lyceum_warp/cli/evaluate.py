@@ -51,7 +51,7 @@ class Eval:
     )  # fmt: skip
 
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|TASK")]
-    """The run's folder, or with --pretrained the name of a task."""
+    """The run's folder; with --pretrained, the name of a task."""
     pretrained: bool = False
     """Whether to evaluate the package's pretrained policy of a task."""
     which: str = "last"
@@ -70,8 +70,8 @@ class Eval:
     """Whether to write a video of one episode: eval.mp4 in the run's folder, or TASK.mp4 with --pretrained."""
     camera: CameraWords = ()
     transfer: bool = False
-    """Whether to play the episodes on both engines, and under each of the task's physics, and to print the differences
-    with a verdict. The Warp engine runs on --device, by default on a GPU if there is one."""
+    """Whether to play the episodes on both engines and under each of the task's physics. The command then prints the
+    differences and a verdict. The Warp engine runs on --device, by default on a GPU if there is one."""
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder for the episodes, one file each, in the format of lyceum-warp plan: episode-000.npz and so
     on."""

@@ -83,7 +83,7 @@ class Settings:
 class Plan:
     """Control a task with a planner that replans at every step, and report rewards, success and planning times.
 
-    The planner is MPPI, or with --update the cross-entropy method (cem) or predictive sampling. The default settings of
+    The planner is MPPI; --update selects the cross-entropy method (cem) or predictive sampling. The default settings of
     the planner come from the task. Physics options (--physics, --integrator, ...) apply only to the planner; --physics
     exact is the controlled world's physics.
 

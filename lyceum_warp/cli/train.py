@@ -129,7 +129,7 @@ class Train:
     none."""
     camera: CameraWords = ()
     transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
-    """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default only two
+    """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default, only two
     cheap comparisons run: the C engine after training on a GPU, and the task's own physics if the run has other
     physics. With --transfer, a policy trained on CPU cores is also tested under each physics of the task, and on the
     Warp engine, whose kernels may take minutes to compile."""

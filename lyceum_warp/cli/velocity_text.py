@@ -11,7 +11,7 @@ from lyceum_warp import walkers
 from lyceum_warp.cli.task_text import literal
 
 TRAINING = "--algorithm ppo --device cuda --iterations 800"
-"""Options of lyceum-warp train by which robots learn to walk on one GPU."""
+"""Options of lyceum-warp train with which robots learn to walk on one GPU."""
 
 _STEP = 0.02
 """Seconds in a step."""

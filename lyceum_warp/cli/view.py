@@ -52,9 +52,9 @@ class Place:
 class View:
     """Show a task, a policy, a planner or episodes in a browser.
 
-    For a task, the viewer shows its worlds, lets you push bodies with the mouse, and with --mppi runs a planner in real
-    time. For a run, it shows the run's policy, and with --follow the newest policy while the run trains. Episode files,
-    or a folder of lyceum-warp plan, are played back.
+    For a task, the viewer shows its worlds, lets you push bodies with the mouse and, with --mppi, runs a planner in
+    real time. For a run, it shows the run's policy; with --follow, it shows the newest policy while the run trains.
+    Episode files, or a folder of lyceum-warp plan, are played back.
 
     The viewer is a web page. The command prints the address of the page, which contains a secret, and over ssh also the
     command that forwards the port.
@@ -74,7 +74,7 @@ class View:
     pretrained: bool = False
     """Show the package's pretrained policy of a task."""
     mppi: bool = False
-    """Control the shown world with a planner: MPPI, or with --update a different one."""
+    """Control the displayed world with a planner: MPPI, or the planner that --update selects."""
     follow: bool = False
     """Show the newest policy of a run while it trains."""
     which: str = "last"
