@@ -79,7 +79,7 @@ class TD3(lw.Learner):
         )  # fmt: skip
 
     def update(self) -> torch.Tensor:
-        """Update the critics, and in every second call the actor and the target networks; return the critics' loss."""
+        """Update the critics and, in every second call, the actor and the target networks; return the critics' loss."""
         config, (actor, critic), (actor_step, critic_step) = self.config, self.targets, self.optimizers
         batch = self.replay.sample(config.batch, n_step=config.n_step, gamma=config.gamma, generator=self.generator)
         obs, next_obs = batch.obs["policy"], batch.next_obs["policy"]

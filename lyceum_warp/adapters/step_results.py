@@ -70,7 +70,7 @@ class HostArrays:
 
     def __init__(self, env: Env, *, copy: bool = True, one_world: bool = False) -> None:
         self._env, self._copy = env, copy
-        # on the CPU the array shares the action buffer's memory; on a GPU, pinned memory holds the actions before the
+        # on the CPU, the array shares the action buffer's memory; on a GPU, pinned memory holds the actions before the
         # copy
         pinned = torch.empty(env.action.shape, pin_memory=True) if env.action.is_cuda else None
         self._pinned = pinned

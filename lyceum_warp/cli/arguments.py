@@ -145,8 +145,8 @@ class Physics:
     """Physics options of the worlds. The defaults come from the run, the task or its model."""
 
     physics: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """One of the task's physics by name, as listed by lyceum-warp tasks, or exact for the task's own. Flags of single
-    physics options override it."""
+    """One of the task's physics by name, as listed by lyceum-warp tasks, or exact for the task's own
+    physics. Flags of single physics options override it."""
     solver: Repeated = ()
     """A limit of the constraint solver, such as iterations=4, ls_iterations=10 or noslip_iterations=0; may be repeated.
     The default limits come from the model."""

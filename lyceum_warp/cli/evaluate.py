@@ -170,8 +170,8 @@ def run_worlds(
 
     Args:
         run: The run.
-        words: Options that override the run's; with the engine auto and no device, the worlds run on the CPU.
-        params: Parameters that override the run's.
+        words: Options that override the run's options; with the engine auto and no device, the worlds run on the CPU.
+        params: Parameters that override the run's parameters.
         nworld: Number of worlds.
         task: A different task, with its own options and parameters.
         trust: Whether to execute a run's task although this user did not make the run on this machine.

@@ -86,10 +86,10 @@ class Train:
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class."""
     algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac")] = None
-    """npg, the natural policy gradient; ppo; or sac, soft actor-critic with a replay buffer. By default the algorithm
-    that the task suggests, with its hyperparameters: ppo for walking robots, npg for others."""
+    """npg, the natural policy gradient; ppo; or sac, soft actor-critic with a replay buffer. By default, the algorithm that
+    the task suggests, with its hyperparameters: ppo for walking robots, npg for others."""
     iterations: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Iterations in total, including those before --resume; by default those that the task suggests, or 100."""
+    """Total number of iterations, including those before --resume; by default as many as the task suggests, or 100."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Seed of the networks, the noise and the worlds' initial states."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -262,7 +262,7 @@ class Train:
         )  # fmt: skip
 
     def _learner(self, source: Run | None, team: Team) -> tuple[Learner, Path, dict[str, Any]]:
-        """Make the learner, and return it, the run's folder and additional entries for config.json."""
+        """Make the learner; return the learner, the run's folder and additional entries for config.json."""
         configuration = self.configuration(source, team)
         if self.out is not None and team.leads:
             Run.check_free(self.out)

@@ -87,8 +87,8 @@ def separate_captures() -> None:
     """Make captures of CPU launches thread-local.
 
     Warp's native library captures only launches of the thread that started the capture, but Warp's Python code applies
-    the capture to all threads. Loops of other threads would enter the graph, and launches of other threads would
-    overwrite the graph's arguments.
+    the capture to all threads. Captured loops of other threads would become part of the graph, and launches of other
+    threads would overwrite the graph's arguments.
     """
     for name in ("_apic_capture", "_apic_graph"):
         setattr(wp._src.context.Runtime, name, _PerThread())
