@@ -86,8 +86,8 @@ class Train:
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class."""
     algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac")] = None
-    """npg, the natural policy gradient; ppo; or sac, soft actor-critic with a replay buffer. By default, the algorithm that
-    the task suggests, with its hyperparameters: ppo for walking robots, npg for others."""
+    """npg, the natural policy gradient; ppo; or sac, soft actor-critic with a replay buffer. By default, the algorithm
+    that the task suggests, with its hyperparameters: ppo for walking robots, npg for others."""
     iterations: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Total number of iterations, including those before --resume; by default as many as the task suggests, or 100."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
