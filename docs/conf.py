@@ -39,7 +39,7 @@ highlight_language = "none"  # blocks without a language are output and formulas
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 nb_execution_mode, nb_execution_raise_on_error = "force", True
-nb_execution_timeout = 900  # seconds for each cell; compiling kernels may take minutes
+nb_execution_timeout = 900  # time limit of a cell in seconds; compiling kernels may take minutes
 nb_merge_streams = nb_execution_in_temp = True
 KernelManager.transport_encryption.default_value = "auto"  # other values make Jupyter kernels warn
 

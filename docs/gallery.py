@@ -31,7 +31,7 @@ FOLDER = DOCS / "images" / "gallery"
 RESULTS = FOLDER / "results.json"
 PRETRAINED = Path(lw.__file__).parent / "pretrained"
 
-SIZE, SCALE = (208, 156), 2  # pixels; pictures are drawn larger and reduced, for smooth edges
+SIZE, SCALE = (208, 156), 2  # pixels; pictures are drawn larger and then scaled down, which smooths edges
 RATE = 12.5  # frames per second
 LARGEST = 80_000  # bytes of a picture
 
@@ -147,7 +147,7 @@ SHOWS = {
 }  # fmt: skip
 """The tasks that need other settings than the defaults of Show."""
 
-for _name in ("g1_full_velocity", "g1_rough_velocity"):  # without a policy; under the planner they fall soon
+for _name in ("g1_full_velocity", "g1_rough_velocity"):  # no policy, and these robots soon fall under the planner
     _settings = {"horizon": 32, "samples": 48, "knots": 5, "noise": 0.1, "temperature": 0.02}
     SHOWS[_name] = dataclasses.replace(SHOWS[_name], settings=_settings, replan_every=2, start=0.0, seconds=1.6)
 
@@ -194,7 +194,7 @@ def training(name: str, run: Path, config: dict[str, Any]) -> str:
 
 
 def written(flags: dict[str, Any]) -> str:
-    """Write flags as words of a command, each after a space."""
+    """Format flags for a command line, each preceded by a space."""
     words = ""
     for name, value in flags.items():
         flag = name.replace("_", "-")

@@ -49,7 +49,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         copy: Whether to copy results. Without copies, most tensors and most arrays on the CPU are live buffers that the
             next step overwrites.
         dict_obs: Whether observations are dicts of all observation groups; otherwise they are the group ``policy``. By
-            default True if the task has several groups.
+            default, True if the task has several groups.
         render_mode: "rgb_array" for pictures, or None.
         camera: The camera for pictures, as in ``lyceum_warp.viz.video.write_video``.
         render_size: Width and height of pictures in pixels, even numbers.

@@ -17,7 +17,7 @@ class Observations:
 
     Args:
         env: The environment.
-        dict_obs: Whether to return a dict of all groups. By default True if the task has several groups.
+        dict_obs: Whether to return a dict of all groups. By default, True if the task has several groups.
     """
 
     def __init__(self, env: Env, *, dict_obs: bool | None) -> None:

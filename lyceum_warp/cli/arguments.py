@@ -20,7 +20,7 @@ ParamWords = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
     tyro.conf.arg(
         metavar="NAME=VALUE",
-        help="A parameter of the task. A vector is written as NAME=0.7,inf, a table as NAME=file.npy. The flag "
+        help="A parameter of the task. Write a vector as NAME=0.7,inf and a table as NAME=file.npy. The flag "
         "may be repeated.",
     ),
 ]

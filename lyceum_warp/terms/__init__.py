@@ -85,7 +85,7 @@ ARGUMENTS = {
     "fastest_yaw_rate": "greatest yaw rate (rad/s)",
     "feet": "table: indices of the feet's sites",
     "flag": "memory: 1 element, which is 1 or 0",
-    "foot": "number of a foot, from 0",
+    "foot": "index of a foot, from 0",
     "foot_contacts": "table: indices in ``sensordata`` of a contact or touch sensor of each foot",
     "foot_forces": "table: indices in ``sensordata`` of the contact force on each foot (N)",
     "foot_height": "height of a foot above the ground (m)",
