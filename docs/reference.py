@@ -115,7 +115,7 @@ def converted(text: str) -> list[str]:
 
 
 def short_signature(app: Any, what: str, name: str, obj: Any, options: Any, signature: str, result: str) -> Any:
-    """Remove a dataclass's fields, which are documented as members, and the fields of default objects."""
+    """Remove the fields of a dataclass and of default objects; a dataclass's fields are documented as members."""
     if what == "class" and dataclasses.is_dataclass(obj):
         return "", result
     return signature and re.sub(r"(PhysicsOptions)\(.*?\)", r"\1()", signature), result

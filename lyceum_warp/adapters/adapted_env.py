@@ -84,7 +84,7 @@ class ResetSeeds:
 
 
 def per_world(value: Any, nworld: int) -> list[Any]:
-    """Return a list with one value per world: the rows of a tensor with ``nworld`` rows, or copies of another value."""
+    """Return the rows of a tensor with one row per world; repeat any other value for each world."""
     if isinstance(value, torch.Tensor) and value.ndim and len(value) == nworld:
         return list(value)
     return [value] * nworld
