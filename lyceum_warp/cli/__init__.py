@@ -22,7 +22,7 @@ _COMMANDS = {
     "eval": ("evaluate", "Eval", "Evaluate a run's policy, and print statistics of its episodes."),
     "export": ("export", "Export", "Write a run's policy to an ONNX or .pt2 file."),
     "plan": ("plan", "Plan", "Control a task with a planner, and report rewards, success and planning times."),
-    "tune": ("tune", "Tune", "Measure physics options of a task, and find the fastest with the same returns."),
+    "tune": ("tune", "Tune", "Find the fastest physics options that do not change a task's returns."),
     "view": ("view", "View", "Show a task, a policy, a planner or saved episodes in a browser."),
     "bench": ("bench", "Bench", "Run an experiment or another program of bench/."),
 }
