@@ -35,20 +35,20 @@ from lyceum_warp.worlds import Worlds
 _BUFFERS = (*step_types.OUTCOMES, "obs", "final_obs", "action")
 
 _ARGUMENTS = """Args:
-    task: Name of a task, a file with one (path/to/file.py, or path/to/file.py:Class), or its class.
+    task: Name of a task, a task file (path/to/file.py, or path/to/file.py:Class), or a task class.
     options: Options as one object; options given by name replace its fields.
 {options}
     **params: Parameters of the task, fields of its ``Params``. A scalar may also be given as one value per world,
         (nworld,). A table is an array, a tensor, a nested list, or the path of a ``.npy`` file.
 
 Raises:
-    ValueError: An argument is unknown or not valid; the message names the argument and the fix. FileNotFoundError: A
-    model file or a task file is missing.
+    ValueError: An argument is unknown or not valid; the message names the argument and the fix.
+    FileNotFoundError: A model file or a task file is missing.
 """
 
 
 def _document_arguments(function: Any) -> Any:
-    """Decorate a function by inserting the arguments into its docstring and signature, for ``help``."""
+    """Insert the arguments of ``make`` into a function's docstring and signature, for ``help``."""
     arguments = _ARGUMENTS.replace("{options}", OPTION_DOCS)
     function.__doc__ = inspect.cleandoc(function.__doc__).replace("{arguments}", arguments)
     function.__signature__ = signature_of_options(function)
@@ -107,7 +107,7 @@ class Env:
     episode_metric_sums: torch.Tensor
     """``episode_metrics`` as one tensor, (nworld, number of metrics), in the order of ``metrics``."""
     shared: dict[str, torch.Tensor]
-    """The memory that all worlds share, by name; only ``update_shared`` changes the memory, with the task's
+    """The memory that all worlds share, by name; only ``update_shared`` changes the memory, by calling the task's
     ``share``."""
     success: torch.Tensor
     """Whether the task's goal has been met for ``success_steps`` steps in a row, (nworld,), bool."""
@@ -450,10 +450,11 @@ class Env:
         return view[:, where.start] if one_object else view[:, where]
 
     def set_dynamics(self, mask: torch.Tensor | None = None, **fields: Any) -> None:
-        """Set model fields that the task randomizes or ``dynamics=`` lists, and update derived constants.
+        """Set model fields of worlds, and update derived constants.
 
-        Each reset first restores the nominal values of fields that the task's ``initialize``, ``randomize`` or
-        ``event`` writes. Other fields keep the new values until ``rand_reset(seed=...)``.
+        The task must randomize the fields, or the option ``dynamics`` must list them. Each reset first restores the
+        nominal values of fields that the task's ``initialize``, ``randomize`` or ``event`` writes. Other fields keep
+        the new values until ``rand_reset(seed=...)``.
 
         Args:
             mask: Worlds to change, (nworld,) bool; by default all.
@@ -488,7 +489,7 @@ class Env:
         host does not wait for the device.
 
         Args:
-            total: Function that adds the sums, int64, of several processes in place, such as ``Team.sum``. All
+            total: Function that sums an int64 tensor over several processes in place, such as ``Team.sum``. All
                 processes must call ``update_shared``.
         """
         if self.shared and total is not None:
@@ -496,7 +497,7 @@ class Env:
         self.worlds.update_shared()
 
     def get_shared(self) -> torch.Tensor:
-        """Copy the memory that all worlds share and the sums for the memory's next update, for ``set_shared``.
+        """Copy the memory that all worlds share, and the sums for the memory's next update.
 
         Returns:
             The memory followed by the sums, float64; empty if the task has no shared memory.

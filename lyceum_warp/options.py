@@ -80,8 +80,8 @@ class PhysicsOptions:
     """
 
     base: str | None = None
-    """Name of physics options in the task's ``physics``, to which all other options are added; "exact" means the
-    options of the task's model."""
+    """Name of a set of options in the task's ``physics``; the other options change this set. "exact" means the options
+    of the task's model."""
     frame_skip: int | None = None
     """Substeps in a step."""
     timestep: float | None = None

@@ -24,7 +24,7 @@ _BASE = 1.0
 
 
 def _inwards(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Compute the distance of points from the outline of a patch, m, with the platform's distance as maximum."""
+    """Compute the distance of points from the outline of a patch, m, clipped to the distance of the platform."""
     half = float(x.max())
     return np.clip(half - np.maximum(abs(x), abs(y)), 0.0, max(half - _PLATFORM, 0.0))
 
@@ -88,7 +88,7 @@ _KINDS: dict[str, tuple[Shape, float]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Terrain:
-    """Rough ground, a field of square patches in rows of increasing difficulty along y and columns by kind along x.
+    """Rough ground: a grid of square patches. Difficulty increases along y, and each column has one kind of patch.
 
     The difficulty of level i is (i + 1) / ``levels``. A patch depends only on the seed and on the patch's level and
     column. All patches have height 0 along their outline, and a flat border surrounds all patches.
@@ -210,7 +210,7 @@ class Terrain:
 
     @property
     def _cells(self) -> int:
-        """Return the number of distances between points along the side of a patch."""
+        """Return the number of intervals between points along the side of a patch."""
         return round(self.patch / self.resolution)
 
     @property
@@ -269,7 +269,7 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
 
 
 def height_field(name: str) -> Any:
-    """Declare the table of a model's height field, as a default in Params.
+    """Make a default for Params: the table of a model's height field.
 
     The table is for ``lw.ground_height`` and ``lw.height_scan``. The first row of the table has the points' x
     coordinates, the first column the y coordinates, and the rest the heights z in the world's frame, m, (1 + points
@@ -283,7 +283,7 @@ def height_field(name: str) -> Any:
 
 
 def scan_grid(length: float, width: float, *, spacing: float = 0.1) -> np.ndarray:
-    """Declare a grid of points around a robot for ``lw.height_scan``, (n, 2), m, as a default in Params.
+    """Make a default for Params: a grid of points around a robot, (n, 2), m, for ``lw.height_scan``.
 
     The first point is at the rear right. Points are ordered by x (forwards), then by y (to the left).
     ``lw.scan_grid(1.6, 1.0)`` has 17 x 11 points. Declare the grid as in ``scan: wp.array[wp.vec2] = lw.scan_grid(1.6,

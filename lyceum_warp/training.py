@@ -103,8 +103,8 @@ def train(
             "free" for MuJoCo's default free camera.
         transfer: Whether to judge the policy's transfer at the end with ``lw.transfer``, and to write ``transfer.json``
             into the folder. By default, only comparisons of a few seconds run: the C engine after training on a GPU,
-            and the task's exact physics after training with different physics options. With ``transfer=True``, the Warp
-            engine after training on CPU cores, and each of the task's physics options, are also compared.
+            and the task's exact physics after training with different physics options. ``transfer=True`` adds
+            comparisons with each of the task's physics options and, after training on CPU cores, with the Warp engine.
         resume: Whether to continue the run in the folder. To resume, make the learner with the same arguments as
             before.
         take_over: Whether to continue a run that another process has locked, on the same or another host. The locking
@@ -214,7 +214,7 @@ def _learn(
     learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None,
     limit: float,
 ) -> None:  # fmt: skip
-    """Iterate up to the target, the last iteration or the time limit, in seconds; all ranks save and end together."""
+    """Iterate up to the target, the last iteration or the time limit; all ranks save and end together."""
     team, run, deadline = learner.team, saver.run, time.monotonic() + limit
     ended = False
     with postponed(insist=team.size == 1) as noted:

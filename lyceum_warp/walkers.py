@@ -137,8 +137,8 @@ def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
 def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
     """Make the mirror image of a velocity task in the plane y = 0 of the base, for ``lw.Task.mirror``.
 
-    With all joints at 0, the position and axis of a joint must be the mirror image of its partner's. The partner is the
-    joint on the other side, or the joint itself. The masses of the robot need not be symmetric.
+    With all joints at 0, the position and the axis of a joint must mirror the position and the axis of its partner. The
+    partner is the joint on the other side, or the joint itself. The masses of the robot need not be symmetric.
 
     Raises:
         ValueError: A joint or a foot has no partner, or the default pose or the scale of actions is not symmetric.
@@ -232,11 +232,12 @@ def foot_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Compute spheres that touch a plane if and only if the foot does, (feet, most spheres, 4): centre and radius, m.
+    """Compute spheres for each foot; they touch a plane if and only if the foot touches the plane.
 
-    Centres are relative to the foot's last joint. A capsule becomes spheres at both ends, a box becomes spheres at its
-    corners, and any other geom becomes spheres at the corners of its bounding box. Radii include the margin at which a
-    contact starts to exert force.
+    The result has the shape (feet, most spheres, 4), and contains centres and radii, m. Centres are relative to the
+    foot's last joint. A capsule becomes spheres at both ends, a box becomes spheres at its corners, and any other geom
+    becomes spheres at the corners of its bounding box. Radii include the margin at which a contact starts to exert
+    force.
 
     Raises:
         ValueError: A foot has no geom in ``foot_geoms``.
@@ -333,7 +334,7 @@ def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[
 
 
 def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.ndarray:
-    """Add a geom's contact margin minus its gap, for contacts with the ground, to the radii of the geom's spheres."""
+    """Add the margin minus the gap of contacts with the ground to the radii of a geom's spheres."""
     ground = np.flatnonzero(model.geom_bodyid == 0)
     margin = model.geom_margin[geom] + model.geom_margin[ground].max()
     gap = model.geom_gap[geom] + model.geom_gap[ground].max()
@@ -418,8 +419,8 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
 
     Args:
         spec: The model.
-        feet: Map from the name of a site to its body, or a joint or geom of this body, and to its position in the body,
-            m.
+        feet: Map from the name of each new site to two values: the name of the site's body, or of a joint or geom of
+            this body; and the site's position in this body, m.
 
     Raises:
         ValueError: The model has no element of this name.

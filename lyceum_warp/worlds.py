@@ -78,7 +78,7 @@ class Worlds(WorldArrays):
         self.step = self.programs.step
 
     def drop_programs(self) -> None:
-        """Break reference cycles through the programs, so that the environment's threads and memory are freed."""
+        """Delete the programs. They contain reference cycles, which would keep threads and memory alive."""
         self._programs.clear()
         del self.programs, self.step
 

@@ -17,7 +17,7 @@ from lyceum_warp.graphs.capture import capturing
 
 
 class Team:
-    """Processes that learn together, and their communication; a team of one process does not communicate.
+    """Sums and copies tensors between the processes that learn together; a single process does not communicate.
 
     Except for ``share`` and ``locate``, all processes must call the methods in the same order.
 

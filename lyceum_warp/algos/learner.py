@@ -115,8 +115,8 @@ class Learner(abc.ABC):
     generator: torch.Generator | None = None
     """The random generator, if the algorithm has one."""
     replay: Replay | None = None
-    """The replay buffer, if the algorithm has one. ``state_dict`` does not contain the replay buffer, because of its
-    size; a run updates separate files incrementally."""
+    """The replay buffer, if the algorithm has one. ``state_dict`` does not contain the replay buffer, because the
+    buffer is large. A run saves the buffer in separate files."""
     own_worlds: slice
     """Indices of this process's worlds among the worlds of all processes."""
     iteration: int
@@ -154,7 +154,7 @@ class Learner(abc.ABC):
 
     @property
     def best_by(self) -> str:
-        """Name of the return that selects the best policy and is compared with the target.
+        """Name of the return that selects the best policy, and that is compared with a target return.
 
         "mean_return" describes the policy after the iteration, "return_mean" the policy before the iteration. The
         default is "mean_return", or "return_mean" if the configuration has ``mean_every=0``.

@@ -41,7 +41,8 @@ class MPPIConfig:
     """Temperature of MPPI's weights, in units of reward. Low temperatures follow the best sample; high temperatures
     average all samples."""
     elites: int | None = None
-    """Number of best samples that CEM fits. None means a tenth of the samples, but at least two."""
+    """Number of best samples to which CEM fits the plan and the noise. None means a tenth of the samples, but at least
+    two."""
     noise: Numbers = 0.5
     """Noise that is added to the plan, in units of the action: a standard deviation, a standard deviation for each
     action, or a covariance, (nact, nact). CEM adapts the noise, starting from the standard deviations in ``noise``."""

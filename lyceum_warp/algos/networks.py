@@ -168,7 +168,7 @@ class Normalized(nn.Module):
         self.normalizer = Normalizer(nobs, limit) if normalize else nn.Identity()
 
     def observe(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
-        """Update the normaliser, if there is one, which changes the module's outputs.
+        """Update the normaliser, if there is one. The update changes the module's outputs.
 
         Args:
             obs: Observations, (..., nobs).

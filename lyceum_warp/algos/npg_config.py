@@ -38,10 +38,11 @@ class NPGConfig:
     min_restarts: float | None = None
     """Minimum number of worlds that start an episode in each iteration, as a multiple of samples / horizon. If fewer
     worlds started an episode in the last iteration, random worlds are restarted. Restarts apply only to segments with a
-    time limit. Without restarts, worlds that started together reach the time limit together, so that few samples in
-    between come from the start of an episode. The statistics do not count interrupted episodes, so values well above 1
-    bias ``return_mean`` towards short episodes. 0 turns restarts off. The default is 0.5 if an episode lasts longer
-    than 20 iterations (as with 205 or more worlds, 1,000 steps and the default samples), and 0 otherwise."""
+    time limit. Without restarts, worlds that started together also reach the time limit together. Between two time
+    limits, few samples then come from the start of an episode. The statistics do not count interrupted episodes, so
+    values well above 1 bias ``return_mean`` towards short episodes. 0 turns restarts off. The default is 0.5 if an
+    episode lasts longer than 20 iterations, and 0 otherwise. For example, episodes of 1,000 steps last longer than 20
+    iterations with 205 or more worlds and the default number of samples."""
     gamma: float = 0.995
     """Discount factor."""
     lam: float = 0.97

@@ -47,7 +47,8 @@ class NPGIteration(OnPolicyIteration):
     time_solve: float
     """Seconds for conjugate gradient and the step."""
     time_value: float
-    """Seconds for the value function's fit, without time that overlaps ``time_solve`` with two CPU threads."""
+    """Seconds for the value function's fit. With two CPU threads, seconds that also count in ``time_solve`` are
+    omitted."""
 
 
 class UpdateNumbers(NamedTuple):

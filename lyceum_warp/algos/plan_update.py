@@ -20,8 +20,8 @@ from lyceum_warp.support.docstrings import document_attributes
 class PlanSamples:
     """Samples of one improvement of the plans, which an update reads and writes.
 
-    Plans and samples have one row per step of the horizon or, with knots, per knot. All tensors are float32, on the
-    device of the planner's worlds, at fixed addresses: write into the tensors.
+    Plans and samples have one row per step of the horizon or, with knots, per knot. All tensors are float32 on the
+    device of the planner's worlds. Their addresses are fixed, so write into the tensors instead of replacing them.
     """
 
     returns: torch.Tensor

@@ -59,7 +59,7 @@ _BUFFERS = (
     "actions", "nominal", "knot_actions", "standard_noise", "adapted_noise", "sampled", "model_returns", "returns",
     "weights", "model_fields",
 )  # fmt: skip
-_MODELS = 0x6D6F64656C73  # the word "models" in ASCII, which with the planner's seed seeds the draws of models
+_MODELS = 0x6D6F64656C73  # second seed, beside the planner's seed, for drawing models: "models" in ASCII
 _DRAWING = ("startup", "initialize", "randomize")
 """Task functions that can randomize a planner's model fields."""
 
@@ -70,13 +70,13 @@ Value: TypeAlias = ValueFunction | wp.Function | Callable[[torch.Tensor], torch.
 class Planner:
     """A controller that replans at every step: ``action = plan(state)``.
 
-    The planner simulates in its own worlds, one per sample. The controlled world is called the plant. The plant is an
-    environment, as in ``plan(env.get_state()[0])``, or a robot, as in ``plan(plan.state_of(qpos=..., qvel=...,
-    time=...))``. The plant's model, physics, time step and parameters may differ from the planner's. If the planner's
-    time step is a multiple of the plant's, ``lw.control`` and ``lw.control_async`` apply the plan according to the
-    setting ``between``. Random streams are counter-based: a plan depends on the seed, on the number of earlier plans,
-    and on the plan from which it starts. In each sample, the task's functions draw from a separate stream seeded by the
-    planner, so a plan cannot anticipate the plant's random numbers.
+    The planner simulates in its own worlds, one per sample. The controlled world is called the plant. The plant may be
+    an environment: ``plan(env.get_state()[0])``. The plant may also be a robot: ``plan(plan.state_of(qpos=...,
+    qvel=..., time=...))``. The plant's model, physics, time step and parameters may differ from the planner's. If the
+    planner's time step is a multiple of the plant's, ``lw.control`` and ``lw.control_async`` apply the plan according
+    to the setting ``between``. Random streams are counter-based: a plan depends on the seed, on the number of earlier
+    plans, and on the plan from which it starts. In each sample, the task's functions draw from a separate stream seeded
+    by the planner, so a plan cannot anticipate the plant's random numbers.
 
     ``plants=n`` plans for n plants at a time, as in ``env.step(plan(env.get_state()))`` with n worlds. Plant i uses the
     seed ``seed + i`` for its noise, so its plan equals the plan of a single-plant planner with this seed on the same
@@ -96,7 +96,7 @@ class Planner:
         seed: Seed of the noise. With several plants, ``seed`` is the seed of the first plant, or a list with one seed
             per plant.
         plants: Number of plants to plan for.
-        params: Parameters of the task; required for parameters with the name of a setting.
+        params: Parameters of the task. A parameter that has the same name as a setting must be given here.
         words: Individual settings by their names in ``lw.MPPIConfig`` (None keeps the default; ``update`` may be a
             custom ``lw.PlanUpdate``), options of the planner's worlds as for ``lw.make``, and parameters of the task.
             Parameters with one value per world are ordered by plant, then by sample, then by model. With a CUDA device,
@@ -129,7 +129,8 @@ class Planner:
     sampled: torch.Tensor
     """The last improvement's actions, (horizon, samples, nact)."""
     model_fields: dict[str, torch.Tensor]
-    """The model fields of each model, (models, size) float64, which each call reads; empty with one model."""
+    """The values of model fields in each model, (models, size) float64; empty with one model. Each call reads the
+    values."""
     model_returns: torch.Tensor
     """The samples' returns in each model, (samples, models); minus infinity for failed samples."""
     returns: torch.Tensor
@@ -137,7 +138,7 @@ class Planner:
     weights: torch.Tensor
     """The samples' weights, (samples,)."""
 
-    _only_update: str | None = None  # the update of a subclass that fixes ``update``
+    _only_update: str | None = None  # the only value of ``update`` that a subclass accepts
 
     def __init__(
         self,
@@ -223,7 +224,7 @@ class Planner:
             self._value_in_torch = True
             try:
                 self._torch_values()
-            # reasons are missing weights, a different input size, or critics that also take actions
+            # for example missing weights, another input size, or a critic that also takes actions
             except (RuntimeError, TypeError) as error:
                 observations = described(self._value_obs)
                 raise ValueError(f"value cannot take observations {observations}: {error}") from error
@@ -343,7 +344,7 @@ class Planner:
         return self._sequence(parts)
 
     def _sequence(self, parts: Iterable[Phase | Callable[[], None]]) -> Calls:
-        """Turn phases into as few graphs as possible, with torch functions between the graphs."""
+        """Turn phases into as few graphs as possible; functions that use torch run between the graphs."""
         calls: list[Any] = []
         for is_phase, group in itertools.groupby(parts, lambda part: isinstance(part, Phase)):
             some: Any = list(group)

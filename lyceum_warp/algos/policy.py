@@ -82,7 +82,7 @@ class GaussianPolicy(Normalized):
         self.mirror: PolicyMirror | None = None
 
     def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:
-        """Make later calls average the mean actions with the policy's mirror image.
+        """Make the policy symmetric: average its mean actions with its mirrored mean actions for mirrored observations.
 
         Args:
             reflections: The reflections of ``obs`` and ``action`` (``algos.symmetry.reflections``).

@@ -35,7 +35,8 @@ class PPOConfig:
     lam: float = 0.95
     """Lambda of the generalised advantage estimate."""
     clip: float = 0.2
-    """Clipping range of the probability ratio around 1, and with clip_value_loss of values around the old values."""
+    """Clipping range of the probability ratio around 1. With clip_value_loss, values are clipped to the same range
+    around the old values."""
     clip_value_loss: bool = True
     """Whether the value loss is the larger of the prediction's error and the clipped prediction's error."""
     value_coef: float = 1.0

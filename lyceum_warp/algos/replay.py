@@ -185,7 +185,7 @@ class Replay:
         )  # fmt: skip
 
     def _groups(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Get views of each group's observations in the first columns."""
+        """Split the first columns into views of each group's observations."""
         parts = rows[..., : sum(self._sizes)].split(self._sizes, dim=-1)
         return dict(zip(self.env.obs_groups, parts, strict=True))
 
@@ -197,13 +197,13 @@ class Replay:
         return {name: array[place] for name, array in self._arrays().items()}
 
     def set_rows(self, first: int, rows: Rows) -> None:
-        """Write the contents of steps from ``first`` on; the steps count as stored after ``restore``."""
+        """Write the contents of consecutive steps, beginning with step ``first``; then call ``restore``."""
         place = torch.arange(first, first + len(rows["reward"]), device=self.reward.device) % self.steps
         for name, array in self._arrays().items():
             array[place] = rows[name].to(array.device)
 
     def restore(self, stored: int) -> None:
-        """Set the number of stored steps, after ``set_rows``."""
+        """Set the number of stored steps, after calls of ``set_rows``."""
         self._set_stored(whole_number("stored", stored, low=0, high=2**62))
 
     def state_dict(self) -> dict[str, Any]:

@@ -209,7 +209,7 @@ class Rollout:
         self.running_return.masked_fill_(mask, 0.0)
 
     def explain_not_finite(self) -> str:
-        """Describe in one sentence the first number that is not finite or too large for float32, and the fix.
+        """Describe in one sentence the first number that is infinite, NaN or too large for float32, and the fix.
 
         The host waits for the device. A task's rewards and observations are always finite, because non-finite values
         are faults.

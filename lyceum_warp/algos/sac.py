@@ -368,7 +368,7 @@ class SAC(Learner):
         """Compute the actor's loss, and the actor's entropy.
 
         Args:
-            batch: Transitions, of which the loss uses only the observations.
+            batch: Transitions; the loss uses only their observations.
             weight: Weights of the transitions, as in ``critic_loss``.
             noise: Standard normal numbers for the actions of the observations, (batch, nact).
         """

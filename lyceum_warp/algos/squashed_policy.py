@@ -78,7 +78,7 @@ class SquashedPolicy(Normalized):
             self.use_mirror(mirror)
 
     def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:
-        """Make later calls average the Gaussian with its mirror image.
+        """Make the policy symmetric: average its Gaussian with the Gaussian's mirror image.
 
         Args:
             reflections: The reflections of ``obs`` and ``action`` (``algos.symmetry.reflections``).

@@ -150,7 +150,7 @@ class ValueFunction(Normalized):
 
 
 BOUND = 10.0
-"""Number of scales from the mean beyond which returns and advantages are outliers."""
+"""Number of standard deviations from the mean beyond which returns and advantages are outliers."""
 
 
 def value_group(env: Env, given: str | None) -> str:

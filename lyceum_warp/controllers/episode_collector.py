@@ -129,7 +129,7 @@ class EpisodeCollector:
         return self._now() - self.start
 
     def add_plan(self, plan: TimedPlan, quality: tuple[float, float]) -> None:
-        """Add a finished plan with its ``quality``, the number of failed samples and the effective sample size."""
+        """Add a finished plan; ``quality`` is its number of failed samples and its effective sample size."""
         self._plans.append((plan.step, plan.begun - self.start, plan.seconds, *quality))
 
     def before_step(self, plan: TimedPlan, now: float, age: float, *, late: bool) -> None:

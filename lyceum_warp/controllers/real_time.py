@@ -83,7 +83,7 @@ def control_async(
         on_abort: Called with the trajectory of the complete steps if an exception, such as Ctrl-C, ends the run after
             the first step. The trajectory's ``done_reason`` is 0. The loop raises the exception after calling
             ``on_abort``.
-        clock: Clock that replaces the wall clock, such as a subclass that does other work while the plant waits.
+        clock: Clock that replaces the wall clock, such as a clock that does other work while the plant waits.
 
     Returns:
         The episode.
@@ -216,7 +216,7 @@ class PlannerThread:
         self._thread.start()
 
     def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor) -> None:
-        """Make the thread plan from a state next, unless a newer state follows.
+        """Pass a state to the thread. The thread plans next from the newest state.
 
         The caller must not change the tensors.
         """

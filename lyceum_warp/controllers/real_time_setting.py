@@ -52,7 +52,7 @@ class RealTimeChoice:
 
     @property
     def replan_every(self) -> int:
-        """Number of deadlines from one plan to the next plan; 1 if plans meet the deadline."""
+        """Number of steps from one plan to the next, if a step takes one deadline; 1 if plans meet the deadline."""
         return max(1, math.ceil(self.planning_time / (SHARE * self.deadline)))
 
     def __str__(self) -> str:

@@ -126,7 +126,7 @@ def capturing() -> Iterator[None]:
 
 
 class _Graph:
-    """Captures functions that consist of launches as one graph, or for long functions as one graph per thread.
+    """Captures functions of launches: in one graph, or in one graph per thread if the functions take long.
 
     The first call runs the functions directly, which loads their modules. The second call captures and replays the
     functions; later calls only replay. With workers, the first replays are timed, and the shortest time determines how

@@ -28,7 +28,7 @@ from lyceum_warp.support.versions import versions
 
 _CONFIG, _VERSIONS, _TASK = "config.json", "versions.json", "task"
 _UNFINISHED = {f"{name}.tmp" for name in (_CONFIG, _VERSIONS, _TASK)}
-"""Files that may remain if the creation of a run is killed, and that a new run replaces."""
+"""Files that may remain in the folder if a process is killed while it creates a run. A new run replaces these files."""
 
 log = logging.getLogger(__name__)
 
@@ -122,7 +122,7 @@ class Run:
         Args:
             folder: A new or empty folder.
             config: The configuration, which consists of JSON values.
-            device: Device of the run, of which ``versions.json`` names the hardware.
+            device: Device of the run; ``versions.json`` names the device's hardware.
             files: Contents of the folder ``task`` by path; each is a file to copy, or bytes.
 
         Raises:

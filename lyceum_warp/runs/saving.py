@@ -15,23 +15,23 @@ from lyceum_warp.runs.replay_files import clean_replay, write_replay
 log = logging.getLogger(__name__)
 
 SAVE_SECONDS = 30.0
-"""Maximum number of seconds between saves."""
+"""Maximum number of seconds between saves, unless saves take long; see ``LONG``."""
 
 SHARE = 100
-"""Ratio of training time to the last save's duration above which a save is due before the maximum time."""
+"""Time between saves, as a multiple of the last save's duration, if this is less than ``SAVE_SECONDS``."""
 
 LONG = 20
-"""Minimum ratio of training time to the last save's duration before the next save."""
+"""Minimum time between saves, as a multiple of the last save's duration."""
 
 
 class Saver:
     """Writes a run's files.
 
     Rows of iterations, a new best policy and numbered policies are written immediately. The last policy and the
-    complete state are saved together: at the start, at the end, and at most 30 s after the last save, or after training
-    for 100 times the duration of the last save if this is earlier. For example, saves of 20 ms happen every 2 s and
-    take 1 % of the time; saves of 1 s happen every 30 s and take 3 % of the time. After ``kill -9``, the run resumes
-    from the last save.
+    complete state are saved together: at the start, at the end and in between. The time between two saves is 100 times
+    the duration of the last save, but at most 30 s. For example, saves of 20 ms happen every 2 s and take 1 % of the
+    time; saves of 1 s happen every 30 s and take 3 % of the time. After ``kill -9``, the run resumes from the last
+    save.
 
     All ranks have a saver and make the same calls; only rank 0 writes.
 

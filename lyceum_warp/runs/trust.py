@@ -53,7 +53,7 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
 
 
 def _record(folder: Path, config: Mapping[str, Any]) -> Path:
-    """Name the file that records a run as trusted by a hash of everything that the run can execute or read."""
+    """Get the file that records a run as trusted. Its name is a hash of everything that the run can execute or read."""
     kept = config.get("kept", {})
     paths = [{key: value for key, value in config.get(part, {}).items() if isinstance(value, str)}
              for part in ("params", "options")]  # fmt: skip

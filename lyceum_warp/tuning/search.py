@@ -76,7 +76,7 @@ def tune(
     progress: Callable[[Row], object] | None = None,
     **words: Any,
 ) -> Tuning:
-    """Measure gain and side effects of a task's physics options, and find the fastest options with equal returns.
+    """Measure speed and side effects of physics options for a task, and find the fastest options with equal returns.
 
     Every setting is compared with the unchanged task in the same process: steps per second, memory, faults, divergence,
     and the returns of equal episodes under random actions and under a policy. Settings are first tried alone.
@@ -90,7 +90,8 @@ def tune(
         which: Policy of the run: "last", "best", or the number of a saved iteration.
         tolerance: Tolerance for the 95 % interval of the difference of returns, relative to the mean absolute return:
             "strict" (2 %), "loose" (5 %) or "any" (only faults count).
-        short: Whether to compare the first 100 steps of episodes, for a few seconds, instead of whole episodes.
+        short: Whether to compare only the first 100 steps of episodes, which takes a few seconds, instead of whole
+            episodes.
         episodes: Number of episodes of each setting, rounded up to a multiple of the number of worlds. By default, the
             width of the interval determines the number, within the time limit of a minute, or of 5 s if ``short``.
         planning: Whether to find physics options for the task's planner instead of its worlds, by comparing planning

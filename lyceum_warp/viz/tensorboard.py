@@ -58,8 +58,8 @@ class TensorBoard:
         folder: The folder, which is created if it does not exist. Pass this folder, or one above it, to ``tensorboard
             --logdir``.
         env: The environment of the run. Episode_Reward/NAME is the sum of a reward term over an episode, divided by the
-            time limit in seconds. Episode_Termination/NAME is the number of terminations of that name in a step of all
-            worlds.
+            time limit in seconds. Episode_Termination/NAME is the number of episodes that the function NAME ended, per
+            step of all worlds.
 
     Raises:
         ImportError: The package tensorboard is not installed.

@@ -39,7 +39,7 @@ def write_video(
     speed: float = 1.0,
     progress: Progress | None = None,
 ) -> Path:
-    """Render states into an mp4 file, each with its own model fields.
+    """Render states into an mp4 file; each state has its own model fields.
 
     The video has at most 60 frames per second; with a shorter time step, states are skipped. A subprocess draws the
     video, without a display.

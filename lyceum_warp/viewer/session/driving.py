@@ -29,7 +29,7 @@ class Driving:
     def __init__(self, env: Env) -> None:
         self._parts, self._params = env.state_space.parts, env.task.params
         self.limits: tuple[float, float, float] | None = None
-        """The task's largest forward velocity and lateral velocity, m/s, and yaw rate, rad/s; None without a
+        """The task's largest forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s); None without a
         command."""
         if all(name in self._parts for name in _MEMORY):
             _, _, forward, turn = np.asarray(self._params["stages"])[0]

@@ -64,7 +64,7 @@ class FrameMaker:
 
         Args:
             live: The worlds.
-            main: All worlds, of which ``live`` is one or a copy of one.
+            main: All worlds. ``live`` is either the same object, or a plant that copies the shown world of ``main``.
             traces: The paths of a planner's samples.
             status: A function that makes the complete status.
             paused: Whether the frame must show the present state; otherwise the frame may lag by one.
@@ -132,7 +132,7 @@ class FrameMaker:
         )  # fmt: skip
 
     def _report(self, rows: Rows, plant_of: int | None) -> None:
-        """Report the end of an episode, and faults; ``plant_of`` is the world of which the plant is a copy."""
+        """Report the end of an episode, and faults; a plant is a copy of the world ``plant_of``."""
         number, bits, returned, length, success = rows.end
         if number > self._seen_end:
             why = "success" if success else reasons(int(bits))

@@ -1,7 +1,7 @@
 """Step the worlds of a session, keep their history, and copy the rows of a frame to the host.
 
-A step works only on the worlds' device, including the history, the returns and the points of the curves. On a GPU no
-step waits for the device, and a frame copies its rows to the host asynchronously.
+The history, the returns and the points of the curves stay on the worlds' device. On a GPU, no step waits for the
+device, and a frame copies its rows to the host asynchronously.
 """
 
 import dataclasses
@@ -182,7 +182,7 @@ class Live:
         self._clock += 1
         self.made += 1
         ended, reward = self._ended.copy_(env.done), self._reward.copy_(env.reward)
-        if not env.autoreset:  # without autoreset done stays set, and the return must not grow
+        if not env.autoreset:  # without autoreset, ``done`` stays set after the episode, and the return must not grow
             ended.logical_and_(~self._over)
             reward.masked_fill_(self._over, 0.0)
         self.returns.add_(reward)

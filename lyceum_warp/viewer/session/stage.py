@@ -31,8 +31,8 @@ _OLD = 1.0  # seconds after which traces disappear
 class Stage:
     """Holds the worlds, controllers and episodes of a session.
 
-    Policies act in all worlds. A controller of one world, such as a planner, acts in the plant, a copy of the shown
-    world, while the other worlds wait. ``lw.view`` explains the arguments.
+    Policies act in all worlds. A controller of one world, such as a planner, acts in a copy of the shown world, called
+    the plant. The other worlds wait. ``lw.view`` explains the arguments.
 
     Raises:
         ValueError: An argument is invalid.
@@ -220,7 +220,7 @@ class Stage:
         self._trace()
 
     def show_world(self, world: int) -> None:
-        """Show another world; end a push and the driving of the previous world."""
+        """Show another world. The user stops pushing and driving the previous world."""
         before = self.live
         before.end_push()
         if self.driving.wanted is not None:

@@ -75,7 +75,7 @@ class Screen:
 
 
 class _Guard(Plugin):  # type: ignore[misc]  # studio has no types
-    """Raise an error if studio did not take the given socket, because studio would listen on all addresses."""
+    """Raise an error if studio did not take the given socket, because it would then listen on all addresses."""
 
     def __init__(self, taken: list[bool]) -> None:
         self.taken = taken
