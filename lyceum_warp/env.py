@@ -124,7 +124,7 @@ class Env:
     nworld: int
     """Number of worlds."""
     timestep: float
-    """Simulated duration of a step, which includes all substeps, seconds."""
+    """Simulated duration of a step, which includes all substeps, in seconds."""
     device: wp.Device
     """The Warp device; ``obs.device`` is the same device in torch."""
     options: EnvOptions

@@ -94,7 +94,7 @@ def train(
             returns True. If the callback raises an error, the run is saved and the error is raised again.
         target_return: Return at which training ends, compared with the return that selects the best policy.
         minutes: Time limit; training ends after the iteration that exceeds the limit. A limit of None means no limit.
-        keep_every: Iterations between two numbered policies; 0 for no numbered policies.
+        keep_every: Iterations between two policies that are saved in numbered files; 0 saves none.
         save_every: Iterations between two saves; 0 to save by time.
         tensorboard: Whether to also write the metrics for TensorBoard.
         video_every: Iterations between two videos of the policy, such as ``videos/000100.mp4`` in the folder; 0 for no

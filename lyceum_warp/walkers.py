@@ -68,7 +68,7 @@ def controls(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Compute mjlab's scale of actions, 0.25 * limit / kp, rad, (joints,).
+    """Compute mjlab's scale of actions, 0.25 * limit / kp, in rad, (joints,).
 
     The scale is a quarter of the position error at which a joint's servo reaches its force limit.
 
@@ -83,7 +83,7 @@ def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def force_limits(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the largest force of each joint's servo, N m, (joints,); 0 without a limit."""
+    """Get the largest force of each joint's servo, in N m, (joints,); 0 without a limit."""
     actuators = servos(model, p)
     return np.where(
         model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators, 1],
@@ -98,12 +98,12 @@ def home_qpos(model: mujoco.MjModel) -> np.ndarray:
 
 
 def home_pose(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the positions of the joints in ``home_qpos``, rad, (joints,)."""
+    """Get the positions of the joints in ``home_qpos``, in rad, (joints,)."""
     return home_qpos(model)[joint_qpos(model, p)]
 
 
 def home_height(model: mujoco.MjModel, p: Any) -> float:
-    """Get the height of the base in ``home_qpos``, m."""
+    """Get the height of the base in ``home_qpos``, in m."""
     return float(home_qpos(model)[2])
 
 
@@ -119,7 +119,7 @@ def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
     clock = {"gait_frequency": float(p.gait_frequency)} if hasattr(p, "gait_frequency") else {}  # Hz
     return clock | {
         "base": model.body(base(model)).name,
-        "velocimeter": np.asarray(p.imu).tolist(),  # position on base, m
+        "velocimeter": np.asarray(p.imu).tolist(),  # position on base, in m
         "joints": [model.joint(joint).name for joint in p.joints],
         "default_pose": np.asarray(p.default_pose).tolist(),
         "action_scale": np.asarray(p.action_scale).tolist(),
@@ -220,13 +220,13 @@ def leg_axes(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def leg_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the position of each of ``leg_joints`` relative to the leg's previous joint, or to the base, m."""
+    """Get the position of each of ``leg_joints`` relative to the leg's previous joint, or to the base, in m."""
     anchors = _straight(model).xanchor[leg_joints(model, p)]
     return np.diff(anchors, axis=1, prepend=0.0)
 
 
 def foot_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the position of each foot's site relative to the foot's last joint, m, (feet, 3)."""
+    """Get the position of each foot's site relative to the foot's last joint, in m, (feet, 3)."""
     data = _straight(model)
     return np.array([data.site_xpos[foot] - data.xanchor[_last_joint(model, foot)] for foot in p.feet])
 
@@ -234,7 +234,7 @@ def foot_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
 def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
     """Compute spheres for each foot; they touch a plane if and only if the foot touches the plane.
 
-    The result has the shape (feet, most spheres, 4), and contains centres and radii, m. Centres are relative to the
+    The result has the shape (feet, most spheres, 4), and contains centres and radii, in m. Centres are relative to the
     foot's last joint. A capsule becomes spheres at both ends, a box becomes spheres at its corners, and any other geom
     becomes spheres at the corners of its bounding box. Radii include the margin at which a contact starts to exert
     force.
@@ -420,7 +420,7 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
     Args:
         spec: The model.
         feet: Map from the name of each new site to two values: the name of the site's body, or of a joint or geom of
-            this body; and the site's position in this body, m.
+            this body; and the site's position in this body, in m.
 
     Raises:
         ValueError: The model has no element of this name.
@@ -443,7 +443,7 @@ def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0
     Args:
         spec: The model.
         joints: Names of the joints, which have one actuator each.
-        reach: Position error at which a servo's force reaches its limit, rad.
+        reach: Position error at which a servo's force reaches its limit, in rad.
 
     Raises:
         ValueError: A joint has no actuator, or its force has no limit.
@@ -483,7 +483,7 @@ def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.01
     Args:
         spec: The model after ``prepare_walker``, which is changed in place.
         feet: Names of the sites of the feet.
-        radius: Radius of the capsules, m.
+        radius: Radius of the capsules, in m.
 
     Raises:
         ValueError: A box is narrower than a capsule.

@@ -19,7 +19,7 @@ from lyceum_warp.graphs.capture import capturing
 class Team:
     """Sums and copies tensors between the processes that learn together; a single process does not communicate.
 
-    Except for ``share`` and ``locate``, all processes must call the methods in the same order.
+    All processes must call the methods in the same order; only ``share`` and ``locate`` are exceptions.
 
     Args:
         rank: Rank of this process.
@@ -80,8 +80,8 @@ class Team:
             nworld: Number of this process's worlds.
 
         Returns:
-            Indices into a flattened array (steps, nworld), 0 for samples of other processes, and a mask of this
-            process's samples.
+            Indices into a flattened array (steps, nworld), which are 0 for samples of other processes; and a mask of
+            this process's samples.
         """
         step, world = index // (nworld * self.size), index % (nworld * self.size) - self.rank * nworld
         own = (world >= 0) & (world < nworld)

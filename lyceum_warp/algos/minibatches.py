@@ -1,4 +1,4 @@
-"""Run epochs of mini-batches; on a GPU an epoch is one CUDA graph, without host synchronisation."""
+"""Run epochs of mini-batches; on a GPU, an epoch is one CUDA graph without host synchronisation."""
 
 import contextlib
 import math

@@ -50,8 +50,8 @@ class MPPIConfig:
     """Lower limit of CEM's adapted standard deviations, one number or one for each action. None means a tenth of
     ``noise``."""
     include_plan: bool | None = None
-    """Whether the first sample is the plan itself, without noise. None means True, but False with a single sample or
-    with an update that adapts the noise, as CEM does."""
+    """Whether the first sample is the plan itself, without noise. None means True in general, but False with a single
+    sample, and False with an update that adapts the noise, such as CEM."""
     smoothing: tuple[float, float, float] = (0.25, 0.8, 0.0)
     """Weights (b0, b1, b2) that smooth the noise n over time: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) from the third
     step on. (1, 0, 0) is white noise. The noise of knots is not smoothed."""

@@ -15,9 +15,9 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 _LONG_EPISODE = 20
-"""Number of iterations per episode above which NPG restarts worlds by default. On hopper with some seeds, NPG's return
-stayed low for a long time with 63 and 31 iterations per episode, but not with 16 (bench/README.md, "NPG's learning
-curves")."""
+"""By default, NPG restarts worlds if an episode lasts longer than this number of iterations. On hopper with some seeds,
+NPG's return stayed low for a long time with 63 and 31 iterations per episode, but not with 16 (bench/README.md, "NPG's
+learning curves")."""
 
 
 @document_attributes

@@ -330,7 +330,7 @@ class Planner:
         return self._action.to(state.device, copy=True)
 
     def _program(self, *, first: bool) -> Calls:
-        """Make the calls of one improvement; the first improvement also shifts the plan in time."""
+        """List the calls that make one improvement; the first improvement also shifts the plan in time."""
         parts: list[Phase | Callable[[], None]] = [Phase("perturb", partial(self._perturb, first)), *self._loop.phases]
         if self._value_in_torch:
             parts.append(self._evaluate)
@@ -416,7 +416,7 @@ class Planner:
         self._interpolate(self._plan, self._actions)
 
     def _weigh_in_torch(self) -> None:
-        """Compute an improvement's weights with a torch update, and the summary of the improvement."""
+        """Compute the weights by an update that uses torch, and compute the statistics of the improvement."""
         arrays = self._arrays
         if (returned := self._update.weigh(arrays)) is not None:
             raise ValueError(

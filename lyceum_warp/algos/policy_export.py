@@ -131,7 +131,7 @@ class _Acting(torch.nn.Module):
 
 
 def check_export(path: Path) -> None:
-    """Check a file's suffix, and that the packages for the file's format are installed; see ``export_policy``."""
+    """Check a file's suffix, and whether the packages for its format are installed; see ``export_policy``."""
     if path.suffix not in _SUFFIXES:
         raise ValueError(f"{path} must end with {' or '.join(_SUFFIXES)}")
     missing = [name for name in ("onnx", "onnxscript") if importlib.util.find_spec(name) is None]

@@ -66,8 +66,8 @@ class SACConfig:
     """Step size of the target critics: each update moves the target critics by this fraction towards the critics
     (Polyak averaging). The default is 0.125 with 256 or more worlds, and otherwise 0.005."""
     critic_bound: Literal["min", "mean"] | None = None
-    """Whether the value of an action is the minimum or the mean of the two critics' predictions. The default is "mean"
-    with 256 or more worlds, and otherwise "min"."""
+    """Value of an action: the minimum or the mean of the two critics' predictions. The default is "mean" with 256 or
+    more worlds, and otherwise "min"."""
     learning_rate: float = 3e-4
     """Learning rate of the actor, the critics and the temperature (Adam)."""
     temperature: float | None = None

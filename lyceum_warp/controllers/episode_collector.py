@@ -21,7 +21,7 @@ class ControlProgress:
     step: int
     """Number of steps so far."""
     time: float
-    """Wall time so far, including the last step, seconds."""
+    """Wall time so far, including the last step, in seconds."""
     reward: float
     """Reward of the step."""
     eval: float
@@ -29,9 +29,9 @@ class ControlProgress:
     success: bool
     """Whether the state after the step is a success."""
     plan_time: float
-    """Planning time of the plan that contains the action, seconds."""
+    """Planning time of the plan that contains the action, in seconds."""
     age: float
-    """Age of the action when it was applied, seconds; see ``Trajectory.ages``."""
+    """Age of the action when it was applied, in seconds; see ``Trajectory.ages``."""
     plans: int
     """Number of plans so far, up to the plan that contains the action."""
 
@@ -100,7 +100,7 @@ class EpisodeCollector:
         env: The plant, in its initial state.
         controller: The checked controller.
         mode: "sync" or "async"; see ``Trajectory.mode``.
-        period: Wall time between two steps, seconds.
+        period: Wall time between two steps, in seconds.
         seed: Seed of the run.
         now: Function that reads the clock, in seconds.
     """
@@ -138,7 +138,7 @@ class EpisodeCollector:
         Args:
             plan: The plan that contains the action.
             now: Seconds since the clock started.
-            age: Age of the action, seconds.
+            age: Age of the action, in seconds.
             late: Whether the step starts late.
         """
         self._applied.append((self.env.action[0].clone(), plan, age, late))

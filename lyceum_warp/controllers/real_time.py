@@ -74,7 +74,8 @@ def control_async(
         env: The plant, an environment of one world made with ``autoreset=False``.
         controller: Controller that is called in the second thread; see ``lw.Controller``. The controller must plan in a
             separate environment.
-        period: Wall time between steps, seconds; by default the plant's time step, which is real time.
+        period: Wall time between steps, in seconds; by default the plant's time step, so that the plant runs in real
+            time.
         steps: Maximum number of steps, if the episode does not end earlier.
         seed: Seed of the initial state and of the controller.
         reset: Whether to reset the plant and the controller first. If False, the run continues from the plant's state
@@ -150,7 +151,7 @@ def run_plant(
     limit: int,
     on_step: OnStep | None,
 ) -> float:
-    """Step the plant by the clock until its episode ends, and return the end of the last period, seconds."""
+    """Step the plant by the clock until its episode ends. Return the end of the last period, in seconds."""
     start, period = episode.start, episode.period
     for k in range(limit):
         due = start + k * period

@@ -35,7 +35,7 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
         folder: The run's folder.
         config: Content of the run's config.json.
         named: A file to which the run refers, for the error message.
-        runs: Whether the run's task is executed, instead of files only being read.
+        runs: Whether the run's task is executed; otherwise, files are only read.
         trust: Whether to trust and record the run.
 
     Raises:

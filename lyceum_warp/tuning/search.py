@@ -37,8 +37,8 @@ class Tuning:
     """Results of each setting, the fastest first; docs/physics.md describes the entries. The entry ``verdict`` is
     "same", "different" or "not shown" (the interval of the returns lies within, outside or across the tolerance),
     "faults" (more than twice as many faults as in the unchanged task), "no gain" (less than 3 % faster and not smaller,
-    so that returns are not compared), "refused" (by MuJoCo or the engine; ``refused`` has the reason), or for a planner
-    "ranks badly"."""
+    so that returns are not compared), "refused" (by MuJoCo or the engine; ``refused`` has the reason), or, for a
+    planner, "ranks badly"."""
     reference: Row
     """Results of comparing the unchanged task with itself."""
     not_tried: list[str]

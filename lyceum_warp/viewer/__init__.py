@@ -1,4 +1,6 @@
-"""View worlds interactively in a browser. The viewer has two processes, each with a folder.
+"""View worlds interactively in a browser.
+
+The viewer has two processes, and each process has a folder.
 
 - ``show.py`` opens a session and its window: ``lw.view``.
 - ``follow.py`` follows a training run: ``lw.RunViewer``.

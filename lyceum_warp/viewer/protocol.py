@@ -70,7 +70,7 @@ class Ghost:
     colour: tuple[float, float, float, float] | None
     """Red, green, blue and opacity, from 0 to 1; None for the model's own colours."""
     shift: tuple[float, float] = (0.0, 0.0)
-    """The displacement of the ghost from its world's position, metres."""
+    """The displacement of the ghost from its world's position, in metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Arrow:
     """An arrow in the scene, such as a commanded velocity."""
 
     start: np.ndarray
-    """(3,), metres."""
+    """(3,), in metres."""
     end: np.ndarray
     colour: tuple[float, float, float, float]
 
@@ -154,7 +154,7 @@ class Frame:
     status: Status
     ghosts: tuple[Ghost, ...] = ()
     traces: np.ndarray | None = None
-    """The paths of the planner's samples, (samples, points, 3), metres."""
+    """The paths of the planner's samples, (samples, points, 3), in metres."""
     best: int | None = None
     """The index of the best sample."""
     arrows: tuple[Arrow, ...] = ()
@@ -256,7 +256,7 @@ class Perturb:
     qpos: np.ndarray | None = None
     """Positions, (nq,) float64, which take effect only while paused."""
     mocap_pos: np.ndarray | None = None
-    """(nmocap, 3) float64, metres."""
+    """(nmocap, 3) float64, in metres."""
     mocap_quat: np.ndarray | None = None
     """(nmocap, 4) float64: w, x, y, z."""
 

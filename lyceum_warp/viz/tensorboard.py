@@ -140,7 +140,7 @@ def _terms(env: Env) -> dict[str, tuple[str, float]]:
 
 
 def _total_fps(iteration: Iteration) -> dict[str, float]:
-    """Compute an iteration's samples per second, without evaluation of the mean policy; empty if times are unknown."""
+    """Compute an iteration's samples per second, without the time of evaluations; empty if times are unknown."""
     times = {name: time for name, time in iteration.row().items() if name.startswith("time_") and name != "time_mean"}
     seconds = sum(filter(None, times.values()))
     return {"total_fps": iteration.samples / iteration.iteration / seconds} if seconds else {}

@@ -21,7 +21,7 @@ _COLOURS = (
     (0.30, 0.80, 0.80),
 )  # fmt: skip
 _PAST, _FUTURE, _PLAN = (0.90, 0.25, 0.20), (0.25, 0.40, 0.95), (0.25, 0.90, 0.45)
-_OPACITY, _FADE = 0.35, 0.95  # fade: the opacity of a state in the burst, relative to the previous state
+_OPACITY, _FADE = 0.35, 0.95  # fade: the opacity of a state relative to the opacity of the state before it
 
 
 class FrameMaker:
@@ -67,7 +67,8 @@ class FrameMaker:
             main: All worlds. ``live`` is either the same object, or a plant that copies the shown world of ``main``.
             traces: The paths of a planner's samples.
             status: A function that makes the complete status.
-            paused: Whether the frame must show the present state; otherwise the frame may lag by one.
+            paused: Whether the frame must show the present state; otherwise the frame may show the state of the
+                previous frame's time.
         """
         shown = _following(main.world, main.env.nworld, self.ghosts.worlds)
         wanted = shown if live is main else [], self.ghosts.burst
@@ -156,7 +157,7 @@ class FrameMaker:
 
     @functools.cached_property
     def _grid_step(self) -> float:
-        """The distance between the worlds of a grid, m, slightly more than the robot's size."""
+        """The distance between the worlds of a grid, in m. It is slightly larger than the robot."""
         model = self._env.task.model
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)

@@ -90,7 +90,7 @@ class Traces:
     """The paths of a plan and its samples."""
 
     paths: np.ndarray
-    """The paths, (samples + 1, points, 3), metres; the plan comes last."""
+    """The paths, (samples + 1, points, 3), in metres; the plan comes last."""
     best: int | None
     """The index of the best sample."""
     final: Pose

@@ -18,11 +18,11 @@ from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import Command, Failed, Frame, Opened, Scene
 
 FRAME_TIME = 1 / 60
-"""The minimum seconds between two frames."""
+"""The minimum time between two frames, in seconds."""
 OPENING_TIME = 60.0
-"""The maximum seconds until the process must report that the window is open."""
+"""The maximum time until the process must report that the window is open, in seconds."""
 CLOSING_TIME = 5.0
-"""The maximum seconds that the process may take to end."""
+"""The maximum time that the process may take to end, in seconds."""
 
 _PROGRAM = """
 import sys

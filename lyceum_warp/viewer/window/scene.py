@@ -59,7 +59,7 @@ class ExtraGeoms:
         Args:
             pose: The pose of the shown world.
             ghosts: Further poses.
-            traces: The paths of samples, (samples, points, 3), metres.
+            traces: The paths of samples, (samples, points, 3), in metres.
             best: The index of the best sample.
             arrows: Arrows.
             groups: Whether each group of geoms is visible, (6,); by default unchanged.
