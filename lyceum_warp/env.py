@@ -124,7 +124,7 @@ class Env:
     nworld: int
     """Number of worlds."""
     timestep: float
-    """Simulated duration of a step, which includes all substeps, in seconds."""
+    """Simulated duration of a step with all its substeps, in seconds."""
     device: wp.Device
     """The Warp device; ``obs.device`` is the same device in torch."""
     options: EnvOptions
@@ -568,7 +568,7 @@ class Env:
         return made
 
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
-        """Replicate the environment with a few worlds, as for an evaluation; engine="auto" selects the C engine.
+        """Replicate the environment with a few worlds, such as for evaluation; engine="auto" selects the C engine.
 
         On a GPU, a step of a few worlds takes nearly as long as a step of thousands of worlds.
         """
@@ -598,7 +598,7 @@ class Env:
 
     @property
     def bytes_per_world(self) -> float:
-        """Estimate the bytes of memory per world, without the model, which all worlds share."""
+        """Estimate the bytes of memory per world. The model is not counted, because all worlds share it."""
         physics = self.options.engine, self.task.model, self.device, self.task.fields
         engine = bytes_per_world(*physics, dynamics=self.task.dynamics, **self.options.for_engine())
         return engine + own_bytes_per_world(self.task)

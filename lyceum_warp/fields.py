@@ -162,7 +162,7 @@ class Field:
     reset: Stage
     """The stage to compute after a reset; ``Stage.NONE`` for a field that a reset sets to zero."""
     lagged: bool
-    """Whether the field keeps the value left by ``mj_step``, which lags one substep behind the state."""
+    """Whether the field keeps the value left by ``mj_step``. This value lags one substep behind the state."""
     snapshot: bool
     """Whether states include the field, because it is not a function of the integration state."""
     written: bool = False
@@ -201,8 +201,8 @@ def describe(
     Args:
         model: The compiled model.
         name: MuJoCo's name of the field, an attribute of MjData.
-        lagged: Whether to keep the value left by ``mj_step``, which lags one substep behind the state. Fields of the
-            acceleration stage always lag; fields of the integration state never do.
+        lagged: Whether to keep the value left by ``mj_step``. This value lags one substep behind the state. Fields of
+            the acceleration stage always lag; fields of the integration state never do.
         cleared: Whether the field is 0 at the start of an episode instead of computed from the first state.
         written: Whether the task writes the field before a step. Controls are always written.
 
@@ -312,7 +312,7 @@ def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
 
 
 def has_several_rows(name: str) -> bool:
-    """Check whether an object may have several rows in a field, as a joint has in ``cdof``."""
+    """Check whether an object may have several rows in a field, such as a joint in ``cdof``."""
     return name in _RANGES or name.partition("_")[0] in _RANGES
 
 

@@ -18,7 +18,7 @@ from lyceum_warp.support.docstrings import attribute_docs, document_attributes, 
 from lyceum_warp.support.validate import check_flag, check_kind, described, finite_number, positive_number, whole_number
 
 ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
-"""Source of a model, which is a file or an MjSpec."""
+"""Source of a model: a file or an MjSpec."""
 
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 INTEGRATORS = {

@@ -480,10 +480,10 @@ class Task:
     """Number of steps after which an episode is truncated; 0 means never."""
     success_steps: ClassVar[int] = 1
     """Number of successive steps that must end in success before ``env.success`` is True. If ``success_steps`` is more
-    than 1, the state has a part ``success_steps`` with the current count, which a reset clears."""
+    than 1, the state has a part ``success_steps`` with the current count; a reset clears the count."""
     lagged: ClassVar[tuple[str, ...]] = ()
-    """Fields that keep the values left by ``mj_step``, which lag one substep behind the state, as in some Gymnasium
-    tasks."""
+    """Fields that keep the values left by ``mj_step``. These values lag one substep behind the state, as in some
+    Gymnasium tasks."""
     cleared: ClassVar[tuple[str, ...]] = ()
     """Fields left by the last substep, such as contact forces, that a reset clears before ``initialize``. If
     ``cleared`` does not list such fields, a forward pass computes them in the worlds that restart."""
@@ -492,8 +492,8 @@ class Task:
     then converts actions to inputs. A size may be the name of a table in Params with one row per number. If ``actions``
     is None, an action has one number for each control."""
     action_range: ClassVar[tuple[float, float] | None] = None
-    """The range of actions, which the default ``control`` scales to the model's control ranges. If ``action_range`` is
-    None, actions are controls, or are unbounded if the task has ``actions``."""
+    """The range of actions. The default ``control`` scales this range to the model's control ranges. If
+    ``action_range`` is None, actions are controls, or are unbounded if the task has ``actions``."""
     keyframe: ClassVar[str | None] = None
     """Name of the model's keyframe to which ``reset`` sets the state before ``initialize``; None means ``qpos0``."""
     draws: ClassVar[int] = 10
@@ -507,8 +507,8 @@ class Task:
     environment. Model, observation, reward, termination, reset and parameters are the same. Subclasses do not inherit
     this attribute."""
     trace: ClassVar[str | None] = None
-    """Name of the site or body whose path the viewer draws for a planner's samples. If None, the viewer draws the
-    centre of mass of a robot with a floating base, or the end of an arm."""
+    """Name of a site or body. For a planner's samples, the viewer draws the path of this site or body. If None, the
+    viewer draws the centre of mass of a robot with a floating base, or the end of an arm."""
     mirror: ClassVar[Any] = None
     """The task's mirror image, ``lw.Mirror(...)``, or a static method ``mirror(model, p)`` that returns the mirror
     image, to learn symmetric policies; None without a mirror image."""

@@ -122,7 +122,7 @@ class Terrain:
     seed: int = 0
     """Seed of all random heights."""
     scale: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Sizes at difficulty 1, by kind, which replace the sizes in the table."""
+    """Sizes at difficulty 1, by kind. They replace the sizes in the table."""
 
     def __post_init__(self) -> None:
         """Check the description.
@@ -277,7 +277,7 @@ def height_field(name: str) -> Any:
     table as in ``ground: wp.array2d[float] = lw.height_field("terrain")``.
 
     Args:
-        name: Name of the height field in the model, which is "terrain" by default in ``lw.Terrain.add_to``.
+        name: Name of the height field in the model. ``lw.Terrain.add_to`` uses the name "terrain" by default.
     """
     return from_model(lambda model, _: height_table(model, name))
 

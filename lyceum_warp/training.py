@@ -99,8 +99,8 @@ def train(
         tensorboard: Whether to also write the metrics for TensorBoard.
         video_every: Iterations between two videos of the policy, such as ``videos/000100.mp4`` in the folder; 0 for no
             videos. If a video fails, a warning is logged, and training continues without videos.
-        camera: Camera of the videos, which is a camera of the model by name or index, a ``viz.cameras.FreeCamera``, or
-            "free" for MuJoCo's default free camera.
+        camera: Camera of the videos: a camera of the model by name or index, a ``viz.cameras.FreeCamera``, or "free"
+            for MuJoCo's default free camera.
         transfer: Whether to judge the policy's transfer at the end with ``lw.transfer``, and to write ``transfer.json``
             into the folder. By default, only comparisons of a few seconds run: the C engine after training on a GPU,
             and the task's exact physics after training with different physics options. ``transfer=True`` adds
@@ -284,7 +284,7 @@ def _check_equal(run: Run, learner: Learner) -> None:
     old, new, algorithm = then.options, env.options, run.config["algorithm"]
     now["engine"] = engine_name(now["engine"], now["device"])
     own = {"engine": engine_name(old.engine, old.device), "algorithm": algorithm, "nworld": old.nworld}
-    # omit options that do not affect results, and the model, which note_changes compares
+    # omit options that do not affect results; omit the model, because note_changes compares it
     options = {"horizon": old.horizon, "fields": old.fields, "dynamics": old.dynamics}
     params = dict.fromkeys(now["params"]) | run_params(run, then.params)
     # runs of earlier releases lack the newest hyperparameters

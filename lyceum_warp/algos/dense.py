@@ -96,8 +96,7 @@ class DensePasses:
         self._arrays = [result.numpy() for result in self.results]
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
-        """Compute outputs, (rows, outputs), from inputs, (rows, inputs), and store the inputs for ``push`` and
-        ``pull``."""
+        """Compute outputs, (rows, outputs), from inputs, (rows, inputs). Keep the inputs for ``push`` and ``pull``."""
         if len(x) != self._rows:
             self._resize(len(x))
         self._inputs = [x, *self.results[:-1]]

@@ -98,7 +98,7 @@ class Learner(abc.ABC):
     """
 
     algorithm: str
-    """The name of the algorithm, which is the key of its hyperparameters in a run's config.json."""
+    """The name of the algorithm, and the key of its hyperparameters in a run's config.json."""
     env: Env
     """The environment that provides the samples."""
     policy: torch.nn.Module

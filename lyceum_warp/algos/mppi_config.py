@@ -184,7 +184,7 @@ class MPPIConfig:
 
     @property
     def noise_smoothing(self) -> tuple[float, float, float]:
-        """Return the effective ``smoothing``, which is none for knots."""
+        """Return the effective ``smoothing``; knots are not smoothed."""
         return self.smoothing if self.knots is None else (1.0, 0.0, 0.0)
 
     def fill_action(self, space: Space) -> np.ndarray:
@@ -217,7 +217,7 @@ def _array(value: Any) -> np.ndarray | None:
 
 
 def _tuples(array: np.ndarray) -> Any:
-    """Convert an array to a float or to tuples, which are hashable."""
+    """Convert an array to a hashable value: a float or tuples."""
     return array.item() if array.ndim == 0 else tuple(map(_tuples, array))
 
 
@@ -250,7 +250,7 @@ def _smoothing(smoothing: Any) -> Any:
     if array is None or array.shape != (3,):
         raise ValueError(f"smoothing must be 3 finite numbers, not {smoothing!r}")
     b0, b1, b2 = array.tolist()
-    # check the stability triangle of a second-order filter, which has the roots of z^2 - b1 z - b2 as poles
+    # check the stability triangle of a second-order filter; its poles are the roots of z^2 - b1 z - b2
     if not (abs(b2) < 1 and abs(b1) < 1 - b2):
         raise ValueError(
             f"smoothing {(b0, b1, b2)} is unstable: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) must have its poles inside "

@@ -34,7 +34,7 @@ class NPGConfig:
     every world if that is more."""
     rollout: Literal["auto", "episodes", "segments"] = "auto"
     """"episodes" starts new episodes in every iteration, as in the paper; "segments" continues the last iteration's
-    episodes, which suits many worlds with few steps each; "auto" selects "episodes" if samples / worlds >= horizon."""
+    episodes, and suits many worlds with few steps each; "auto" selects "episodes" if samples / worlds >= horizon."""
     min_restarts: float | None = None
     """Minimum number of worlds that start an episode in each iteration, as a multiple of samples / horizon. If fewer
     worlds started an episode in the last iteration, random worlds are restarted. Restarts apply only to segments with a
@@ -48,7 +48,8 @@ class NPGConfig:
     lam: float = 0.97
     """Lambda of the generalised advantage estimate."""
     delta: float = 0.1
-    """Squared step length in the Fisher metric, which is twice the KL divergence between the old and the new policy."""
+    """Squared length of a step in the Fisher metric. It is twice the KL divergence between the old and the new
+    policy."""
     whiten: bool = True
     """Whether to normalise advantages to mean 0 and standard deviation 1 (as in mjrl, unlike Lyceum)."""
     cg_iterations: int = 10

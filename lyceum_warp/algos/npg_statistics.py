@@ -88,7 +88,7 @@ class ProcessNumbers(NamedTuple):
     """The result of ``metric_sums``."""
 
     def pack(self) -> torch.Tensor:
-        """Pack all numbers into one float64 tensor, which needs one copy to other processes and to the host."""
+        """Pack all numbers into one float64 tensor, so that one copy to other processes or to the host suffices."""
         return torch.stack([number.double() for part in self for number in part])
 
     @classmethod

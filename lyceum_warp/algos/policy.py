@@ -33,7 +33,7 @@ class GaussianPolicy(Normalized):
         activation: Activation of the hidden layers.
         log_std: Initial logarithm of the standard deviations.
         normalize: Whether to normalise observations by their running mean and variance.
-        limit: Limit of normalised observations, which are clipped to [-limit, limit]; inf means no limit.
+        limit: Normalised observations are clipped to [-limit, limit]; inf means no limit.
         generator: Draws the initial weights.
 
     Raises:

@@ -42,7 +42,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
 
     Args:
         policy: The policy, on any device: a module with the method ``act`` and the attribute ``nobs``.
-        path: Path of the file, which replaces an existing file.
+        path: Path of the file; an existing file is replaced.
         env: An environment of the policy's task; an ONNX file gets the task's ``deployment_metadata``.
 
     Returns:

@@ -191,8 +191,8 @@ class Rollout:
     def restart_some(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
         """Restart random worlds so that at least ``least`` worlds started an episode within the last ``steps`` steps.
 
-        Interrupted episodes are not counted. Do not restart worlds with ``first_only``, which would count restarted
-        worlds twice. The host does not wait for the device.
+        Interrupted episodes are not counted. Do not restart worlds if ``first_only`` is set, because the first episodes
+        of restarted worlds would count twice. The host does not wait for the device.
 
         Args:
             least: Minimum number of worlds in all processes.

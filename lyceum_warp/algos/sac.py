@@ -54,7 +54,7 @@ class SACIteration(SampledIteration):
     """
 
     critic_loss: float
-    """Loss of the two critics, which is the sum of their mean squared errors."""
+    """Loss of the two critics: the sum of their mean squared errors."""
     q_mean: float
     """Mean of the critics' predictions."""
     actor_loss: float
@@ -62,7 +62,7 @@ class SACIteration(SampledIteration):
     entropy: float
     """Entropy of the policy for actions scaled to [-1, 1]."""
     temperature: float
-    """Temperature, the weight of the entropy, after the iteration."""
+    """Temperature (the weight of the entropy) after the iteration."""
     time_update: float
     """Seconds for the updates."""
 

@@ -105,7 +105,7 @@ class SACConfig:
     bf16: bool = False
     """Whether SAC computes the losses in bfloat16 (torch.autocast)."""
     compiled: bool = False
-    """Whether torch.compile compiles the losses, which takes about half a minute."""
+    """Whether torch.compile compiles the losses. Compilation takes about half a minute."""
     mean_every: int = 10
     """Iterations between evaluations of the mean policy; 0 means no evaluations."""
     mean_episodes: int = 16

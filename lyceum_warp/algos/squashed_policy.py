@@ -31,7 +31,7 @@ class SquashedPolicy(Normalized):
         high: Upper bounds of the actions, (nact,).
         activation: Activation of the hidden layers.
         normalize: Whether to normalise observations by their running mean and variance.
-        limit: Limit of normalised observations, which are clipped to [-limit, limit]; inf means no limit.
+        limit: Normalised observations are clipped to [-limit, limit]; inf means no limit.
         mirror: Reflections for ``use_mirror``.
         generator: Draws the initial weights.
 

@@ -23,7 +23,7 @@ class Controller(Protocol):
             obs: The plant's observation, (nobs,) float32, on the plant's device.
 
         Returns:
-            The action, (nu,), which is finite and on any device.
+            The action, (nu,): finite numbers on any device.
         """
         ...
 
@@ -58,7 +58,7 @@ class PlanningController(Controller, Protocol):
 
     @property
     def actions(self) -> torch.Tensor:
-        """The last plan, (horizon, nact), which is finite. The plan's first row is the action for the given state."""
+        """The last plan, (horizon, nact): finite numbers. The plan's first row is the action for the given state."""
         ...
 
     @property

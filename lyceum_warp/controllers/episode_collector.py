@@ -16,7 +16,7 @@ from lyceum_warp.support.validate import check_flag, check_function, check_kind,
 @document_attributes
 @dataclasses.dataclass(frozen=True)
 class ControlProgress:
-    """Progress of an episode after a step, which is the argument of ``on_step``."""
+    """Progress of an episode after a step: the argument of ``on_step``."""
 
     step: int
     """Number of steps so far."""

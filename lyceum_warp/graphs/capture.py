@@ -36,7 +36,7 @@ class Phase:
     """
 
     name: str
-    """Name of the phase, which ``lyceum_warp.testing`` uses."""
+    """Name of the phase, for ``lyceum_warp.testing``."""
     run: Callable[[], object]
     """The function to run, without arguments."""
     engine: bool = False
@@ -113,7 +113,7 @@ separate_tiles()
 def capturing() -> Iterator[None]:
     """Exclude other captures and disable Python's garbage collection during a capture.
 
-    Garbage collection may delete unused torch graphs, which makes a CUDA capture fail.
+    Garbage collection may delete unused torch graphs, and a deletion makes a CUDA capture fail.
     """
     with _CAPTURING:
         collects = gc.isenabled()
@@ -128,7 +128,7 @@ def capturing() -> Iterator[None]:
 class _Graph:
     """Captures functions of launches: in one graph, or in one graph per thread if the functions take long.
 
-    The first call runs the functions directly, which loads their modules. The second call captures and replays the
+    The first call runs the functions directly, and loads their modules. The second call captures and replays the
     functions; later calls only replay. With workers, the first replays are timed, and the shortest time determines how
     many threads share the work.
     """

@@ -231,7 +231,7 @@ class Run:
     # policies
 
     def numbered(self, iteration: int) -> Path:
-        """Get the path of an iteration's policy, which exists if the policy was saved."""
+        """Get the path of an iteration's policy; the file exists if the policy was saved."""
         return self.folder / "policies" / f"{iteration:06d}.pt"
 
     def policy_file(self, which: str | int = "last") -> Path:

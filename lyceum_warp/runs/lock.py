@@ -124,7 +124,7 @@ def _named(owner: dict[str, Any]) -> str:
 
 
 def _started(pid: int) -> str:
-    """Get the start time of a process, which distinguishes processes with the same pid; "" if there is no process."""
+    """Get the start time of a process, to distinguish processes with the same pid; "" if there is no process."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         return "" if state[0] == "Z" else state[19]  # a zombie process counts as ended

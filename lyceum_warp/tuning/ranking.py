@@ -30,7 +30,7 @@ class Rankings:
     coarser physics. The states are of three kinds:
 
     - standing: states after a random reset;
-    - moving: states after 30 steps under the planner with the plant's physics, which replans every 6 steps;
+    - moving: states after 30 steps under a planner that has the plant's physics and replans every 6 steps;
     - fallen: states after random actions for up to 200 steps, until the end of the episode, and then for 10 more steps.
 
     Args:

@@ -117,7 +117,7 @@ class Painter:
 
 
 def set_camera(view: Any, values: tuple[float, ...]) -> None:
-    """Set the values of a camera, which come from ``cameras.camera_values``."""
+    """Set the values of a camera; ``cameras.camera_values`` returns such values."""
     view.type, view.fixedcamid, view.trackbodyid = (int(value) for value in values[:3])
     view.lookat[:] = values[3:6]
     view.distance, view.azimuth, view.elevation = values[6:9]

@@ -186,7 +186,7 @@ class Live:
             ended.logical_and_(~self._over)
             reward.masked_fill_(self._over, 0.0)
         self.returns.add_(reward)
-        # on a GPU, do not read the mask, which would wait for the device
+        # on a GPU, do not read the mask, because reading would wait for the device
         if self.asynchronous or ended.any():
             self._note_ends(ended)
         values = [
@@ -300,7 +300,7 @@ class Live:
         return self.env.get_state()[self.world]
 
     def write(self, **parts: np.ndarray) -> None:
-        """Change parts of the shown world's state, which are named as in ``env.state_space``."""
+        """Change parts of the shown world's state, by their names in ``env.state_space``."""
         state = self.row()
         for name, value in parts.items():
             where = self.env.state_space.parts[name]

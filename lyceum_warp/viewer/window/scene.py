@@ -54,7 +54,7 @@ class ExtraGeoms:
         arrows: Sequence[Arrow] = (),
         groups: np.ndarray | None = None,
     ) -> list[mujoco.MjvGeom]:
-        """Make the geoms of a frame, which are valid until the next frame.
+        """Make the geoms of a frame; the geoms are valid until the next frame.
 
         Args:
             pose: The pose of the shown world.
@@ -150,7 +150,7 @@ class ModelValues:
     """Holds a copy of the model with the values of one world.
 
     Args:
-        nominal: The model, which is copied.
+        nominal: The model. It is copied.
     """
 
     def __init__(self, nominal: mujoco.MjModel) -> None:

@@ -29,7 +29,7 @@ Plugin: Any = plugin.ViewerPlugin
 """The base class of plugins; after ``Started``, ``self.viewer`` is the viewer."""
 
 handler: Any = messages.handler
-"""Decorator for a plugin's method, which handles the type of message in its annotation."""
+"""Decorator for a plugin's method. The method handles messages of the type in its annotation."""
 
 Started: Any = plugin.ViewerInitEvent
 Update: Any = messages.UpdateEvent
