@@ -71,7 +71,7 @@ class Env:
 
     Write ``action``, call ``step``, and read the other buffers, which are updated in place. When an episode ends, the
     world starts a new random episode within the same step: ``obs`` is then the new episode's first observation, and
-    ``final_obs`` the old episode's last observation.
+    ``final_obs`` is the old episode's last observation.
 
     A world with a fault (see ``Done``) restarts, and ``fault_counts`` counts the fault; no bit of any other world
     changes. A transition with a fault has the reward 0 and the last valid observation as ``final_obs``. In the Warp

@@ -106,7 +106,7 @@ class PhysicsOptions:
     rollouts, plus room for inactive equality constraints."""
     deterministic: bool = _for_engine(False)
     """Make runs on a CUDA device reproducible bit for bit, as runs on the CPU always are. Reproducible runs of hopper,
-    half_cheetah and humanoid take 5 to 18 times the time and 5 to 7 times the memory."""
+    half_cheetah and humanoid take 5 to 18 times as much time and 5 to 7 times as much memory as other runs."""
 
     def __post_init__(self) -> None:
         """Check every value."""

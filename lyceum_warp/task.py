@@ -459,9 +459,9 @@ class Task:
     obs: ClassVar[Any]
     """Parts of the observation and their sizes, in order, such as ``{"position": 5, "velocity": 6}``; or a static
     method that computes the sizes from the Params. A task may have several groups of observations, such as ``{"policy":
-    {"position": 5}, "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy``, which is
-    ``env.obs``, and ``observe_critic``, with the same arguments, writes the group ``critic``. A task omits ``obs`` if
-    the last argument of ``observe`` is a Warp struct with the defaults ``lw.part(size)``."""
+    {"position": 5}, "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy`` (``env.obs``).
+    ``observe_critic`` has the same arguments, and writes the group ``critic``. A task omits ``obs`` if the last
+    argument of ``observe`` is a Warp struct with the defaults ``lw.part(size)``."""
     rewards: ClassVar[Mapping[str, float]] = {}
     """Terms of the reward with weights per second, such as ``{"upright": 1.0, "effort": -0.1}``, in place of
     ``reward``. A term is a function of the module that returns a float. The arguments of a term are found by name:
@@ -510,8 +510,8 @@ class Task:
     """Name of a site or body. For a planner's samples, the viewer draws the path of this site or body. If None, the
     viewer draws the centre of mass of a robot with a floating base, or the end of an arm."""
     mirror: ClassVar[Any] = None
-    """The task's mirror image, ``lw.Mirror(...)``, or a static method ``mirror(model, p)`` that returns the mirror
-    image, to learn symmetric policies; None without a mirror image."""
+    """The task's mirror image, for learning symmetric policies: ``lw.Mirror(...)``, or a static method ``mirror(model,
+    p)`` that returns an ``lw.Mirror``. None means that the task has no mirror image."""
     physics: ClassVar[Mapping[str, PhysicsOptions]] = {}
     """Physics options by name, such as ``{"fast": lw.PhysicsOptions(integrator="implicitfast")}`` for ``lw.make(task,
     physics="fast")``. The default, "exact", means the options of the model and ``frame_skip``."""

@@ -80,8 +80,8 @@ class Team:
             nworld: Number of this process's worlds.
 
         Returns:
-            Indices into a flattened array (steps, nworld), which are 0 for samples of other processes; and a mask of
-            this process's samples.
+            Indices into a flattened array (steps, nworld), and a mask of this process's samples. The index of another
+            process's sample is 0.
         """
         step, world = index // (nworld * self.size), index % (nworld * self.size) - self.rank * nworld
         own = (world >= 0) & (world < nworld)

@@ -188,7 +188,7 @@ class MPPIConfig:
         return self.smoothing if self.knots is None else (1.0, 0.0, 0.0)
 
     def fill_action(self, space: Space) -> np.ndarray:
-        """Return the action that fills the initial plan and the end of shifted plans, clipped to the bounds, (nact,).
+        """Return the clipped action, (nact,), that fills the initial plan and the end of shifted plans.
 
         Raises:
             ValueError: The size of ``fill`` does not match the actions.

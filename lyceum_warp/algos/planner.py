@@ -89,10 +89,10 @@ class Planner:
     Args:
         task: Name of a task, path of a task file, or a task class.
         config: Settings that replace the task's settings.
-        value: Terminal value that is added to each sample's return: a ``ValueFunction``, a function from (nworld, nobs)
-            observations to (nworld,) values, or a Warp function of one observation, ``value(obs: Row[float]) ->
-            float``, which becomes part of the graph on the Warp engine. If a value is given, the parameters in
-            ``planning`` do not apply, because the value function was fitted to the task's own rewards.
+        value: Terminal value that is added to each sample's return: a ``ValueFunction``; a function from (nworld, nobs)
+            observations to (nworld,) values; or a Warp function of one observation, ``value(obs: Row[float]) ->
+            float``. On the Warp engine, a Warp function becomes part of the graph. If a value is given, the parameters
+            in ``planning`` do not apply, because the value function was fitted to the task's own rewards.
         seed: Seed of the noise. With several plants, ``seed`` is the seed of the first plant, or a list with one seed
             per plant.
         plants: Number of plants to plan for.
@@ -100,8 +100,8 @@ class Planner:
         words: Individual settings by their names in ``lw.MPPIConfig`` (None keeps the default; ``update`` may be a
             custom ``lw.PlanUpdate``), options of the planner's worlds as for ``lw.make``, and parameters of the task.
             Parameters with one value per world are ordered by plant, then by sample, then by model. With a CUDA device,
-            engine="auto" and few samples, the C engine rolls out the samples, because it is faster for few samples, and
-            plans are on the CPU.
+            engine="auto" and few samples, the C engine rolls out the samples, because it is faster for few samples.
+            Plans are then on the CPU.
 
     Raises:
         ValueError: An argument is unknown, ambiguous or invalid, or the samples do not fit into memory.
@@ -492,7 +492,7 @@ class Planner:
             rows.copy_(states[:, self.env.state_space.parts[name]])
 
     def state_of(self, **parts: Any) -> torch.Tensor:
-        """Make a state from some of its parts, as measured on a robot; all other parts equal the task's fixed reset.
+        """Make a state from some of its parts, such as measurements; all other parts equal the task's fixed reset.
 
         Model fields have nominal values unless given, as in ``body_mass=...``.
 

@@ -196,7 +196,7 @@ class SAC(Learner):
 
     @property
     def title(self) -> str:
-        """Name of the algorithm, with the size of its replay buffer."""
+        """Name of the algorithm, and the size of the replay buffer."""
         size = self.replay.nbytes * self.team.size / 1e9
         return f"{self.algorithm} with a replay buffer of {self.config.replay:,d} samples ({size:.2g} GB)"
 

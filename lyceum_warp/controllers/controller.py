@@ -42,9 +42,9 @@ class PlanningController(Controller, Protocol):
             state: See ``Controller``.
             obs: See ``Controller``.
             shift: Number of steps of length ``timestep`` since the state of the last plan; 0 for the first plan after a
-                reset. With ``reset=False``, the loops assume that the last plan was made in the previous step. With
-                ``replan_every`` as well, they assume that it was made in the last step in which a plan was due. The
-                loops pass ``shift`` only to controllers with an argument ``shift``.
+                reset. With ``reset=False``, the loops assume that the last plan was made in the previous step or, with
+                ``replan_every``, in the last step for which a plan was due. The loops pass ``shift`` only to
+                controllers with an argument ``shift``.
 
         Returns:
             The first action of the plan, (nu,). If the controller has ``actions``, the loops read the plan from

@@ -52,10 +52,10 @@ def control_async(
     The plant steps in the calling thread. Step k of the plant is due at ``k * period``; a late step does not delay
     later steps. The controller plans in a second thread, always from the newest state, and only once from each state.
 
-    Each step applies an action of the newest finished plan, selected by the time since the plan's initial state; after
-    the end of the plan, its last action applies. Selecting actions by time compensates for planning delays up to the
-    length of the plan. The plant waits for the first plan, so the first action has age 0. Later actions are at least
-    one step old, and exactly one step old if every plan takes less than a period.
+    Each step applies an action of the newest finished plan. The time since the plan's initial state selects the action;
+    after the end of the plan, its last action applies. Selecting actions by time compensates for planning delays up to
+    the length of the plan. The plant waits for the first plan, so the first action has age 0. Later actions are at
+    least one step old, and exactly one step old if every plan takes less than a period.
 
     Before the clock starts, a warm-up calls the controller three times with the first state, steps the plant three
     times, and restores the plant's state. The warm-up loads kernels and captures graphs, because Warp cannot capture a
@@ -210,7 +210,7 @@ class PlannerThread:
         self._plans: list[TimedPlan] = []
         self._qualities: list[tuple[float, float]] = []  # one entry per plan, appended after the plan
         self._error: BaseException | None = None
-        self._begun = threading.Event()  # set after the first plan, or an error
+        self._begun = threading.Event()  # set after the first plan or after an error
         # use SimpleQueue, which is implemented in C, so that no thread loses the GIL while it holds the queue's lock
         self._states: queue.SimpleQueue[tuple[int, torch.Tensor, torch.Tensor] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="lyceum_warp planner", daemon=True)

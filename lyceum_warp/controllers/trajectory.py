@@ -110,9 +110,9 @@ class Trajectory:
     action_names: Sequence[str]
     """Names of the action columns."""
     source: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Arguments of ``lw.make`` from which ``episode_env`` rebuilds the plant: ``task``, a name or "file:class" (None
-    for a task from a notebook or script); ``params``, the names of the given parameters; and ``options``. Files of
-    earlier releases lack these arguments."""
+    """Arguments of ``lw.make``, with which ``episode_env`` rebuilds the plant: ``task`` is a name or "file:class" (None
+    for a task from a notebook or script); ``params`` lists the names of the given parameters; and ``options`` holds the
+    options. Files of earlier releases lack these arguments."""
 
     @property
     def steps(self) -> int:

@@ -20,7 +20,7 @@ BEAT, STALE = 10.0, 120.0
 
 
 class RunLock:
-    """Lock of a run within a with block, by a file ``lock`` that stores the process and its host.
+    """Locks a run within a with block. The file ``lock`` stores the process and its host.
 
     A daemon thread updates the lock file's modification time every 10 s. A process takes over a lock from the same host
     if the locking process is gone or the modification time is more than 120 s old. Clocks of different hosts differ, so

@@ -31,7 +31,7 @@ class Rankings:
 
     - standing: states after a random reset;
     - moving: states after 30 steps under a planner that has the plant's physics and replans every 6 steps;
-    - fallen: states after random actions for up to 200 steps, until the end of the episode, and then for 10 more steps.
+    - fallen: states after random actions until the end of the episode (at most 200 steps), and for 10 more steps.
 
     Args:
         task: The task.

@@ -67,8 +67,8 @@ class FrameMaker:
             main: All worlds. ``live`` is either the same object, or a plant that copies the shown world of ``main``.
             traces: The paths of a planner's samples.
             status: A function that makes the complete status.
-            paused: Whether the frame must show the present state; otherwise the frame may show the state of the
-                previous frame's time.
+            paused: Whether the frame must show the present state; otherwise the frame may show the state at the time of
+                the previous frame.
         """
         shown = _following(main.world, main.env.nworld, self.ghosts.worlds)
         wanted = shown if live is main else [], self.ghosts.burst

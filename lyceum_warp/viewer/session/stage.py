@@ -199,7 +199,7 @@ class Stage:
             self._threads[current.name] = TraceThread(TraceRollouts(current.controller, self.live.env))
 
     def set_number(self, of: str, name: str, value: float) -> None:
-        """Change a setting of the planner in use, and rebuild the planner, or change a task parameter in all worlds.
+        """Rebuild the planner in use with another value of a setting, or change a task parameter in all worlds.
 
         Raises:
             ValueError: The value is not valid.
