@@ -128,7 +128,7 @@ class Env:
     device: wp.Device
     """The Warp device; ``obs.device`` is the same device in torch."""
     options: EnvOptions
-    """The options of the environment, in which named physics options are resolved."""
+    """The options of the environment; the physics options replace their name."""
     task: BoundTask
     """The task with the model, the parameters (``task.params``) and the kernels."""
     engine: Engine

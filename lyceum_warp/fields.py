@@ -154,7 +154,7 @@ class Field:
 
     name: str
     shape: tuple[int, ...]
-    """Shape of the field in one world, without the axis that is part of ``dtype``."""
+    """Shape of the field in one world. An axis that belongs to ``dtype`` is omitted."""
     dtype: type
     """Warp type of an element: float, wp.vec3, quat (w, x, y, z), ..."""
     refresh: Stage

@@ -42,7 +42,7 @@ class Display:
 
     @contextlib.contextmanager
     def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
-        """Make a context that surrounds training, up to a total number of iterations."""
+        """Make a context for training up to a total number of iterations."""
         yield
 
     def __call__(self, iteration: Iteration) -> None:

@@ -279,7 +279,7 @@ def contact_geoms(model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def foot_forces(model: mujoco.MjModel, p: Any) -> list[int]:
-    """Get the index in ``sensordata`` of the force on each foot, from the sensor FOOT_force, (feet,).
+    """Get the index in ``sensordata`` of each foot's force sensor, FOOT_force, (feet,).
 
     Raises:
         ValueError: The model has no sensor FOOT_force with three numbers.

@@ -33,7 +33,7 @@ class Transitions(NamedTuple):
     discount: torch.Tensor
     """Factors of the value of ``next_obs``: gamma^k after k steps, and 0 if the task ended the episode, (batch,)."""
     next_obs: dict[str, torch.Tensor]
-    """Observations after the last step, before any reset, by group."""
+    """Observations of each group after the last step and before any reset."""
 
 
 @document_attributes
@@ -78,7 +78,7 @@ class Replay:
     truncated: torch.Tensor
     """Whether the time limit or a fault ended the episode, (steps, nworld) bool."""
     next_obs: dict[str, torch.Tensor]
-    """Observations after each step, before any reset, by group."""
+    """Observations of each group after each step and before any reset."""
 
     def __init__(self, env: Env, capacity: int | None = None) -> None:
         check_kind("env of Replay", env, Env, "as lw.make(...) makes it")
@@ -211,7 +211,7 @@ class Replay:
         return {"stored": self.stored, "rows": self.rows(self.stored - self.count, self.stored)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of ``state_dict``; equal random numbers then sample equal transitions.
+        """Restore a state of ``state_dict``. Equal random numbers then draw equal transitions.
 
         Raises:
             ValueError: The state belongs to a buffer of a different size.

@@ -181,7 +181,7 @@ def _check_call(controller: Any) -> None:
 
 
 def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
-    """Get a function's signature, or None if it is unknown, as for some C functions."""
+    """Get a function's signature; None if it is unknown (for some C functions)."""
     try:
         return inspect.signature(function)
     except (TypeError, ValueError):

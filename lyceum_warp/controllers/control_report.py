@@ -63,7 +63,7 @@ class ControlReport:
     miss_share: float | None
     """Fraction of plans with a planning time above the deadline."""
     blind_plans: int | None
-    """Number of plans, including first plans, without a valid sample. A plan without a valid sample is the previous
+    """Number of plans without a valid sample. First plans are included. A plan without a valid sample is the previous
     plan shifted in time."""
     known_plans: int
     """Number of plans with a known number of failed samples, including first plans."""

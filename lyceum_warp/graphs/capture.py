@@ -111,7 +111,7 @@ separate_tiles()
 
 @contextlib.contextmanager
 def capturing() -> Iterator[None]:
-    """Exclude other captures and disable Python's garbage collection during a capture.
+    """During a capture, exclude other captures, and disable Python's garbage collection.
 
     Garbage collection may delete unused torch graphs, and a deletion makes a CUDA capture fail.
     """

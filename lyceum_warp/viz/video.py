@@ -196,7 +196,7 @@ class Recorder:
             raise self._error
 
     def _draw(self) -> None:
-        """Draw shots from the queue, in a thread."""
+        """Draw shots from the queue in a thread."""
         try:
             with self._drawing as drawing:
                 while (shot := self._next()) is not None:

@@ -165,7 +165,7 @@ class Stage:
         self.frames.add_point(self.playback)
 
     def end_old_push(self) -> None:
-        """End a push that belongs to a restored past state, before the worlds continue from this state."""
+        """End a push that was active in a restored past state, before the worlds continue from this state."""
         live = self.live
         if live.pushed is not None and not self.dragging and not live.past.ahead:
             live.end_push()

@@ -1,4 +1,4 @@
-"""Roll out a planner's plan and samples again to get their paths, in a thread.
+"""Roll out a planner's plan and samples again in a thread, to get their paths.
 
 A planner does not store positions. This module rolls out the actions of some samples from the plan's initial state, in
 worlds with the planner's task, model and time step. The random streams of these worlds differ from the planner's, so

@@ -76,7 +76,7 @@ class VideoTaker:
         self._start = time.perf_counter()
 
     def picture(self, camera: dict[str, Any], frame: Frame) -> None:
-        """Write a picture of a frame, in a thread.
+        """Write a picture of a frame in a thread.
 
         Raises:
             NoVideoError: A package for pictures is not installed.

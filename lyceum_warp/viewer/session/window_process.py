@@ -163,7 +163,7 @@ class Window:
         return lines[-1].strip() if lines else f"its process ended with code {code}"
 
     def _send(self) -> None:
-        """Send frames, in a thread."""
+        """Send frames in a thread."""
         while True:
             self._wake.wait()
             if self._ended:
@@ -183,7 +183,7 @@ class Window:
             time.sleep(FRAME_TIME)
 
     def _receive(self) -> None:
-        """Receive replies, in a thread."""
+        """Receive replies in a thread."""
         closed = False
         try:
             while not self._ended:

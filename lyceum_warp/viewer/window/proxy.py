@@ -189,7 +189,7 @@ class Proxy:
         return f"http://{_bracketed(host)}:{self.port}/?token={self._token}"
 
     def start(self, upstream: tuple[str, int], on_quiet: Callable[[], object] = lambda: None) -> None:
-        """Begin to answer, in a thread.
+        """Begin to answer in a thread.
 
         Args:
             upstream: The host and the port of studio's server.
