@@ -20,7 +20,8 @@ import torch
 from PIL import Image
 
 import lyceum_warp as lw
-from lyceum_warp.binding.registry import file_name
+from lyceum_warp.binding.registry import file_name, find_task
+from lyceum_warp.runs.configuration import ALGORITHMS
 from lyceum_warp.viz.cameras import CameraChoice, FreeCamera, camera_values, find_camera
 from lyceum_warp.viz.render import Painter
 from lyceum_warp.viz.video import shots
@@ -40,7 +41,9 @@ class Show:
     """Settings for the picture of a task."""
 
     settings: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Settings of MPPI and options of its worlds that differ from the task's."""
+    """Settings of the planner and options of its worlds that differ from the task's."""
+    params: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Parameters of the task for the planner only."""
     replan_every: int = 1
     """Number of steps from one MPPI plan to the next."""
     seconds: float = 4.0
@@ -51,35 +54,79 @@ class Show:
     camera: CameraChoice = None
 
 
+QUADRUPED = FreeCamera(track=1, distance=5.0, azimuth=135.0, elevation=-20.0)
+
 SHOWS = {
-    "adroit_door": Show(seconds=2.0, replan_every=2),
-    "adroit_hammer": Show(seconds=2.0, replan_every=2),
+    "adroit_door": Show(
+        seconds=1.2, replan_every=2,
+        camera=FreeCamera(lookat=(0.1, 0.0, 0.2), distance=1.6, azimuth=120.0, elevation=-25.0),
+    ),
+    "adroit_hammer": Show(
+        seconds=1.2, replan_every=2,
+        camera=FreeCamera(lookat=(0.0, 0.0, 0.15), distance=1.1, azimuth=60.0, elevation=-25.0),
+    ),
     "adroit_pen": Show(seconds=1.5, replan_every=2),
-    "adroit_relocate": Show(seconds=2.0, replan_every=2),
-    "aloha_lift": Show(replan_every=2),
-    "ant": Show({"noise": 0.6}, start=1.0, seconds=3.0),
+    "adroit_relocate": Show(
+        seconds=2.0, replan_every=2,
+        camera=FreeCamera(lookat=(0.0, 0.0, 0.2), distance=1.2, azimuth=90.0, elevation=-30.0),
+    ),
+    "aloha_lift": Show(
+        start=1.6, seconds=2.4, replan_every=2, camera=FreeCamera(lookat=(0.0, 0.0, 0.15), distance=1.3)
+    ),
+    "ant": Show(
+        {"horizon": 40, "knots": 6, "noise": 0.4, "temperature": 1.0}, start=1.5, seconds=2.5,
+        camera=FreeCamera(track=1, distance=3.5, azimuth=90.0, elevation=-8.0),
+    ),
     "arm_hand_pickup": Show(replan_every=2),
-    "dm/acrobot_swingup": Show({"horizon": 150, "noise": 1.0}, start=2.0, replan_every=2),
+    "dm/acrobot_swingup": Show(start=6.0, seconds=3.0, replan_every=2),
+    "dm/acrobot_swingup_sparse": Show(start=6.0, seconds=3.0, replan_every=2),
     "dm/ball_in_cup_catch": Show(seconds=2.5),
     "dm/cartpole_balance": Show(seconds=2.5),
+    "dm/cartpole_swingup_sparse": Show(
+        {"horizon": 100, "knots": 12, "noise": 0.5, "temperature": 0.5}, {"sparse": False}, start=1.0, seconds=4.0
+    ),
     "dm/cheetah_run": Show({"horizon": 40}, start=1.0, seconds=2.5, replan_every=2),
-    "dm/fish_upright": Show(seconds=3.0),
-    "dm/hopper_hop": Show({"horizon": 50}, start=1.0, seconds=3.0, replan_every=2),
-    "dm/hopper_stand": Show({"horizon": 50}, seconds=3.0, replan_every=2),
-    "dm/humanoid_stand": Show(seconds=3.0, replan_every=2),
-    "dm/pendulum_swingup": Show({"horizon": 60}),
+    "dm/fish_upright": Show(seconds=3.0, camera=FreeCamera(track=1, distance=0.6, elevation=-30.0)),
+    "dm/hopper_hop": Show({"horizon": 60, "knots": 8, "noise": 0.7, "temperature": 0.1}, seconds=2.4),
+    "dm/hopper_stand": Show({"horizon": 50, "knots": 6, "noise": 0.7, "temperature": 0.05}),
+    "dm/humanoid_run": Show({"update": "cem", "horizon": 40, "knots": 5, "noise": 0.4}),
+    "dm/humanoid_stand": Show({"update": "cem", "horizon": 40, "knots": 5, "noise": 0.4}, seconds=3.6),
+    "dm/humanoid_walk": Show({"update": "cem", "horizon": 40, "knots": 5, "noise": 0.4}),
+    "dm/manipulator_bring_ball": Show(
+        {"horizon": 32, "knots": 5, "noise": 0.5, "temperature": 0.05}, {"close": 0.1}, seconds=2.5, seed=12,
+        camera=FreeCamera(lookat=(0.0, 0.0, 0.5), distance=1.1, azimuth=90.0, elevation=-5.0),
+    ),
+    "dm/pendulum_swingup": Show(
+        {"horizon": 150, "knots": 12, "noise": 1.0, "temperature": 1.0}, {"largest_angle": 130}, start=5.0, seconds=6.0
+    ),
     "dm/point_mass_easy": Show(seconds=3.0),
+    "dm/quadruped_run": Show(
+        {"horizon": 40, "knots": 6, "noise": 0.5, "temperature": 0.1}, replan_every=2, camera=QUADRUPED
+    ),
+    "dm/quadruped_walk": Show(seed=8, camera=QUADRUPED),
     "dm/reacher_easy": Show(seconds=2.0, camera=FreeCamera(lookat=(0.0, 0.0, 0.0), distance=0.8, elevation=-90.0)),
     "dm/reacher_hard": Show(seconds=2.0, camera=FreeCamera(lookat=(0.0, 0.0, 0.0), distance=0.8, elevation=-90.0)),
+    "dm/swimmer_swimmer15": Show(
+        {"horizon": 50, "knots": 8, "noise": 0.7, "temperature": 0.02, "timestep": 0.01, "frame_skip": 3},
+        {"target_size": 1.0}, start=3.0, seconds=5.0, replan_every=2,
+        camera=FreeCamera(lookat=(0.5, -0.7, 0.0), distance=2.6, azimuth=90.0, elevation=-89.0),
+    ),
     "dm/walker_run": Show(start=2.0, seconds=3.0),
     "dm/walker_stand": Show(seconds=3.0),
     "dm/walker_walk": Show(start=1.0, seconds=3.0),
     "half_cheetah": Show(start=0.5, seconds=3.0),
     "hopper": Show(start=1.0, seconds=2.5, replan_every=4),
-    "humanoid": Show({"noise": 0.2}, seconds=2.0, replan_every=2),
+    "humanoid": Show(
+        {"horizon": 48, "knots": 6, "noise": 0.25, "temperature": 1.0}, start=1.0, seconds=3.0,
+        camera=FreeCamera(lookat=(3.2, 0.0, 0.9), distance=4.8, azimuth=90.0, elevation=-8.0),
+    ),
     "humanoid_get_up": Show(seconds=3.0),
     "humanoid_stand": Show(seconds=3.0),
-    "humanoid_standup": Show({"noise": 0.3}, seconds=2.0, replan_every=2),
+    "humanoid_standup": Show(
+        {"horizon": 40, "knots": 5, "noise": 0.3, "temperature": 20.0, "integrator": "implicitfast", "timestep": 0.015,
+         "frame_skip": 1}, seconds=3.0, replan_every=2,
+        camera=FreeCamera(lookat=(1.0, 0.0, 0.7), distance=4.2, azimuth=90.0, elevation=-10.0),
+    ),
     "humanoid_walk": Show(seconds=3.0),
     "inverted_pendulum": Show({"noise": 1.0}, seconds=2.5),
     "inverted_double_pendulum": Show(
@@ -87,7 +134,10 @@ SHOWS = {
     ),
     "panda_lift": Show(replan_every=2),
     "point_mass": Show(seconds=3.0),
-    "soft_ball": Show({"samples": 32}, seconds=3.0, replan_every=4),
+    "soft_ball": Show(
+        {"samples": 128, "horizon": 40, "knots": 5, "noise": 0.6, "temperature": 0.3}, start=0.6, seconds=2.4,
+        replan_every=2,
+    ),
     "swimmer": Show({"horizon": 48}, start=1.0, seconds=3.0),
     "walker2d": Show(start=1.0, seconds=2.5),
     **{f"{robot}_velocity": Show(start=1.0, seconds=3.2, camera=FreeCamera(track=1, distance=distance, azimuth=135.0,
@@ -96,6 +146,10 @@ SHOWS = {
                                ("g1_rough", 3.2), ("h1", 3.6), ("t1", 2.8))},
 }  # fmt: skip
 """Settings of tasks that differ from the defaults of Show."""
+
+for _name in ("g1_full_velocity", "g1_rough_velocity"):  # without a policy; under the planner they fall soon
+    _settings = {"horizon": 32, "samples": 48, "knots": 5, "noise": 0.1, "temperature": 0.02}
+    SHOWS[_name] = dataclasses.replace(SHOWS[_name], settings=_settings, replan_every=2, start=0.0, seconds=1.6)
 
 
 def draw(name: str, run: Path | None) -> dict[str, str]:
@@ -106,8 +160,9 @@ def draw(name: str, run: Path | None) -> dict[str, str]:
     if run is None:
         states, result = planned(env, show, steps)
         flags = show.settings | ({"replan-every": show.replan_every} if show.replan_every > 1 else {})
-        words = " ".join(f"--{flag} {value}" for flag, value in flags.items())
-        command = f"lyceum-warp plan {name} {words}".rstrip()
+        flags |= {"seed": show.seed} if show.seed else {}
+        command = f"lyceum-warp plan {name}{written(flags)}"
+        command += "".join(f" --planner-param {param}={value}" for param, value in show.params.items())
     else:
         policy = lw.load(run)
         states = acted(env, policy, show, steps)
@@ -117,22 +172,44 @@ def draw(name: str, run: Path | None) -> dict[str, str]:
         else:
             mean = lw.evaluate(lw.make(name, nworld=16), policy, 16, seed=0).returns.mean().item()
         result = f"{config['algorithm'].upper()}: return {number(mean)}"
-        command = f"lyceum-warp train {name} --algorithm {config['algorithm']}"
-        command += " --device cuda" if config["device"].startswith("cuda") else ""
-        if run.parent == PRETRAINED:
-            command = f"lyceum-warp view {name} --pretrained"
+        command = f"lyceum-warp view {name} --pretrained" if run.parent == PRETRAINED else training(name, run, config)
     save(pictures(env, states[round(show.start / env.timestep) :], show), FOLDER / f"{file_name(name)}.webp")
     return {"command": command, "result": result}
 
 
+def training(name: str, run: Path, config: dict[str, Any]) -> str:
+    """Write the command that repeats a run, with every flag that changes the policy."""
+    algorithm = config["algorithm"]
+    rows = (run / "metrics.csv").read_text().splitlines()
+    flags = {"algorithm": algorithm} | ({"device": "cuda"} if config["device"].startswith("cuda") else {})
+    flags |= {"iterations": rows[-1].partition(",")[0]} | ({"seed": config["seed"]} if config["seed"] else {})
+    suggested = find_task(name).training
+    settings = suggested.settings if suggested.algorithm == algorithm else {}
+    defaults = json.loads(json.dumps(vars(ALGORITHMS[algorithm][1](**settings))))
+    flags |= {
+        flag: value for flag, value in config[algorithm].items()
+        if flag != "mean_every" and defaults[flag] not in (None, value)
+    }  # fmt: skip
+    return f"lyceum-warp train {name}{written(flags)}"
+
+
+def written(flags: dict[str, Any]) -> str:
+    """Write flags as words of a command, each after a space."""
+    words = ""
+    for name, value in flags.items():
+        flag = name.replace("_", "-")
+        words += f" --{'no-' * (value is False)}{flag}" if isinstance(value, bool) else f" --{flag} {value}"
+    return words
+
+
 def planned(env: lw.Env, show: Show, steps: int) -> tuple[torch.Tensor, str]:
-    """Control an episode by MPPI, and return its states and its result."""
-    plan = lw.MPPI(env.task.name, seed=show.seed, **show.settings)
+    """Control an episode by a planner, and return its states and its result."""
+    plan = lw.MPPI(env.task.name, seed=show.seed, params=show.params, **show.settings)
     trajectory = lw.control(env, plan, steps=steps, seed=show.seed, replan_every=show.replan_every)
-    seconds = trajectory.steps * env.timestep
+    seconds, planner = trajectory.steps * env.timestep, plan.settings["update"].upper()
     if trajectory.succeeded:
-        return trajectory.states, f"MPPI: success within {seconds:.2g} s"
-    return trajectory.states, f"MPPI: return {number(trajectory.rewards.sum().item())} in {seconds:.2g} s"
+        return trajectory.states, f"{planner}: success within {seconds:.2g} s"
+    return trajectory.states, f"{planner}: return {number(trajectory.rewards.sum().item())} in {seconds:.2g} s"
 
 
 @torch.no_grad()
@@ -198,7 +275,8 @@ def page(results: dict[str, dict[str, str]]) -> str:
     """Return the gallery's page."""
     lines = ["# Gallery", "", "Each picture shows a task under a policy or a planner, with the result and a command "
              "that shows or trains it. The", "return of a policy is the mean over whole episodes. The return of a "
-             "planner covers the seconds in the picture. Each name", "links to the task's details.", ""]  # fmt: skip
+             "planner counts from the start of the episode to", "the end of the picture. Each name links to the task's "
+             "details.", ""]  # fmt: skip
     for stem, (title, names) in families().items():
         cells = []
         for name in names:
