@@ -136,7 +136,7 @@ functions."""
 
 
 RESULTS = ("obs", "ctrl", "metrics", "rng", "sums", "shared")
-"""Arguments that are rows for results, into which a function may write."""
+"""Arguments that are rows for results; a function may write into these rows."""
 
 MEMORIES = ("memory", "lasting_memory")
 """Kinds of memory that World declares. Each world has one row of floats per kind."""
@@ -376,7 +376,7 @@ class Planning:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Training:
-    """A task's settings for ``lyceum-warp train``, which flags override.
+    """A task's settings for ``lyceum-warp train``; flags override the settings.
 
     Raises:
         ValueError: ``settings`` is not a dict.

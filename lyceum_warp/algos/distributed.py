@@ -146,7 +146,7 @@ class Team:
 
 
 class Captured:
-    """Calls a function of torch operations and communication; on a GPU, replays it as a CUDA graph.
+    """Calls a function that runs torch operations and communication; on a GPU, replays it as a CUDA graph.
 
     The first call runs the function directly, so that it allocates its buffers. The second call captures and replays a
     graph; all later calls replay it. A graph stores addresses, so the function must update tensors in place.

@@ -192,7 +192,7 @@ class Learner(abc.ABC):
         return copy.deepcopy(state)  # copy, because a module's state_dict shares memory with the parameters
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from a state of ``state_dict``; later iterations equal an uninterrupted run's bit for bit.
+        """Resume from a state of ``state_dict``; later iterations equal an uninterrupted run bit for bit.
 
         Raises:
             ValueError: The state has a different number of worlds, or a counter is not a whole number.

@@ -17,7 +17,7 @@ from lyceum_warp.support.validate import check_flag, check_word, finite_number, 
 Numbers: TypeAlias = float | Sequence[float] | Sequence[Sequence[float]] | np.ndarray | torch.Tensor
 
 _SMALLEST = float(np.finfo(np.float32).tiny)
-"""The smallest normal float32, the type of the kernels."""
+"""The smallest normal float32; kernels compute in float32."""
 
 
 @document_attributes

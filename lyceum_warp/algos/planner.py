@@ -314,10 +314,10 @@ class Planner:
             state: A state from ``state_of`` or from ``get_state`` of an environment of the same task, on either engine:
                 (state_space.size,) or (1, state_space.size) float64; with several plants (plants, state_space.size).
             obs: Not used; present because control loops call controllers with observations.
-            shift: Number of the planner's steps since the last call, by which the last plan is shifted.
+            shift: Number of the planner's steps since the last call. The last plan is shifted by this number of steps.
 
         Returns:
-            The action to apply now, (nu,), or with several plants (plants, nu), on the state's device.
+            The action to apply now, on the state's device: (nu,), or (plants, nu) with several plants.
 
         Raises:
             ValueError: The state has the wrong shape or type, or is not finite.

@@ -106,7 +106,7 @@ class ControlReport:
     controller: Mapping[str, Any]
     """Name and settings of the controller; see ``Trajectory.controller``."""
     versions: Mapping[str, Any]
-    """Versions of packages and Python, and the machine, of the first trajectory."""
+    """Versions of packages and of Python, and the machine, as stored in the first trajectory."""
 
     def to_json(self) -> str:
         """Convert the report to JSON; missing and non-finite numbers become null."""

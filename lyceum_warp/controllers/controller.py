@@ -86,7 +86,7 @@ class PlanningController(Controller, Protocol):
 
     @property
     def summary(self) -> Mapping[str, float]:
-        """Quality of the last plan: ``failed_samples``, and ``effective_samples``, the effective sample size."""
+        """Quality of the last plan: ``failed_samples`` and ``effective_samples`` (the effective sample size)."""
         ...
 
     @property

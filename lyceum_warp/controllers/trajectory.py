@@ -39,7 +39,7 @@ _SCALARS: dict[str, Callable[[Any], Any]] = {
 @document_attributes
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trajectory:
-    """One episode of one world, the plant, under a controller. All tensors are on the CPU.
+    """One episode of a controlled world, which is called the plant. All tensors are on the CPU.
 
     In step k, the plant moves from state k to state k + 1 under action k. To replay the episode bit for bit on the same
     engine, set the first state with ``set_state`` and step with each action.

@@ -81,7 +81,7 @@ class Rankings:
         return found
 
     def _prepared(self, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Plan from some states, and return the plans and the returns, (states, samples), of samples around them."""
+        """Plan from some states. Return the plans, and the returns of samples around the plans, (states, samples)."""
         self.exact.reset(self.seed)
         for _ in range(_IMPROVEMENTS):
             self.exact(start, shift=0)

@@ -140,7 +140,7 @@ class Recorder:
 
     @property
     def finished(self) -> bool:
-        """Whether the subprocess has ended, with a file, or with an error that ``close`` raises."""
+        """Whether the subprocess has ended, either with a file or with an error that ``close`` raises."""
         return self._done.is_set()
 
     def add(self, shot: Shot) -> None:

@@ -86,7 +86,7 @@ class PolicyControl:
 
 
 class WorldControl:
-    """Calls a controller of one world, in several runs of a control loop.
+    """Calls a controller of one world; several runs of a control loop share the controller.
 
     Args:
         name: The controller's name in the viewer.

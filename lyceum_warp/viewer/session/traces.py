@@ -161,7 +161,7 @@ class TraceThread:
     """A thread that rolls out the newest plan, and sleeps between rollouts.
 
     Args:
-        rollouts: Makes the rollouts; used only by the thread after this call.
+        rollouts: Object that makes the rollouts. After this call, only the thread may use it.
     """
 
     def __init__(self, rollouts: TraceRollouts) -> None:

@@ -15,7 +15,7 @@ from lyceum_warp.viewer.window.studio import imgui, inputs, ux
 SPEEDS = tuple(2.0**power for power in range(-4, 5))
 """The available speeds, in simulated seconds per second."""
 MANY_STEPS = 50
-"""The number of steps for the arrow keys with Shift."""
+"""The number of steps by which an arrow key with Shift moves."""
 
 _DRIVING = tuple(getattr(imgui.Key, name) for name in "WSADQE")  # forward, back, left, right, turn left, turn right
 
