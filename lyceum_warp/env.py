@@ -128,7 +128,7 @@ class Env:
     device: wp.Device
     """The Warp device; ``obs.device`` is the same device in torch."""
     options: EnvOptions
-    """The options of the environment; the physics options replace their name."""
+    """The options of the environment. If physics options were given by name, the options replace the name."""
     task: BoundTask
     """The task with the model, the parameters (``task.params``) and the kernels."""
     engine: Engine

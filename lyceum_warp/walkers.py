@@ -334,7 +334,7 @@ def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[
 
 
 def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.ndarray:
-    """Add the margin minus the gap of contacts with the ground to the radii of a geom's spheres."""
+    """Add the contact margin with the ground, minus the gap, to the radii of a geom's spheres."""
     ground = np.flatnonzero(model.geom_bodyid == 0)
     margin = model.geom_margin[geom] + model.geom_margin[ground].max()
     gap = model.geom_gap[geom] + model.geom_gap[ground].max()

@@ -116,7 +116,7 @@ class Planner:
     """The settings, and the options and parameters of the planner's worlds, as JSON values."""
     actions: torch.Tensor
     """The plan, (horizon, nact); the first row is the action returned by the last call. To start from a different plan,
-    write into ``actions``, or with knots into ``knot_actions``."""
+    write into ``actions`` or, with knots, into ``knot_actions``."""
     nominal: torch.Tensor
     """The plan from which the last improvement started, (horizon, nact)."""
     knot_actions: torch.Tensor
@@ -515,7 +515,7 @@ class Planner:
         """Return statistics of the last improvement.
 
         The names are ``best_return``, ``mean_return``, ``effective_samples`` (the effective sample size) and
-        ``failed_samples`` (the number of failed samples). The values are numbers, or with several plants (plants,)
+        ``failed_samples`` (the number of failed samples). The values are numbers or, with several plants, (plants,)
         float32 tensors on the CPU.
         """
         names = ("best_return", "mean_return", "effective_samples", "failed_samples")

@@ -36,8 +36,8 @@ class Rollout:
         env: The environment.
         steps: Number of steps.
         groups: Groups of observations to store in addition to "policy", such as ``("critic",)``.
-        first_only: Whether to count only each world's first episode since ``restart``. If all worlds start together,
-            counting all episodes that end would favour short episodes.
+        first_only: Whether to count only each world's first episode since ``restart``. If all worlds start together, a
+            count of all finished episodes would favour short episodes.
 
     Raises:
         ValueError: The task has no group of observations of this name.

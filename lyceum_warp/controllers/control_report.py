@@ -66,7 +66,7 @@ class ControlReport:
     """Number of plans without a valid sample. First plans are included. A plan without a valid sample is the previous
     plan shifted in time."""
     known_plans: int
-    """Number of plans with a known number of failed samples, including first plans."""
+    """Number of plans with a known number of failed samples. First plans are included."""
     failed_share: float | None
     """Fraction of failed samples in the plans with a known number of failed samples."""
     effective_samples_mean: float | None

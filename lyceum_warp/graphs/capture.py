@@ -24,7 +24,7 @@ from lyceum_warp.support.arrays import part_of_worlds
 from lyceum_warp.support.upstream import TILES_ON_CPU, separate_captures, separate_tiles, tiles
 
 Calls = tuple[Callable[[], None], ...]
-"""The result of ``Graphs.sequence``, functions to call in order."""
+"""The result of ``Graphs.sequence``: functions to call in order."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Wrap mujoco.studio, which no other module imports, because its interface may still change.
 
 Studio draws a scene and a panel in a browser, and handles keys and the mouse. ``Screen.run`` opens studio with a
-plugin, an object derived from ``Plugin`` with handlers for ``Started``, ``Update`` and ``Gui``. The simulation is in
-another process, so studio's own stepping, history and model loading are not used.
+plugin. The plugin is derived from ``Plugin``, and has handlers for ``Started``, ``Update`` and ``Gui``. The simulation
+is in another process, so studio's own stepping, history and model loading are not used.
 """
 
 import socket
