@@ -96,7 +96,9 @@ class NPGConfig:
         if self.fisher_fraction == 0.0:
             raise ValueError("fisher_fraction must be greater than 0, such as 0.1 for every tenth sample")
         if self.log_std < self.min_log_std:
-            raise ValueError(f"log_std must not be below min_log_std, which is {self.min_log_std}, but is {self.log_std}")
+            raise ValueError(
+                f"log_std must not be below min_log_std, which is {self.min_log_std}, but is {self.log_std}"
+            )
 
 
 def enough_samples(config: NPGConfig, nworld: int) -> int:
