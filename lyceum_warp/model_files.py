@@ -28,9 +28,9 @@ _SCENES_IN_ASSETS = "mujoco/playground/assets/mujoco_playground/_src"
 class ModelFile:
     """Model file in an installed package or in a local folder. A task may name it as its ``model``.
 
-    Making an environment searches for the file, so that tasks can be listed on a machine without the file. The
-    functions ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model``, ``menagerie_model`` and
-    ``playground_model`` make a ``ModelFile``.
+    ``lw.make`` searches for the file, so tasks can be listed on a machine without the file. The functions
+    ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model``, ``menagerie_model`` and ``playground_model``
+    make a ``ModelFile``.
     """
 
     file: str

@@ -192,7 +192,7 @@ _PAIRS = 64
 
 
 def _judge_transfer(run: Run, learner: Learner, wanted: bool | None, display: Display) -> None:
-    """Write the policy's transfer verdict into the run, if requested or if the comparison takes only seconds."""
+    """Write the policy's transfer verdict into the run if requested, or if the comparison takes only seconds."""
     env, exact = learner.env, task_physics(learner.env)[1] == EXACT
     on_gpu = env.device.is_cuda and env.engine.name == "warp"
     if wanted is False or (wanted is None and exact and not on_gpu):

@@ -59,7 +59,7 @@ _BUFFERS = (
     "actions", "nominal", "knot_actions", "standard_noise", "adapted_noise", "sampled", "model_returns", "returns",
     "weights", "model_fields",
 )  # fmt: skip
-_MODELS = 0x6D6F64656C73  # second seed, beside the planner's seed, for drawing models: "models" in ASCII
+_MODELS = 0x6D6F64656C73  # seed for drawing models, in addition to the planner's seed ("models" in ASCII)
 _DRAWING = ("startup", "initialize", "randomize")
 """Task functions that can randomize a planner's model fields."""
 

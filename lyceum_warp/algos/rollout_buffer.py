@@ -256,7 +256,7 @@ class Rollout:
 
 
 class _Rows:
-    """Storage, (steps, nworld, size), for one buffer of an environment, (nworld, size)."""
+    """Storage for one buffer of an environment: (steps, nworld, size) for a buffer (nworld, size)."""
 
     def __init__(self, source: torch.Tensor, steps: int, device: wp.Device) -> None:
         self._source = wp.from_torch(source)

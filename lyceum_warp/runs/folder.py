@@ -293,7 +293,7 @@ class Run:
         write_content(self.checkpoint, checkpoint, durable=True, previous=self.previous)
 
     def read(self, device: str | torch.device = "cpu", *, note: Callable[[str], None] = log.warning) -> dict[str, Any]:
-        """Read the checkpoint's ``iteration``, ``policy`` and ``state``, and ``value`` if the checkpoint has one.
+        """Read the checkpoint's ``iteration``, ``policy``, ``state`` and (if the checkpoint has one) ``value``.
 
         If the checkpoint is broken or missing, the previous checkpoint is read instead.
 
