@@ -21,7 +21,7 @@ import lyceum_warp as lw
 
 for each in ("lyceum_warp", "traitlets"):
     logging.getLogger(each).setLevel(logging.WARNING)
-sys.modules["lw"] = lw  # documents names as they are written: lw.make
+sys.modules["lw"] = lw  # the reference shows names as users write them: lw.make
 
 project, version, author = "lyceum_warp", lw.__version__, "The lyceum_warp authors"
 extensions = ["myst_nb", "sphinx.ext.autodoc"]
@@ -39,7 +39,7 @@ highlight_language = "none"  # blocks without a language are output and formulas
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 nb_execution_mode, nb_execution_raise_on_error = "force", True
-nb_execution_timeout = 900  # seconds for each cell; compiling kernels may take minutes
+nb_execution_timeout = 900  # time limit of a cell in seconds; compiling kernels may take minutes
 nb_merge_streams = nb_execution_in_temp = True
 KernelManager.transport_encryption.default_value = "auto"  # other values make Jupyter kernels warn
 
@@ -57,7 +57,7 @@ CONTENTS = {
     "Reference": "reference/environments reference/tasks reference/functions reference/models reference/learning "
     "reference/planning reference/runs",
 }
-"""The pages of each section, in order, relative to docs/."""
+"""The paths of each section's pages, relative to docs/, in order."""
 
 
 def contents(_: str) -> str:

@@ -1,6 +1,6 @@
 """Draw the gallery: MUJOCO_GL=egl python docs/gallery.py [--runs FOLDER] [TASK ...].
 
-If FOLDER contains a run of a task, the run's policy controls the task. MPPI controls tasks without a run. By default
+If FOLDER contains a run of a task, the run's policy controls the task. MPPI controls tasks without a run. By default,
 FOLDER contains the pretrained policies. The program writes a moving picture of each task, its command and its result
 into docs/images/gallery/, and then the page gallery.md. Without the argument TASK, the program draws all tasks.
 """
@@ -31,7 +31,7 @@ FOLDER = DOCS / "images" / "gallery"
 RESULTS = FOLDER / "results.json"
 PRETRAINED = Path(lw.__file__).parent / "pretrained"
 
-SIZE, SCALE = (208, 156), 2  # pixels; pictures are drawn larger and reduced, for smooth edges
+SIZE, SCALE = (208, 156), 2  # pixels; pictures are drawn larger and then scaled down, which smooths edges
 RATE = 12.5  # frames per second
 LARGEST = 80_000  # bytes of a picture
 
@@ -41,9 +41,9 @@ class Show:
     """Settings for the picture of a task."""
 
     settings: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Settings of the planner and options of its worlds that differ from the task's."""
+    """Settings of the planner, and options of its worlds, that replace the task's."""
     params: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Parameters of the task for the planner only."""
+    """Parameters of the task that only the planner uses."""
     replan_every: int = 1
     """Number of steps from one MPPI plan to the next."""
     seconds: float = 4.0
@@ -145,9 +145,9 @@ SHOWS = {
        for robot, distance in (("go1", 1.7), ("go1_rough", 2.2), ("spot", 2.6), ("g1", 2.8), ("g1_full", 2.8),
                                ("g1_rough", 3.2), ("h1", 3.6), ("t1", 2.8))},
 }  # fmt: skip
-"""Settings of tasks that differ from the defaults of Show."""
+"""The tasks that need other settings than the defaults of Show."""
 
-for _name in ("g1_full_velocity", "g1_rough_velocity"):  # without a policy; under the planner they fall soon
+for _name in ("g1_full_velocity", "g1_rough_velocity"):  # no policy, and these robots soon fall under the planner
     _settings = {"horizon": 32, "samples": 48, "knots": 5, "noise": 0.1, "temperature": 0.02}
     SHOWS[_name] = dataclasses.replace(SHOWS[_name], settings=_settings, replan_every=2, start=0.0, seconds=1.6)
 
@@ -194,7 +194,7 @@ def training(name: str, run: Path, config: dict[str, Any]) -> str:
 
 
 def written(flags: dict[str, Any]) -> str:
-    """Write flags as words of a command, each after a space."""
+    """Format flags for a command line, each preceded by a space."""
     words = ""
     for name, value in flags.items():
         flag = name.replace("_", "-")

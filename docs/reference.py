@@ -109,13 +109,13 @@ def convert(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[
 
 
 def converted(text: str) -> list[str]:
-    """Convert a docstring to lines of reStructuredText, and escape bars outside of code."""
+    """Convert a docstring to lines of reStructuredText, and escape vertical bars outside of code."""
     text = re.sub(r"``.*?``|\|", lambda found: "\\|" if found[0] == "|" else found[0], text, flags=re.DOTALL)
     return str(GoogleDocstring(text, SECTIONS)).splitlines()
 
 
 def short_signature(app: Any, what: str, name: str, obj: Any, options: Any, signature: str, result: str) -> Any:
-    """Remove a dataclass's fields, which are documented as members, and the fields of default objects."""
+    """Remove the fields of a dataclass and of default objects; a dataclass's fields are documented as members."""
     if what == "class" and dataclasses.is_dataclass(obj):
         return "", result
     return signature and re.sub(r"(PhysicsOptions)\(.*?\)", r"\1()", signature), result

@@ -24,7 +24,7 @@ class TD3Config:
     num_steps: int = 125
     """Steps of each world per iteration."""
     warmup: int = 1000
-    """Number of samples with random actions, which are taken first."""
+    """Number of samples with random actions, taken before learning starts."""
     batch: int = 256
     n_step: int = 1
     gamma: float = 0.99
@@ -40,7 +40,7 @@ class TD3Config:
 
 
 class TD3(lw.Learner):
-    """A learner of a deterministic policy from a replay buffer, whose targets use the smaller of two critics."""
+    """Learns a deterministic policy from a replay buffer; its targets use the smaller of two critics' values."""
 
     algorithm = "td3"
 
@@ -79,7 +79,7 @@ class TD3(lw.Learner):
         )  # fmt: skip
 
     def update(self) -> torch.Tensor:
-        """Update the critics, and in every second call the actor and the target networks; return the critics' loss."""
+        """Update the critics and, in every second call, the actor and the target networks; return the critics' loss."""
         config, (actor, critic), (actor_step, critic_step) = self.config, self.targets, self.optimizers
         batch = self.replay.sample(config.batch, n_step=config.n_step, gamma=config.gamma, generator=self.generator)
         obs, next_obs = batch.obs["policy"], batch.next_obs["policy"]

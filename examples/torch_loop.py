@@ -29,7 +29,7 @@ def main(nworld: int = 256, iterations: int = 100, steps: int = 32, device: str 
             obs = env.obs.clone()  # env.obs changes in place
             with torch.no_grad():
                 action = torch.normal(actor(obs), log_std.exp())
-            env.step(action)  # the step copies the action into env.action; a world whose episode ends starts a new one
+            env.step(action)  # the step copies the action, and restarts worlds at the end of their episode
             with torch.no_grad():
                 # env.obs may already belong to a new episode; env.final_obs is the observation after this step.
                 # Bootstrap from the value of env.final_obs unless the task terminated: a time limit only truncates the

@@ -145,7 +145,7 @@ _NAMES = {
     "viewer.follow": "RunViewer",
     "viewer.show": "view",
 }
-"""Map modules to their public names; type checkers read the module's imports instead."""
+"""Map modules to their public names. Type checkers do not read this table, but the imports above."""
 # isort: on
 # fmt: on
 

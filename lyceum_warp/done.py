@@ -33,7 +33,7 @@ class Done(enum.IntFlag):
     OBSERVATION = 256
     """The observation was not finite."""
     MODEL = 512
-    """A randomized model field cannot be simulated, such as a negative mass."""
+    """A value of a randomized model field cannot be simulated, for example a negative mass."""
 
 
 FAULTS = ~(Done.TERMINATED | Done.TRUNCATED)

@@ -35,20 +35,20 @@ from lyceum_warp.worlds import Worlds
 _BUFFERS = (*step_types.OUTCOMES, "obs", "final_obs", "action")
 
 _ARGUMENTS = """Args:
-    task: Name of a task, a file with one (path/to/file.py, or path/to/file.py:Class), or its class.
+    task: Name of a task, a task file (path/to/file.py, or path/to/file.py:Class), or a task class.
     options: Options as one object; options given by name replace its fields.
 {options}
     **params: Parameters of the task, fields of its ``Params``. A scalar may also be given as one value per world,
         (nworld,). A table is an array, a tensor, a nested list, or the path of a ``.npy`` file.
 
 Raises:
-    ValueError: An argument is unknown or not valid; the message names the argument and the fix. FileNotFoundError: A
-    model file or a task file is missing.
+    ValueError: An argument is unknown or not valid; the message names the argument and the fix.
+    FileNotFoundError: A model file or a task file is missing.
 """
 
 
 def _document_arguments(function: Any) -> Any:
-    """Decorate a function by inserting the arguments into its docstring and signature, for ``help``."""
+    """Insert the arguments of ``make`` into a function's docstring and signature, for ``help``."""
     arguments = _ARGUMENTS.replace("{options}", OPTION_DOCS)
     function.__doc__ = inspect.cleandoc(function.__doc__).replace("{arguments}", arguments)
     function.__signature__ = signature_of_options(function)
@@ -71,7 +71,7 @@ class Env:
 
     Write ``action``, call ``step``, and read the other buffers, which are updated in place. When an episode ends, the
     world starts a new random episode within the same step: ``obs`` is then the new episode's first observation, and
-    ``final_obs`` the old episode's last observation.
+    ``final_obs`` is the old episode's last observation.
 
     A world with a fault (see ``Done``) restarts, and ``fault_counts`` counts the fault; no bit of any other world
     changes. A transition with a fault has the reward 0 and the last valid observation as ``final_obs``. In the Warp
@@ -107,7 +107,7 @@ class Env:
     episode_metric_sums: torch.Tensor
     """``episode_metrics`` as one tensor, (nworld, number of metrics), in the order of ``metrics``."""
     shared: dict[str, torch.Tensor]
-    """The memory that all worlds share, by name; only ``update_shared`` changes the memory, with the task's
+    """The memory that all worlds share, by name; only ``update_shared`` changes the memory, by calling the task's
     ``share``."""
     success: torch.Tensor
     """Whether the task's goal has been met for ``success_steps`` steps in a row, (nworld,), bool."""
@@ -124,11 +124,11 @@ class Env:
     nworld: int
     """Number of worlds."""
     timestep: float
-    """Simulated duration of a step, which includes all substeps, seconds."""
+    """Simulated duration of a step with all its substeps, in seconds."""
     device: wp.Device
     """The Warp device; ``obs.device`` is the same device in torch."""
     options: EnvOptions
-    """The options of the environment, in which named physics options are resolved."""
+    """The options of the environment. If physics options were given by name, the options replace the name."""
     task: BoundTask
     """The task with the model, the parameters (``task.params``) and the kernels."""
     engine: Engine
@@ -450,10 +450,11 @@ class Env:
         return view[:, where.start] if one_object else view[:, where]
 
     def set_dynamics(self, mask: torch.Tensor | None = None, **fields: Any) -> None:
-        """Set model fields that the task randomizes or ``dynamics=`` lists, and update derived constants.
+        """Set model fields of worlds, and update derived constants.
 
-        Each reset first restores the nominal values of fields that the task's ``initialize``, ``randomize`` or
-        ``event`` writes. Other fields keep the new values until ``rand_reset(seed=...)``.
+        The task must randomize the fields, or the option ``dynamics`` must list them. Each reset first restores the
+        nominal values of fields that the task's ``initialize``, ``randomize`` or ``event`` writes. Other fields keep
+        the new values until ``rand_reset(seed=...)``.
 
         Args:
             mask: Worlds to change, (nworld,) bool; by default all.
@@ -488,7 +489,7 @@ class Env:
         host does not wait for the device.
 
         Args:
-            total: Function that adds the sums, int64, of several processes in place, such as ``Team.sum``. All
+            total: Function that sums an int64 tensor over several processes in place, such as ``Team.sum``. All
                 processes must call ``update_shared``.
         """
         if self.shared and total is not None:
@@ -496,7 +497,7 @@ class Env:
         self.worlds.update_shared()
 
     def get_shared(self) -> torch.Tensor:
-        """Copy the memory that all worlds share and the sums for the memory's next update, for ``set_shared``.
+        """Copy the memory that all worlds share, and the sums for the memory's next update.
 
         Returns:
             The memory followed by the sums, float64; empty if the task has no shared memory.
@@ -567,7 +568,7 @@ class Env:
         return made
 
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
-        """Replicate the environment with a few worlds, as for an evaluation; engine="auto" selects the C engine.
+        """Replicate the environment with a few worlds, such as for evaluation; engine="auto" selects the C engine.
 
         On a GPU, a step of a few worlds takes nearly as long as a step of thousands of worlds.
         """
@@ -597,7 +598,7 @@ class Env:
 
     @property
     def bytes_per_world(self) -> float:
-        """Estimate the bytes of memory per world, without the model, which all worlds share."""
+        """Estimate the bytes of memory per world. The model is not counted, because all worlds share it."""
         physics = self.options.engine, self.task.model, self.device, self.task.fields
         engine = bytes_per_world(*physics, dynamics=self.task.dynamics, **self.options.for_engine())
         return engine + own_bytes_per_world(self.task)

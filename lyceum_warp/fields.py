@@ -128,8 +128,8 @@ _RANGES = (
     | {"sensordata": _SENSORS, "flexvert_xpos": _VERTICES}
     | dict.fromkeys(("flexedge_length", "flexedge_velocity"), _EDGES)
 )  # fmt: skip
-"""Map the name or prefix of a field in which an object may have several rows to the kind of object, the MjModel array
-with the index of an object's first row, and the array of row counts or the total number of rows."""
+"""Describe the fields in which an object may have several rows, by the field's name or prefix: the kind of object, the
+MjModel array with the index of each object's first row, and the array of row counts or the total number of rows."""
 
 _COUNTS = {
     _Kind.mjOBJ_ACTUATOR: "nactuator",
@@ -154,7 +154,7 @@ class Field:
 
     name: str
     shape: tuple[int, ...]
-    """Shape of the field in one world, without the axis that is part of ``dtype``."""
+    """Shape of the field in one world. An axis that belongs to ``dtype`` is omitted."""
     dtype: type
     """Warp type of an element: float, wp.vec3, quat (w, x, y, z), ..."""
     refresh: Stage
@@ -162,7 +162,7 @@ class Field:
     reset: Stage
     """The stage to compute after a reset; ``Stage.NONE`` for a field that a reset sets to zero."""
     lagged: bool
-    """Whether the field keeps the value left by ``mj_step``, which lags one substep behind the state."""
+    """Whether the field keeps the value left by ``mj_step``. This value lags one substep behind the state."""
     snapshot: bool
     """Whether states include the field, because it is not a function of the integration state."""
     written: bool = False
@@ -194,15 +194,15 @@ def describe(
     """Describe a field of a model.
 
     Fields of the position and velocity stages match the current state after every step, restart and event. Fields of
-    the acceleration stage, such as ``qacc``, ``cfrc_ext`` or actuator forces, are computed by the last substep from the
-    state before the substep, and at the start of an episode from the first state. In ``sensordata``, each sensor's
-    columns follow the sensor's stage.
+    the acceleration stage, such as ``qacc``, ``cfrc_ext`` or actuator forces, come from the last substep, which
+    computes them from the state before the substep. At the start of an episode, these fields are computed from the
+    first state. In ``sensordata``, each sensor's columns follow the sensor's stage.
 
     Args:
         model: The compiled model.
         name: MuJoCo's name of the field, an attribute of MjData.
-        lagged: Whether to keep the value left by ``mj_step``, which lags one substep behind the state. Fields of the
-            acceleration stage always lag; fields of the integration state never do.
+        lagged: Whether to keep the value left by ``mj_step``. This value lags one substep behind the state. Fields of
+            the acceleration stage always lag; fields of the integration state never do.
         cleared: Whether the field is 0 at the start of an episode instead of computed from the first state.
         written: Whether the task writes the field before a step. Controls are always written.
 
@@ -280,10 +280,10 @@ def _sensed(model: mujoco.MjModel, name: str) -> bool:
 def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
     """Get the rows of a named element of the model in a field of MjData or MjModel.
 
-    A joint may have several rows (coordinates in ``qpos``; degrees of freedom in ``qvel``, ``dof_damping`` and similar
-    fields), as may a sensor (``sensordata``), an actuator (controls in ``ctrl``, activations in ``act``, outputs in
-    ``actuator_force``) and a flex (vertices). A mocap body has one row in ``mocap_pos``. In all other fields, each
-    object has one row.
+    The following objects may have several rows: a joint (coordinates in ``qpos``; degrees of freedom in ``qvel``,
+    ``dof_damping`` and similar fields), a sensor (``sensordata``), an actuator (controls in ``ctrl``, activations in
+    ``act``, outputs in ``actuator_force``) and a flex (vertices). A mocap body has one row in ``mocap_pos``. In all
+    other fields, each object has one row.
 
     Raises:
         ValueError: The model has no element of this name, or the element has no rows in the field.
@@ -312,7 +312,7 @@ def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
 
 
 def has_several_rows(name: str) -> bool:
-    """Check whether an object may have several rows in a field, as a joint has in ``cdof``."""
+    """Check whether an object may have several rows in a field, such as a joint in ``cdof``."""
     return name in _RANGES or name.partition("_")[0] in _RANGES
 
 

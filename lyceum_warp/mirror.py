@@ -1,4 +1,4 @@
-"""Declare the mirror image of a task, which exchanges left and right, by the names of its parts."""
+"""Declare how the parts of observations, actions and states change if left and right are exchanged."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -14,11 +14,12 @@ Reflection = tuple[Sequence[int], Sequence[float]]
 class Mirror:
     """The mirror image of a task in the plane between left and right, for ``lw.Task.mirror``.
 
-    A reflection applies to all parts with the given name in observations, actions and states. A reflection consists of
-    either the signs of the part's columns, such as ``"command": (1, -1, -1)`` for velocities forwards and to the left
-    and a yaw rate, or an order of the columns followed by their signs, such as ``"foot_force": ([1, 0], [1, 1])`` for a
-    left and a right foot. In the base's axes, a vector has the signs (1, -1, 1), and an angular velocity has the signs
-    (-1, 1, -1). The reflection "action" applies to the whole action, if its parts are actuators.
+    A reflection applies to all parts with the given name in observations, actions and states. A reflection may consist
+    of the signs of the part's columns: ``"command": (1, -1, -1)`` keeps the forward velocity, and inverts the lateral
+    velocity and the yaw rate. A reflection may also consist of an order of the columns and their signs: ``"foot_force":
+    ([1, 0], [1, 1])`` exchanges the left and the right foot. In the base's axes, a vector has the signs (1, -1, 1), and
+    an angular velocity has the signs (-1, 1, -1). The reflection "action" applies to the whole action, if its parts are
+    actuators.
 
     Args:
         parts: Reflections by the names of parts.

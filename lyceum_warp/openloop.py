@@ -36,7 +36,7 @@ class OpenLoop:
     otherwise step by step. On the Warp engine, the rollout is one graph.
 
     Args:
-        env: Environment of the worlds to roll out, which must not be used for anything else.
+        env: Environment of the worlds to roll out; do not use it for anything else.
         horizon: Number of steps.
         keys: Keys of the worlds' random streams, (nworld,) uint32 on the environment's device, read at every run. By
             default, each world uses the key in ``state`` and draws the same numbers as with ``env.step``.
@@ -169,7 +169,7 @@ class OpenLoop:
         )
 
     def _step_by_step(self) -> tuple[Phase, ...]:
-        """List the phases for a task with ``control`` or ``substep``, which read the state at every step or substep."""
+        """List the phases for tasks with ``control`` or ``substep``. Both functions read the state at every call."""
         engine, worlds = self.env.engine, self.worlds
         phases = [
             Phase("start", self._start),

@@ -18,7 +18,7 @@ from lyceum_warp.support.docstrings import attribute_docs, document_attributes, 
 from lyceum_warp.support.validate import check_flag, check_kind, described, finite_number, positive_number, whole_number
 
 ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
-"""Source of a model, which is a file or an MjSpec."""
+"""Source of a model: a file or an MjSpec."""
 
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 INTEGRATORS = {
@@ -80,8 +80,8 @@ class PhysicsOptions:
     """
 
     base: str | None = None
-    """Name of physics options in the task's ``physics``, to which all other options are added; "exact" means the
-    options of the task's model."""
+    """Name of a set of options in the task's ``physics``; the other options change this set. "exact" means the options
+    of the task's model."""
     frame_skip: int | None = None
     """Substeps in a step."""
     timestep: float | None = None
@@ -106,7 +106,7 @@ class PhysicsOptions:
     rollouts, plus room for inactive equality constraints."""
     deterministic: bool = _for_engine(False)
     """Make runs on a CUDA device reproducible bit for bit, as runs on the CPU always are. Reproducible runs of hopper,
-    half_cheetah and humanoid take 5 to 18 times the time and 5 to 7 times the memory."""
+    half_cheetah and humanoid take 5 to 18 times as much time and 5 to 7 times as much memory as other runs."""
 
     def __post_init__(self) -> None:
         """Check every value."""

@@ -75,8 +75,8 @@ def action_space(
 ) -> Space:
     """Make the space of actions from the actuators' controls, with ``action_range`` or the control ranges as bounds.
 
-    An actuator may have several controls or none. An actuator without a name gets a name from its index. Actions in
-    ``actions``, which are not controls, have bounds only if ``action_range`` is given.
+    An actuator may have several controls or none. An actuator without a name gets a name from its index. If the task
+    declares its actions in ``actions``, they are not controls, and have bounds only if ``action_range`` is given.
     """
     if actions is not None:
         space = Space.of(actions)

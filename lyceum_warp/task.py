@@ -85,11 +85,11 @@ FUNCTIONS = {
     function.name: function
     for function in (
         TaskFunction("observe", "s: World, p: Params, obs: Row[float]", None,
-                     "Writes the observation, into a row or into a struct of named parts. Every task needs it. With "
-                     "``rng`` as a last argument it may draw noise.", optional=_RNG),
+                     "Writes the observation, into a row or into a struct of named parts. Every task needs this "
+                     "function. With ``rng`` as its last argument, the function may draw noise.", optional=_RNG),
         TaskFunction("control", "s: World, action: Row[float], p: Params, ctrl: Row[float]", None,
-                     "Turns an action into controls, and writes further inputs. Default: copies it, or scales it (see "
-                     "``action_range``).", "pass", writes={"s": "inputs"}),
+                     "Turns an action into controls, and writes further inputs. Default: copies or scales the action "
+                     "(see ``action_range``).", "pass", writes={"s": "inputs"}),
         TaskFunction("reward", _TRANSITION, float,
                      "Reward of one transition. ``advance`` has already written the memory of ``s1``. Default: 0.",
                      "return 0.0"),
@@ -101,34 +101,34 @@ FUNCTIONS = {
         TaskFunction("terminated", "s: World, p: Params", bool,
                      "Whether the state ends the episode. Default: False.", "return False"),
         TaskFunction("success", "s: World, p: Params", bool,
-                     "Whether the state meets the task's goal; ``success_steps`` asks for several steps in a row. "
+                     "Whether the state meets the task's goal; ``success_steps`` may require several steps in a row. "
                      "Default: False.", "return False"),
         TaskFunction("startup", f"s: World, p: Params, {_RNG}", None,
                      "Draws model fields and lasting memory once for each world, when its random stream starts. "
-                     "Default: keeps them.", "pass", writes={"s": "lasting"}),
+                     "Default: no change.", "pass", writes={"s": "lasting"}),
         TaskFunction("initialize", "s: World, p: Params", None,
-                     "Changes the fixed initial state, which is the model's. Default: keeps it.", "pass",
+                     "Changes the fixed initial state, which the model defines. Default: no change.", "pass",
                      writes={"s": "start"}),
         TaskFunction("randomize", f"s: World, p: Params, {_RNG}", None,
-                     "Turns the fixed initial state into a random one. Default: keeps it.", "pass",
+                     "Turns the fixed initial state into a random initial state. Default: no change.", "pass",
                      writes={"s": "start"}),
         TaskFunction("reject", "s: World, p: Params", bool,
                      "Whether a random initial state must be drawn again, at most ``draws`` times. Default: False.",
                      "return False"),
         TaskFunction("event", f"s: World, p: Params, {_RNG}", None,
-                     "Changes the state between two steps, after the first is judged and before the next is observed. "
-                     "Default: keeps it.", "pass", writes={"s": "start"}),
+                     "Changes the state between two steps, after the reward and before the next observation. "
+                     "Default: no change.", "pass", writes={"s": "start"}),
         TaskFunction("substep", "s: World, p: Params", None,
-                     "Writes task memory after each substep. Default: keeps it.", "pass", writes={"s": "memory"}),
+                     "Writes task memory after each substep. Default: no change.", "pass", writes={"s": "memory"}),
         TaskFunction("advance", f"{_TRANSITION}, {_RNG}", None,
-                     "Writes task memory of ``s1`` after each step and before ``reward``. Default: keeps it.", "pass",
+                     "Writes task memory of ``s1`` after each step and before ``reward``. Default: no change.", "pass",
                      writes={"s1": "memory"}),
         TaskFunction("tally", f"{_TRANSITION}, ended: bool, sums: Sums", None,
-                     "Writes a transition's share of sums over all worlds; ``ended`` says whether the episode ended. "
+                     "Writes what one transition adds to sums over all worlds. ``ended`` is True at an episode's end. "
                      "Only in environments with automatic resets. Default: none."),
         TaskFunction("share", "shared: Shared, sums: Sums, p: Params", None,
-                     "Updates the memory that all worlds share from the sums since the last update, in "
-                     "``env.update_shared``. Default: keeps it."),
+                     "Updates the memory that all worlds share, from the sums since the last update. "
+                     "``env.update_shared`` calls this function. Default: no change."),
     )
 }  # fmt: skip
 """The functions of a task, by name. Checks, kernels, error messages and ``help(lw.Task)`` use this table of
@@ -136,10 +136,10 @@ functions."""
 
 
 RESULTS = ("obs", "ctrl", "metrics", "rng", "sums", "shared")
-"""Arguments that are rows for results, into which a function may write."""
+"""Arguments that are rows for results; a function may write into these rows."""
 
 MEMORIES = ("memory", "lasting_memory")
-"""Kinds of memory. Each world has one row of floats per kind for the memory that World declares."""
+"""Kinds of memory that World declares. Each world has one row of floats per kind."""
 
 GROUP_PREFIX = "observe_"
 """Prefix of functions that write a group of observations; ``observe_critic`` writes the group ``critic``."""
@@ -171,9 +171,10 @@ class Part:
 
 
 def memory(size: int | str = 1) -> Any:
-    """Declare task memory, as a default in World; ``advance`` or ``substep`` writes the row, and a reset clears it.
+    """Declare task memory; use the result as a default in World.
 
-    Task memory belongs to the state. The field's type is ``Row[float]``, ``Row[wp.vec3]`` or another row of numbers.
+    ``advance`` or ``substep`` writes the memory, and a reset clears it. Task memory belongs to the state. The field's
+    type is ``Row[float]``, ``Row[wp.vec3]`` or another row of numbers.
 
     Args:
         size: Number of elements, or the name of a table in Params with one row per element.
@@ -182,7 +183,7 @@ def memory(size: int | str = 1) -> Any:
 
 
 def lasting_memory(size: int | str = 1) -> Any:
-    """Declare memory that outlives episodes, such as the level of a curriculum, as a default in World.
+    """Declare memory that outlives episodes, such as a curriculum's level; use the result as a default in World.
 
     Lasting memory is cleared only when a world's random stream starts (``rand_reset(seed=...)``), and ``startup`` may
     then write it.
@@ -194,7 +195,7 @@ def lasting_memory(size: int | str = 1) -> Any:
 
 
 def part(size: int | str = 1) -> Any:
-    """Declare a part of an observation group, of Shared or of Sums, as a default in the struct.
+    """Declare a part of an observation group, of Shared or of Sums; use the result as a default in the struct.
 
     Args:
         size: Number of elements, or the name of a table in Params with one row per element.
@@ -216,62 +217,62 @@ class Element(int):
 
 
 def site(name: str) -> int:
-    """Declare the index of a site in ``site_xpos`` and other ``site_`` fields, as a default in Params."""
+    """Make a default for Params: the index of a site in ``site_xpos`` and other ``site_`` fields."""
     return Element("site_xpos", name)
 
 
 def sites(*names: str) -> Any:
-    """Declare the indices of sites, as a default of a ``wp.array[int]`` in Params."""
+    """Make a default for a ``wp.array[int]`` in Params: the indices of sites."""
     return [site(name) for name in names]
 
 
 def body(name: str) -> int:
-    """Declare the index of a body in ``xpos`` and other fields of bodies, as a default in Params."""
+    """Make a default for Params: the index of a body in ``xpos`` and other fields of bodies."""
     return Element("xpos", name)
 
 
 def bodies(*names: str) -> Any:
-    """Declare the indices of bodies, as a default of a ``wp.array[int]`` in Params."""
+    """Make a default for a ``wp.array[int]`` in Params: the indices of bodies."""
     return [body(name) for name in names]
 
 
 def geom(name: str) -> int:
-    """Declare the index of a geom in ``geom_xpos`` and other ``geom_`` fields, as a default in Params."""
+    """Make a default for Params: the index of a geom in ``geom_xpos`` and other ``geom_`` fields."""
     return Element("geom_xpos", name)
 
 
 def geoms(*names: str) -> Any:
-    """Declare the indices of geoms, as a default of a ``wp.array[int]`` in Params."""
+    """Make a default for a ``wp.array[int]`` in Params: the indices of geoms."""
     return [geom(name) for name in names]
 
 
 def camera(name: str) -> int:
-    """Declare the index of a camera in ``cam_xpos`` and other ``cam_`` fields, as a default in Params."""
+    """Make a default for Params: the index of a camera in ``cam_xpos`` and other ``cam_`` fields."""
     return Element("cam_xpos", name)
 
 
 def tendon(name: str) -> int:
-    """Declare the index of a tendon in ``ten_`` and ``tendon_`` fields, as a default in Params."""
+    """Make a default for Params: the index of a tendon in ``ten_`` and ``tendon_`` fields."""
     return Element("ten_length", name)
 
 
 def equality(name: str) -> int:
-    """Declare the index of an equality constraint in ``eq_active`` and other ``eq_`` fields, as a default in Params."""
+    """Make a default for Params: the index of an equality constraint in ``eq_active`` and other ``eq_`` fields."""
     return Element("eq_active", name)
 
 
 def actuator(name: str) -> int:
-    """Declare the index of an actuator in ``actuator_force`` and other ``actuator_`` fields, as a default in Params."""
+    """Make a default for Params: the index of an actuator in ``actuator_force`` and other ``actuator_`` fields."""
     return Element("actuator_force", name)
 
 
 def actuators(*names: str) -> Any:
-    """Declare the indices of actuators, as a default of a ``wp.array[int]`` in Params."""
+    """Make a default for a ``wp.array[int]`` in Params: the indices of actuators."""
     return [actuator(name) for name in names]
 
 
 def ctrl(actuator: str) -> int:
-    """Declare the index of an actuator's first control in ``ctrl``, as a default in Params.
+    """Make a default for Params: the index of an actuator's first control in ``ctrl``.
 
     Most actuators have one control.
     """
@@ -279,52 +280,52 @@ def ctrl(actuator: str) -> int:
 
 
 def act(actuator: str) -> int:
-    """Declare the index of an actuator's first activation in ``act``, as a default in Params."""
+    """Make a default for Params: the index of an actuator's first activation in ``act``."""
     return Element("act", actuator)
 
 
 def joint(name: str) -> int:
-    """Declare the index of a joint in ``xanchor``, ``xaxis`` and ``jnt_`` fields, as a default in Params."""
+    """Make a default for Params: the index of a joint in ``xanchor``, ``xaxis`` and ``jnt_`` fields."""
     return Element("xanchor", name)
 
 
 def joints(*names: str) -> Any:
-    """Declare the indices of joints, as a default of a ``wp.array[int]`` in Params."""
+    """Make a default for a ``wp.array[int]`` in Params: the indices of joints."""
     return [joint(name) for name in names]
 
 
 def qpos(joint: str) -> int:
-    """Declare the index of a joint's first coordinate in ``qpos``, as a default in Params."""
+    """Make a default for Params: the index of a joint's first coordinate in ``qpos``."""
     return Element("qpos", joint)
 
 
 def qposes(*joints: str) -> Any:
-    """Declare the indices of joints' first coordinates in ``qpos``, as a default of a ``wp.array[int]`` in Params."""
+    """Make a default for a ``wp.array[int]`` in Params: the indices of joints' first coordinates in ``qpos``."""
     return [qpos(name) for name in joints]
 
 
 def dof(joint: str) -> int:
-    """Declare the index of a joint's first degree of freedom in ``qvel`` and similar fields, as a default in Params."""
+    """Make a default for Params: the index of a joint's first degree of freedom in ``qvel`` and similar fields."""
     return Element("qvel", joint)
 
 
 def dofs(*joints: str) -> Any:
-    """Declare the indices of joints' first degrees of freedom, as a default of a ``wp.array[int]`` in Params."""
+    """Make a default for a ``wp.array[int]`` in Params: the indices of joints' first degrees of freedom."""
     return [dof(name) for name in joints]
 
 
 def sensor(name: str) -> int:
-    """Declare the index of a sensor's first number in ``sensordata``, as a default in Params."""
+    """Make a default for Params: the index of a sensor's first number in ``sensordata``."""
     return Element("sensordata", name)
 
 
 def sensors(*names: str) -> Any:
-    """Declare the indices of sensors in ``sensordata``, as a default of a ``wp.array[int]`` in Params."""
+    """Make a default for a ``wp.array[int]`` in Params: the indices of sensors in ``sensordata``."""
     return [sensor(name) for name in names]
 
 
 def mocap(body: str) -> int:
-    """Declare the index of a mocap body in ``mocap_pos`` and ``mocap_quat``, as a default in Params."""
+    """Make a default for Params: the index of a mocap body in ``mocap_pos`` and ``mocap_quat``."""
     return Element("mocap_pos", body)
 
 
@@ -336,7 +337,7 @@ class FromModel:
 
 
 def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
-    """Declare a parameter computed from the compiled model and other parameters, as a default in Params.
+    """Make a default for Params: a function computes the parameter from the compiled model and other parameters.
 
     ``mass: float = lw.from_model(lambda model, p: model.body_subtreemass[p.trunk])`` is the mass of the robot. The
         parameter is recomputed if another parameter changes, unless a value was given explicitly.
@@ -375,7 +376,7 @@ class Planning:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Training:
-    """A task's settings for ``lyceum-warp train``, which flags override.
+    """A task's settings for ``lyceum-warp train``; flags override the settings.
 
     Raises:
         ValueError: ``settings`` is not a dict.
@@ -406,9 +407,10 @@ class Task:
     step and a substep. Each function is a ``wp.func``. Structs and functions may also be attributes of the class.
 
     ``World`` lists fields of MjData, such as ``qpos`` and ``site_xpos``, and fields of MjModel, such as ``body_mass``
-    and ``geom_friction``, under MuJoCo's names. Model fields that ``startup``, ``initialize``, ``randomize`` or
-    ``event`` write differ between worlds and belong to the state; all other model fields are the same in all worlds.
-    ``World`` also names the task's memory: ``air_time: Row[float] = lw.memory(4)``, or ``lw.lasting_memory(4)``.
+    and ``geom_friction``, under MuJoCo's names. Model fields that are written by ``startup``, ``initialize``,
+    ``randomize`` or ``event`` differ between worlds, and belong to the state; all other model fields are the same in
+    all worlds. ``World`` also names the task's memory: ``air_time: Row[float] = lw.memory(4)``, or
+    ``lw.lasting_memory(4)``.
 
     A default in ``Params`` may name an element of the model, such as ``tip: int = lw.site("tip")``; the functions then
     get the element's index. ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``,
@@ -422,11 +424,11 @@ class Task:
     Functions:
     {functions}
 
-    The arguments ``s``, ``s0`` and ``s1`` are one world's fields in the current state, before the step, and after the
-    step. Fields of the position and velocity stages belong to this state; fields of the acceleration stage (forces,
-    accelerations) come from the last substep. Each sensor has the stage of its quantity. Controls are clipped to the
-    model's ranges, but ``reward`` gets the unclipped action. Pass the argument ``rng``, the world's random stream, to
-    ``lw.uniform`` and ``lw.normal``.
+    The argument ``s`` holds one world's fields in the current state, ``s0`` in the state before the step, and ``s1`` in
+    the state after the step. Fields of the position and velocity stages belong to this state; fields of the
+    acceleration stage (forces, accelerations) come from the last substep. A sensor belongs to the stage that computes
+    its quantity. Controls are clipped to the model's ranges, but ``reward`` gets the unclipped action. Pass the
+    argument ``rng``, the world's random stream, to ``lw.uniform`` and ``lw.normal``.
 
     A function may write the following fields if ``World`` lists them; any other write is refused:
 
@@ -434,10 +436,10 @@ class Task:
       until the next write or reset.
     - ``initialize``, ``randomize`` and ``event``: qpos, qvel, act, ctrl, eq_active, the inputs, memory, lasting memory
       and model fields. Every reset restores the nominal values of model fields before ``initialize`` runs, so that
-      draws never add up. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
-      ``sensordata``), which are computed afterwards.
-    - ``startup``: model fields and lasting memory, with values that resets do not change.
-    - ``substep``: memory and lasting memory. ``advance``: memory and lasting memory of ``s1``.
+      random changes do not accumulate over episodes. ``initialize`` and ``randomize`` must not read derived fields
+      (``xpos``, ``site_xpos``, ``sensordata``), which are computed afterwards.
+    - ``startup``: model fields and lasting memory. Resets do not change these values. - ``substep``: memory and lasting
+    memory. ``advance``: memory and lasting memory of ``s1``.
 
     ``reject`` gets the initial state before the state settles. While an initial state settles, no ``substep`` runs.
 
@@ -457,9 +459,9 @@ class Task:
     obs: ClassVar[Any]
     """Parts of the observation and their sizes, in order, such as ``{"position": 5, "velocity": 6}``; or a static
     method that computes the sizes from the Params. A task may have several groups of observations, such as ``{"policy":
-    {"position": 5}, "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy``, which is
-    ``env.obs``, and ``observe_critic``, with the same arguments, writes the group ``critic``. A task omits ``obs`` if
-    the last argument of ``observe`` is a Warp struct with the defaults ``lw.part(size)``."""
+    {"position": 5}, "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy`` (``env.obs``).
+    ``observe_critic`` has the same arguments, and writes the group ``critic``. A task omits ``obs`` if the last
+    argument of ``observe`` is a Warp struct with the defaults ``lw.part(size)``."""
     rewards: ClassVar[Mapping[str, float]] = {}
     """Terms of the reward with weights per second, such as ``{"upright": 1.0, "effort": -0.1}``, in place of
     ``reward``. A term is a function of the module that returns a float. The arguments of a term are found by name:
@@ -478,20 +480,20 @@ class Task:
     """Number of steps after which an episode is truncated; 0 means never."""
     success_steps: ClassVar[int] = 1
     """Number of successive steps that must end in success before ``env.success`` is True. If ``success_steps`` is more
-    than 1, the state has a part ``success_steps`` with the current count, which a reset clears."""
+    than 1, the state has a part ``success_steps`` with the current count; a reset clears the count."""
     lagged: ClassVar[tuple[str, ...]] = ()
-    """Fields that keep the values left by ``mj_step``, which lag one substep behind the state, as in some Gymnasium
-    tasks."""
+    """Fields that keep the values left by ``mj_step``. These values lag one substep behind the state, as in some
+    Gymnasium tasks."""
     cleared: ClassVar[tuple[str, ...]] = ()
-    """Fields left by the last substep, such as contact forces, that a reset clears before ``initialize``. A forward
-    pass of the restarting worlds computes such fields if ``cleared`` does not list them."""
+    """Fields left by the last substep, such as contact forces, that a reset clears before ``initialize``. If
+    ``cleared`` does not list such fields, a forward pass computes them in the worlds that restart."""
     actions: ClassVar[Mapping[str, int | str] | None] = None
     """Parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls; ``control``
     then converts actions to inputs. A size may be the name of a table in Params with one row per number. If ``actions``
     is None, an action has one number for each control."""
     action_range: ClassVar[tuple[float, float] | None] = None
-    """The range of actions, which the default ``control`` scales to the model's control ranges. If ``action_range`` is
-    None, actions are controls, or are unbounded if the task has ``actions``."""
+    """The range of actions. The default ``control`` scales this range to the model's control ranges. If
+    ``action_range`` is None, actions are controls, or are unbounded if the task has ``actions``."""
     keyframe: ClassVar[str | None] = None
     """Name of the model's keyframe to which ``reset`` sets the state before ``initialize``; None means ``qpos0``."""
     draws: ClassVar[int] = 10
@@ -501,15 +503,15 @@ class Task:
     """Number of substeps in which an initial state settles, under its own controls and without ``substep``, before the
     first observation of the episode. The episode's time starts at 0 after settling."""
     gymnasium: ClassVar[str | None] = None
-    """Id of the Gymnasium environment that the task reimplements, with its model, observation, reward, termination,
-    reset and parameters, such as "Hopper-v5"; None without such an environment. Subclasses do not inherit this
-    attribute."""
+    """Id of the Gymnasium environment that the task reimplements, such as "Hopper-v5"; None without such an
+    environment. Model, observation, reward, termination, reset and parameters are the same. Subclasses do not inherit
+    this attribute."""
     trace: ClassVar[str | None] = None
-    """Name of the site or body whose path the viewer draws for a planner's samples. If None, the viewer draws the
-    centre of mass of a robot with a floating base, or the end of an arm."""
+    """Name of a site or body. For a planner's samples, the viewer draws the path of this site or body. If None, the
+    viewer draws the centre of mass of a robot with a floating base, or the end of an arm."""
     mirror: ClassVar[Any] = None
-    """The task's mirror image, ``lw.Mirror(...)``, or a static method ``mirror(model, p)`` that returns the mirror
-    image, to learn symmetric policies; None without a mirror image."""
+    """The task's mirror image, for learning symmetric policies: ``lw.Mirror(...)``, or a static method ``mirror(model,
+    p)`` that returns an ``lw.Mirror``. None means that the task has no mirror image."""
     physics: ClassVar[Mapping[str, PhysicsOptions]] = {}
     """Physics options by name, such as ``{"fast": lw.PhysicsOptions(integrator="implicitfast")}`` for ``lw.make(task,
     physics="fast")``. The default, "exact", means the options of the model and ``frame_skip``."""
@@ -518,7 +520,7 @@ class Task:
     training: ClassVar[Training] = Training()
     """The task's settings for ``lyceum-warp train``, such as ``lw.Training(algorithm="ppo", settings={...})``."""
 
-    # World, Params and Warp functions of the module at the definition of the class
+    # the module's World, Params and Warp functions when the class was defined
     scope: ClassVar[dict[str, Any]]
 
     @staticmethod

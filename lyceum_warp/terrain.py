@@ -12,19 +12,19 @@ import numpy as np
 from lyceum_warp.task import from_model
 
 Shape = Callable[[np.ndarray, np.ndarray, float, np.random.Generator], np.ndarray]
-"""Function ``shape(x, y, amount, rng)`` that returns the heights of a square patch, m, (n, n), from the coordinates of
-the points relative to the patch's centre, m, (n, n) each. The outline of a patch is set to 0 afterwards, so that
-patches meet without a step."""
+"""Function ``shape(x, y, amount, rng)`` that returns the heights of a square patch. ``x`` and ``y`` are the coordinates
+of the points relative to the patch's centre. All three arrays are (n, n), in m. The outline of a patch is set to 0
+afterwards, so that patches meet without a step."""
 
 _PLATFORM = 1.0
-"""Half the side of the flat square at the centre of a patch, m."""
+"""Half the side of the flat square at the centre of a patch, in m."""
 
 _BASE = 1.0
-"""Thickness of the ground below the lowest point, m."""
+"""Thickness of the ground below the lowest point, in m."""
 
 
 def _inwards(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Compute the distance of points from the outline of a patch, m, with the platform's distance as maximum."""
+    """Compute the distance of points from the outline of a patch, in m, clipped to the distance of the platform."""
     half = float(x.max())
     return np.clip(half - np.maximum(abs(x), abs(y)), 0.0, max(half - _PLATFORM, 0.0))
 
@@ -88,7 +88,7 @@ _KINDS: dict[str, tuple[Shape, float]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Terrain:
-    """Rough ground, a field of square patches in rows of increasing difficulty along y and columns by kind along x.
+    """Rough ground: a grid of square patches. Difficulty increases along y, and each column has one kind of patch.
 
     The difficulty of level i is (i + 1) / ``levels``. A patch depends only on the seed and on the patch's level and
     column. All patches have height 0 along their outline, and a flat border surrounds all patches.
@@ -108,21 +108,21 @@ class Terrain:
 
     kinds: Mapping[str | Shape, int]
     """Kinds of patches, in order, each with a number of columns. A kind is a name from the table, or a function
-    ``shape(x, y, difficulty, rng)`` that returns the heights of a patch, m, (n, n); x and y are the coordinates of the
-    points relative to the patch's centre, (n, n)."""
+    ``shape(x, y, difficulty, rng)`` that returns the heights of a patch, (n, n), in m. The arguments x and y are the
+    coordinates of the points relative to the patch's centre, (n, n)."""
     levels: int = 10
     """Number of rows."""
     patch: float = 8.0
-    """Side of a patch, m, which is a multiple of ``resolution``."""
+    """Side of a patch, in m; a multiple of ``resolution``."""
     resolution: float = 0.1
-    """Distance between neighbouring points of the field, m. A vertical wall becomes a slope of the width
+    """Distance between neighbouring points of the field, in m. A vertical wall becomes a slope of the width
     ``resolution``."""
     border: float = 4.0
-    """Width of the border, m, which is a multiple of ``resolution``."""
+    """Width of the border, in m; a multiple of ``resolution``."""
     seed: int = 0
     """Seed of all random heights."""
     scale: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Sizes at difficulty 1, by kind, which replace the sizes in the table."""
+    """Sizes at difficulty 1, by kind. They replace the sizes in the table."""
 
     def __post_init__(self) -> None:
         """Check the description.
@@ -153,7 +153,7 @@ class Terrain:
 
     @functools.cached_property
     def heights(self) -> np.ndarray:
-        """Compute the heights of all points, m, (points along y, points along x)."""
+        """Compute the heights of all points, in m, (points along y, points along x)."""
         cells, edge = self._cells, round(self.border / self.resolution)
         found = np.zeros([count * cells + 1 + 2 * edge for count in (self.levels, len(self.columns))])
         for level in range(self.levels):
@@ -166,7 +166,7 @@ class Terrain:
 
     @functools.cached_property
     def origins(self) -> np.ndarray:
-        """Compute the patches' centres relative to the plane that the field replaces, m, (levels, columns, 3).
+        """Compute the patches' centres relative to the plane that the field replaces, in m, (levels, columns, 3).
 
         The z coordinate of a centre is the greatest height within 0.5 m.
         """
@@ -210,16 +210,16 @@ class Terrain:
 
     @property
     def _cells(self) -> int:
-        """Return the number of distances between points along the side of a patch."""
+        """Return the number of intervals between points along the side of a patch."""
         return round(self.patch / self.resolution)
 
     @property
     def _corner(self) -> np.ndarray:
-        """Return the corner of the first patch, m, (2,)."""
+        """Return the corner of the first patch, in m, (2,)."""
         return -self.patch * np.array([len(self.columns) // 2, self.levels // 2])
 
     def _patch(self, level: int, column: int) -> np.ndarray:
-        """Compute the heights of one patch, m, (n, n)."""
+        """Compute the heights of one patch, in m, (n, n)."""
         kind, difficulty = self.columns[column], (level + 1) / self.levels
         side = self.resolution * (np.arange(self._cells + 1) - self._cells / 2)
         x, y = np.meshgrid(side, side)
@@ -238,7 +238,7 @@ class Terrain:
 
 
 def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Make the table of a model's height field, m, (1 + points along y, 1 + points along x); see ``height_field``.
+    """Make the table of a model's height field, in m, (1 + points along y, 1 + points along x); see ``height_field``.
 
     Raises:
         ValueError: The model has no height field of this name, or the height field does not belong to exactly one fixed
@@ -269,30 +269,30 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
 
 
 def height_field(name: str) -> Any:
-    """Declare the table of a model's height field, as a default in Params.
+    """Make a default for Params: the table of a model's height field.
 
-    The table is for ``lw.ground_height`` and ``lw.height_scan``. The first row of the table has the points' x
-    coordinates, the first column the y coordinates, and the rest the heights z in the world's frame, m, (1 + points
-    along y, 1 + points along x). All worlds share the table. Declare the table as in ``ground: wp.array2d[float] =
-    lw.height_field("terrain")``.
+    The table is for ``lw.ground_height`` and ``lw.height_scan``. The table has the shape (1 + points along y, 1 +
+    points along x). Its first row has the points' x coordinates, and its first column has their y coordinates. All
+    other elements are heights z. Coordinates are in the world's frame, in m. All worlds share the table. Declare the
+    table as in ``ground: wp.array2d[float] = lw.height_field("terrain")``.
 
     Args:
-        name: Name of the height field in the model, which is "terrain" by default in ``lw.Terrain.add_to``.
+        name: Name of the height field in the model. ``lw.Terrain.add_to`` uses the name "terrain" by default.
     """
     return from_model(lambda model, _: height_table(model, name))
 
 
 def scan_grid(length: float, width: float, *, spacing: float = 0.1) -> np.ndarray:
-    """Declare a grid of points around a robot for ``lw.height_scan``, (n, 2), m, as a default in Params.
+    """Make a default for Params: a grid of points around a robot, (n, 2), in m, for ``lw.height_scan``.
 
     The first point is at the rear right. Points are ordered by x (forwards), then by y (to the left).
     ``lw.scan_grid(1.6, 1.0)`` has 17 x 11 points. Declare the grid as in ``scan: wp.array[wp.vec2] = lw.scan_grid(1.6,
     1.0)``.
 
     Args:
-        length: Extent along x, forwards, m.
-        width: Extent along y, m.
-        spacing: Distance between neighbouring points, m.
+        length: Extent along x, forwards, in m.
+        width: Extent along y, in m.
+        spacing: Distance between neighbouring points, in m.
     """
     x, y = (np.linspace(-side / 2, side / 2, round(side / spacing) + 1) for side in (length, width))
     return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)

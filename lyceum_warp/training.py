@@ -42,7 +42,7 @@ class Display:
 
     @contextlib.contextmanager
     def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
-        """Make a context that surrounds training, up to a total number of iterations."""
+        """Make a context for training up to a total number of iterations."""
         yield
 
     def __call__(self, iteration: Iteration) -> None:
@@ -94,17 +94,17 @@ def train(
             returns True. If the callback raises an error, the run is saved and the error is raised again.
         target_return: Return at which training ends, compared with the return that selects the best policy.
         minutes: Time limit; training ends after the iteration that exceeds the limit. A limit of None means no limit.
-        keep_every: Iterations between two numbered policies; 0 for no numbered policies.
+        keep_every: Iterations between two policies that are saved in numbered files; 0 saves none.
         save_every: Iterations between two saves; 0 to save by time.
         tensorboard: Whether to also write the metrics for TensorBoard.
         video_every: Iterations between two videos of the policy, such as ``videos/000100.mp4`` in the folder; 0 for no
             videos. If a video fails, a warning is logged, and training continues without videos.
-        camera: Camera of the videos, which is a camera of the model by name or index, a ``viz.cameras.FreeCamera``, or
-            "free" for MuJoCo's default free camera.
+        camera: Camera of the videos: a camera of the model by name or index, a ``viz.cameras.FreeCamera``, or "free"
+            for MuJoCo's default free camera.
         transfer: Whether to judge the policy's transfer at the end with ``lw.transfer``, and to write ``transfer.json``
             into the folder. By default, only comparisons of a few seconds run: the C engine after training on a GPU,
-            and the task's exact physics after training with different physics options. With ``transfer=True``, the Warp
-            engine after training on CPU cores, and each of the task's physics options, are also compared.
+            and the task's exact physics after training with different physics options. ``transfer=True`` adds
+            comparisons with each of the task's physics options and, after training on CPU cores, with the Warp engine.
         resume: Whether to continue the run in the folder. To resume, make the learner with the same arguments as
             before.
         take_over: Whether to continue a run that another process has locked, on the same or another host. The locking
@@ -192,7 +192,7 @@ _PAIRS = 64
 
 
 def _judge_transfer(run: Run, learner: Learner, wanted: bool | None, display: Display) -> None:
-    """Write the policy's transfer verdict into the run, if requested or if the comparison takes only seconds."""
+    """Write the policy's transfer verdict into the run if requested, or if the comparison takes only seconds."""
     env, exact = learner.env, task_physics(learner.env)[1] == EXACT
     on_gpu = env.device.is_cuda and env.engine.name == "warp"
     if wanted is False or (wanted is None and exact and not on_gpu):
@@ -214,7 +214,7 @@ def _learn(
     learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None,
     limit: float,
 ) -> None:  # fmt: skip
-    """Iterate up to the target, the last iteration or the time limit, in seconds; all ranks save and end together."""
+    """Iterate up to the target, the last iteration or the time limit; all ranks save and end together."""
     team, run, deadline = learner.team, saver.run, time.monotonic() + limit
     ended = False
     with postponed(insist=team.size == 1) as noted:
@@ -284,7 +284,7 @@ def _check_equal(run: Run, learner: Learner) -> None:
     old, new, algorithm = then.options, env.options, run.config["algorithm"]
     now["engine"] = engine_name(now["engine"], now["device"])
     own = {"engine": engine_name(old.engine, old.device), "algorithm": algorithm, "nworld": old.nworld}
-    # omit options that do not affect results, and the model, which note_changes compares
+    # omit options that do not affect results; omit the model, because note_changes compares it
     options = {"horizon": old.horizon, "fields": old.fields, "dynamics": old.dynamics}
     params = dict.fromkeys(now["params"]) | run_params(run, then.params)
     # runs of earlier releases lack the newest hyperparameters

@@ -68,7 +68,7 @@ def controls(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Compute mjlab's scale of actions, 0.25 * limit / kp, rad, (joints,).
+    """Compute mjlab's scale of actions, 0.25 * limit / kp, in rad, (joints,).
 
     The scale is a quarter of the position error at which a joint's servo reaches its force limit.
 
@@ -83,7 +83,7 @@ def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def force_limits(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the largest force of each joint's servo, N m, (joints,); 0 without a limit."""
+    """Get the largest force of each joint's servo, in N m, (joints,); 0 without a limit."""
     actuators = servos(model, p)
     return np.where(
         model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators, 1],
@@ -98,12 +98,12 @@ def home_qpos(model: mujoco.MjModel) -> np.ndarray:
 
 
 def home_pose(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the positions of the joints in ``home_qpos``, rad, (joints,)."""
+    """Get the positions of the joints in ``home_qpos``, in rad, (joints,)."""
     return home_qpos(model)[joint_qpos(model, p)]
 
 
 def home_height(model: mujoco.MjModel, p: Any) -> float:
-    """Get the height of the base in ``home_qpos``, m."""
+    """Get the height of the base in ``home_qpos``, in m."""
     return float(home_qpos(model)[2])
 
 
@@ -119,7 +119,7 @@ def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
     clock = {"gait_frequency": float(p.gait_frequency)} if hasattr(p, "gait_frequency") else {}  # Hz
     return clock | {
         "base": model.body(base(model)).name,
-        "velocimeter": np.asarray(p.imu).tolist(),  # position on base, m
+        "velocimeter": np.asarray(p.imu).tolist(),  # position on base, in m
         "joints": [model.joint(joint).name for joint in p.joints],
         "default_pose": np.asarray(p.default_pose).tolist(),
         "action_scale": np.asarray(p.action_scale).tolist(),
@@ -137,8 +137,8 @@ def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
 def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
     """Make the mirror image of a velocity task in the plane y = 0 of the base, for ``lw.Task.mirror``.
 
-    With all joints at 0, the position and axis of a joint must be the mirror image of its partner's. The partner is the
-    joint on the other side, or the joint itself. The masses of the robot need not be symmetric.
+    With all joints at 0, the position and the axis of a joint must mirror the position and the axis of its partner. The
+    partner is the joint on the other side, or the joint itself. The masses of the robot need not be symmetric.
 
     Raises:
         ValueError: A joint or a foot has no partner, or the default pose or the scale of actions is not symmetric.
@@ -220,23 +220,24 @@ def leg_axes(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def leg_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the position of each of ``leg_joints`` relative to the leg's previous joint, or to the base, m."""
+    """Get the position of each of ``leg_joints`` relative to the leg's previous joint, or to the base, in m."""
     anchors = _straight(model).xanchor[leg_joints(model, p)]
     return np.diff(anchors, axis=1, prepend=0.0)
 
 
 def foot_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the position of each foot's site relative to the foot's last joint, m, (feet, 3)."""
+    """Get the position of each foot's site relative to the foot's last joint, in m, (feet, 3)."""
     data = _straight(model)
     return np.array([data.site_xpos[foot] - data.xanchor[_last_joint(model, foot)] for foot in p.feet])
 
 
 def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Compute spheres that touch a plane if and only if the foot does, (feet, most spheres, 4): centre and radius, m.
+    """Compute spheres for each foot; they touch a plane if and only if the foot touches the plane.
 
-    Centres are relative to the foot's last joint. A capsule becomes spheres at both ends, a box becomes spheres at its
-    corners, and any other geom becomes spheres at the corners of its bounding box. Radii include the margin at which a
-    contact starts to exert force.
+    The result has the shape (feet, most spheres, 4), and contains centres and radii, in m. Centres are relative to the
+    foot's last joint. A capsule becomes spheres at both ends, a box becomes spheres at its corners, and any other geom
+    becomes spheres at the corners of its bounding box. Radii include the margin at which a contact starts to exert
+    force.
 
     Raises:
         ValueError: A foot has no geom in ``foot_geoms``.
@@ -278,7 +279,7 @@ def contact_geoms(model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def foot_forces(model: mujoco.MjModel, p: Any) -> list[int]:
-    """Get the index in ``sensordata`` of the force on each foot, from the sensor FOOT_force, (feet,).
+    """Get the index in ``sensordata`` of each foot's force sensor, FOOT_force, (feet,).
 
     Raises:
         ValueError: The model has no sensor FOOT_force with three numbers.
@@ -333,7 +334,7 @@ def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[
 
 
 def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.ndarray:
-    """Add a geom's contact margin minus its gap, for contacts with the ground, to the radii of the geom's spheres."""
+    """Add the contact margin with the ground, minus the gap, to the radii of a geom's spheres."""
     ground = np.flatnonzero(model.geom_bodyid == 0)
     margin = model.geom_margin[geom] + model.geom_margin[ground].max()
     gap = model.geom_gap[geom] + model.geom_gap[ground].max()
@@ -418,8 +419,8 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
 
     Args:
         spec: The model.
-        feet: Map from the name of a site to its body, or a joint or geom of this body, and to its position in the body,
-            m.
+        feet: Map from the name of each new site to two values: the name of the site's body, or of a joint or geom of
+            this body; and the site's position in this body, in m.
 
     Raises:
         ValueError: The model has no element of this name.
@@ -442,7 +443,7 @@ def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0
     Args:
         spec: The model.
         joints: Names of the joints, which have one actuator each.
-        reach: Position error at which a servo's force reaches its limit, rad.
+        reach: Position error at which a servo's force reaches its limit, in rad.
 
     Raises:
         ValueError: A joint has no actuator, or its force has no limit.
@@ -476,13 +477,14 @@ def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0
 def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.015) -> None:
     """Replace each colliding box of a foot by two capsules along the box's longer side, for height fields.
 
-    MuJoCo Warp 4.0 finds contacts of boxes and height fields with wrong normals and depths, which throw robots into the
-    air. The capsules lie within the outline of the foot's sole and touch the sole's lowest plane; masses do not change.
+    MuJoCo Warp 4.0 finds contacts of boxes and height fields with wrong normals and depths. Such contacts throw robots
+    into the air. The capsules lie within the outline of the foot's sole and touch the sole's lowest plane; masses do
+    not change.
 
     Args:
-        spec: The model after ``prepare_walker``, which is changed in place.
+        spec: The model after ``prepare_walker``. It is changed in place.
         feet: Names of the sites of the feet.
-        radius: Radius of the capsules, m.
+        radius: Radius of the capsules, in m.
 
     Raises:
         ValueError: A box is narrower than a capsule.

@@ -78,7 +78,7 @@ class Worlds(WorldArrays):
         self.step = self.programs.step
 
     def drop_programs(self) -> None:
-        """Break reference cycles through the programs, so that the environment's threads and memory are freed."""
+        """Delete the programs. They contain reference cycles, which would keep threads and memory alive."""
         self._programs.clear()
         del self.programs, self.step
 
@@ -384,7 +384,7 @@ class Worlds(WorldArrays):
             self.engine.apply_model(self.mask)
 
     def update_shared(self) -> None:
-        """Update the memory that all worlds share from the sums, clear the sums, and observe the worlds again."""
+        """From the sums, update the memory that all worlds share; then clear the sums, and observe the worlds again."""
         if (kernel := self.task.kernels.share_memory) is not None:
             launch_worlds(kernel, 1, [self.sums, self._shares, self.params, self.shared], self.device)
             self._observe(self.everyone)

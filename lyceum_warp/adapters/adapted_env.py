@@ -15,7 +15,7 @@ _SEEDS = 2**31
 """Seeds of an environment are smaller than this number."""
 
 _OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode (in adapters that have it)"}
-"""Options of ``lw.make`` that an adapter sets, and the adapter's arguments that replace them."""
+"""Options of ``lw.make`` that adapters do not accept, each with the adapter's argument to use instead."""
 
 
 def environment_of(
@@ -84,7 +84,7 @@ class ResetSeeds:
 
 
 def per_world(value: Any, nworld: int) -> list[Any]:
-    """Return a list with one value per world: the rows of a tensor with ``nworld`` rows, else copies of the value."""
+    """Return the rows of a tensor with one row per world; repeat any other value for each world."""
     if isinstance(value, torch.Tensor) and value.ndim and len(value) == nworld:
         return list(value)
     return [value] * nworld

@@ -22,7 +22,7 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
     Args:
         task: A task, as in ``lw.make``, or an environment with one world, made with ``autoreset=False``.
         dict_obs: Whether observations are dicts of all observation groups; otherwise they are the group ``policy``. By
-            default True if the task has several groups.
+            default, True if the task has several groups.
         render_mode: "rgb_array" for pictures, or None.
         camera: The camera for pictures, as in ``lyceum_warp.viz.video.write_video``.
         render_size: Width and height of pictures in pixels, even numbers.
@@ -105,7 +105,7 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         self._pictures.close()
 
     def _rows(self, *buffers: torch.Tensor) -> list[Any]:
-        """The first row of each buffer, which belongs to the single world."""
+        """The first row of each buffer: the row of the single world."""
         return [array[0] for array in self._host.of(*buffers)]
 
 

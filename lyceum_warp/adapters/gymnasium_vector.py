@@ -24,7 +24,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     ``autoreset_mode`` determines when a world is reset after its episode ends:
 
-    - SAME_STEP resets it within the same step. The world returns the first observation of its next episode;
+    - SAME_STEP resets the world within that step. The world returns the first observation of its next episode;
       ``infos["final_obs"]`` and ``infos["final_info"]`` hold the last observations and infos of ended episodes, and the
       masks ``_final_obs`` and ``_final_info`` select their worlds. With NumPy, ``final_obs`` and ``final_info`` exist
       only if an episode ended, and ``final_obs`` is an object array with None for the other worlds, as Gymnasium's
@@ -33,11 +33,11 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     - DISABLED leaves resets to ``reset(options={"reset_mask": mask})``. An ended world keeps stepping until its reset,
       and its termination or truncation stays set. A world with a fault is reset at once, but returns its last valid
       observation.
-    - NEXT_STEP resets it in the next step, which ignores the world's action. With NEXT_STEP, every step has a second
-      reset phase. Some wrappers, such as ``NormalizeObservation``, require NEXT_STEP.
+    - NEXT_STEP resets the world in the next step, which ignores the world's action. With NEXT_STEP, every step has a
+      second reset phase. Some wrappers, such as ``NormalizeObservation``, require NEXT_STEP.
 
     As in Gymnasium's own environments, a first reset without a seed draws one at random, unless the constructor gets
-    ``seed=``. A seed determines the random numbers of all worlds, which differ between worlds.
+    ``seed=``. One seed determines the random numbers of all worlds, but every world has different random numbers.
 
     Args:
         task: A task, as in ``lw.make``, or an environment.
@@ -49,7 +49,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         copy: Whether to copy results. Without copies, most tensors and most arrays on the CPU are live buffers that the
             next step overwrites.
         dict_obs: Whether observations are dicts of all observation groups; otherwise they are the group ``policy``. By
-            default True if the task has several groups.
+            default, True if the task has several groups.
         render_mode: "rgb_array" for pictures, or None.
         camera: The camera for pictures, as in ``lyceum_warp.viz.video.write_video``.
         render_size: Width and height of pictures in pixels, even numbers.
@@ -136,7 +136,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Advance every world by one step.
 
         Args:
-            actions: (num_envs, nact), a float32 array, or with ``torch=True`` a tensor on the environment's device.
+            actions: (num_envs, nact), a float32 array; with ``torch=True``, a tensor on the environment's device.
 
         Returns:
             Observations, rewards, terminations, truncations and infos.

@@ -102,7 +102,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         return self._obs.clone()
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advance every world by one step; worlds whose episode ends start a new one.
+        """Advance every world by one step, and restart worlds at the end of their episode.
 
         Args:
             actions: (nworld, nact), float32.

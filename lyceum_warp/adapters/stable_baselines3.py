@@ -29,7 +29,7 @@ class StableBaselines3VecEnv(VecEnv):
     ``done_reason``, ``is_success`` if the task has a goal, and ``episode_metrics`` if it has metrics. The info dicts of
     all other worlds are empty, and are the same objects in every step.
 
-    By default observations are only the group ``policy``, because Stable-Baselines3 feeds all groups to the policy.
+    By default, observations are only the group ``policy``, because Stable-Baselines3 feeds all groups to the policy.
 
     Args:
         task: A task, as in ``lw.make``, or an ``Env``.

@@ -17,7 +17,7 @@ class Observations:
 
     Args:
         env: The environment.
-        dict_obs: Whether to return a dict of all groups. By default True if the task has several groups.
+        dict_obs: Whether to return a dict of all groups. By default, True if the task has several groups.
     """
 
     def __init__(self, env: Env, *, dict_obs: bool | None) -> None:
@@ -70,7 +70,7 @@ class HostArrays:
 
     def __init__(self, env: Env, *, copy: bool = True, one_world: bool = False) -> None:
         self._env, self._copy = env, copy
-        # on the CPU the array shares the action buffer's memory; on a GPU, pinned memory holds the actions before the
+        # on the CPU, the array shares the action buffer's memory; on a GPU, pinned memory holds the actions before the
         # copy
         pinned = torch.empty(env.action.shape, pin_memory=True) if env.action.is_cuda else None
         self._pinned = pinned

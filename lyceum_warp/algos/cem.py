@@ -5,10 +5,11 @@ samples (the elites) u_t^1, ..., u_t^n determine the next plan and its noise:
 
     u_t = 1/n sum_k u_t^k,    s_t = max(sqrt(1/n sum_k (u_t^k - u_t)^2), min_noise)
 
-CEM was proposed by Rubinstein (1999, "The cross-entropy method for combinatorial and continuous optimization") and has
-a diagonal covariance here, as in hydrax, judo and MuJoCo MPC. The planner shifts the standard deviations in time with
-the plan, and fills their end with the initial values. If the noise is smoothed over time, s_t is the standard deviation
-before smoothing: the elites' standard deviation, divided by the standard deviation of smoothed standard normal noise.
+CEM was proposed by Rubinstein (1999, "The cross-entropy method for combinatorial and continuous optimization"). Here,
+as in hydrax, judo and MuJoCo MPC, the covariance is diagonal. When the planner shifts the plan in time, it also shifts
+the standard deviations, and appends initial values at the end. If the noise is smoothed over time, s_t is the standard
+deviation before smoothing. It is the elites' standard deviation divided by the standard deviation of smoothed standard
+normal noise.
 """
 
 from collections.abc import Sequence
@@ -50,7 +51,7 @@ class CrossEntropy(EliteWeights):
     """Update plans by CEM.
 
     Args:
-        elites: Number of best samples to which the update fits.
+        elites: Number of best samples, which determine the new plan and the new noise.
         min_noise: Lower limit of the standard deviations, one number or one for each action.
         smoothing: Weights (b0, b1, b2) that smooth the noise over time.
     """

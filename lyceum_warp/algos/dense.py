@@ -37,8 +37,8 @@ is computed from the activation's output."""
 
 _FEW = 2**18
 """Largest matrix product (rows times weights of the largest layer) that NumPy computes; torch computes larger products.
-NumPy calls have less overhead with cold caches, as between two steps of the worlds. Large products run faster in
-torch."""
+Calls of NumPy have less overhead than calls of torch, in particular with cold caches after a step of the worlds. Large
+products run faster in torch."""
 
 
 class DensePasses:
@@ -96,7 +96,7 @@ class DensePasses:
         self._arrays = [result.numpy() for result in self.results]
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
-        """Compute outputs, (rows, outputs), from inputs, (rows, inputs); ``push`` and ``pull`` use the same inputs."""
+        """Compute outputs, (rows, outputs), from inputs, (rows, inputs). Keep the inputs for ``push`` and ``pull``."""
         if len(x) != self._rows:
             self._resize(len(x))
         self._inputs = [x, *self.results[:-1]]
@@ -128,7 +128,7 @@ class DensePasses:
         """Compute J^T u at the last inputs, from u, (rows, outputs), into tensors of the parameters' shapes."""
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
-            # compute the transposed product, which is faster, because its result has longer rows
+            # the transposed product is faster, because its result has longer rows
             if x.shape[1] < u.shape[1]:
                 out[2 * i].copy_((x.t() @ u).t())
             else:
@@ -150,7 +150,7 @@ class DensePolicy:
 
     @staticmethod
     def of(policy: GaussianPolicy) -> "DensePolicy | None":
-        """Wrap a policy; None if its network is unsupported or partly frozen, or if it is a subclass or mirrored."""
+        """Wrap a policy; None for a subclass, a mirrored policy, or an unsupported or partly frozen network."""
         plain = (
             type(policy) is GaussianPolicy
             and policy.mirror is None
@@ -202,7 +202,7 @@ class DenseValue:
 
     @staticmethod
     def of(value: ValueFunction) -> "DenseValue | None":
-        """Wrap a value function; None if its network is not supported, or if the value function is a subclass."""
+        """Wrap a value function; None for a subclass or an unsupported network."""
         if type(value) is not ValueFunction or _hooked(value):
             return None
         passes = DensePasses.of(value.network)

@@ -17,9 +17,9 @@ from lyceum_warp.graphs.capture import capturing
 
 
 class Team:
-    """Processes that learn together, and their communication; a team of one process does not communicate.
+    """Sums and copies tensors between the processes that learn together; a single process does not communicate.
 
-    Except for ``share`` and ``locate``, all processes must call the methods in the same order.
+    All processes must call the methods in the same order; only ``share`` and ``locate`` are exceptions.
 
     Args:
         rank: Rank of this process.
@@ -80,8 +80,8 @@ class Team:
             nworld: Number of this process's worlds.
 
         Returns:
-            Indices into a flattened array (steps, nworld), 0 for samples of other processes, and a mask of this
-            process's samples.
+            Indices into a flattened array (steps, nworld), and a mask of this process's samples. The index of another
+            process's sample is 0.
         """
         step, world = index // (nworld * self.size), index % (nworld * self.size) - self.rank * nworld
         own = (world >= 0) & (world < nworld)
@@ -146,7 +146,7 @@ class Team:
 
 
 class Captured:
-    """Calls a function of torch operations and communication; on a GPU, replays it as a CUDA graph.
+    """Calls a function that runs torch operations and communication; on a GPU, replays it as a CUDA graph.
 
     The first call runs the function directly, so that it allocates its buffers. The second call captures and replays a
     graph; all later calls replay it. A graph stores addresses, so the function must update tensors in place.
@@ -208,7 +208,7 @@ def join(device: str = "cpu") -> Iterator[Team]:
         yield Team(device=device)
         return
     # The first optimizer imports torch's compiler. If a process group exists during this import, the compiler keeps the
-    # group and its threads alive until Python exits, which sometimes aborts the process.
+    # group and its threads alive until Python exits. This sometimes aborts the process.
     torch.optim.SGD([torch.zeros(1)])
     place, neighbours = int(os.environ.get("LOCAL_RANK", "0")), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     if device.startswith("cuda"):

@@ -131,7 +131,7 @@ def _first_actions(act: Callable[[torch.Tensor], torch.Tensor], env: Env) -> tor
 
 
 ENDLESS_STEPS = 1000
-"""Length of an episode, in steps, in evaluations of a task without a horizon."""
+"""Number of steps in an episode, for evaluations of a task without a horizon."""
 
 
 def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from lyceum_warp.support.validate import check_flag, check_word, finite_number, layer_sizes, whole_number
 
 LEAST = -math.inf
-"""Lower bound of a number without a lower limit."""
+"""Lower bound that admits every finite number."""
 
 
 def check_fields(config: Any, bounds: Mapping[str, float | tuple[float, float]]) -> None:

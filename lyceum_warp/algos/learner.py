@@ -98,7 +98,7 @@ class Learner(abc.ABC):
     """
 
     algorithm: str
-    """The name of the algorithm, which is the key of its hyperparameters in a run's config.json."""
+    """The name of the algorithm, and the key of its hyperparameters in a run's config.json."""
     env: Env
     """The environment that provides the samples."""
     policy: torch.nn.Module
@@ -115,8 +115,8 @@ class Learner(abc.ABC):
     generator: torch.Generator | None = None
     """The random generator, if the algorithm has one."""
     replay: Replay | None = None
-    """The replay buffer, if the algorithm has one. ``state_dict`` does not contain the replay buffer, because of its
-    size; a run updates separate files incrementally."""
+    """The replay buffer, if the algorithm has one. ``state_dict`` does not contain the replay buffer, because the
+    buffer is large. A run saves the buffer in separate files."""
     own_worlds: slice
     """Indices of this process's worlds among the worlds of all processes."""
     iteration: int
@@ -154,7 +154,7 @@ class Learner(abc.ABC):
 
     @property
     def best_by(self) -> str:
-        """Name of the return that selects the best policy and is compared with the target.
+        """Name of the return that selects the best policy, and that is compared with a target return.
 
         "mean_return" describes the policy after the iteration, "return_mean" the policy before the iteration. The
         default is "mean_return", or "return_mean" if the configuration has ``mean_every=0``.
@@ -192,7 +192,7 @@ class Learner(abc.ABC):
         return copy.deepcopy(state)  # copy, because a module's state_dict shares memory with the parameters
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from a state of ``state_dict``; later iterations equal an uninterrupted run's bit for bit.
+        """Resume from a state of ``state_dict``; later iterations equal an uninterrupted run bit for bit.
 
         Raises:
             ValueError: The state has a different number of worlds, or a counter is not a whole number.

@@ -1,4 +1,4 @@
-"""Run epochs of mini-batches; on a GPU an epoch is one CUDA graph, without host synchronisation."""
+"""Run epochs of mini-batches; on a GPU, an epoch is one CUDA graph without host synchronisation."""
 
 import contextlib
 import math
@@ -12,7 +12,7 @@ Samples = Mapping[str, torch.Tensor]
 """Map names to tensors with one row per sample."""
 
 _SURE = 6.0
-"""Number of standard deviations by which a mini-batch's size exceeds a process's mean number of samples."""
+"""Room for samples beyond the mean number of samples per process, in standard deviations."""
 
 
 def room(batch: int, team: Team) -> int:
@@ -31,8 +31,8 @@ class Minibatches:
     On a GPU, an epoch runs as a CUDA graph, so ``learn`` must update tensors in place.
 
     Args:
-        learn: Function of the process's samples of a mini-batch and their weights, (samples,), which sum to 1 over all
-            processes.
+        learn: Function that learns from a mini-batch, called with this process's samples and their weights, (samples,).
+            The weights sum to 1 over all processes.
         steps: Steps per world in a rollout.
         nworld: Number of this process's worlds.
         count: Number of mini-batches.

@@ -115,7 +115,7 @@ def plant_seeds(seed: int | Sequence[int], plants: int) -> Sequence[int]:
 
 @contextlib.contextmanager
 def explained_worlds(config: MPPIConfig, plants: int) -> Iterator[None]:
-    """Name the settings that determine the number of worlds in a NotEnoughMemoryError of the with block.
+    """If the with block raises NotEnoughMemoryError, name the settings that determine the number of worlds.
 
     Raises:
         NotEnoughMemoryError: The worlds do not fit into memory.

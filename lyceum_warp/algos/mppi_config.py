@@ -17,7 +17,7 @@ from lyceum_warp.support.validate import check_flag, check_word, finite_number, 
 Numbers: TypeAlias = float | Sequence[float] | Sequence[Sequence[float]] | np.ndarray | torch.Tensor
 
 _SMALLEST = float(np.finfo(np.float32).tiny)
-"""The smallest normal float32, the type of the kernels."""
+"""The smallest normal float32; kernels compute in float32."""
 
 
 @document_attributes
@@ -41,7 +41,8 @@ class MPPIConfig:
     """Temperature of MPPI's weights, in units of reward. Low temperatures follow the best sample; high temperatures
     average all samples."""
     elites: int | None = None
-    """Number of best samples that CEM fits. None means a tenth of the samples, but at least two."""
+    """Number of best samples to which CEM fits the plan and the noise. None means a tenth of the samples, but at least
+    two."""
     noise: Numbers = 0.5
     """Noise that is added to the plan, in units of the action: a standard deviation, a standard deviation for each
     action, or a covariance, (nact, nact). CEM adapts the noise, starting from the standard deviations in ``noise``."""
@@ -49,8 +50,8 @@ class MPPIConfig:
     """Lower limit of CEM's adapted standard deviations, one number or one for each action. None means a tenth of
     ``noise``."""
     include_plan: bool | None = None
-    """Whether the first sample is the plan itself, without noise. None means True, but False with a single sample or
-    with an update that adapts the noise, as CEM does."""
+    """Whether the first sample is the plan itself, without noise. None means True in general, but False with a single
+    sample, and False with an update that adapts the noise, such as CEM."""
     smoothing: tuple[float, float, float] = (0.25, 0.8, 0.0)
     """Weights (b0, b1, b2) that smooth the noise n over time: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) from the third
     step on. (1, 0, 0) is white noise. The noise of knots is not smoothed."""
@@ -183,11 +184,11 @@ class MPPIConfig:
 
     @property
     def noise_smoothing(self) -> tuple[float, float, float]:
-        """Return the effective ``smoothing``, which is none for knots."""
+        """Return the effective ``smoothing``; knots are not smoothed."""
         return self.smoothing if self.knots is None else (1.0, 0.0, 0.0)
 
     def fill_action(self, space: Space) -> np.ndarray:
-        """Return the action that fills the initial plan and the end of shifted plans, clipped to the bounds, (nact,).
+        """Return the clipped action, (nact,), that fills the initial plan and the end of shifted plans.
 
         Raises:
             ValueError: The size of ``fill`` does not match the actions.
@@ -216,7 +217,7 @@ def _array(value: Any) -> np.ndarray | None:
 
 
 def _tuples(array: np.ndarray) -> Any:
-    """Convert an array to a float or to tuples, which are hashable."""
+    """Convert an array to a hashable value: a float or tuples."""
     return array.item() if array.ndim == 0 else tuple(map(_tuples, array))
 
 
@@ -249,7 +250,7 @@ def _smoothing(smoothing: Any) -> Any:
     if array is None or array.shape != (3,):
         raise ValueError(f"smoothing must be 3 finite numbers, not {smoothing!r}")
     b0, b1, b2 = array.tolist()
-    # check the stability triangle of a second-order filter, which has the roots of z^2 - b1 z - b2 as poles
+    # check the stability triangle of a second-order filter; its poles are the roots of z^2 - b1 z - b2
     if not (abs(b2) < 1 and abs(b1) < 1 - b2):
         raise ValueError(
             f"smoothing {(b0, b1, b2)} is unstable: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) must have its poles inside "

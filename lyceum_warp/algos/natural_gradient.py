@@ -17,7 +17,7 @@ def score_gradient(
     *,
     dense: DensePolicy | None = None,
 ) -> torch.Tensor:
-    """Compute the gradient of sum(weight * log pi(action | obs)) in the trainable parameters, (parameters,).
+    """Compute the gradient of sum(weight * log pi(action | obs)) for all trainable parameters, (parameters,).
 
     Args:
         policy: The policy.

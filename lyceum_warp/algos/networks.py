@@ -32,7 +32,7 @@ def check_memory(sizes: Sequence[int], **arguments: Any) -> None:
 
     Args:
         sizes: Widths of all layers, including input and output.
-        arguments: The arguments that determine the sizes, which an error message names.
+        arguments: The arguments that determine the sizes; an error message names these arguments.
 
     Raises:
         ValueError: The weights do not fit into memory.
@@ -98,7 +98,7 @@ class Normalizer(nn.Module):
 
     Args:
         size: Length of an observation.
-        limit: Limit of normalised values, which are clipped to [-limit, limit]; inf means no limit.
+        limit: Normalised values are clipped to [-limit, limit]; inf means no limit.
     """
 
     count: torch.Tensor
@@ -168,7 +168,7 @@ class Normalized(nn.Module):
         self.normalizer = Normalizer(nobs, limit) if normalize else nn.Identity()
 
     def observe(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
-        """Update the normaliser, if there is one, which changes the module's outputs.
+        """Update the normaliser, if there is one. The update changes the module's outputs.
 
         Args:
             obs: Observations, (..., nobs).
@@ -188,7 +188,7 @@ def moved(module: Module, env: Env) -> Module:
 
 
 def trainable(module: Module) -> Module:
-    """Unfreeze a module if all its parameters are frozen, as after ``lw.load``, and return the module."""
+    """Unfreeze a module if all its parameters are frozen (``lw.load`` freezes them), and return the module."""
     if isinstance(module, nn.Module) and not any(parameter.requires_grad for parameter in module.parameters()):
         module.requires_grad_(True)
     return module

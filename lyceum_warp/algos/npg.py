@@ -97,7 +97,7 @@ class NPG(OnPolicyLearner):
         scale = 1.0 / max(1.0 - config.gamma, 1e-3)
         self._make_networks(policy, value, scale=scale, time_orders=config.time_orders)
 
-        # branching on a tensor needs no synchronisation with one process on the CPU
+        # with one process on the CPU, branching on a tensor needs no synchronisation
         self._reads_numbers = device.type == "cpu" and team.size == 1
 
         # samples
@@ -313,12 +313,12 @@ class NPG(OnPolicyLearner):
     def move(
         self, step: torch.Tensor, obs: torch.Tensor, old_mean: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Add a step to the policy's parameters, or a fraction of the step within the limit of the KL divergence.
+        """Add a step to the policy's parameters; shorten the step if the KL divergence exceeds its limit.
 
-        The Fisher information approximates the KL divergence only to second order and on a subset of the samples. While
-        the measured divergence exceeds its limit, up to four times, the step is shortened to the second-order estimate,
-        but at least by half. If the divergence still exceeds the limit, or if the step is not finite, the policy does
-        not change. The host does not wait for the device.
+        The Fisher information approximates the KL divergence only to second order and on a subset of the samples. If
+        the measured divergence exceeds its limit, the step is shortened, up to four times. The new length comes from a
+        second-order estimate, but is at most half of the old length. If the divergence still exceeds the limit, or if
+        the step is not finite, the policy does not change. The host does not wait for the device.
 
         Args:
             step: The step, (parameters,).

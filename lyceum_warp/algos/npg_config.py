@@ -15,9 +15,9 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 _LONG_EPISODE = 20
-"""Number of iterations per episode above which NPG restarts worlds by default. On hopper with some seeds, NPG's return
-stayed low for a long time with 63 and 31 iterations per episode, but not with 16 (bench/README.md, "NPG's learning
-curves")."""
+"""By default, NPG restarts worlds if an episode lasts longer than this number of iterations. On hopper with some seeds,
+NPG's return stayed low for a long time with 63 and 31 iterations per episode, but not with 16 (bench/README.md, "NPG's
+learning curves")."""
 
 
 @document_attributes
@@ -34,20 +34,22 @@ class NPGConfig:
     every world if that is more."""
     rollout: Literal["auto", "episodes", "segments"] = "auto"
     """"episodes" starts new episodes in every iteration, as in the paper; "segments" continues the last iteration's
-    episodes, which suits many worlds with few steps each; "auto" selects "episodes" if samples / worlds >= horizon."""
+    episodes, and suits many worlds with few steps each; "auto" selects "episodes" if samples / worlds >= horizon."""
     min_restarts: float | None = None
     """Minimum number of worlds that start an episode in each iteration, as a multiple of samples / horizon. If fewer
     worlds started an episode in the last iteration, random worlds are restarted. Restarts apply only to segments with a
-    time limit. Without restarts, worlds that started together reach the time limit together, so that few samples in
-    between come from the start of an episode. The statistics do not count interrupted episodes, so values well above 1
-    bias ``return_mean`` towards short episodes. 0 turns restarts off. The default is 0.5 if an episode lasts longer
-    than 20 iterations (as with 205 or more worlds, 1,000 steps and the default samples), and 0 otherwise."""
+    time limit. Without restarts, worlds that started together also reach the time limit together. Between two time
+    limits, few samples then come from the start of an episode. The statistics do not count interrupted episodes, so
+    values well above 1 bias ``return_mean`` towards short episodes. 0 turns restarts off. The default is 0.5 if an
+    episode lasts longer than 20 iterations, and 0 otherwise. For example, episodes of 1,000 steps last longer than 20
+    iterations with 205 or more worlds and the default number of samples."""
     gamma: float = 0.995
     """Discount factor."""
     lam: float = 0.97
     """Lambda of the generalised advantage estimate."""
     delta: float = 0.1
-    """Squared step length in the Fisher metric, which is twice the KL divergence between the old and the new policy."""
+    """Squared length of a step in the Fisher metric. It is twice the KL divergence between the old and the new
+    policy."""
     whiten: bool = True
     """Whether to normalise advantages to mean 0 and standard deviation 1 (as in mjrl, unlike Lyceum)."""
     cg_iterations: int = 10
@@ -94,7 +96,9 @@ class NPGConfig:
         if self.fisher_fraction == 0.0:
             raise ValueError("fisher_fraction must be greater than 0, such as 0.1 for every tenth sample")
         if self.log_std < self.min_log_std:
-            raise ValueError(f"log_std={self.log_std} must not be below min_log_std, which is {self.min_log_std}")
+            raise ValueError(
+                f"log_std must not be below min_log_std, which is {self.min_log_std}, but is {self.log_std}"
+            )
 
 
 def enough_samples(config: NPGConfig, nworld: int) -> int:

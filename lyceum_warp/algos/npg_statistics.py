@@ -47,7 +47,8 @@ class NPGIteration(OnPolicyIteration):
     time_solve: float
     """Seconds for conjugate gradient and the step."""
     time_value: float
-    """Seconds for the value function's fit, without time that overlaps ``time_solve`` with two CPU threads."""
+    """Seconds for the value function's fit. With two CPU threads, seconds that also count in ``time_solve`` are
+    omitted."""
 
 
 class UpdateNumbers(NamedTuple):
@@ -87,7 +88,7 @@ class ProcessNumbers(NamedTuple):
     """The result of ``metric_sums``."""
 
     def pack(self) -> torch.Tensor:
-        """Pack all numbers into one float64 tensor, which needs one copy to other processes and to the host."""
+        """Pack all numbers into one float64 tensor, so that one copy to other processes or to the host suffices."""
         return torch.stack([number.double() for part in self for number in part])
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Implement what NPG and PPO share: networks, rollouts, advantages, evaluation and checkpoints."""
+"""Define the base class of NPG and PPO: networks, rollouts, advantages, evaluation and checkpoints."""
 
 import dataclasses
 from typing import Any, ClassVar

@@ -18,16 +18,16 @@ from lyceum_warp.support.docstrings import document_attributes
 @document_attributes
 @dataclasses.dataclass(frozen=True)
 class PlanSamples:
-    """Samples of one improvement of the plans, which an update reads and writes.
+    """The samples of one improvement of the plans, for an update to read and write.
 
-    Plans and samples have one row per step of the horizon or, with knots, per knot. All tensors are float32, on the
-    device of the planner's worlds, at fixed addresses: write into the tensors.
+    Plans and samples have one row per step of the horizon or, with knots, per knot. All tensors are float32 on the
+    device of the planner's worlds. Their addresses are fixed, so write into the tensors instead of replacing them.
     """
 
     returns: torch.Tensor
     """The samples' returns, (plants, samples); minus infinity for failed samples."""
     weights: torch.Tensor
-    """The samples' weights, (plants, samples), which ``weigh`` writes and which sum to 1 for each plant."""
+    """The samples' weights, (plants, samples). ``weigh`` writes them; they sum to 1 for each plant."""
     actions: torch.Tensor
     """The samples, (rows, plants, samples, nact)."""
     nominal: torch.Tensor
@@ -57,8 +57,8 @@ class PlanUpdate(abc.ABC):
     """Whether ``weigh`` and ``fit`` consist of Warp launches on arrays at fixed addresses, so that the planner's graph
     can include both. If False, ``weigh`` and ``fit`` may use torch, and run between two graphs."""
     adapts_noise: ClassVar[bool] = False
-    """Whether each element of a plan has its own standard deviation of the noise, which ``fit`` adapts and the planner
-    shifts in time. If False, the planner's setting ``noise`` applies."""
+    """Whether the noise has a separate standard deviation for each element of a plan. ``fit`` adapts these standard
+    deviations, and the planner shifts them in time. If False, the planner's setting ``noise`` applies."""
 
     def prepare(self, samples: PlanSamples) -> None:
         """Check sizes and allocate buffers; called once, when the planner is made."""

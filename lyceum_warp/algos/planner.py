@@ -59,7 +59,7 @@ _BUFFERS = (
     "actions", "nominal", "knot_actions", "standard_noise", "adapted_noise", "sampled", "model_returns", "returns",
     "weights", "model_fields",
 )  # fmt: skip
-_MODELS = 0x6D6F64656C73  # the word "models" in ASCII, which with the planner's seed seeds the draws of models
+_MODELS = 0x6D6F64656C73  # seed for drawing models, in addition to the planner's seed ("models" in ASCII)
 _DRAWING = ("startup", "initialize", "randomize")
 """Task functions that can randomize a planner's model fields."""
 
@@ -70,13 +70,13 @@ Value: TypeAlias = ValueFunction | wp.Function | Callable[[torch.Tensor], torch.
 class Planner:
     """A controller that replans at every step: ``action = plan(state)``.
 
-    The planner simulates in its own worlds, one per sample. The controlled world is called the plant. The plant is an
-    environment, as in ``plan(env.get_state()[0])``, or a robot, as in ``plan(plan.state_of(qpos=..., qvel=...,
-    time=...))``. The plant's model, physics, time step and parameters may differ from the planner's. If the planner's
-    time step is a multiple of the plant's, ``lw.control`` and ``lw.control_async`` apply the plan according to the
-    setting ``between``. Random streams are counter-based: a plan depends on the seed, on the number of earlier plans,
-    and on the plan from which it starts. In each sample, the task's functions draw from a separate stream seeded by the
-    planner, so a plan cannot anticipate the plant's random numbers.
+    The planner simulates in its own worlds, one per sample. The controlled world is called the plant. The plant may be
+    an environment: ``plan(env.get_state()[0])``. The plant may also be a robot: ``plan(plan.state_of(qpos=...,
+    qvel=..., time=...))``. The plant's model, physics, time step and parameters may differ from the planner's. If the
+    planner's time step is a multiple of the plant's, ``lw.control`` and ``lw.control_async`` apply the plan according
+    to the setting ``between``. Random streams are counter-based: a plan depends on the seed, on the number of earlier
+    plans, and on the plan from which it starts. In each sample, the task's functions draw from a separate stream seeded
+    by the planner, so a plan cannot anticipate the plant's random numbers.
 
     ``plants=n`` plans for n plants at a time, as in ``env.step(plan(env.get_state()))`` with n worlds. Plant i uses the
     seed ``seed + i`` for its noise, so its plan equals the plan of a single-plant planner with this seed on the same
@@ -89,19 +89,19 @@ class Planner:
     Args:
         task: Name of a task, path of a task file, or a task class.
         config: Settings that replace the task's settings.
-        value: Terminal value that is added to each sample's return: a ``ValueFunction``, a function from (nworld, nobs)
-            observations to (nworld,) values, or a Warp function of one observation, ``value(obs: Row[float]) ->
-            float``, which becomes part of the graph on the Warp engine. If a value is given, the parameters in
-            ``planning`` do not apply, because the value function was fitted to the task's own rewards.
+        value: Terminal value that is added to each sample's return: a ``ValueFunction``; a function from (nworld, nobs)
+            observations to (nworld,) values; or a Warp function of one observation, ``value(obs: Row[float]) ->
+            float``. On the Warp engine, a Warp function becomes part of the graph. If a value is given, the parameters
+            in ``planning`` do not apply, because the value function was fitted to the task's own rewards.
         seed: Seed of the noise. With several plants, ``seed`` is the seed of the first plant, or a list with one seed
             per plant.
         plants: Number of plants to plan for.
-        params: Parameters of the task; required for parameters with the name of a setting.
+        params: Parameters of the task. A parameter that has the same name as a setting must be given here.
         words: Individual settings by their names in ``lw.MPPIConfig`` (None keeps the default; ``update`` may be a
             custom ``lw.PlanUpdate``), options of the planner's worlds as for ``lw.make``, and parameters of the task.
             Parameters with one value per world are ordered by plant, then by sample, then by model. With a CUDA device,
-            engine="auto" and few samples, the C engine rolls out the samples, because it is faster for few samples, and
-            plans are on the CPU.
+            engine="auto" and few samples, the C engine rolls out the samples, because it is faster for few samples.
+            Plans are then on the CPU.
 
     Raises:
         ValueError: An argument is unknown, ambiguous or invalid, or the samples do not fit into memory.
@@ -116,7 +116,7 @@ class Planner:
     """The settings, and the options and parameters of the planner's worlds, as JSON values."""
     actions: torch.Tensor
     """The plan, (horizon, nact); the first row is the action returned by the last call. To start from a different plan,
-    write into ``actions``, or with knots into ``knot_actions``."""
+    write into ``actions`` or, with knots, into ``knot_actions``."""
     nominal: torch.Tensor
     """The plan from which the last improvement started, (horizon, nact)."""
     knot_actions: torch.Tensor
@@ -129,7 +129,8 @@ class Planner:
     sampled: torch.Tensor
     """The last improvement's actions, (horizon, samples, nact)."""
     model_fields: dict[str, torch.Tensor]
-    """The model fields of each model, (models, size) float64, which each call reads; empty with one model."""
+    """The values of model fields in each model, (models, size) float64; empty with one model. Each call reads the
+    values."""
     model_returns: torch.Tensor
     """The samples' returns in each model, (samples, models); minus infinity for failed samples."""
     returns: torch.Tensor
@@ -137,7 +138,7 @@ class Planner:
     weights: torch.Tensor
     """The samples' weights, (samples,)."""
 
-    _only_update: str | None = None  # the update of a subclass that fixes ``update``
+    _only_update: str | None = None  # the only value of ``update`` that a subclass accepts
 
     def __init__(
         self,
@@ -223,7 +224,7 @@ class Planner:
             self._value_in_torch = True
             try:
                 self._torch_values()
-            # reasons are missing weights, a different input size, or critics that also take actions
+            # for example missing weights, another input size, or a critic that also takes actions
             except (RuntimeError, TypeError) as error:
                 observations = described(self._value_obs)
                 raise ValueError(f"value cannot take observations {observations}: {error}") from error
@@ -313,10 +314,10 @@ class Planner:
             state: A state from ``state_of`` or from ``get_state`` of an environment of the same task, on either engine:
                 (state_space.size,) or (1, state_space.size) float64; with several plants (plants, state_space.size).
             obs: Not used; present because control loops call controllers with observations.
-            shift: Number of the planner's steps since the last call, by which the last plan is shifted.
+            shift: Number of the planner's steps since the last call. The last plan is shifted by this number of steps.
 
         Returns:
-            The action to apply now, (nu,), or with several plants (plants, nu), on the state's device.
+            The action to apply now, on the state's device: (nu,), or (plants, nu) with several plants.
 
         Raises:
             ValueError: The state has the wrong shape or type, or is not finite.
@@ -329,7 +330,7 @@ class Planner:
         return self._action.to(state.device, copy=True)
 
     def _program(self, *, first: bool) -> Calls:
-        """Make the calls of one improvement; the first improvement also shifts the plan in time."""
+        """List the calls that make one improvement; the first improvement also shifts the plan in time."""
         parts: list[Phase | Callable[[], None]] = [Phase("perturb", partial(self._perturb, first)), *self._loop.phases]
         if self._value_in_torch:
             parts.append(self._evaluate)
@@ -343,7 +344,7 @@ class Planner:
         return self._sequence(parts)
 
     def _sequence(self, parts: Iterable[Phase | Callable[[], None]]) -> Calls:
-        """Turn phases into as few graphs as possible, with torch functions between the graphs."""
+        """Turn phases into as few graphs as possible; functions that use torch run between the graphs."""
         calls: list[Any] = []
         for is_phase, group in itertools.groupby(parts, lambda part: isinstance(part, Phase)):
             some: Any = list(group)
@@ -415,7 +416,7 @@ class Planner:
         self._interpolate(self._plan, self._actions)
 
     def _weigh_in_torch(self) -> None:
-        """Compute an improvement's weights with a torch update, and the summary of the improvement."""
+        """Compute the weights by an update that uses torch, and compute the statistics of the improvement."""
         arrays = self._arrays
         if (returned := self._update.weigh(arrays)) is not None:
             raise ValueError(
@@ -491,7 +492,7 @@ class Planner:
             rows.copy_(states[:, self.env.state_space.parts[name]])
 
     def state_of(self, **parts: Any) -> torch.Tensor:
-        """Make a state from some of its parts, as measured on a robot; all other parts equal the task's fixed reset.
+        """Make a state from some of its parts, such as measurements; all other parts equal the task's fixed reset.
 
         Model fields have nominal values unless given, as in ``body_mass=...``.
 
@@ -514,7 +515,7 @@ class Planner:
         """Return statistics of the last improvement.
 
         The names are ``best_return``, ``mean_return``, ``effective_samples`` (the effective sample size) and
-        ``failed_samples`` (the number of failed samples). The values are numbers, or with several plants (plants,)
+        ``failed_samples`` (the number of failed samples). The values are numbers or, with several plants, (plants,)
         float32 tensors on the CPU.
         """
         names = ("best_return", "mean_return", "effective_samples", "failed_samples")

@@ -57,8 +57,7 @@ def checked_state(env: Env, state: torch.Tensor, like: torch.Tensor) -> torch.Te
     if state.device.type != "cpu":
         return state
     values = state.numpy().ravel()
-    # a dot product is a fast check, as a plan may take only a millisecond; the slow check runs only if the dot product
-    # is not finite
+    # a plan may take only a millisecond, so check with a fast dot product first
     if not math.isfinite(values.dot(values)) and not (finite := np.isfinite(values)).all():
         where = int(np.flatnonzero(~finite)[0])
         plant, column = divmod(where, env.state_space.size)

@@ -33,7 +33,7 @@ class GaussianPolicy(Normalized):
         activation: Activation of the hidden layers.
         log_std: Initial logarithm of the standard deviations.
         normalize: Whether to normalise observations by their running mean and variance.
-        limit: Limit of normalised observations, which are clipped to [-limit, limit]; inf means no limit.
+        limit: Normalised observations are clipped to [-limit, limit]; inf means no limit.
         generator: Draws the initial weights.
 
     Raises:
@@ -82,7 +82,7 @@ class GaussianPolicy(Normalized):
         self.mirror: PolicyMirror | None = None
 
     def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:
-        """Make later calls average the mean actions with the policy's mirror image.
+        """Make the policy symmetric: average its mean actions with its mirrored mean actions for mirrored observations.
 
         Args:
             reflections: The reflections of ``obs`` and ``action`` (``algos.symmetry.reflections``).

@@ -16,8 +16,9 @@ _ROWS = 4
 def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
     """Check that an algorithm can train a policy in an environment.
 
-    The policy must be a ``GaussianPolicy``, and must map observations (..., nobs) to mean actions (..., nact)
-    deterministically and independently for each row, and be differentiable with respect to its trainable parameters.
+    The policy must be a ``GaussianPolicy``. It must map observations (..., nobs) to mean actions (..., nact)
+    deterministically, and independently for each row. It must be differentiable with respect to its trainable
+    parameters.
 
     Args:
         policy: The policy.

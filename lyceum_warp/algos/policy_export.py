@@ -42,7 +42,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
 
     Args:
         policy: The policy, on any device: a module with the method ``act`` and the attribute ``nobs``.
-        path: Path of the file, which replaces an existing file.
+        path: Path of the file; an existing file is replaced.
         env: An environment of the policy's task; an ONNX file gets the task's ``deployment_metadata``.
 
     Returns:
@@ -131,7 +131,7 @@ class _Acting(torch.nn.Module):
 
 
 def check_export(path: Path) -> None:
-    """Check a file's suffix, and that the packages for the file's format are installed; see ``export_policy``."""
+    """Check a file's suffix, and whether the packages for its format are installed; see ``export_policy``."""
     if path.suffix not in _SUFFIXES:
         raise ValueError(f"{path} must end with {' or '.join(_SUFFIXES)}")
     missing = [name for name in ("onnx", "onnxscript") if importlib.util.find_spec(name) is None]

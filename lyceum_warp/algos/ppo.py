@@ -258,10 +258,10 @@ class PPO(OnPolicyLearner):
     def evaluated_samples(self) -> dict[str, torch.Tensor]:
         """Compute the inputs of the update, each (steps, nworld, ...), from the samples and the old networks.
 
-        Every transition bootstraps from its next observation before any events of the task. A push or a new command
-        between two steps changes the value of the state, but no action caused this change, so advantages and targets
-        exclude the change. Time limits, faults and the end of the rollout also bootstrap from the next observation. The
-        value function's targets are its predictions plus the advantages.
+        Every transition bootstraps from the observation after its step. The task's events, such as a push or a new
+        command, follow later. An event changes the value of the state, but no action caused this change, so advantages
+        and targets exclude the change. Time limits, faults and the end of the rollout also bootstrap from this
+        observation. The value function's targets are its predictions plus the advantages.
         """
         rollout, config, team = self.rollout, self.config, self.team
         obs, final_obs = rollout.obs_groups[self.value.group], rollout.final_obs_groups[self.value.group]
@@ -375,7 +375,7 @@ class PPO(OnPolicyLearner):
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
-        """Get the returns of the counted episodes that ended in the iteration in any process, in step order."""
+        """Get the returns of counted episodes that ended in the iteration, from all processes, ordered by step."""
         ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
         ended = self.team.gather(ended.T).T
         found: list[float] = ended[~ended.isnan()].tolist()

@@ -35,7 +35,8 @@ class PPOConfig:
     lam: float = 0.95
     """Lambda of the generalised advantage estimate."""
     clip: float = 0.2
-    """Clipping range of the probability ratio around 1, and with clip_value_loss of values around the old values."""
+    """Clipping range of the probability ratio around 1. With clip_value_loss, values are clipped to the same range
+    around the old values."""
     clip_value_loss: bool = True
     """Whether the value loss is the larger of the prediction's error and the clipped prediction's error."""
     value_coef: float = 1.0
@@ -50,7 +51,8 @@ class PPOConfig:
     """Learning rate of Adam, or the initial learning rate if schedule is "adaptive"."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """"adaptive" divides the learning rate by 1.5 if a mini-batch's KL divergence exceeds twice desired_kl, and
-    multiplies it by 1.5 if the divergence is below half of desired_kl, within the limits 1e-5 and 1e-2."""
+    multiplies it by 1.5 if the divergence is below half of desired_kl. The learning rate stays between 1e-5 and
+    1e-2."""
     desired_kl: float = 0.02
     """Target KL divergence of the adaptive learning rate. PPO learns go1_velocity faster with 0.02 than with mjlab's
     0.01 (bench/README.md)."""

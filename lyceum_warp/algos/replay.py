@@ -33,7 +33,7 @@ class Transitions(NamedTuple):
     discount: torch.Tensor
     """Factors of the value of ``next_obs``: gamma^k after k steps, and 0 if the task ended the episode, (batch,)."""
     next_obs: dict[str, torch.Tensor]
-    """Observations after the last step, before any reset, by group."""
+    """Observations of each group after the last step and before any reset."""
 
 
 @document_attributes
@@ -78,7 +78,7 @@ class Replay:
     truncated: torch.Tensor
     """Whether the time limit or a fault ended the episode, (steps, nworld) bool."""
     next_obs: dict[str, torch.Tensor]
-    """Observations after each step, before any reset, by group."""
+    """Observations of each group after each step and before any reset."""
 
     def __init__(self, env: Env, capacity: int | None = None) -> None:
         check_kind("env of Replay", env, Env, "as lw.make(...) makes it")
@@ -185,7 +185,7 @@ class Replay:
         )  # fmt: skip
 
     def _groups(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Get views of each group's observations in the first columns."""
+        """Split the first columns into views of each group's observations."""
         parts = rows[..., : sum(self._sizes)].split(self._sizes, dim=-1)
         return dict(zip(self.env.obs_groups, parts, strict=True))
 
@@ -197,13 +197,13 @@ class Replay:
         return {name: array[place] for name, array in self._arrays().items()}
 
     def set_rows(self, first: int, rows: Rows) -> None:
-        """Write the contents of steps from ``first`` on; the steps count as stored after ``restore``."""
+        """Write the contents of consecutive steps, beginning with step ``first``; then call ``restore``."""
         place = torch.arange(first, first + len(rows["reward"]), device=self.reward.device) % self.steps
         for name, array in self._arrays().items():
             array[place] = rows[name].to(array.device)
 
     def restore(self, stored: int) -> None:
-        """Set the number of stored steps, after ``set_rows``."""
+        """Set the number of stored steps, after calls of ``set_rows``."""
         self._set_stored(whole_number("stored", stored, low=0, high=2**62))
 
     def state_dict(self) -> dict[str, Any]:
@@ -211,7 +211,7 @@ class Replay:
         return {"stored": self.stored, "rows": self.rows(self.stored - self.count, self.stored)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of ``state_dict``; equal random numbers then sample equal transitions.
+        """Restore a state of ``state_dict``. Equal random numbers then draw equal transitions.
 
         Raises:
             ValueError: The state belongs to a buffer of a different size.

@@ -36,8 +36,8 @@ class Rollout:
         env: The environment.
         steps: Number of steps.
         groups: Groups of observations to store in addition to "policy", such as ``("critic",)``.
-        first_only: Whether to count only each world's first episode since ``restart``. If all worlds start together,
-            counting all episodes that end would favour short episodes.
+        first_only: Whether to count only each world's first episode since ``restart``. If all worlds start together, a
+            count of all finished episodes would favour short episodes.
 
     Raises:
         ValueError: The task has no group of observations of this name.
@@ -191,8 +191,8 @@ class Rollout:
     def restart_some(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
         """Restart random worlds so that at least ``least`` worlds started an episode within the last ``steps`` steps.
 
-        Interrupted episodes are not counted. Do not restart worlds with ``first_only``, which would count restarted
-        worlds twice. The host does not wait for the device.
+        Interrupted episodes are not counted. Do not restart worlds if ``first_only`` is set, because the first episodes
+        of restarted worlds would count twice. The host does not wait for the device.
 
         Args:
             least: Minimum number of worlds in all processes.
@@ -209,7 +209,7 @@ class Rollout:
         self.running_return.masked_fill_(mask, 0.0)
 
     def explain_not_finite(self) -> str:
-        """Describe in one sentence the first number that is not finite or too large for float32, and the fix.
+        """Describe in one sentence the first number that is infinite, NaN or too large for float32, and the fix.
 
         The host waits for the device. A task's rewards and observations are always finite, because non-finite values
         are faults.
@@ -256,7 +256,7 @@ class Rollout:
 
 
 class _Rows:
-    """Storage, (steps, nworld, size), for one buffer of an environment, (nworld, size)."""
+    """Storage for one buffer of an environment: (steps, nworld, size) for a buffer (nworld, size)."""
 
     def __init__(self, source: torch.Tensor, steps: int, device: wp.Device) -> None:
         self._source = wp.from_torch(source)

@@ -54,7 +54,7 @@ class SACIteration(SampledIteration):
     """
 
     critic_loss: float
-    """Loss of the two critics, which is the sum of their mean squared errors."""
+    """Loss of the two critics: the sum of their mean squared errors."""
     q_mean: float
     """Mean of the critics' predictions."""
     actor_loss: float
@@ -62,7 +62,7 @@ class SACIteration(SampledIteration):
     entropy: float
     """Entropy of the policy for actions scaled to [-1, 1]."""
     temperature: float
-    """Temperature, the weight of the entropy, after the iteration."""
+    """Temperature (the weight of the entropy) after the iteration."""
     time_update: float
     """Seconds for the updates."""
 
@@ -196,7 +196,7 @@ class SAC(Learner):
 
     @property
     def title(self) -> str:
-        """Name of the algorithm, with the size of its replay buffer."""
+        """Name of the algorithm, and the size of the replay buffer."""
         size = self.replay.nbytes * self.team.size / 1e9
         return f"{self.algorithm} with a replay buffer of {self.config.replay:,d} samples ({size:.2g} GB)"
 
@@ -368,7 +368,7 @@ class SAC(Learner):
         """Compute the actor's loss, and the actor's entropy.
 
         Args:
-            batch: Transitions, of which the loss uses only the observations.
+            batch: Transitions; the loss uses only their observations.
             weight: Weights of the transitions, as in ``critic_loss``.
             noise: Standard normal numbers for the actions of the observations, (batch, nact).
         """

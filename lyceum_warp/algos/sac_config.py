@@ -14,7 +14,7 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 MANY_WORLDS = 256
-"""Number of worlds from which on the defaults for many worlds apply."""
+"""Minimum number of worlds for which the defaults for many worlds apply."""
 
 _FEW: dict[str, Any] = {
     "batch": 256, "actor_every": 1, "gamma": 0.99, "tau": 0.005, "temperature": 1.0, "target_entropy": -1.0,
@@ -26,7 +26,7 @@ _MANY: dict[str, Any] = {
     "batch": 8192, "actor_every": 4, "gamma": 0.97, "tau": 0.125, "temperature": 1e-3, "target_entropy": 0.0,
     "critic_bound": "mean", "hidden": (512, 256, 128), "value_hidden": (512, 512, 512),
 }  # fmt: skip
-"""Defaults for 256 worlds or more, close to Seo et al., 2025, for humanoids."""
+"""Defaults for 256 worlds or more. They are close to the settings of Seo et al., 2025, for humanoids."""
 
 
 @document_attributes
@@ -34,9 +34,9 @@ _MANY: dict[str, Any] = {
 class SACConfig:
     """Hyperparameters of SAC.
 
-    The number of worlds determines values of None (``resolved``). Defaults for fewer than 256 worlds follow Haarnoja et
-    al., 2018 ("Soft Actor-Critic Algorithms and Applications"). Defaults for 256 worlds or more are close to Seo et
-    al., 2025 ("Learning Sim-to-Real Humanoid Locomotion in 15 Minutes").
+    ``resolved`` replaces None by a default that depends on the number of worlds. Defaults for fewer than 256 worlds
+    follow Haarnoja et al., 2018 ("Soft Actor-Critic Algorithms and Applications"). Defaults for 256 worlds or more are
+    close to Seo et al., 2025 ("Learning Sim-to-Real Humanoid Locomotion in 15 Minutes").
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.
@@ -54,8 +54,8 @@ class SACConfig:
     """Number of updates of the critics after each step of all worlds. The default is one update for every world, but at
     most 8."""
     actor_every: int | None = None
-    """Number of updates of the critics for each update of the actor, which must divide ``updates``. The default is 1,
-    or 4 with 256 or more worlds."""
+    """Number of updates of the critics for each update of the actor. This number must divide ``updates``. The default
+    is 1, or 4 with 256 or more worlds."""
     batch: int | None = None
     """Number of samples in an update. The default is 8,192 samples with 256 or more worlds, and otherwise 256."""
     n_step: int = 1
@@ -66,8 +66,8 @@ class SACConfig:
     """Step size of the target critics: each update moves the target critics by this fraction towards the critics
     (Polyak averaging). The default is 0.125 with 256 or more worlds, and otherwise 0.005."""
     critic_bound: Literal["min", "mean"] | None = None
-    """Whether the value of an action is the minimum or the mean of the two critics' predictions. The default is "mean"
-    with 256 or more worlds, and otherwise "min"."""
+    """Value of an action: the minimum or the mean of the two critics' predictions. The default is "mean" with 256 or
+    more worlds, and otherwise "min"."""
     learning_rate: float = 3e-4
     """Learning rate of the actor, the critics and the temperature (Adam)."""
     temperature: float | None = None
@@ -105,7 +105,7 @@ class SACConfig:
     bf16: bool = False
     """Whether SAC computes the losses in bfloat16 (torch.autocast)."""
     compiled: bool = False
-    """Whether torch.compile compiles the losses, which takes about half a minute."""
+    """Whether torch.compile compiles the losses. Compilation takes about half a minute."""
     mean_every: int = 10
     """Iterations between evaluations of the mean policy; 0 means no evaluations."""
     mean_episodes: int = 16

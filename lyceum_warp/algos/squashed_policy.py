@@ -31,7 +31,7 @@ class SquashedPolicy(Normalized):
         high: Upper bounds of the actions, (nact,).
         activation: Activation of the hidden layers.
         normalize: Whether to normalise observations by their running mean and variance.
-        limit: Limit of normalised observations, which are clipped to [-limit, limit]; inf means no limit.
+        limit: Normalised observations are clipped to [-limit, limit]; inf means no limit.
         mirror: Reflections for ``use_mirror``.
         generator: Draws the initial weights.
 
@@ -78,7 +78,7 @@ class SquashedPolicy(Normalized):
             self.use_mirror(mirror)
 
     def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:
-        """Make later calls average the Gaussian with its mirror image.
+        """Make the policy symmetric: average its Gaussian with the Gaussian's mirror image.
 
         Args:
             reflections: The reflections of ``obs`` and ``action`` (``algos.symmetry.reflections``).

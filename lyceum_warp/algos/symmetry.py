@@ -1,4 +1,4 @@
-"""Mirror observations and actions, and average functions with their mirror images."""
+"""Compute mirror images of observations and actions, and make policies symmetric."""
 
 from collections.abc import Callable, Mapping
 from types import SimpleNamespace

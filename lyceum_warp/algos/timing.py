@@ -60,7 +60,8 @@ def beside(function: Callable[[], Result], *, allowed: bool) -> Iterator[Callabl
     """If torch has exactly two threads, run a function and the with block in parallel, on one thread each.
 
     Mini-batches do not benefit from a second thread, and large products speed up by less than a factor of two.
-    With any other number of threads, or without ``allowed``, the function runs when the with block asks for its result.
+    With any other number of threads, or without ``allowed``, the function runs when the with block asks for the
+    function's result.
 
     Args:
         function: The function, which must not share state with the with block.

@@ -36,15 +36,15 @@ class Difference:
     second: float
     """The mean in the second simulation."""
     low: float
-    """Lower end of the interval of the second mean minus the first mean."""
+    """Lower end of the confidence interval of the difference (second mean minus first mean)."""
     high: float
-    """Upper end of the interval of the second mean minus the first mean."""
+    """Upper end of the confidence interval of the difference (second mean minus first mean)."""
     margin: float
     """Largest irrelevant difference."""
 
     @property
     def verdict(self) -> str:
-        """Compare the interval with the margin: "same" inside, "different" outside, "not shown" if both overlap."""
+        """Compare the interval with the margin: "same" if inside, "different" if outside, "not shown" otherwise."""
         if -self.margin <= self.low and self.high <= self.margin:
             return "same"
         return "different" if self.low > self.margin or self.high < -self.margin else "not shown"

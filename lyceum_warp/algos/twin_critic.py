@@ -25,7 +25,7 @@ class TwinCritic(Normalized):
         layer_norm: Whether to normalise each hidden layer before its activation (Ba et al. 2016, "Layer
             Normalization").
         normalize: Whether to normalise observations by their running mean and variance.
-        limit: Limit of normalised observations, which are clipped to [-limit, limit]; inf means no limit.
+        limit: Normalised observations are clipped to [-limit, limit]; inf means no limit.
         group: The group of observations that the critics use.
         generator: Draws the initial weights.
     """

@@ -25,7 +25,7 @@ class ValueFunction(Normalized):
         time_orders: Highest power of the time features t, t^2, ... with t = step / 1000 (as in mjrl); 0 means no time
             features. Time features help if the time limit is not observable, because returns then depend on the step.
         normalize: Whether to normalise observations by their running mean and variance.
-        limit: Limit of normalised observations, which are clipped to [-limit, limit]; inf means no limit.
+        limit: Normalised observations are clipped to [-limit, limit]; inf means no limit.
         discount: Discount factor of the predicted returns, if known.
         group: The group of observations that the value function uses.
         generator: Draws the initial weights.
@@ -40,9 +40,9 @@ class ValueFunction(Normalized):
     group: str
     """The group of observations that the value function uses."""
     shift: torch.Tensor
-    """Offset of the scaled output, which is the mean of the returns."""
+    """Offset of the scaled output: the mean of the returns."""
     scale: torch.Tensor
-    """Factor on the network's output, which is the standard deviation of the returns."""
+    """Factor on the network's output: the standard deviation of the returns."""
     discount: float | None
     """Discount factor of the predicted returns, if known."""
     orders: torch.Tensor
@@ -150,7 +150,7 @@ class ValueFunction(Normalized):
 
 
 BOUND = 10.0
-"""Number of scales from the mean beyond which returns and advantages are outliers."""
+"""Number of standard deviations from the mean beyond which returns and advantages are outliers."""
 
 
 def value_group(env: Env, given: str | None) -> str:

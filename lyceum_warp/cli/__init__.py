@@ -18,11 +18,11 @@ _COMMANDS = {
     "tasks": ("list_tasks", "Tasks", "List the tasks of the package, their sizes and the sources of their models."),
     "new": ("new_task", "New", "Write a task file for a model."),
     "check": ("check", "Check", "Check that a task follows every rule of an environment."),
-    "train": ("train", "Train", "Train a policy on a task, with the natural policy gradient or with PPO."),
+    "train": ("train", "Train", "Train a policy on a task, with NPG, PPO or SAC."),
     "eval": ("evaluate", "Eval", "Evaluate a run's policy, and print statistics of its episodes."),
     "export": ("export", "Export", "Write a run's policy to an ONNX or .pt2 file."),
     "plan": ("plan", "Plan", "Control a task with a planner, and report rewards, success and planning times."),
-    "tune": ("tune", "Tune", "Measure physics options of a task, and find the fastest with the same returns."),
+    "tune": ("tune", "Tune", "Find the fastest physics options that do not change a task's returns."),
     "view": ("view", "View", "Show a task, a policy, a planner or saved episodes in a browser."),
     "bench": ("bench", "Bench", "Run an experiment or another program of bench/."),
 }

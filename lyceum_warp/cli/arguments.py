@@ -20,7 +20,7 @@ ParamWords = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
     tyro.conf.arg(
         metavar="NAME=VALUE",
-        help="A parameter of the task. A vector is written as NAME=0.7,inf, a table as NAME=file.npy. The flag "
+        help="A parameter of the task. Write a vector as NAME=0.7,inf and a table as NAME=file.npy. The flag "
         "may be repeated.",
     ),
 ]
@@ -90,7 +90,7 @@ def optional_flags(
                     setattr(cls, name, field.default if default is None else None)
                 value = getattr(cls, name)
                 flag = own.pop(name, None) or hints[name]
-                if value is None and flag is hints[name]:  # the first sentence explains None, which a flag cannot have
+                if value is None and flag is hints[name]:  # flags do not accept None, which the first sentence explains
                     (kind_of_flag,) = {*(typing.get_args(flag) if isinstance(flag, _UNIONS) else [flag])} - {type(None)}
                     flag = Annotated[kind_of_flag | None, tyro.conf.DisallowNone]
                 text = default[name] if isinstance(default, Mapping) else default or ""
@@ -103,7 +103,7 @@ def optional_flags(
 
 
 def given(flags: Any) -> dict[str, Any]:
-    """Return the values of the flags that differ from their defaults, by name.
+    """Return the flags that were changed from their defaults, as a dict of values by name.
 
     Raises:
         ValueError: A limit of the solver is not of the form NAME=VALUE.
@@ -136,7 +136,7 @@ class EnvFlags:
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto (the default): warp on a CUDA device and mujoco on the CPU."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu (the default), or a CUDA device such as cuda:0. Without this flag a run with the engine auto is evaluated on
+    """cpu (the default), or a CUDA device such as cuda:0. Without this flag, a run with the engine auto is evaluated on
     the CPU, where a few worlds step fastest."""
 
 
@@ -145,8 +145,8 @@ class Physics:
     """Physics options of the worlds. The defaults come from the run, the task or its model."""
 
     physics: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """One of the task's physics by name, as listed by lyceum-warp tasks, or exact for the task's own. Flags of single
-    physics options override it."""
+    """One of the task's physics by name, as listed by lyceum-warp tasks, or exact for the task's own
+    physics. Flags of single physics options override it."""
     solver: Repeated = ()
     """A limit of the constraint solver, such as iterations=4, ls_iterations=10 or noslip_iterations=0; may be repeated.
     The default limits come from the model."""

@@ -113,7 +113,7 @@ _COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skippe
 columns."""
 
 _BAR_WIDTH = 36
-"""The width of the bar, the iteration number and the times in characters."""
+"""The total width, in characters, of the progress bar, the iteration number and the times."""
 
 
 def counted(number: int, what: str) -> str:
@@ -160,8 +160,7 @@ def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omi
 def curve_table(rows: list[dict[str, float | None]], console: Console) -> Table:
     """Make a table of at most 15 iterations of a run, without empty columns and columns that do not fit the console.
 
-    Iterations without an evaluation of the mean policy are omitted if at least 4 between the first and the last have
-    one.
+    Iterations that did not evaluate the mean policy are omitted if at least 4 others remain between the first and last.
     """
     known = [_known(row) for row in rows]
     between = [row for row in known[1:-1] if "mean_return" in row]
@@ -210,8 +209,8 @@ def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
 class PlanDisplay:
     """Shows the progress of a planner's episode: a live line on a terminal, and a line at the end of the episode.
 
-    With ``real_time`` the live line shows the rate of plans and the age of the action, otherwise the rate of the plant.
-    Rates are averaged over the episode so far.
+    With ``real_time``, the live line shows the rate of plans and the age of the action. Otherwise it shows the rate of
+    the plant. Rates are averaged over the episode so far.
     """
 
     def __init__(

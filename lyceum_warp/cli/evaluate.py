@@ -51,13 +51,13 @@ class Eval:
     )  # fmt: skip
 
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|TASK")]
-    """The run's folder, or with --pretrained the name of a task."""
+    """The run's folder; with --pretrained, the name of a task."""
     pretrained: bool = False
     """Whether to evaluate the package's pretrained policy of a task."""
     which: str = "last"
     """The policy to evaluate: last, best, or the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """A task, by name or file, that replaces the run's task and its physics and defaults. The replacement may be the
+    """A task, by name or file, to use instead of the run's task, with its own physics and defaults. It may be the
     current version of the run's task. The observations and actions of both tasks must have the same sizes."""
     param: ParamWords = ()
     episodes: int = 32
@@ -67,11 +67,11 @@ class Eval:
     nworld: int = 32
     """Maximum number of worlds; there are never more worlds than episodes."""
     video: bool = False
-    """Whether to write a video of one episode: eval.mp4 in the run's folder, or with --pretrained TASK.mp4."""
+    """Whether to write a video of one episode: eval.mp4 in the run's folder, or TASK.mp4 with --pretrained."""
     camera: CameraWords = ()
     transfer: bool = False
-    """Whether to play the episodes on both engines, and under each of the task's physics, and to print the differences
-    with a verdict. The Warp engine runs on --device, by default on a GPU if there is one."""
+    """Whether to play the episodes on both engines and under each of the task's physics. The command then prints the
+    differences and a verdict. The Warp engine runs on --device, by default on a GPU if there is one."""
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder for the episodes, one file each, in the format of lyceum-warp plan: episode-000.npz and so
     on."""
@@ -170,8 +170,8 @@ def run_worlds(
 
     Args:
         run: The run.
-        words: Options that override the run's; with the engine auto and no device, the worlds run on the CPU.
-        params: Parameters that override the run's.
+        words: Options that override the run's options; with the engine auto and no device, the worlds run on the CPU.
+        params: Parameters that override the run's parameters.
         nworld: Number of worlds.
         task: A different task, with its own options and parameters.
         trust: Whether to execute a run's task although this user did not make the run on this machine.

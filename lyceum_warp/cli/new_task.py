@@ -28,7 +28,7 @@ _SOURCES: dict[str, Callable[[str], ModelFile]] = {
 """Functions that locate a model, by the prefix before the colon in --model."""
 
 _TAKEN = ("World", "Params", "Row")
-"""Names that a generated file defines, which a task's class therefore cannot have."""
+"""Names that a generated file uses for other purposes, so a task's class cannot have them."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -83,17 +83,18 @@ class Settings:
 class Plan:
     """Control a task with a planner that replans at every step, and report rewards, success and planning times.
 
-    The planner is MPPI, or with --update the cross-entropy method (cem) or predictive sampling. The default settings of
+    The planner is MPPI; --update selects the cross-entropy method (cem) or predictive sampling. The default settings of
     the planner come from the task. Physics options (--physics, --integrator, ...) apply only to the planner; --physics
     exact is the controlled world's physics.
 
-    With --real-time the world keeps its rate. The command then measures planning times for a few seconds, and chooses
-    the largest number of samples that meets the deadline on this machine, or if none does, a shorter horizon or other
-    physics of the task. Values of --samples, --horizon and --physics that you give are never changed.
+    With --real-time, the world does not wait for plans. The command then measures planning times for a few seconds, and
+    chooses the largest number of samples that meets the deadline on this machine. If no number meets it, the command
+    tries a shorter horizon and then other physics of the task. Values of --samples, --horizon and --physics that you
+    give are never changed.
 
     The command writes config.json, versions.json, report.json, plan.png, a video of the first episode (video.mp4), and
     one file per episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy) into a
-    folder. After Ctrl-C the interrupted episode is saved too, but is not part of the report.
+    folder. After Ctrl-C, the interrupted episode is saved, too, but is not part of the report.
 
     $ lyceum-warp plan reach
     $ lyceum-warp plan reach --real-time --episodes 10
@@ -129,7 +130,7 @@ class Plan:
     final state."""
     param: ParamWords = ()
     planner_param: Repeated = ()
-    """A parameter of the planner's model that differs from the controlled world's; the flag may be repeated."""
+    """A parameter of the task that only the planner's worlds use; the flag may be repeated."""
     planner_model: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """The planner's model, if it differs from the controlled world's."""
     video: bool = True
@@ -244,10 +245,10 @@ _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 
 
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
-    """Choose the settings that no flag gives, from measured planning times; return None if flags give all settings.
+    """Measure planning times to choose the settings that no flag gives; return None if flags give all settings.
 
-    A plan must be ready within a step of the plant. If no setting is fast enough, a plan may take a step of the
-    planner, which may be longer.
+    A plan must be ready within a step of the plant. If no setting is fast enough, a plan may take as long as a step of
+    the planner.
     """
     task, flags = plant.task.task, given(options.mppi)
     config = options.mppi.on_top_of(task_config(task))

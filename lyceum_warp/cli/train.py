@@ -73,7 +73,7 @@ class Train:
     $ lyceum-warp train half_cheetah --algorithm sac --iterations 1000
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
-    The processes of torchrun share the worlds, even across machines. With --device cuda each process uses the GPU of
+    The processes of torchrun share the worlds, even across machines. With --device cuda, each process uses the GPU of
     its local rank. The number of processes affects only the rounding of the results, and may change when a run is
     resumed. Rank 0 writes files and messages. After Ctrl-C or SIGTERM to torchrun or to any process, all processes
     finish the iteration and end together; torchrun waits for them for 30 s, or for its --shutdown-timeout.
@@ -86,10 +86,10 @@ class Train:
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class."""
     algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac")] = None
-    """npg, the natural policy gradient; ppo; or sac, soft actor-critic with a replay buffer. By default the algorithm
+    """npg, the natural policy gradient; ppo; or sac, soft actor-critic with a replay buffer. By default, the algorithm
     that the task suggests, with its hyperparameters: ppo for walking robots, npg for others."""
     iterations: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Iterations in total, including those before --resume; by default those that the task suggests, or 100."""
+    """Total number of iterations, including those before --resume; by default as many as the task suggests, or 100."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Seed of the networks, the noise and the worlds' initial states."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -98,7 +98,7 @@ class Train:
     """Continue the run in the given folder exactly, with its settings, up to --iterations."""
     from_run: Annotated[Path | None, tyro.conf.arg(name="from", metavar="RUN")] = None
     """Start a new run from the policy, the value function and the normaliser of another run. The run's settings are the
-    defaults, but a different TASK has its own parameters, and a different --algorithm its own hyperparameters."""
+    defaults, but a different TASK has its own parameters, and a different --algorithm has its own hyperparameters."""
     which: str = "last"
     """The policy to start from with --from: last, best, or the number of a saved iteration."""
     target_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
@@ -129,10 +129,10 @@ class Train:
     none."""
     camera: CameraWords = ()
     transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
-    """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default only two
+    """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default, only two
     cheap comparisons run: the C engine after training on a GPU, and the task's own physics if the run has other
-    physics. With --transfer a policy trained on CPU cores is also tested on the Warp engine, whose kernels may take
-    minutes to compile, and under each physics of the task."""
+    physics. With --transfer, a policy trained on CPU cores is also tested under each physics of the task, and on the
+    Warp engine, whose kernels may take minutes to compile."""
     trust: Trust = False
     take_over: bool = False
     """Continue a run that another process has locked, on this or another host. The process that held the lock ends at
@@ -212,7 +212,7 @@ class Train:
             return self._report(run, learner, console)
 
     def _suggestion(self) -> Training:
-        """Return the task's settings for training, or only the flag's algorithm if that is another one."""
+        """Return the settings that the task suggests, or none of them if a flag gives another algorithm."""
         assert self.task is not None
         suggestion = find_task(self.task).training
         if self.algorithm in (None, suggestion.algorithm):
@@ -262,7 +262,7 @@ class Train:
         )  # fmt: skip
 
     def _learner(self, source: Run | None, team: Team) -> tuple[Learner, Path, dict[str, Any]]:
-        """Make the learner, and return it, the run's folder and additional entries for config.json."""
+        """Make the learner; return the learner, the run's folder and additional entries for config.json."""
         configuration = self.configuration(source, team)
         if self.out is not None and team.leads:
             Run.check_free(self.out)

@@ -1,4 +1,4 @@
-"""Measure physics options of a task, and find the fastest with the same returns: lyceum-warp tune."""
+"""Find the fastest physics options that do not change a task's returns: lyceum-warp tune."""
 
 import dataclasses
 from collections.abc import Callable
@@ -20,7 +20,7 @@ Cell: TypeAlias = Callable[[dict[str, Any]], str]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Tune:
-    """Measure the gain and the side effects of each physics option of a task, and print the fastest with equal returns.
+    """Measure the gains and side effects of physics options, and find the fastest that do not change a task's returns.
 
     Each setting is compared with the unchanged task: steps per second, memory, faults, the divergence of trajectories,
     and the returns of the same episodes under random actions and, with --run, under a policy. Every result is appended
@@ -44,11 +44,11 @@ class Tune:
     short: bool = False
     """Compare the first 100 steps of episodes, for a few seconds for each setting, instead of whole episodes."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Number of episodes of each setting. By default as many as the interval needs, within a minute (5 s with
-    --short)."""
+    """Number of episodes of each setting. By default, as many as the confidence interval needs, for at most a
+    minute (5 s with --short)."""
     planning: bool = False
-    """Find physics for the task's planner: compare planning times, and compare how coarser physics and the task's own
-    rank the same samples. --nworld is then the number of samples, and --episodes the number of states of each kind."""
+    """Find physics for the task's planner: compare planning times, and test whether coarser physics rank samples as the
+    task's own physics do. --nworld is then the number of samples, and --episodes the number of states of each kind."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of worlds; by default 256, or 4096 on a GPU. With --planning, the number of the planner's samples, by
     default 64."""

@@ -11,7 +11,7 @@ from lyceum_warp import walkers
 from lyceum_warp.cli.task_text import literal
 
 TRAINING = "--algorithm ppo --device cuda --iterations 800"
-"""Options of lyceum-warp train by which robots learn to walk on one GPU."""
+"""Options of lyceum-warp train with which robots learn to walk on one GPU."""
 
 _STEP = 0.02
 """Seconds in a step."""
@@ -152,7 +152,7 @@ class Walker:
         return names
 
     def _moved(self) -> np.ndarray:
-        """Return the mask of the joints that an actuator moves, (njnt,), also through a tendon."""
+        """Return the mask, (njnt,), of the joints that an actuator moves directly or through a tendon."""
         m, d = self.model, self.data
         mujoco.mj_forward(m, d)
         moment = np.zeros((m.nu, m.nv))

@@ -40,21 +40,21 @@ _NICE = 10  # the niceness of the subprocess of `lw.RunViewer`
 
 @optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)")
 class Place:
-    """Engine and device of the shown worlds, or with --mppi of the planner's worlds."""
+    """Engine and device of the displayed worlds; with --mppi, of the planner's worlds."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu, or a CUDA device such as cuda:0. By default a run with engine auto is shown on the CPU."""
+    """cpu, or a CUDA device such as cuda:0. By default, a run with engine auto is shown on the CPU."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View:
     """Show a task, a policy, a planner or episodes in a browser.
 
-    For a task, the viewer shows its worlds, lets you push bodies with the mouse, and with --mppi runs a planner in real
-    time. For a run, it shows the run's policy, and with --follow the newest policy while the run trains. Episode files,
-    or a folder of lyceum-warp plan, are played back.
+    For a task, the viewer shows its worlds, lets you push bodies with the mouse and, with --mppi, runs a planner in
+    real time. For a run, it shows the run's policy; with --follow, it shows the newest policy while the run trains.
+    Episode files, or a folder of lyceum-warp plan, are played back.
 
     The viewer is a web page. The command prints the address of the page, which contains a secret, and over ssh also the
     command that forwards the port.
@@ -74,7 +74,7 @@ class View:
     pretrained: bool = False
     """Show the package's pretrained policy of a task."""
     mppi: bool = False
-    """Control the shown world with a planner: MPPI, or with --update a different one."""
+    """Control the displayed world with a planner: MPPI, or the planner that --update selects."""
     follow: bool = False
     """Show the newest policy of a run while it trains."""
     which: str = "last"
@@ -203,7 +203,7 @@ def _planner(options: View, env: Env) -> MPPI:
 
 
 def _words(options: View) -> dict[str, Any]:
-    """Return the options of the worlds, or with --mppi of the planner's worlds."""
+    """Return the options of the displayed worlds; with --mppi, of the planner's worlds."""
     return given(options.place) | given(options.physics)
 
 
@@ -238,7 +238,7 @@ def attached() -> None:
 
 
 def _end_with_parent() -> None:
-    """Wait for EOF on stdin, which follows any end of the parent process, even SIGKILL; then end this process."""
+    """End this process at EOF on stdin: the parent process has ended, perhaps by SIGKILL."""
     with contextlib.suppress(OSError, ValueError):
         sys.stdin.read()
     os.kill(os.getpid(), signal.SIGTERM)

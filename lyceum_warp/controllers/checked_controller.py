@@ -21,9 +21,9 @@ class CheckedController:
         env: The plant.
 
     Raises:
-        ValueError: The controller cannot be called with a state and an observation, uses the plant for planning or
-            plans for several plants, or has a time step that is neither a multiple nor a fraction of the plant's time
-            step.
+        ValueError: The controller cannot be called with a state and an observation, plans in the plant itself, or plans
+            for several plants; or neither the controller's time step nor the plant's time step is a multiple of the
+            other.
     """
 
     def __init__(self, controller: Controller, env: Env) -> None:
@@ -92,8 +92,9 @@ class CheckedController:
     def action(self, plan: torch.Tensor, plant_steps: int) -> torch.Tensor:
         """Select the action for the plant ``plant_steps`` steps after the plan's initial state.
 
-        If a plan's step covers several steps of the plant, all plant steps apply the same action, or with
-        ``between="linear"`` interpolate to the next action. After the end of the plan, the plan's last action applies.
+        If a plan's step covers several steps of the plant, all plant steps apply the same action; with
+        ``between="linear"``, they interpolate to the next action. After the end of the plan, the plan's last action
+        applies.
 
         Args:
             plan: The plan, (horizon, nact).
@@ -180,7 +181,7 @@ def _check_call(controller: Any) -> None:
 
 
 def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
-    """Get a function's signature, or None if it is unknown, as for some C functions."""
+    """Get a function's signature; None if it is unknown (for some C functions)."""
     try:
         return inspect.signature(function)
     except (TypeError, ValueError):

@@ -39,48 +39,48 @@ class ControlReport:
     plans: int
     """Number of plans, excluding the first plan of each trajectory."""
     first_plan_ms: float | None
-    """Longest planning time of a trajectory's first plan, milliseconds."""
+    """Longest planning time of a trajectory's first plan, in milliseconds."""
     plan_mean_ms: float | None
-    """Mean planning time, milliseconds."""
+    """Mean planning time, in milliseconds."""
     plan_p50_ms: float | None
-    """Median planning time, milliseconds; needs 2 plans. All quantiles are interpolated."""
+    """Median planning time, in milliseconds; needs 2 plans. All quantiles are interpolated."""
     plan_p90_ms: float | None
-    """90 % quantile of the planning time, milliseconds; needs 10 plans."""
+    """90 % quantile of the planning time, in milliseconds; needs 10 plans."""
     plan_p99_ms: float | None
-    """99 % quantile of the planning time, milliseconds; needs 100 plans."""
+    """99 % quantile of the planning time, in milliseconds; needs 100 plans."""
     plan_p99_9_ms: float | None
-    """99.9 % quantile of the planning time, milliseconds; needs 1000 plans."""
+    """99.9 % quantile of the planning time, in milliseconds; needs 1000 plans."""
     plan_max_ms: float | None
-    """Longest planning time, milliseconds."""
+    """Longest planning time, in milliseconds."""
     plan_jitter_ms: float | None
-    """Standard deviation of the planning time, milliseconds."""
+    """Standard deviation of the planning time, in milliseconds."""
     plans_per_second: float | None
     """Number of finished plans per second of wall time."""
     deadline_ms: float
-    """Deadline of a plan, milliseconds: 1 / ``rate``, or the plant's period."""
+    """Deadline of a plan, in milliseconds: 1 / ``rate``, or the plant's period."""
     misses: int
     """Number of plans with a planning time above the deadline."""
     miss_share: float | None
     """Fraction of plans with a planning time above the deadline."""
     blind_plans: int | None
-    """Number of plans, including first plans, without a valid sample. A plan without a valid sample is the previous
+    """Number of plans without a valid sample. First plans are included. A plan without a valid sample is the previous
     plan shifted in time."""
     known_plans: int
-    """Number of plans with a known number of failed samples, including first plans."""
+    """Number of plans with a known number of failed samples. First plans are included."""
     failed_share: float | None
     """Fraction of failed samples in the plans with a known number of failed samples."""
     effective_samples_mean: float | None
     """Mean effective sample size of a plan: 1 if a single sample has all the weight, 0 if all samples failed."""
     tick_jitter_ms: float | None
-    """Standard deviation of the delay of the plant's steps, milliseconds; None in a synchronous run."""
+    """Standard deviation of the delay of the plant's steps, in milliseconds; None in a synchronous run."""
     tick_delay_max_ms: float | None
-    """Longest delay of a step, milliseconds."""
+    """Longest delay of a step, in milliseconds."""
     late_ticks: int | None
     """Number of steps that started late because the previous step was not finished in time."""
     age_mean_ms: float
-    """Mean age of the applied actions, milliseconds; see ``Trajectory.ages``."""
+    """Mean age of the applied actions, in milliseconds; see ``Trajectory.ages``."""
     age_max_ms: float
-    """Maximum age of the applied actions, milliseconds."""
+    """Maximum age of the applied actions, in milliseconds."""
     age_steps_mean: float
     """Mean age of the applied actions, in steps of the plant."""
     age_steps_max: int
@@ -88,7 +88,7 @@ class ControlReport:
     real_time_factor: float
     """Simulated seconds per second of wall time, over all episodes."""
     episode_seconds_mean: float
-    """Mean wall time of an episode, seconds."""
+    """Mean wall time of an episode, in seconds."""
     return_mean: float
     """Mean return."""
     return_std: float | None
@@ -106,7 +106,7 @@ class ControlReport:
     controller: Mapping[str, Any]
     """Name and settings of the controller; see ``Trajectory.controller``."""
     versions: Mapping[str, Any]
-    """Versions of packages and Python, and the machine, of the first trajectory."""
+    """Versions of packages and of Python, and the machine, as stored in the first trajectory."""
 
     def to_json(self) -> str:
         """Convert the report to JSON; missing and non-finite numbers become null."""

@@ -23,7 +23,7 @@ class Controller(Protocol):
             obs: The plant's observation, (nobs,) float32, on the plant's device.
 
         Returns:
-            The action, (nu,), which is finite and on any device.
+            The action, (nu,): finite numbers on any device.
         """
         ...
 
@@ -42,9 +42,9 @@ class PlanningController(Controller, Protocol):
             state: See ``Controller``.
             obs: See ``Controller``.
             shift: Number of steps of length ``timestep`` since the state of the last plan; 0 for the first plan after a
-                reset. With ``reset=False``, the loops assume that the last plan was made in the previous step, or with
-                ``replan_every`` at the last step that was due. The loops pass ``shift`` only to controllers with an
-                argument ``shift``.
+                reset. With ``reset=False``, the loops assume that the last plan was made in the previous step or, with
+                ``replan_every``, in the last step for which a plan was due. The loops pass ``shift`` only to
+                controllers with an argument ``shift``.
 
         Returns:
             The first action of the plan, (nu,). If the controller has ``actions``, the loops read the plan from
@@ -58,7 +58,7 @@ class PlanningController(Controller, Protocol):
 
     @property
     def actions(self) -> torch.Tensor:
-        """The last plan, (horizon, nact), which is finite. The plan's first row is the action for the given state."""
+        """The last plan, (horizon, nact): finite numbers. The plan's first row is the action for the given state."""
         ...
 
     @property
@@ -86,7 +86,7 @@ class PlanningController(Controller, Protocol):
 
     @property
     def summary(self) -> Mapping[str, float]:
-        """Quality of the last plan: ``failed_samples``, and ``effective_samples``, the effective sample size."""
+        """Quality of the last plan: ``failed_samples`` and ``effective_samples`` (the effective sample size)."""
         ...
 
     @property

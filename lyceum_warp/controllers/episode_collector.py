@@ -16,12 +16,12 @@ from lyceum_warp.support.validate import check_flag, check_function, check_kind,
 @document_attributes
 @dataclasses.dataclass(frozen=True)
 class ControlProgress:
-    """Progress of an episode after a step, which is the argument of ``on_step``."""
+    """Progress of an episode after a step: the argument of ``on_step``."""
 
     step: int
     """Number of steps so far."""
     time: float
-    """Wall time so far, including the last step, seconds."""
+    """Wall time so far, including the last step, in seconds."""
     reward: float
     """Reward of the step."""
     eval: float
@@ -29,9 +29,9 @@ class ControlProgress:
     success: bool
     """Whether the state after the step is a success."""
     plan_time: float
-    """Planning time of the plan that contains the action, seconds."""
+    """Planning time of the plan that contains the action, in seconds."""
     age: float
-    """Age of the action when it was applied, seconds; see ``Trajectory.ages``."""
+    """Age of the action when it was applied, in seconds; see ``Trajectory.ages``."""
     plans: int
     """Number of plans so far, up to the plan that contains the action."""
 
@@ -100,7 +100,7 @@ class EpisodeCollector:
         env: The plant, in its initial state.
         controller: The checked controller.
         mode: "sync" or "async"; see ``Trajectory.mode``.
-        period: Wall time between two steps, seconds.
+        period: Wall time between two steps, in seconds.
         seed: Seed of the run.
         now: Function that reads the clock, in seconds.
     """
@@ -129,7 +129,7 @@ class EpisodeCollector:
         return self._now() - self.start
 
     def add_plan(self, plan: TimedPlan, quality: tuple[float, float]) -> None:
-        """Add a finished plan with its ``quality``, the number of failed samples and the effective sample size."""
+        """Add a finished plan; ``quality`` is its number of failed samples and its effective sample size."""
         self._plans.append((plan.step, plan.begun - self.start, plan.seconds, *quality))
 
     def before_step(self, plan: TimedPlan, now: float, age: float, *, late: bool) -> None:
@@ -138,7 +138,7 @@ class EpisodeCollector:
         Args:
             plan: The plan that contains the action.
             now: Seconds since the clock started.
-            age: Age of the action, seconds.
+            age: Age of the action, in seconds.
             late: Whether the step starts late.
         """
         self._applied.append((self.env.action[0].clone(), plan, age, late))

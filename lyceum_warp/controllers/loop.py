@@ -58,7 +58,7 @@ def control(
     check_arguments(env, reset=reset, on_step=on_step, on_abort=on_abort)
     every = whole_number("replan_every", replan_every, low=1)
     checked = CheckedController(controller, env)
-    # count steps from the reset, so that a run in several parts shifts plans as a single run does
+    # count steps from the reset, so that a continued run shifts plans like an uninterrupted run
     limit, first = begin_episode(env, checked, steps, seed, reset=reset)
     episode = EpisodeCollector(env, checked, mode="sync", period=env.timestep, seed=seed)
     planned = max(first - 1, 0) // every * every

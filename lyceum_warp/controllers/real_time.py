@@ -52,10 +52,10 @@ def control_async(
     The plant steps in the calling thread. Step k of the plant is due at ``k * period``; a late step does not delay
     later steps. The controller plans in a second thread, always from the newest state, and only once from each state.
 
-    Each step applies an action of the newest finished plan, selected by the time since the plan's initial state; after
-    the end of the plan, its last action applies. Selecting actions by time compensates for planning delays up to the
-    length of the plan. The plant waits for the first plan, so the first action has age 0. Later actions are at least
-    one step old, and exactly one step old if every plan takes less than a period.
+    Each step applies an action of the newest finished plan. The time since the plan's initial state selects the action;
+    after the end of the plan, its last action applies. Selecting actions by time compensates for planning delays up to
+    the length of the plan. The plant waits for the first plan, so the first action has age 0. Later actions are at
+    least one step old, and exactly one step old if every plan takes less than a period.
 
     Before the clock starts, a warm-up calls the controller three times with the first state, steps the plant three
     times, and restores the plant's state. The warm-up loads kernels and captures graphs, because Warp cannot capture a
@@ -74,7 +74,8 @@ def control_async(
         env: The plant, an environment of one world made with ``autoreset=False``.
         controller: Controller that is called in the second thread; see ``lw.Controller``. The controller must plan in a
             separate environment.
-        period: Wall time between steps, seconds; by default the plant's time step, which is real time.
+        period: Wall time between steps, in seconds; by default the plant's time step, so that the plant runs in real
+            time.
         steps: Maximum number of steps, if the episode does not end earlier.
         seed: Seed of the initial state and of the controller.
         reset: Whether to reset the plant and the controller first. If False, the run continues from the plant's state
@@ -83,7 +84,7 @@ def control_async(
         on_abort: Called with the trajectory of the complete steps if an exception, such as Ctrl-C, ends the run after
             the first step. The trajectory's ``done_reason`` is 0. The loop raises the exception after calling
             ``on_abort``.
-        clock: Clock that replaces the wall clock, such as a subclass that does other work while the plant waits.
+        clock: Clock that replaces the wall clock, such as a clock that does other work while the plant waits.
 
     Returns:
         The episode.
@@ -150,7 +151,7 @@ def run_plant(
     limit: int,
     on_step: OnStep | None,
 ) -> float:
-    """Step the plant by the clock until its episode ends, and return the end of the last period, seconds."""
+    """Step the plant by the clock until its episode ends. Return the end of the last period, in seconds."""
     start, period = episode.start, episode.period
     for k in range(limit):
         due = start + k * period
@@ -209,14 +210,14 @@ class PlannerThread:
         self._plans: list[TimedPlan] = []
         self._qualities: list[tuple[float, float]] = []  # one entry per plan, appended after the plan
         self._error: BaseException | None = None
-        self._begun = threading.Event()  # set after the first plan, or an error
+        self._begun = threading.Event()  # set after the first plan or after an error
         # use SimpleQueue, which is implemented in C, so that no thread loses the GIL while it holds the queue's lock
         self._states: queue.SimpleQueue[tuple[int, torch.Tensor, torch.Tensor] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="lyceum_warp planner", daemon=True)
         self._thread.start()
 
     def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor) -> None:
-        """Make the thread plan from a state next, unless a newer state follows.
+        """Pass a state to the thread. The thread plans next from the newest state.
 
         The caller must not change the tensors.
         """

@@ -46,13 +46,13 @@ class RealTimeChoice:
     planning_time: float
     """Planning time of the setting."""
     deadline: float
-    """Longest permitted planning time, seconds."""
+    """Longest permitted planning time, in seconds."""
     larger: tuple[int, float] | None
-    """The smallest measured number of samples that misses the deadline, and the planning time with it."""
+    """The smallest measured number of samples that misses the deadline, and its planning time."""
 
     @property
     def replan_every(self) -> int:
-        """Number of deadlines from one plan to the next plan; 1 if plans meet the deadline."""
+        """Number of steps from one plan to the next, if a step takes one deadline; 1 if plans meet the deadline."""
         return max(1, math.ceil(self.planning_time / (SHARE * self.deadline)))
 
     def __str__(self) -> str:
@@ -80,8 +80,8 @@ def choose_setting(
         samples: Numbers of samples, in ascending order.
         horizons: Horizons in the order of preference.
         physics: Names of physics options in the order of preference.
-        measure: Function from a setting to the 99 % quantile of its planning times, seconds.
-        deadline: Longest permitted planning time, seconds.
+        measure: Function from a setting to the 99 % quantile of its planning times, in seconds.
+        deadline: Longest permitted planning time, in seconds.
 
     Returns:
         The choice. If no setting meets the deadline, the choice is the fastest measured setting.
@@ -117,7 +117,7 @@ def planning_time(plant: Env, planner: Controller) -> float:
         planner: The planner.
 
     Returns:
-        The 99 % quantile of the planning times, seconds.
+        The 99 % quantile of the planning times, in seconds.
     """
     before = plant.get_state()
     done = control_async(plant, planner, steps=max(_STEPS, round(_SECONDS / plant.timestep)), seed=0)

@@ -45,9 +45,9 @@ def episode_env(
     The environment has the parameters, the model and the physics options of the first episode. ``env.set_state``
     accepts the states of all given episodes.
 
-    Files of episodes may come from other people, and name a task file that is run as Python code. Without ``task``,
-    this function runs a task file only if the file and its folder belong to this user or to root, and no other user can
-    write to the file or folder.
+    The file of an episode names a task file, which is run as Python code. The episode may come from another person.
+    Without ``task``, this function runs a task file only if the file and its folder belong to this user or to root, and
+    no other user can write to the file or folder.
 
     Args:
         episodes: The episodes, as ``load_episodes`` returns them.
@@ -178,7 +178,7 @@ def _foreign(file: Path) -> str:
 
 
 def _is_private(group: int) -> bool:
-    """Check whether a group belongs to root or has only this user as a member, as on many systems."""
+    """Check whether a group is root's, or has only this user as a member; many systems have one for each user."""
     import grp
     import pwd
 

@@ -39,7 +39,7 @@ _SCALARS: dict[str, Callable[[Any], Any]] = {
 @document_attributes
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trajectory:
-    """One episode of one world, the plant, under a controller. All tensors are on the CPU.
+    """One episode of a controlled world, which is called the plant. All tensors are on the CPU.
 
     In step k, the plant moves from state k to state k + 1 under action k. To replay the episode bit for bit on the same
     engine, set the first state with ``set_state`` and step with each action.
@@ -61,10 +61,10 @@ class Trajectory:
     success: torch.Tensor
     """Whether the state after each step is a success, (steps,) bool."""
     times: torch.Tensor
-    """Time at which each action was applied, (steps,) float64, seconds."""
+    """Time at which each action was applied, (steps,) float64, in seconds."""
     ages: torch.Tensor
-    """Age of each action when it was applied, (steps,) float64, seconds. The age is the time since the plant was in the
-    plan's initial state. In a synchronous run, the age of a plan's first action is the planning time."""
+    """Age of each action when it was applied, (steps,) float64, in seconds. The age is the time since the plant was in
+    the plan's initial state. In a synchronous run, the age of a plan's first action is the planning time."""
     late: torch.Tensor
     """Whether each step started late because the previous step was not finished in time, (steps,) bool. In a
     synchronous run, no step is late."""
@@ -73,19 +73,20 @@ class Trajectory:
     plan_steps: torch.Tensor
     """Index of each plan's initial state, (plans,) int64."""
     plan_starts: torch.Tensor
-    """Time at which planning started, (plans,) float64, seconds; negative for the first plan of an asynchronous run."""
+    """Time at which planning started, (plans,) float64, in seconds; negative for the first plan of an asynchronous
+    run."""
     plan_times: torch.Tensor
-    """Planning time, including the copy of the actions to the CPU, (plans,) float64, seconds."""
+    """Planning time, including the copy of the actions to the CPU, (plans,) float64, in seconds."""
     plan_failed: torch.Tensor
     """Number of failed samples of each plan, (plans,) float64; NaN if unknown."""
     plan_effective: torch.Tensor
     """Effective sample size of each plan, (plans,) float64: 0 if all samples failed, NaN if unknown."""
     timestep: float
-    """Simulated duration of a step, seconds."""
+    """Simulated duration of a step, in seconds."""
     period: float
-    """Wall time between two steps, seconds; in a synchronous run equal to ``timestep``."""
+    """Wall time between two steps, in seconds; equal to ``timestep`` in a synchronous run."""
     wall_seconds: float
-    """Wall time of the run, seconds."""
+    """Wall time of the run, in seconds."""
     mode: str
     """"sync" if the plant waited for each plan, "async" if it ran in real time."""
     done_reason: int
@@ -109,9 +110,9 @@ class Trajectory:
     action_names: Sequence[str]
     """Names of the action columns."""
     source: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Arguments of ``lw.make`` from which ``episode_env`` rebuilds the plant: ``task``, a name or "file:class" (None
-    for a task from a notebook or script); ``params``, the names of the given parameters; and ``options``. Files of
-    earlier releases lack these arguments."""
+    """Arguments of ``lw.make``, with which ``episode_env`` rebuilds the plant: ``task`` is a name or "file:class" (None
+    for a task from a notebook or script); ``params`` lists the names of the given parameters; and ``options`` holds the
+    options. Files of earlier releases lack these arguments."""
 
     @property
     def steps(self) -> int:

@@ -24,7 +24,7 @@ from lyceum_warp.support.arrays import part_of_worlds
 from lyceum_warp.support.upstream import TILES_ON_CPU, separate_captures, separate_tiles, tiles
 
 Calls = tuple[Callable[[], None], ...]
-"""The result of ``Graphs.sequence``, functions to call in order."""
+"""The result of ``Graphs.sequence``: functions to call in order."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Phase:
     """
 
     name: str
-    """Name of the phase, which ``lyceum_warp.testing`` uses."""
+    """Name of the phase, for ``lyceum_warp.testing``."""
     run: Callable[[], object]
     """The function to run, without arguments."""
     engine: bool = False
@@ -111,9 +111,9 @@ separate_tiles()
 
 @contextlib.contextmanager
 def capturing() -> Iterator[None]:
-    """Exclude other captures and disable Python's garbage collection during a capture.
+    """During a capture, exclude other captures, and disable Python's garbage collection.
 
-    Garbage collection may delete unused torch graphs, which makes a CUDA capture fail.
+    Garbage collection may delete unused torch graphs, and a deletion makes a CUDA capture fail.
     """
     with _CAPTURING:
         collects = gc.isenabled()
@@ -126,9 +126,9 @@ def capturing() -> Iterator[None]:
 
 
 class _Graph:
-    """Captures functions that consist of launches as one graph, or for long functions as one graph per thread.
+    """Captures functions of launches: in one graph, or in one graph per thread if the functions take long.
 
-    The first call runs the functions directly, which loads their modules. The second call captures and replays the
+    The first call runs the functions directly, and loads their modules. The second call captures and replays the
     functions; later calls only replay. With workers, the first replays are timed, and the shortest time determines how
     many threads share the work.
     """

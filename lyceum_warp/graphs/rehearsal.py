@@ -30,8 +30,8 @@ class Rehearsal:
 def rehearse() -> Iterator[Rehearsal]:
     """List this thread's launches instead of running the kernels; graph branches and loops run once.
 
-    Copies and allocations still run, so arrays may contain garbage afterwards. Other threads launch as usual, but wait
-    before rehearsing.
+    Copies and allocations still run, so arrays may contain garbage afterwards. Other threads launch kernels as usual,
+    but only one thread can rehearse at a time.
     """
     rehearsal = Rehearsal()
     functions: dict[str, Callable[..., None]] = {"launch": rehearsal.launch, "launch_tiled": rehearsal.launch}

@@ -9,7 +9,7 @@ from lyceum_warp.runs.checkpoints import check_format
 from lyceum_warp.support.validate import whole_number
 
 _COUNT = 0
-"""Mark of entries that are non-negative whole numbers."""
+"""Stands for the type of entries that are non-negative whole numbers."""
 
 _ENTRIES: dict[str, Any] = {
     "task": str | None, "params": dict, "options": dict, "physics": dict, "engine": str, "device": str,

@@ -158,9 +158,9 @@ def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, 
 
     Args:
         run: The run that saved the networks.
-        which: Policy of the run, or None to resume the run. When resuming, the networks are None if the hyperparameters
-            describe the networks completely, which they do not if the run started from another run's networks or uses
-            ``limit``.
+        which: Policy of the run, or None to resume the run. The networks are None if the run is resumed and its
+            hyperparameters determine the networks. The hyperparameters do not determine them if the run started from
+            another run's networks, or uses ``limit``.
 
     Raises:
         FileNotFoundError: The run has no policy of this name or number.

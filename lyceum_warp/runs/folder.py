@@ -28,7 +28,7 @@ from lyceum_warp.support.versions import versions
 
 _CONFIG, _VERSIONS, _TASK = "config.json", "versions.json", "task"
 _UNFINISHED = {f"{name}.tmp" for name in (_CONFIG, _VERSIONS, _TASK)}
-"""Files that may remain if the creation of a run is killed, and that a new run replaces."""
+"""Files that may remain in the folder if a process is killed while it creates a run. A new run replaces these files."""
 
 log = logging.getLogger(__name__)
 
@@ -122,7 +122,7 @@ class Run:
         Args:
             folder: A new or empty folder.
             config: The configuration, which consists of JSON values.
-            device: Device of the run, of which ``versions.json`` names the hardware.
+            device: Device of the run; ``versions.json`` names the device's hardware.
             files: Contents of the folder ``task`` by path; each is a file to copy, or bytes.
 
         Raises:
@@ -231,7 +231,7 @@ class Run:
     # policies
 
     def numbered(self, iteration: int) -> Path:
-        """Get the path of an iteration's policy, which exists if the policy was saved."""
+        """Get the path of an iteration's policy; the file exists if the policy was saved."""
         return self.folder / "policies" / f"{iteration:06d}.pt"
 
     def policy_file(self, which: str | int = "last") -> Path:
@@ -293,7 +293,7 @@ class Run:
         write_content(self.checkpoint, checkpoint, durable=True, previous=self.previous)
 
     def read(self, device: str | torch.device = "cpu", *, note: Callable[[str], None] = log.warning) -> dict[str, Any]:
-        """Read the checkpoint's ``iteration``, ``policy`` and ``state``, and ``value`` if the checkpoint has one.
+        """Read the checkpoint's ``iteration``, ``policy``, ``state`` and (if the checkpoint has one) ``value``.
 
         If the checkpoint is broken or missing, the previous checkpoint is read instead.
 

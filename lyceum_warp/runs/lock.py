@@ -20,7 +20,7 @@ BEAT, STALE = 10.0, 120.0
 
 
 class RunLock:
-    """Lock of a run within a with block, by a file ``lock`` that stores the process and its host.
+    """Locks a run within a with block. The file ``lock`` stores the process and its host.
 
     A daemon thread updates the lock file's modification time every 10 s. A process takes over a lock from the same host
     if the locking process is gone or the modification time is more than 120 s old. Clocks of different hosts differ, so
@@ -124,7 +124,7 @@ def _named(owner: dict[str, Any]) -> str:
 
 
 def _started(pid: int) -> str:
-    """Get the start time of a process, which distinguishes processes with the same pid; "" if there is no process."""
+    """Get the start time of a process, to distinguish processes with the same pid; "" if there is no process."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         return "" if state[0] == "Z" else state[19]  # a zombie process counts as ended

@@ -15,7 +15,7 @@ def pretrained_tasks() -> list[str]:
 
 
 def pretrained_run(task: str) -> Path:
-    """Get the folder of a task's pretrained policy, which functions such as ``lw.load`` accept like any run.
+    """Get the folder of a task's pretrained policy. Functions such as ``lw.load`` accept the folder like any run.
 
     The folder's config.json has the training settings and, under ``evaluated``, the policy's return.
 

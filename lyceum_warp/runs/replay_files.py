@@ -64,7 +64,7 @@ def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
     """
     oldest = max(0, stored - replay.steps)
     for start, end in _parts(replay, oldest, stored):
-        # a part's file may contain more steps after the needed steps, if the checkpoint of a later save was lost
+        # a later save may have written more steps, but no checkpoint; ignore these steps
         longer = sorted(path for path in folder.glob(f"{start:012d}-*.pt") if path.name >= _name(start, end))
         if not longer:
             raise ValueError(f"{folder} lacks steps {start} to {end} of the replay buffer")

@@ -15,21 +15,21 @@ from lyceum_warp.runs.replay_files import clean_replay, write_replay
 log = logging.getLogger(__name__)
 
 SAVE_SECONDS = 30.0
-"""Maximum number of seconds between saves."""
+"""Maximum number of seconds between saves, unless saves take long; see ``LONG``."""
 
 SHARE = 100
-"""Ratio of training time to the last save's duration above which a save is due before the maximum time."""
+"""Time between saves, as a multiple of the last save's duration, if this is less than ``SAVE_SECONDS``."""
 
 LONG = 20
-"""Minimum ratio of training time to the last save's duration before the next save."""
+"""Minimum time between saves, as a multiple of the last save's duration."""
 
 
 class Saver:
     """Writes a run's files.
 
-    Rows of iterations, a new best policy and numbered policies are written immediately. The last policy and the
-    complete state are saved together: at the start, at the end, and at most 30 s after the last save, or after training
-    for 100 times the duration of the last save if this is earlier. For example, saves of 20 ms happen every 2 s and
+    The metrics of an iteration, a new best policy, and a policy in a numbered file are written immediately. The last
+    policy and the complete state are saved together: at the start, at the end and in between. The time between two
+    saves is 100 times the duration of the last save, but at most 30 s. For example, saves of 20 ms happen every 2 s and
     take 1 % of the time; saves of 1 s happen every 30 s and take 3 % of the time. After ``kill -9``, the run resumes
     from the last save.
 
@@ -39,7 +39,7 @@ class Saver:
         run: The run; None on ranks that do not write.
         lock: The run's lock, which is checked before every write; None if ``run`` is None.
         learner: The algorithm.
-        keep_every: Iterations between two numbered policies; 0 for no numbered policies.
+        keep_every: Iterations between two policies that are saved in numbered files; 0 saves none.
         save_every: Iterations between two saves; 0 to save by time.
         saved: Number of the last saved iteration; -1 before the first save.
         note: Function that is called with a message if the file of the best policy is damaged.
@@ -68,7 +68,7 @@ class Saver:
         self._stored = learner.replay.stored if learner.replay is not None and saved >= 0 else 0
 
     def write(self, iteration: Iteration) -> float | None:
-        """Write an iteration's row, and the policy if it is the best so far or due as a numbered policy.
+        """Write an iteration's metrics. Also write the policy if it is the best so far, or if a numbered file is due.
 
         Returns:
             The return that selects the best policy; None if the iteration has no return.

@@ -98,7 +98,7 @@ def _npy(array: np.ndarray) -> bytes:
 
 
 def _sources(file: Path, loaded: Mapping[Path, bytes]) -> dict[Path, bytes]:
-    """Get a task's file and, unless they are too many or too large, the modules that it imports from its folder."""
+    """Get a task's file and the modules that it imports from its folder; too many or too large modules are omitted."""
     size = sum(map(len, loaded.values())) - len(loaded[file])
     if len(loaded) - 1 <= _MOST_MODULES and size <= _LARGEST_MODULES:
         return dict(loaded)

@@ -35,7 +35,7 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
         folder: The run's folder.
         config: Content of the run's config.json.
         named: A file to which the run refers, for the error message.
-        runs: Whether the run's task is executed, instead of files only being read.
+        runs: Whether the run's task is executed; otherwise, files are only read.
         trust: Whether to trust and record the run.
 
     Raises:
@@ -53,7 +53,7 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
 
 
 def _record(folder: Path, config: Mapping[str, Any]) -> Path:
-    """Name the file that records a run as trusted by a hash of everything that the run can execute or read."""
+    """Get the file that records a run as trusted. Its name is a hash of everything that the run can execute or read."""
     kept = config.get("kept", {})
     paths = [{key: value for key, value in config.get(part, {}).items() if isinstance(value, str)}
              for part in ("params", "options")]  # fmt: skip

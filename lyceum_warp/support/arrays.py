@@ -37,9 +37,9 @@ def shared_rows(row: np.ndarray, dtype: type, count: int, device: wp.Device) -> 
 
 
 def with_memory(array: wp.array) -> wp.array:
-    """Return the array, or for an empty array an empty one of the same shape with memory behind it.
+    """Return the array; replace an empty array by an array of the same shape that has allocated memory.
 
-    Without memory behind the array, a task that reads an element by mistake would crash the process.
+    Without allocated memory, a task that reads an element by mistake would crash the process.
     """
     if array.size:
         return array
@@ -125,7 +125,7 @@ PAIRS_A_LAUNCH = 4
 def launch_several_rows(kernel: wp.Kernel, mask: wp.array, pairs: Sequence[tuple[wp.array, wp.array]]) -> None:
     """Launch ``narrow_four`` or ``widen_four`` of ``kernels.state`` over the masked rows of sources and targets.
 
-    On the CPU a launch takes longer than copying a few short rows, so one launch copies up to four arrays.
+    On the CPU, a launch takes longer than copying a few short rows, so one launch copies up to four arrays.
 
     Args:
         kernel: The kernel.

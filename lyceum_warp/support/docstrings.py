@@ -48,7 +48,7 @@ def listed(docs: dict[str, str]) -> str:
 
 
 def document_attributes(cls: Class) -> Class:
-    """Class decorator: append the docstrings of attributes, including inherited dataclass fields, to the class's."""
+    """Class decorator: append the docstrings of attributes, also of inherited fields, to the class's docstring."""
     docs: dict[str, str] = {}
     for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__[1:])):
         docs |= attribute_docs(base)

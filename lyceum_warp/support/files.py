@@ -19,7 +19,7 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
         path: The file.
         durable: Whether to flush the new content to disk before it replaces the old file, so that it survives a power
             loss.
-        previous: The path to which the old file is saved; by default the old file is lost.
+        previous: The path to which the old file is saved; by default, the old file is lost.
     """
     temporary = path.with_name(path.name + ".tmp")
     try:

@@ -10,7 +10,7 @@ log = logging.getLogger(__name__)
 def quiet() -> None:
     """Send MuJoCo's warnings to the log, for the whole process.
 
-    By default MuJoCo prints each warning and appends it to MUJOCO_LOG.TXT in the working directory. The engines report
+    By default, MuJoCo prints each warning and appends it to MUJOCO_LOG.TXT in the working directory. The engines report
     a world's warnings in its done reason.
     """
     mujoco.set_mju_user_warning(_log)

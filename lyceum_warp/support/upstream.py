@@ -45,7 +45,7 @@ def extend_structs() -> None:
 def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
     """Whether a module of kernels for a block size is loaded or in Warp's cache.
 
-    The result is False if Warp's internals have changed, which only costs time.
+    The result is also False if Warp's internals have changed; this only costs time.
     """
     if (device.context, block) in module.execs:
         return True
@@ -87,8 +87,8 @@ def separate_captures() -> None:
     """Make captures of CPU launches thread-local.
 
     Warp's native library captures only launches of the thread that started the capture, but Warp's Python code applies
-    the capture to all threads. Loops of other threads would enter the graph, and launches of other threads would
-    overwrite the graph's arguments.
+    the capture to all threads. Captured loops of other threads would become part of the graph, and launches of other
+    threads would overwrite the graph's arguments.
     """
     for name in ("_apic_capture", "_apic_graph"):
         setattr(wp._src.context.Runtime, name, _PerThread())
@@ -141,8 +141,8 @@ def replaced_in_this_thread(functions: Mapping[str, Callable[..., Any]]) -> Iter
 
 
 _REMADE = ("reset_data", "get_state", "set_state")
-"""The functions of MuJoCo Warp that make their kernels again in every call. The kernels' sources depend only on their
-single free variable, whether there is a mask."""
+"""The functions of MuJoCo Warp that make their kernels again in every call. The kernels have a single
+free variable: whether there is a mask."""
 
 
 def quicken_mujoco_warp() -> None:

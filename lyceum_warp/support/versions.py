@@ -1,4 +1,4 @@
-"""Collect the versions of packages and the data of the machine, on which a run's numbers depend."""
+"""Collect the versions of packages and data about the machine, because both affect a run's numbers."""
 
 import functools
 import importlib.metadata

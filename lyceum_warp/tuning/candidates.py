@@ -78,7 +78,7 @@ def not_tried(env: Env) -> list[str]:
 
 
 def combined(settings: Iterable[Setting]) -> Setting | None:
-    """Combine settings, with priority for earlier settings; None if the result is one of the settings.
+    """Combine settings; earlier settings have priority. None if the result equals one of the settings.
 
     A setting is omitted if an earlier setting has the same group or sets the same option.
     """
@@ -112,7 +112,7 @@ def _name(names: Mapping[str, Any], value: int) -> str | None:
 
 
 def _fewer(substeps: int) -> list[int]:
-    """List numbers of substeps below a given number, halving each time."""
+    """List smaller numbers of substeps: a half of a given number, a quarter, and so on."""
     found = []
     while substeps > 1:
         substeps = (substeps + 1) // 2

@@ -13,11 +13,11 @@ TOLERANCES = {"strict": 0.02, "loose": 0.05, "any": math.inf}
 """Largest accepted difference of returns, relative to the mean absolute return of the unchanged task."""
 
 RANK_CORRELATIONS = {"strict": 0.9, "loose": 0.8, "any": -1.0}
-"""Smallest accepted rank correlation between a planner's physics and the plant's physics, by name of the tolerance. The
-program bench/rank_loss.py compares rank correlations with losses of planned return."""
+"""Smallest accepted rank correlation between returns under a planner's physics and under the plant's physics, by name
+of the tolerance. The program bench/rank_loss.py compares rank correlations with losses of planned return."""
 
 LEAST_GAIN = 1.03
-"""Minimum speed-up of a setting for which returns are compared, unless the setting takes less memory."""
+"""Minimum speed-up for a comparison of returns; settings that take less memory are always compared."""
 _LEAST_SAVING = 0.95
 
 

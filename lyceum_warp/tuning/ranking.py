@@ -30,8 +30,8 @@ class Rankings:
     coarser physics. The states are of three kinds:
 
     - standing: states after a random reset;
-    - moving: states after 30 steps under the planner with the plant's physics, which replans every 6 steps;
-    - fallen: states after random actions until the end of the episode, for at most 200 steps, and for 10 more steps.
+    - moving: states after 30 steps under a planner that has the plant's physics and replans every 6 steps;
+    - fallen: states after random actions until the end of the episode (at most 200 steps), and for 10 more steps.
 
     Args:
         task: The task.
@@ -81,7 +81,7 @@ class Rankings:
         return found
 
     def _prepared(self, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Plan from some states, and return the plans and the returns, (states, samples), of samples around them."""
+        """Plan from some states. Return the plans, and the returns of samples around the plans, (states, samples)."""
         self.exact.reset(self.seed)
         for _ in range(_IMPROVEMENTS):
             self.exact(start, shift=0)

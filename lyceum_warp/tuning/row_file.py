@@ -16,7 +16,7 @@ _VERSIONS = ("lyceum_warp", "mujoco", "mujoco_warp")
 
 
 def identity(env: Env, **more: Any) -> dict[str, Any]:
-    """Collect everything else than the setting that affects results: task, machine, worlds and versions.
+    """Collect everything that affects results, except the setting: task, machine, worlds and versions.
 
     Args:
         env: Environment of the unchanged task.

@@ -37,8 +37,8 @@ class Tuning:
     """Results of each setting, the fastest first; docs/physics.md describes the entries. The entry ``verdict`` is
     "same", "different" or "not shown" (the interval of the returns lies within, outside or across the tolerance),
     "faults" (more than twice as many faults as in the unchanged task), "no gain" (less than 3 % faster and not smaller,
-    so that returns are not compared), "refused" (by MuJoCo or the engine; ``refused`` has the reason), or for a planner
-    "ranks badly"."""
+    so that returns are not compared), "refused" (by MuJoCo or the engine; ``refused`` has the reason), or, for a
+    planner, "ranks badly"."""
     reference: Row
     """Results of comparing the unchanged task with itself."""
     not_tried: list[str]
@@ -76,7 +76,7 @@ def tune(
     progress: Callable[[Row], object] | None = None,
     **words: Any,
 ) -> Tuning:
-    """Measure gain and side effects of a task's physics options, and find the fastest options with equal returns.
+    """Measure speed and side effects of physics options for a task, and find the fastest options with equal returns.
 
     Every setting is compared with the unchanged task in the same process: steps per second, memory, faults, divergence,
     and the returns of equal episodes under random actions and under a policy. Settings are first tried alone.
@@ -90,13 +90,15 @@ def tune(
         which: Policy of the run: "last", "best", or the number of a saved iteration.
         tolerance: Tolerance for the 95 % interval of the difference of returns, relative to the mean absolute return:
             "strict" (2 %), "loose" (5 %) or "any" (only faults count).
-        short: Whether to compare the first 100 steps of episodes, for a few seconds, instead of whole episodes.
+        short: Whether to compare only the first 100 steps of episodes, which takes a few seconds, instead of whole
+            episodes.
         episodes: Number of episodes of each setting, rounded up to a multiple of the number of worlds. By default, the
             width of the interval determines the number, within the time limit of a minute, or of 5 s if ``short``.
-        planning: Whether to find physics options for the task's planner instead of its worlds, by comparing planning
-            times and the rankings of the same samples, from standing, moving and fallen states. A setting is suggested
-            if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8 ("loose"). With ``planning``,
-            ``nworld`` is the number of samples, by default 64, and ``episodes`` is the number of states of each kind.
+        planning: Whether to find physics options for the worlds of the task's planner. The search then compares
+            planning times and the rankings of the same samples, from standing, moving and fallen states. A setting is
+            suggested if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8 ("loose"). With
+            ``planning``, ``nworld`` is the number of samples, by default 64, and ``episodes`` is the number of states
+            of each kind.
         out: File of the results, to which rows are appended; existing rows are not measured again. The default is
             tune/TASK.jsonl, or tune/TASK-planning.jsonl.
         seed: Seed of initial states and actions.

@@ -1,4 +1,6 @@
-"""View worlds interactively in a browser, with two processes that have a folder each.
+"""View worlds interactively in a browser.
+
+The viewer has two processes, and each process has a folder.
 
 - ``show.py`` opens a session and its window: ``lw.view``.
 - ``follow.py`` follows a training run: ``lw.RunViewer``.
@@ -10,6 +12,6 @@
   ``live_settings.py`` change commands and numbers. ``window_process.py`` starts the window process.
 - ``window/`` is the process with mujoco, NumPy and studio. ``main.py`` is its entry point. ``panel.py`` connects studio
   with the session. ``windows.py`` draws the ImGui windows, ``actions.py`` has the keys, and ``mouse.py`` pushes bodies.
-  ``scene.py`` draws ghosts and traces. ``studio.py`` wraps mujoco.studio. ``proxy.py`` and ``sockets.py`` guard the
-  page.
+  ``scene.py`` draws ghosts and traces. ``studio.py`` wraps mujoco.studio. ``proxy.py`` and ``sockets.py`` control the
+  access to the page.
 """

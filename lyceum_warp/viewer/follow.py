@@ -97,8 +97,8 @@ class RunViewer:
     """Shows a run while it trains, in another process: ``with lw.RunViewer(folder): lw.train(npg, folder)``.
 
     The process waits for the folder, and shows the run's newest policy in separate worlds on the CPU, at a lower
-    priority than the training. The viewer ends with ``close``, at the end of a ``with`` block, and with this program.
-    Closing the viewer's window does not end the training.
+    priority than the training. The viewer ends when ``close`` is called, when the ``with`` block ends, or when this
+    program ends. Closing the viewer's window does not end the training.
 
     Args:
         folder: The run's folder, which need not exist yet.

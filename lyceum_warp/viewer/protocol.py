@@ -23,7 +23,7 @@ BEST_COLOUR = (0.1, 0.75, 0.3, 1.0)
 """Colours of a planner's samples and of the best sample, in the window and in videos."""
 
 MAX_POINTS, MAX_MESSAGES = 20_000, 200
-"""The maximum numbers of curve points and of messages that a frame takes over from skipped frames."""
+"""The maximum number of curve points, and of messages, that a frame may take over from skipped frames."""
 
 
 # messages to the window
@@ -46,8 +46,8 @@ class Scene:
     curves: tuple[str, ...]
     """The names of the live curves: "reward", "eval" and the task's metrics."""
     speeds: tuple[float, float, float] | None = None
-    """The largest forward velocity and lateral velocity, m/s, and yaw rate, rad/s, of a robot that the user can
-    drive."""
+    """For a robot that the user can drive: the largest forward velocity (m/s), lateral velocity (m/s) and yaw rate
+    (rad/s)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,13 +64,13 @@ class Pose:
 
 @dataclasses.dataclass(frozen=True)
 class Ghost:
-    """An additional pose to draw."""
+    """A ghost: an additional pose to draw, for example of another world."""
 
     pose: Pose
     colour: tuple[float, float, float, float] | None
     """Red, green, blue and opacity, from 0 to 1; None for the model's own colours."""
     shift: tuple[float, float] = (0.0, 0.0)
-    """The displacement of the ghost from its world's position, metres."""
+    """The displacement of the ghost from its world's position, in metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Arrow:
     """An arrow in the scene, such as a commanded velocity."""
 
     start: np.ndarray
-    """(3,), metres."""
+    """(3,), in metres."""
     end: np.ndarray
     colour: tuple[float, float, float, float]
 
@@ -88,11 +88,12 @@ class SetGhosts:
     """Choose the ghosts to draw."""
 
     worlds: int = 0
-    """The number of worlds to draw as ghosts, at most ``MOST_GHOSTS``, beginning after the shown world."""
+    """The number of worlds to draw as ghosts, at most ``MOST_GHOSTS``. The first is the world after the shown world."""
     grid: bool = False
     """Whether to draw the other worlds beside each other, in the model's colours."""
     episodes: int = 0
-    """The number of episodes to draw as ghosts, at the shown step, beginning after the shown episode."""
+    """The number of episodes to draw as ghosts, all at the same step as the shown episode. The first is the episode
+    after the shown episode."""
     burst: int = 0
     """The number of past (red) and future (blue) states to draw along the trajectory, at most ``MOST_BURST``."""
     plan: bool = True
@@ -128,7 +129,7 @@ class Status:
     ghosts: SetGhosts = SetGhosts()
     """The ghosts that are drawn."""
     command: tuple[float, float, float] | None = None
-    """The commanded forward velocity and lateral velocity, m/s, and yaw rate, rad/s, of a walking robot."""
+    """The command of a walking robot: forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s)."""
     driven: bool = False
     """Whether the command comes from the user."""
     planner: tuple[tuple[str, float], ...] = ()
@@ -153,7 +154,7 @@ class Frame:
     status: Status
     ghosts: tuple[Ghost, ...] = ()
     traces: np.ndarray | None = None
-    """The paths of the planner's samples, (samples, points, 3), metres."""
+    """The paths of the planner's samples, (samples, points, 3), in metres."""
     best: int | None = None
     """The index of the best sample."""
     arrows: tuple[Arrow, ...] = ()
@@ -255,7 +256,7 @@ class Perturb:
     qpos: np.ndarray | None = None
     """Positions, (nq,) float64, which take effect only while paused."""
     mocap_pos: np.ndarray | None = None
-    """(nmocap, 3) float64, metres."""
+    """(nmocap, 3) float64, in metres."""
     mocap_quat: np.ndarray | None = None
     """(nmocap, 4) float64: w, x, y, z."""
 
@@ -265,7 +266,7 @@ class Drive:
     """Command a walking robot."""
 
     command: tuple[float, float, float] | None
-    """The forward velocity and lateral velocity, m/s, and yaw rate, rad/s; with None the task draws commands again."""
+    """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s). If None, the task draws commands again."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -32,9 +32,9 @@ def view(
     back. The panel and its keys choose the mode, the world, the speed, ghosts and the camera.
 
     The viewer steps the worlds of ``env``, and leaves them in their last state. A policy acts in all worlds. A
-    controller of one world acts in a copy of the shown world, in real time as with ``lw.control_async``, while all
-    other worlds wait. Afterwards the shown world gets the copy's state. If ``env`` is one world on the CPU without
-    automatic resets, no copy is made.
+    controller of one world acts in a copy of the shown world. The copy runs in real time, like the world in
+    ``lw.control_async``, and all other worlds wait. Afterwards, the shown world gets the copy's state. If ``env`` is
+    one world on the CPU without automatic resets, no copy is made.
 
     Args:
         env: The worlds, on any engine and device.
@@ -42,7 +42,8 @@ def view(
             nobs), to actions, (nworld, nact). A controller of one world is called with a state and an observation; see
             ``lw.Controller``.
         episodes: Episodes to play back: one, a sequence, or a mapping from names to episodes. An episode is a
-            trajectory, the file of a trajectory, or states, (steps + 1, state_space.size), as from ``env.get_state()``.
+            trajectory, the file of a trajectory, or a tensor of states, (steps + 1, state_space.size), in the format of
+            ``env.get_state()``.
         seed: The seed of a random reset at the start; by default there is no reset.
         paused: Whether to start paused.
         host: The address on which the page is served. The default is the loopback address, which other machines cannot

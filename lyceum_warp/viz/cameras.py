@@ -20,13 +20,15 @@ class FreeCamera:
     """A camera that looks at a point or follows a body. The default values come from MuJoCo's default free camera."""
 
     lookat: tuple[float, float, float] | None = None
-    """The point to look at, metres. A camera that follows a body looks at the centre of mass of the body's subtree."""
+    """The point to look at, in metres. A camera that follows a body looks at the centre of mass of the body's
+    subtree."""
     distance: float | None = None
-    """The distance from the point ``lookat``, metres."""
+    """The distance from the point ``lookat``, in metres."""
     azimuth: float | None = None
-    """The direction of the view around the vertical axis, degrees; a camera at 0 looks along x, and at 90 along y."""
+    """The direction of the view around the vertical axis, in degrees; a camera at 0 looks along x, and at 90 along
+    y."""
     elevation: float | None = None
-    """The direction of the view above the horizontal plane, degrees; a camera at -90 looks straight down."""
+    """The direction of the view above the horizontal plane, in degrees; a camera at -90 looks straight down."""
     track: str | int | None = None
     """The name or the index of a body to follow."""
 

@@ -113,7 +113,7 @@ class DrawingProcess:
         return pixels.reshape(self.size[1], self.size[0], 3)
 
     def abandon(self) -> None:
-        """Kill the subprocess, and do not start another one. Any thread may call this method, which does not wait.
+        """Kill the subprocess, and do not start another one. Any thread may call this method. The method does not wait.
 
         The rendering thread then gets a ``NoVideoError``.
         """

@@ -22,7 +22,7 @@ from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
 _GROUPS = 3  # the groups of geoms that MuJoCo shows by default
 _AROUND, _ALONG = 24, 12  # segments of a circle and of a half circle
 _RATE = 60  # maximum frames per second
-_FLOOR = 200.0  # half the side of an infinite floor, m
+_FLOOR = 200.0  # half the side of an infinite floor, in m
 Surface = tuple[np.ndarray, np.ndarray, np.ndarray]
 """The vertices and the normals of a surface, both (n, 3), and its triangles, (m, 3)."""
 

@@ -54,7 +54,7 @@ def policy_video(
 class Videos:
     """Writes a video of the mean policy every few iterations.
 
-    An error, such as on a machine that cannot draw, is reported once; training then continues without further videos.
+    An error is reported once (for example if the machine cannot draw); training then continues without further videos.
 
     Args:
         learner: The algorithm.

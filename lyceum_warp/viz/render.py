@@ -2,9 +2,9 @@
 
 ``drawing.py`` runs this program as a subprocess and writes pickled objects to its stdin: first a dict with ``size``,
 ``fps``, ``camera`` and ``background``, then a ``Shot`` for each picture, then None. The folder holds the model,
-``model.mjb``. The program writes ``video.mp4``, or if ``fps`` is None each picture into ``picture.raw``. The process
-prints "ready" once it can draw, and "frame" after each picture. EOF without None means that the parent process has
-died; the program then deletes the folder.
+``model.mjb``. The program writes ``video.mp4``; if ``fps`` is None, it writes each picture into ``picture.raw``
+instead. The process prints "ready" once it can draw, and "frame" after each picture. EOF without None means that the
+parent process has died; the program then deletes the folder.
 
 MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. Because the process
 may end, ``drawing.py`` starts a separate process for each graphics library that it tries. The program imports no module
@@ -117,7 +117,7 @@ class Painter:
 
 
 def set_camera(view: Any, values: tuple[float, ...]) -> None:
-    """Set the values of a camera, which come from ``cameras.camera_values``."""
+    """Set the values of a camera; ``cameras.camera_values`` returns such values."""
     view.type, view.fixedcamid, view.trackbodyid = (int(value) for value in values[:3])
     view.lookat[:] = values[3:6]
     view.distance, view.azimuth, view.elevation = values[6:9]

@@ -58,8 +58,8 @@ class TensorBoard:
         folder: The folder, which is created if it does not exist. Pass this folder, or one above it, to ``tensorboard
             --logdir``.
         env: The environment of the run. Episode_Reward/NAME is the sum of a reward term over an episode, divided by the
-            time limit in seconds. Episode_Termination/NAME is the number of terminations of that name in a step of all
-            worlds.
+            time limit in seconds. Episode_Termination/NAME is the number of episodes that the function NAME ended, per
+            step of all worlds.
 
     Raises:
         ImportError: The package tensorboard is not installed.
@@ -140,7 +140,7 @@ def _terms(env: Env) -> dict[str, tuple[str, float]]:
 
 
 def _total_fps(iteration: Iteration) -> dict[str, float]:
-    """Compute an iteration's samples per second, without evaluation of the mean policy; empty if times are unknown."""
+    """Compute an iteration's samples per second, without the time of evaluations; empty if times are unknown."""
     times = {name: time for name, time in iteration.row().items() if name.startswith("time_") and name != "time_mean"}
     seconds = sum(filter(None, times.values()))
     return {"total_fps": iteration.samples / iteration.iteration / seconds} if seconds else {}

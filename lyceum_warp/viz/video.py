@@ -39,7 +39,7 @@ def write_video(
     speed: float = 1.0,
     progress: Progress | None = None,
 ) -> Path:
-    """Render states into an mp4 file, each with its own model fields.
+    """Render states into an mp4 file; each state has its own model fields.
 
     The video has at most 60 frames per second; with a shorter time step, states are skipped. A subprocess draws the
     video, without a display.
@@ -140,7 +140,7 @@ class Recorder:
 
     @property
     def finished(self) -> bool:
-        """Whether the subprocess has ended, with a file, or with an error that ``close`` raises."""
+        """Whether the subprocess has ended, either with a file or with an error that ``close`` raises."""
         return self._done.is_set()
 
     def add(self, shot: Shot) -> None:
@@ -196,7 +196,7 @@ class Recorder:
             raise self._error
 
     def _draw(self) -> None:
-        """Draw shots from the queue, in a thread."""
+        """Draw shots from the queue in a thread."""
         try:
             with self._drawing as drawing:
                 while (shot := self._next()) is not None:

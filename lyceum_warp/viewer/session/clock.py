@@ -46,8 +46,9 @@ Watcher = Callable[[], Sequence[str]]
 class Session:
     """Show worlds in a window.
 
-    Policies act in all worlds, which the session steps by the clock. A controller of one world acts in a plant, as with
-    ``lw.control_async``. The session then handles commands and frames only while the plant waits for its next step.
+    Policies act in all worlds, which the session steps by the clock. A controller of one world controls the plant, a
+    single world that runs in real time. The session then handles commands and frames only while the plant waits for its
+    next step.
 
     Args:
         env: The worlds.
@@ -163,7 +164,7 @@ class Session:
         return isinstance(stage.control, WorldControl) and not stage.paused and not stage.live.past.ahead
 
     def _run_plant(self) -> None:
-        """Run the plant until its episode ends, or a command needs its state."""
+        """Run the plant until its episode ends, or until a command needs its state."""
         stage, control = self.stage, self.stage.control
         assert isinstance(control, WorldControl)
         stage.begin_due_episode()

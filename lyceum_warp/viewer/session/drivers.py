@@ -16,7 +16,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.validate import described
 
 MOST_SAMPLES = 24
-"""The maximum number of a plan's samples of which paths are drawn."""
+"""The maximum number of samples per plan for which the viewer draws paths."""
 
 
 class ControllerError(Exception):
@@ -86,7 +86,7 @@ class PolicyControl:
 
 
 class WorldControl:
-    """Calls a controller of one world, in several runs of a control loop.
+    """Calls a controller of one world; several runs of a control loop share the controller.
 
     Args:
         name: The controller's name in the viewer.
@@ -103,7 +103,7 @@ class WorldControl:
         self._reset_due = self._wanted = False
         self._seen: PlanView | None = None
         self.hidden: slice | None = None
-        """The part of the state that is zero for the controller: a push, which a robot cannot foresee."""
+        """The part of the state that the controller gets as zeros: the forces of the user's push."""
 
     def new_run(self) -> "ControlRun":
         """Return the controller for a new run of a loop. Calls from earlier runs then fail."""

@@ -15,7 +15,7 @@ from lyceum_warp.viewer.session.live import Live
 
 _MEMORY = ("drawn_velocity", "heading_target", "heading_controlled", "standing", "command_timer")
 _NEVER = 1e9  # seconds until the task would draw a command
-_HEIGHT, _SECONDS = 0.25, 0.4  # height of arrows above the base (m), duration that their length shows (s)
+_HEIGHT, _SECONDS = 0.25, 0.4  # height of arrows above the base, in m; an arrow shows the motion during this time, in s
 _COMMANDED, _MEASURED = (0.1, 0.35, 0.95, 1.0), (0.1, 0.85, 0.55, 1.0)
 
 
@@ -29,7 +29,7 @@ class Driving:
     def __init__(self, env: Env) -> None:
         self._parts, self._params = env.state_space.parts, env.task.params
         self.limits: tuple[float, float, float] | None = None
-        """The task's largest forward velocity and lateral velocity, m/s, and yaw rate, rad/s; None without a
+        """The task's largest forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s); None without a
         command."""
         if all(name in self._parts for name in _MEMORY):
             _, _, forward, turn = np.asarray(self._params["stages"])[0]

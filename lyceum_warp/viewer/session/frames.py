@@ -21,7 +21,7 @@ _COLOURS = (
     (0.30, 0.80, 0.80),
 )  # fmt: skip
 _PAST, _FUTURE, _PLAN = (0.90, 0.25, 0.20), (0.25, 0.40, 0.95), (0.25, 0.90, 0.45)
-_OPACITY, _FADE = 0.35, 0.95  # fade: the opacity of a state in the burst, relative to the previous state
+_OPACITY, _FADE = 0.35, 0.95  # fade: the opacity of a state relative to the opacity of the state before it
 
 
 class FrameMaker:
@@ -64,10 +64,11 @@ class FrameMaker:
 
         Args:
             live: The worlds.
-            main: All worlds, of which ``live`` is one or a copy of one.
+            main: All worlds. ``live`` is either the same object, or a plant that copies the shown world of ``main``.
             traces: The paths of a planner's samples.
             status: A function that makes the complete status.
-            paused: Whether the frame must show the present state; otherwise the frame may lag by one.
+            paused: Whether the frame must show the present state; otherwise the frame may show the state at the time of
+                the previous frame.
         """
         shown = _following(main.world, main.env.nworld, self.ghosts.worlds)
         wanted = shown if live is main else [], self.ghosts.burst
@@ -132,7 +133,7 @@ class FrameMaker:
         )  # fmt: skip
 
     def _report(self, rows: Rows, plant_of: int | None) -> None:
-        """Report the end of an episode, and faults; ``plant_of`` is the world of which the plant is a copy."""
+        """Report the end of an episode, and faults; a plant is a copy of the world ``plant_of``."""
         number, bits, returned, length, success = rows.end
         if number > self._seen_end:
             why = "success" if success else reasons(int(bits))
@@ -156,7 +157,7 @@ class FrameMaker:
 
     @functools.cached_property
     def _grid_step(self) -> float:
-        """The distance between the worlds of a grid, m, slightly more than the robot's size."""
+        """The distance between the worlds of a grid, in m. It is slightly larger than the robot."""
         model = self._env.task.model
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)

@@ -1,7 +1,7 @@
 """Step the worlds of a session, keep their history, and copy the rows of a frame to the host.
 
-A step works only on the worlds' device, including the history, the returns and the points of the curves. On a GPU no
-step waits for the device, and a frame copies its rows to the host asynchronously.
+The history, the returns and the points of the curves stay on the worlds' device. On a GPU, no step waits for the
+device, and a frame copies its rows to the host asynchronously.
 """
 
 import dataclasses
@@ -182,11 +182,11 @@ class Live:
         self._clock += 1
         self.made += 1
         ended, reward = self._ended.copy_(env.done), self._reward.copy_(env.reward)
-        if not env.autoreset:  # without autoreset done stays set, and the return must not grow
+        if not env.autoreset:  # without autoreset, ``done`` stays set after the episode, and the return must not grow
             ended.logical_and_(~self._over)
             reward.masked_fill_(self._over, 0.0)
         self.returns.add_(reward)
-        # on a GPU, do not read the mask, which would wait for the device
+        # on a GPU, do not read the mask, because reading would wait for the device
         if self.asynchronous or ended.any():
             self._note_ends(ended)
         values = [
@@ -300,7 +300,7 @@ class Live:
         return self.env.get_state()[self.world]
 
     def write(self, **parts: np.ndarray) -> None:
-        """Change parts of the shown world's state, which are named as in ``env.state_space``."""
+        """Change parts of the shown world's state, by their names in ``env.state_space``."""
         state = self.row()
         for name, value in parts.items():
             where = self.env.state_space.parts[name]

@@ -31,8 +31,8 @@ _OLD = 1.0  # seconds after which traces disappear
 class Stage:
     """Holds the worlds, controllers and episodes of a session.
 
-    Policies act in all worlds. A controller of one world, such as a planner, acts in the plant, a copy of the shown
-    world, while the other worlds wait. ``lw.view`` explains the arguments.
+    Policies act in all worlds. A controller of one world, such as a planner, acts in a copy of the shown world, called
+    the plant. The other worlds wait. ``lw.view`` explains the arguments.
 
     Raises:
         ValueError: An argument is invalid.
@@ -165,7 +165,7 @@ class Stage:
         self.frames.add_point(self.playback)
 
     def end_old_push(self) -> None:
-        """End a push that belongs to a restored past state, before the worlds continue from this state."""
+        """End a push that was active in a restored past state, before the worlds continue from this state."""
         live = self.live
         if live.pushed is not None and not self.dragging and not live.past.ahead:
             live.end_push()
@@ -199,7 +199,7 @@ class Stage:
             self._threads[current.name] = TraceThread(TraceRollouts(current.controller, self.live.env))
 
     def set_number(self, of: str, name: str, value: float) -> None:
-        """Change a setting of the planner in use, and rebuild the planner, or change a task parameter in all worlds.
+        """Rebuild the planner in use with another value of a setting, or change a task parameter in all worlds.
 
         Raises:
             ValueError: The value is not valid.
@@ -220,7 +220,7 @@ class Stage:
         self._trace()
 
     def show_world(self, world: int) -> None:
-        """Show another world; end a push and the driving of the previous world."""
+        """Show another world. The user stops pushing and driving the previous world."""
         before = self.live
         before.end_push()
         if self.driving.wanted is not None:

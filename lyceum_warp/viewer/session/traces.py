@@ -1,4 +1,4 @@
-"""Roll out a planner's plan and samples again to get their paths, in a thread.
+"""Roll out a planner's plan and samples again in a thread, to get their paths.
 
 A planner does not store positions. This module rolls out the actions of some samples from the plan's initial state, in
 worlds with the planner's task, model and time step. The random streams of these worlds differ from the planner's, so
@@ -90,7 +90,7 @@ class Traces:
     """The paths of a plan and its samples."""
 
     paths: np.ndarray
-    """The paths, (samples + 1, points, 3), metres; the plan comes last."""
+    """The paths, (samples + 1, points, 3), in metres; the plan comes last."""
     best: int | None
     """The index of the best sample."""
     final: Pose
@@ -161,7 +161,7 @@ class TraceThread:
     """A thread that rolls out the newest plan, and sleeps between rollouts.
 
     Args:
-        rollouts: Makes the rollouts; used only by the thread after this call.
+        rollouts: Object that makes the rollouts. After this call, only the thread may use it.
     """
 
     def __init__(self, rollouts: TraceRollouts) -> None:

@@ -24,12 +24,12 @@ from lyceum_warp.viz.video import Recorder
 FPS = 30
 _PICTURE_SIZE = (1280, 960)
 _WIDTH = 2.0  # of lines, pixels
-_MOST_WAITING = 4 * FPS  # poses that may wait for the slow start of the rendering subprocess
+_MOST_WAITING = 4 * FPS  # maximum number of waiting poses, because the rendering subprocess starts slowly
 _PATIENCE = 120.0  # seconds to finish videos when the viewer ends, unless a signal discards them
 
 
 class VideoTaker:
-    """Makes one video at a time, while earlier videos may still be in work.
+    """Makes one video at a time, while earlier videos may still be in progress.
 
     Args:
         model: The model.
@@ -76,7 +76,7 @@ class VideoTaker:
         self._start = time.perf_counter()
 
     def picture(self, camera: dict[str, Any], frame: Frame) -> None:
-        """Write a picture of a frame, in a thread.
+        """Write a picture of a frame in a thread.
 
         Raises:
             NoVideoError: A package for pictures is not installed.

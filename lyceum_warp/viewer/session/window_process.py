@@ -18,11 +18,11 @@ from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import Command, Failed, Frame, Opened, Scene
 
 FRAME_TIME = 1 / 60
-"""The minimum seconds between two frames."""
+"""The minimum time between two frames, in seconds."""
 OPENING_TIME = 60.0
-"""The maximum seconds until the process must report that the window is open."""
+"""The maximum time until the process must report that the window is open, in seconds."""
 CLOSING_TIME = 5.0
-"""The maximum seconds that the process may take to end."""
+"""The maximum time that the process may take to end, in seconds."""
 
 _PROGRAM = """
 import sys
@@ -110,7 +110,7 @@ class Window:
 
     @property
     def wants_frame(self) -> bool:
-        """Whether the window can draw another frame; the caller need not make a frame before.
+        """Whether the window can draw another frame. If not, the caller need not make one.
 
         The window draws about 60 frames per second while a page is open, and otherwise four.
         """
@@ -163,7 +163,7 @@ class Window:
         return lines[-1].strip() if lines else f"its process ended with code {code}"
 
     def _send(self) -> None:
-        """Send frames, in a thread."""
+        """Send frames in a thread."""
         while True:
             self._wake.wait()
             if self._ended:
@@ -183,7 +183,7 @@ class Window:
             time.sleep(FRAME_TIME)
 
     def _receive(self) -> None:
-        """Receive replies, in a thread."""
+        """Receive replies in a thread."""
         closed = False
         try:
             while not self._ended:

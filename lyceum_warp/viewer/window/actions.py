@@ -15,16 +15,16 @@ from lyceum_warp.viewer.window.studio import imgui, inputs, ux
 SPEEDS = tuple(2.0**power for power in range(-4, 5))
 """The available speeds, in simulated seconds per second."""
 MANY_STEPS = 50
-"""The number of steps for the arrow keys with Shift."""
+"""The number of steps by which an arrow key with Shift moves."""
 
 _DRIVING = tuple(getattr(imgui.Key, name) for name in "WSADQE")  # forward, back, left, right, turn left, turn right
 
 KEY_NAMES = {"Right": "RightArrow", "Left": "LeftArrow", "Up": "UpArrow", "Down": "DownArrow"}
-"""The names in studio of keys that have other names in the panel."""
+"""Map the panel's names of keys to studio's names, if the names differ."""
 
 
 class Actions:
-    """Stores the user's choices, and sends the commands that follow from them.
+    """Stores the user's choices, and sends the corresponding commands.
 
     Args:
         scene: The part of the display that never changes.

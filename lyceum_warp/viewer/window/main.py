@@ -24,7 +24,7 @@ IDLE_TIME = 0.25
 NICE = 5
 """The niceness of the window process, because the session's planner may need every core."""
 END_TIME = 3.0
-"""The maximum seconds that studio may take to end."""
+"""The maximum time that studio may take to end, in seconds."""
 
 
 class WindowEnd:

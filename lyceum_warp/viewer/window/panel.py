@@ -15,7 +15,7 @@ from lyceum_warp.viewer.window.studio import inputs, ux
 from lyceum_warp.viewer.window.windows import Windows
 
 SWAP_TIME = 0.5
-"""The minimum seconds between two models that are sent to the browser."""
+"""The minimum time between two models that are sent to the browser, in seconds."""
 
 
 class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types

@@ -55,10 +55,10 @@ PROTECTION = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Embedder-Policy": "require-corp",  # browsers require this for memory that threads share
-    "Document-Isolation-Policy": "isolate-and-require-corp",  # the same for a notebook's frames, in Chromium
+    "Document-Isolation-Policy": "isolate-and-require-corp",  # Chromium requires this in notebooks
 }
-"""The headers of every response, which stop other sites from reading or embedding it, and from getting its address.
-Pages of this machine that know the token may embed a response, as a notebook does."""
+"""The headers of every response. They stop other sites from reading or embedding the response, and from getting its
+address. Pages of this machine that know the token, such as notebooks, may embed a response."""
 SCRIPT = """<script>
 (() => {
   const path = location.pathname.slice(0, location.pathname.indexOf("/", 1));
@@ -189,7 +189,7 @@ class Proxy:
         return f"http://{_bracketed(host)}:{self.port}/?token={self._token}"
 
     def start(self, upstream: tuple[str, int], on_quiet: Callable[[], object] = lambda: None) -> None:
-        """Begin to answer, in a thread.
+        """Begin to answer in a thread.
 
         Args:
             upstream: The host and the port of studio's server.
@@ -296,7 +296,7 @@ class Proxy:
         if not _is_cross_site(request):
             return web.Response(status=303, headers={**headers, "Location": target})
         # If the user follows a link on another site, browsers do not send a SameSite=Strict cookie, not even after a
-        # redirect. Browsers send the cookie after a page of the proxy, which belongs to the proxy's site.
+        # redirect. They do send the cookie if a page of the proxy leads to the next request, so send such a page.
         page = f'<!doctype html><meta http-equiv="refresh" content="0; url={target}">'
         return web.Response(text=page, content_type="text/html", headers=headers)
 

@@ -54,12 +54,12 @@ class ExtraGeoms:
         arrows: Sequence[Arrow] = (),
         groups: np.ndarray | None = None,
     ) -> list[mujoco.MjvGeom]:
-        """Make the geoms of a frame, which are valid until the next frame.
+        """Make the geoms of a frame; the geoms are valid until the next frame.
 
         Args:
             pose: The pose of the shown world.
             ghosts: Further poses.
-            traces: The paths of samples, (samples, points, 3), metres.
+            traces: The paths of samples, (samples, points, 3), in metres.
             best: The index of the best sample.
             arrows: Arrows.
             groups: Whether each group of geoms is visible, (6,); by default unchanged.
@@ -150,7 +150,7 @@ class ModelValues:
     """Holds a copy of the model with the values of one world.
 
     Args:
-        nominal: The model, which is copied.
+        nominal: The model. It is copied.
     """
 
     def __init__(self, nominal: mujoco.MjModel) -> None:

@@ -55,7 +55,7 @@ def _is_own(connection: socket.socket) -> bool:
 
 
 def public_sockets(host: str, port: int | None) -> list[socket.socket]:
-    """Listen on the same port of all addresses of a host.
+    """Listen on all addresses of a host, with the same port.
 
     Raises:
         ValueError: The port is out of range or in use, or the address is not an address of this machine.

@@ -1,8 +1,8 @@
 """Wrap mujoco.studio, which no other module imports, because its interface may still change.
 
 Studio draws a scene and a panel in a browser, and handles keys and the mouse. ``Screen.run`` opens studio with a
-plugin, an object derived from ``Plugin`` with handlers for ``Started``, ``Update`` and ``Gui``. The simulation is in
-another process, so studio's own stepping, history and model loading are not used.
+plugin. The plugin is derived from ``Plugin``, and has handlers for ``Started``, ``Update`` and ``Gui``. The simulation
+is in another process, so studio's own stepping, history and model loading are not used.
 """
 
 import socket
@@ -29,7 +29,7 @@ Plugin: Any = plugin.ViewerPlugin
 """The base class of plugins; after ``Started``, ``self.viewer`` is the viewer."""
 
 handler: Any = messages.handler
-"""Decorator for a plugin's method, which handles the type of message in its annotation."""
+"""Decorator for a plugin's method. The method handles messages of the type in its annotation."""
 
 Started: Any = plugin.ViewerInitEvent
 Update: Any = messages.UpdateEvent
@@ -75,7 +75,7 @@ class Screen:
 
 
 class _Guard(Plugin):  # type: ignore[misc]  # studio has no types
-    """Raise an error if studio did not take the given socket, because studio would listen on all addresses."""
+    """Raise an error if studio did not take the given socket, because it would then listen on all addresses."""
 
     def __init__(self, taken: list[bool]) -> None:
         self.taken = taken
