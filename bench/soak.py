@@ -4,9 +4,9 @@
     lyceum-warp bench soak --parts random --tasks dm/walker_walk dm/fish_swim --engine mujoco
     lyceum-warp bench soak --parts faults --device cuda --work runs/soak
 
-Part faults: worlds step under random actions, and each world gets a fault every thousand steps on average. The program
-writes invalid states, states with excessive velocities, and non-finite actions. For the other faults, it writes a
-variant of the task (``VARIANT``), in which an additional action requests a NaN reward, a NaN observation or a
+Part "faults": worlds step under random actions, and each world gets a fault every thousand steps on average. The
+program writes invalid states, states with excessive velocities, and non-finite actions. For the other faults, it writes
+a variant of the task (``VARIANT``), in which an additional action requests a NaN reward, a NaN observation or a
 negative mass. Every fault must be reported in its world and step, nothing else may be reported, and
 ``env.fault_counts`` must agree. A second environment without faults must give bitwise equal numbers for each world
 until its first fault. Every fourth world gets no faults, so its numbers must be equal in both environments throughout.
@@ -14,9 +14,9 @@ until its first fault. Every fourth world gets no faults, so its numbers must be
 A run is divided into chunks. Each chunk is one result, and ends by writing the worlds' states to a file in the folder
 ``--work``. The next chunk continues from this file, even on another machine with a copy of the folder.
 
-Part random: worlds step under uniformly random actions, without injected faults. The result has the number of faults by
-reason, and the step and world of the first fault. Part memory: environments are made and deleted. Part kills: training
-runs are killed and resumed, and must end like an uninterrupted run.
+Part "random": worlds step under uniformly random actions, without injected faults. The result has the number of faults
+by reason, and the step and world of the first fault. Part "memory": environments are made and deleted. Part "kills":
+training runs are killed and resumed, and must end like an uninterrupted run.
 """
 
 import collections
@@ -133,7 +133,7 @@ class Options(experiment.Options):
     parts: tuple[str, ...] = ()
     """Parts: faults, random, memory, kills; by default all."""
     engine: str = "auto"
-    """Engine of the parts faults, random and memory."""
+    """Engine of the parts "faults", "random" and "memory"."""
     nworld: int | None = None
     """Number of worlds; by default the task's."""
     steps: int | None = None

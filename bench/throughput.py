@@ -34,10 +34,10 @@ SHORT_TASKS = ("half_cheetah", "humanoid")
 SUITE = (
     "dm/cartpole_swingup", "dm/cheetah_run", "dm/walker_walk", "dm/quadruped_walk", "dm/humanoid_walk",
 )  # fmt: skip
-"""Tasks of the part suite."""
+"""Tasks of the part "suite"."""
 SUITE_WORLDS = (2, 16, 128)
 SCALED = ("humanoid",)
-"""Default tasks of the parts cores and worlds."""
+"""Default tasks of the parts "cores" and "worlds"."""
 PARTS = {
     "sampling": ("native", "c", "warp", "envpool", "gym-async", "gym-sync", "dm_control"),
     "suite": ("dm_control", "c", "envpool"),
@@ -167,7 +167,7 @@ def rates(rows: Sequence[Row], contestant: str) -> list[float]:
 
 
 def peers(rows: Sequence[Row]) -> str:
-    """Return the versions of the other libraries in the part suite, in parentheses."""
+    """Return the versions of the other libraries in the part "suite", in parentheses."""
     found = {row.result.get("versions") for row in rows if row.case["part"] == "suite"} - {None}
     return f" ({'; '.join(sorted(found))})" * bool(found)
 

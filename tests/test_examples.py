@@ -71,7 +71,7 @@ def test_example_random_search_writes_a_complete_run_folder(run, tmp_path: Path)
 @pytest.mark.long  # tests of SAC and of random_search.py cover the parts of TD3
 def test_example_td3_learns_and_resumes_with_its_replay_buffer(run, tmp_path: Path) -> None:
     ended = numbers(r": (\d+) episodes", run("td3.py", "--out", "once", "--iterations", "4"))
-    assert ended[0] > 50 > 25 > ended[-1]  # the trained policy keeps the pole up for longer
+    assert ended[0] > 50 > 25 > ended[-1]  # the last policy keeps the pole up for longer than the first
     run("td3.py", "--out", "twice", "--iterations", "2")
     lines = run("td3.py", "--out", "twice", "--iterations", "4", "--resume")
     assert numbers(r"return ([\d.]+)", lines)[0] > 10.0

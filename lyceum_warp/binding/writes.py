@@ -221,7 +221,7 @@ class _Reader:
         return isinstance(target, ast.Name) or (isinstance(owner, ast.Name) and owner.id not in self.places)
 
     def _store(self, target: ast.expr) -> None:
-        """Note that an element, a component or a field is assigned."""
+        """Record the assignment of an element, a component or a field."""
         if isinstance(target, ast.Tuple | ast.List):
             for part in target.elts:
                 self._store(part)

@@ -5,7 +5,7 @@ from lyceum_warp.kernels import returns
 
 
 def test_advantages_and_returns_bootstrap_at_time_limits_only() -> None:
-    """World 0 has a truncation and world 1 a termination."""
+    """World 0 has a truncation, and world 1 has a termination."""
     steps, worlds, gamma, lam = 9, 3, 0.9, 0.8
     rng = np.random.default_rng(0)
     reward, value, next_value = rng.normal(size=(3, steps, worlds)).astype(np.float32)

@@ -123,7 +123,7 @@ def growing_joint_velocity_l2(joint_velocity_l2: float, growth: float) -> float:
 
 
 class Gait(walking.Biped):
-    """A robot with two legs that steps to a clock."""
+    """A robot with two legs that steps in time with a clock."""
 
     training = lw.Training(
         algorithm="ppo", iterations=460,

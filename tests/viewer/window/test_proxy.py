@@ -425,7 +425,7 @@ def test_a_silent_controlling_browser_is_reported(monkeypatch: pytest.MonkeyPatc
     proxy, _, quiet = echo
     with open_tab(proxy) as tab:
         tab.send(b"input")
-        wait_until(lambda: len(quiet) == 1)  # the browser's tab may be hidden, or its connection lost
+        wait_until(lambda: len(quiet) == 1)  # the browser's tab may be hidden, or its connection may be lost
         tab.send(b"input")
     wait_until(lambda: len(quiet) == 2)  # closed
     time.sleep(1.0)
