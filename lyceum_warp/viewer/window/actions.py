@@ -195,9 +195,9 @@ def key_table() -> list[Key]:
 OTHER_KEYS = (
     ("0 to 5", "groups of geoms, with Shift groups of sites"),
     ("letters", "MuJoCo's flags, such as T transparent, C contacts, F forces, J joints, M centre of mass"),
-    ("drag left, right", "rotate or move the camera; the wheel zooms"),
+    ("left, right button", "drag to rotate or move the camera; the wheel zooms"),
     ("double-click left", "choose a body"),
-    ("Ctrl + drag right, left", "push or twist that body; while paused, place it"),
+    ("Ctrl + right, left button", "drag to push or twist that body; while paused, to place or turn it"),
     ("double-click right", "look at a point, with Ctrl follow the body"),
 )
 """The keys and mouse actions that studio handles."""

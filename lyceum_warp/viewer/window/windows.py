@@ -184,7 +184,7 @@ class Windows:
         if speeds is None or status.command is None:
             return
         imgui.SeparatorText("drive")
-        if imgui.Checkbox("by W A S D, Q E (Enter)", status.driven)[0]:
+        if imgui.Checkbox("with the keys W A S D, Q E (Enter)", status.driven)[0]:
             self._actions.toggle_driving()
         for i, (name, most) in enumerate(zip(("forward", "left", "turn left"), speeds, strict=True)):
             changed, value = imgui.SliderFloat(name, status.command[i], -2 * most, 2 * most, "%.2f")
@@ -221,7 +221,9 @@ class Windows:
         imgui.SeparatorText(f"push {name or 'a body'}")
         act = "place or turn" if paused else "push or twist"
         imgui.TextWrapped(
-            f"Ctrl + drag right or left: {act} it" if body > 0 else "double-click it, then Ctrl + drag right"
+            f"Ctrl + drag with the right or left button: {act} it"
+            if body > 0
+            else "double-click it, then Ctrl + drag with the right button"
         )
 
     def _metrics(self) -> None:
