@@ -66,7 +66,7 @@ BESIDE = {
     "pushed_falls": "falls with pushes", "pushed_velocity_error": "velocity error with pushes, m/s",
     "pushed_yaw_rate_error": "yaw rate error with pushes, rad/s",
 }  # fmt: skip
-"""Descriptions of the numbers that have no limit."""
+"""Descriptions of measured numbers for which the gates set no limit."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -82,7 +82,7 @@ class Case:
     steps: int
     """Number of steps of an episode."""
     seconds: float
-    """Seconds for plans outside episodes."""
+    """Seconds spent on timing plans, apart from the episodes."""
     threads: int
 
 

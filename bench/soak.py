@@ -490,7 +490,10 @@ def make_and_delete(case: Memory, options: Options) -> dict[str, Any]:
 
 
 def kill(case: Kills, options: Options) -> dict[str, Any]:
-    """Train without interruption and with kills, and compare the results; some progress precedes each kill."""
+    """Train once without interruption and once with kills, and compare the results.
+
+    Every kill waits until the training has made progress.
+    """
     straight, killed = (options.work / f"{case.task}-{case.seed}-{name}" for name in ("straight", "killed"))
     for folder in (straight, killed):
         shutil.rmtree(folder, ignore_errors=True)

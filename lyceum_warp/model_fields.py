@@ -248,7 +248,7 @@ MOVED_INERTIA = {"body_ipos", "body_iquat"}
 
 
 def check_simple(model: mujoco.MjModel, name: str) -> None:
-    """Refuse a field that moves the inertial frame of a body that is compiled as simple.
+    """Raise an error if a field would move the inertial frame of a simple body (``body_simple``).
 
     Raises:
         ValueError: The field moves the inertial frame, and the model has a simple body.

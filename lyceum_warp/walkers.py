@@ -191,7 +191,7 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
 
 
 def leg_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """List the joints from the base to each foot, (feet, longest leg); -1 fills the rows of shorter legs.
+    """List the joints from the base to each foot, (feet, most joints of a leg); -1 fills the rows of shorter legs.
 
     Raises:
         ValueError: A foot is not connected to the base by hinges.
@@ -214,7 +214,7 @@ def leg_dof(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def leg_axes(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the axis of each of ``leg_joints``, (feet, longest leg, 3)."""
+    """Get the axis of each of ``leg_joints``, (feet, most joints of a leg, 3)."""
     data = _straight(model)
     return data.xaxis[leg_joints(model, p)]
 

@@ -342,7 +342,7 @@ def test_evaluation_and_training_with_equal_seeds_draw_different_initial_states(
 
 
 def test_train_command_accepts_ppo(six: Path, tmp_path: Path) -> None:
-    """PPO starts with the networks of an NPG run, and a resumed run gives the same metrics."""
+    """PPO starts with the networks of an NPG run. A resumed PPO run has the metrics of an uninterrupted run."""
     options = ["--num-steps", "16", "--minibatches", "2", "--epochs", "2", "--nworld", "4", *QUIET]
     begin = ["train", "--from", str(six), "--algorithm", "ppo", *options, "--out"]
     assert cli.main([*begin, str(tmp_path / "whole"), "--iterations", "4"]) == 0

@@ -299,7 +299,7 @@ class PPO(OnPolicyLearner):
         """Make one step of Adam on a mini-batch.
 
         Args:
-            samples: This process's samples of the mini-batch, each (samples, ...).
+            samples: The part of the mini-batch that belongs to this process; arrays of shape (samples, ...).
             weight: Weights of the samples, (samples,), which sum to 1 over all processes.
         """
         config, clip = self.config, self.config.clip

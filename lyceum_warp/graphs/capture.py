@@ -1,8 +1,8 @@
 """Capture the phases of a step, a reset or a plan as graphs, and replay them.
 
 ``Graphs.sequence`` turns a list of phases into calls. Consecutive phases that consist of Warp launches become one
-graph, which is captured once and replayed. If the engine's calls also consist of launches, a whole step is one graph;
-otherwise the engine's calls run between the graphs.
+graph, which is captured once and replayed. If the engine's calls consist of launches as well, a whole step is one
+graph. Otherwise, the engine's calls run between the graphs of the phases.
 
 On the CPU, Warp runs each launch in one thread. Phases that process every world independently therefore become several
 graphs, one for each part of the worlds, and threads replay the graphs in parallel.

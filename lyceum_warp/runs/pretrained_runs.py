@@ -15,9 +15,10 @@ def pretrained_tasks() -> list[str]:
 
 
 def pretrained_run(task: str) -> Path:
-    """Get the folder of a task's pretrained policy. Functions such as ``lw.load`` accept the folder like any run.
+    """Get the folder of a task's pretrained policy, which is a run's folder.
 
-    The folder's config.json has the training settings and, under ``evaluated``, the policy's return.
+    ``lw.load`` and other functions accept this folder, as they accept every run's folder. The folder's config.json has
+    the training settings and, under ``evaluated``, the policy's return.
 
     Example:
         >>> policy = lw.load(lw.pretrained_run("hopper"))

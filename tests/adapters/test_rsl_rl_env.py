@@ -36,7 +36,7 @@ def test_rsl_rl_env_passes_options_to_the_task() -> None:
     assert (worlds.num_envs, worlds.max_episode_length, worlds.cfg["params"]) == (3, 7, {"far": 2.0})
 
 
-def test_observations_do_not_change_in_the_next_step(env: lw.Env) -> None:
+def test_returned_observations_are_not_overwritten_by_the_next_step(env: lw.Env) -> None:
     """rsl_rl stores the observations of a step only after the next step."""
     worlds = RslRlVecEnv(env)
     first = worlds.get_observations()

@@ -50,7 +50,7 @@ def test_user_value_network_is_fitted_by_autograd() -> None:
 
 @pytest.mark.gpu
 def test_gpu_captured_value_fit_equals_plain_launches() -> None:
-    """The first fit captures a graph between two mini-batches; the second fit only replays it, on different samples."""
+    """The first fit captures a graph after its first mini-batch; the second fit replays this graph on other samples."""
     samples, batch = 1000, 96  # the last mini-batch is smaller than the others
     generator = torch.Generator("cuda").manual_seed(2)
     data = [torch.randn(samples, 6, generator=generator, device="cuda") for _ in range(2)]

@@ -20,7 +20,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made.folder
 
 
-def test_gate_judges_each_policy_once(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_gate_experiment_tests_each_policy_only_once(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ["--short", "--policy", str(run), "--out", str(tmp_path / "gate.jsonl")]
     assert experiment.main(gate.EXPERIMENT, words) == 0
     out = capsys.readouterr().out

@@ -151,7 +151,7 @@ LADEN = table.PLAIN | {
 
 @pytest.mark.parametrize("asked", table.STAGES)
 def test_step_reuses_fields_that_are_already_computed(asked: str, device: wp.Device) -> None:
-    """The step computes the parts that a field needs, but does not repeat parts that are already computed."""
+    """A step computes only those stages of the physics that a field needs and that are not computed yet."""
     check(LADEN | {"asked": asked}, device)
 
 

@@ -169,7 +169,7 @@ def grasps(distance: wp.array[float], finger: wp.array[float], out: wp.array2d[f
 
 
 def test_grasp_terms_reward_open_fingers_on_the_way_and_closed_fingers_at_the_target() -> None:
-    cases = {  # columns: distance and finger, then the expected near, reach and grasp
+    cases = {  # (distance, finger opening): expected (near, reach, grasp)
         (0.0, 0.005): (1.0, 1.0, 1.0),
         (0.0, 0.04): (1.0, 1.0, 0.0),
         (0.02, 0.04): (0.1, 1.0 / 1.6, 0.45),

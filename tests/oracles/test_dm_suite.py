@@ -221,7 +221,7 @@ def test_margin_of_point_mass_is_the_size_of_its_target() -> None:
     assert env.task.params["margin"] == env.task.params["target_size"] == pytest.approx(0.1)
 
 
-def test_planners_of_acrobot_are_rewarded_for_its_energy(shared_env: SharedEnv) -> None:
+def test_reward_of_acrobot_planners_depends_on_the_energy(shared_env: SharedEnv) -> None:
     env = shared_env("dm/acrobot_swingup", nworld=3, autoreset=False, energy_weight=2.0)
     state = env.get_state()
     parts = env.state_space.split(state)

@@ -252,7 +252,7 @@ class PartialForward:
             self._run(mask, work)
 
     def settle(self, mask: wp.array, nstep: int) -> None:
-        """Advance the masked worlds' states by ``nstep`` substeps, and set their time to 0, by Warp launches only."""
+        """Step the worlds in the mask ``nstep`` times, and set their time to 0. All work consists of Warp launches."""
 
         def work() -> None:
             for _ in range(nstep):

@@ -95,7 +95,9 @@ def run(opening: Opening, end: WindowEnd) -> None:
             return end.send(Failed(str(error), refused=True))
         sock = private_socket()
         model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": opening.scene.model})
-        model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] = 0.0  # studio then draws planes as endless
+        model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] = (
+            0.0  # studio draws planes of size 0 as infinite
+        )
         screen = studio.Screen()
         opened = Opened(proxy.address, tuple(proxy.instructions))
         panel = Panel(opening.scene, model, end.send, end.take, screen, opened, proxy.offer)
