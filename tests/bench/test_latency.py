@@ -9,6 +9,7 @@ def main(out: Path, *words: str) -> int:
     return experiment.main(latency.EXPERIMENT, ["--short", "--threads", "1", "--out", str(out), *words])
 
 
+@pytest.mark.long
 def test_short_latency_run_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "latency.jsonl"
     assert main(out, "--samples", "8", "16") == 0

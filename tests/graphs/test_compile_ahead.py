@@ -44,6 +44,7 @@ print(built.modules, built.known)
 """
 
 
+@pytest.mark.long
 def test_kernels_are_compiled_once_with_progress_messages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

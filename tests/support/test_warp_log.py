@@ -14,6 +14,7 @@ def printed(program: str) -> tuple[str, str]:
     return done.stdout, done.stderr
 
 
+@pytest.mark.long
 @WITHOUT_GPU
 def test_missing_driver_prints_nothing_for_a_cpu_environment_and_one_line_for_a_gpu() -> None:
     program = """
