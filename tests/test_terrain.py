@@ -21,7 +21,7 @@ def patch(kind: str, *, level: int = 0, levels: int = 1, **options: object) -> n
 
 
 def row_of(kind: str, **options: object) -> np.ndarray:
-    """Make the heights from the centre of a patch to its edge along x, (41,)."""
+    """Return a patch's heights along x, from its centre to its edge, (41,)."""
     return patch(kind, **options)[40, 40:]
 
 

@@ -120,7 +120,7 @@ class Planner:
     nominal: torch.Tensor
     """The plan from which the last improvement started, (horizon, nact)."""
     knot_actions: torch.Tensor
-    """The plan's knots, (nknot, nact), some of which lie beyond the horizon; equals ``actions`` without knots."""
+    """The plan's knots, (nknot, nact). The last may lie beyond the horizon. Without knots, equal to ``actions``."""
     standard_noise: torch.Tensor
     """The last improvement's standard normal noise, (horizon, samples, nact) or (nknot, samples, nact)."""
     adapted_noise: torch.Tensor | None

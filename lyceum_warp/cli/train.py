@@ -230,15 +230,15 @@ class Train:
             few = 8 if suggestion.algorithm == "sac" else 64  # SAC makes one update per world and step
             nworld = 4096 * team.size if (self.env.device or "cpu").startswith("cuda") else few
             options = EnvOptions(nworld=nworld, device="cpu")
-            base = Configuration(
-                task=self.task, options=options, algorithm=suggestion.algorithm, hyperparameters=None
-            )  # fmt: skip
+            suggested = None
             if suggestion.settings:
                 try:
                     suggested = ALGORITHMS[suggestion.algorithm][1](**suggestion.settings)
                 except (KeyError, TypeError, ValueError) as error:
                     raise ValueError(f"training of the task {self.task} is not valid: {error}") from error
-                base = dataclasses.replace(base, hyperparameters=suggested)
+            base = Configuration(
+                task=self.task, options=options, algorithm=suggestion.algorithm, hyperparameters=suggested
+            )  # fmt: skip
         else:
             base = Configuration.of(source)
         solver = base.options.physics.solver

@@ -90,7 +90,7 @@ def check_task(
 
     Raises:
         AssertionError: Rules are broken; the message lists them.
-        ValueError: ``nworld`` is less than 2, ``steps`` is less than 1, or an option does not fit.
+        ValueError: ``nworld`` is less than 2, ``steps`` is less than 1, or an option is not valid.
 
     Example:
         >>> print(check_task("hopper", engine="mujoco"))

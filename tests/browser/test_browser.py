@@ -429,6 +429,33 @@ def test_keys_set_the_command_of_a_walking_robot(context: BrowserContext) -> Non
     viewer.thread.join(30)
 
 
+@pytest.mark.long
+def test_output_of_a_notebook_cell_shows_the_page_in_a_frame(context: BrowserContext) -> None:
+    shown = lw.view(lw.make(Block), seed=0, block=False)
+    assert shown is not None
+    text = f"<!doctype html><title>notebook</title>{shown._repr_html_()}".encode()
+
+    class Notebook(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(text)
+
+    page, log = context.new_page(), []
+    page.on("console", lambda message: log.append(message.text))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Notebook) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        page.goto(f"http://localhost:{server.server_port}/")
+        deadline = time.monotonic() + SECONDS
+        while not any("First remote draw frame applied" in line for line in log):
+            assert time.monotonic() < deadline, log
+            page.wait_for_timeout(20)
+        server.shutdown()
+    assert "token" not in page.frames[1].url
+    page.close()
+    shown.close()
+
+
 def test_pages_of_other_sites_cannot_reach_the_viewer(viewer: Viewer, context: BrowserContext) -> None:
     own = context.new_page()
     own.goto(viewer.window.address)

@@ -104,8 +104,7 @@ def count_down(number_inout: wp.array[int], turns_inout: wp.array[int]):
 
 
 def test_graph_contains_only_launches_of_its_own_thread() -> None:
-    """During the capture, another thread launches, copies, loops and captures its own graphs, and must get its own
-    results."""
+    """While one thread captures, another thread launches, copies, loops and captures, and gets correct results."""
     mine, captured = Digits(), []
     cpu, number, turns, copied = wp.get_device("cpu"), *(wp.full(1, 3, dtype=int, device="cpu") for _ in range(3))
     own = Digits()

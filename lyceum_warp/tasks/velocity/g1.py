@@ -44,6 +44,8 @@ class GaitParams(gait.Params, Params):
 
 
 class G1(walking.Biped):
+    """The model that the tasks of the G1 share."""
+
     model = lw.playground_model("locomotion/g1/xmls/scene_mjx_feetonly_flat_terrain.xml")
 
     @staticmethod
