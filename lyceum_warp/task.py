@@ -438,8 +438,8 @@ class Task:
       and model fields. Every reset restores the nominal values of model fields before ``initialize`` runs, so that
       random changes do not accumulate over episodes. ``initialize`` and ``randomize`` must not read derived fields
       (``xpos``, ``site_xpos``, ``sensordata``), which are computed afterwards.
-    - ``startup``: model fields and lasting memory. Resets do not change these values. - ``substep``: memory and lasting
-    memory. ``advance``: memory and lasting memory of ``s1``.
+    - ``startup``: model fields and lasting memory. Resets do not change these values.
+    - ``substep``: memory and lasting memory. ``advance``: memory and lasting memory of ``s1``.
 
     ``reject`` gets the initial state before the state settles. While an initial state settles, no ``substep`` runs.
 
