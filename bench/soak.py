@@ -326,7 +326,7 @@ def tally(
     clean_inout: wp.array[bool], injected_inout: wp.array2d[int], reasons_inout: wp.array2d[int],
     outcome_inout: wp.array2d[int],
 ):  # fmt: skip
-    """Count faults after a step, and compare clean worlds with the worlds of the twin; launched over (nworld,)."""
+    """Count faults after a step, and compare worlds without faults with their copies in the twin environment."""
     w = wp.tid()
     due = wp.where(pending_inout[w], 6, wp.where(kind_in[w] < 6, kind_in[w], 0))
     pending_inout[w] = kind_in[w] == 6 and not done_in[w]  # a world that restarts gets no event in this step

@@ -135,9 +135,10 @@ def hold_success(
     success_inout: wp.array[bool],
     first: int,
 ):
-    """Report success only after ``needed`` consecutive steps, in the masked worlds; launched over (nworld,).
+    """Report success only after ``needed`` successful steps in a row, in the masked worlds; launched over (nworld,).
 
-    A transition increases or clears the count, (nworld, 1). Judging a state without a transition keeps it.
+    ``count``, (nworld, 1), holds the successful steps so far. A transition increases or clears it; the evaluation of a
+    state alone does not change it.
     """
     w = first + wp.tid()
     if mask_in[w]:
@@ -219,7 +220,7 @@ def begin_kernels(task: TaskCode) -> BeginKernels:
         outdated_out: wp.array[bool],
         first: int,
     ):
-        """Run the events of the worlds that do not restart and set ``continuing_out``; launched over (nworld,)."""
+        """Set ``continuing_out`` for the worlds that do not restart, and run their events; launched over (nworld,)."""
         w = first + wp.tid()
         continuing_out[w] = not restarting_in[w]
         physics_changed_out[w] = False

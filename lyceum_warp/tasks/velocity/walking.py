@@ -168,7 +168,7 @@ def distance(x: wp.vec3, s: World, p: Params) -> float:
 
 @wp.func
 def last_joint(s: World, p: Params, foot: int) -> tuple[wp.vec3, lw.quat, wp.vec3, wp.vec3]:
-    """Return the position, the rotation, the velocity and the angular velocity of the last joint before a foot."""
+    """Return position, rotation, velocity and angular velocity of the last joint in the leg of a foot."""
     turn = terms.orientation(s.qpos)
     x, v = wp.vec3(s.qpos[0], s.qpos[1], s.qpos[2]), wp.vec3(s.qvel[0], s.qvel[1], s.qvel[2])
     w = lw.quat_rotate(turn, terms.angular_velocity(s.qvel))
@@ -197,7 +197,7 @@ def height(x: wp.vec3, s: World, p: Params) -> float:  # clipped at 1 m, the ran
 
 @wp.func
 def sole_touches(x: wp.vec3, turn: lw.quat, s: World, p: Params, foot: int) -> bool:
-    """Return whether a foot touches the ground, given the position and the rotation of its last joint."""
+    """Return whether a foot touches the ground, from the position and the rotation of the last joint in its leg."""
     touching = bool(False)
     for i in range(p.soles.shape[1]):
         sphere = p.soles[foot, i]
@@ -257,7 +257,7 @@ def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
 
 @wp.func
 def observe_robot(s: World, p: Params, obs: Any):
-    """Write the parts that both observation groups have, except the positions of the joints."""
+    """Write the observations that policy and critic share, except the joint positions."""
     obs.angular_velocity[0] = terms.angular_velocity(s.qvel)
     obs.linear_velocity[0] = terms.linear_velocity(s.qpos, s.qvel) + wp.cross(obs.angular_velocity[0], p.imu)
     obs.gravity[0] = terms.gravity(s.qpos)
@@ -346,7 +346,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 @wp.func
 def foot_clearance_and_slip(active: float, s: World, p: Params) -> wp.vec2:
-    """Return the terms foot_clearance and foot_slip, so that the motion of the feet is computed once."""
+    """Return the terms foot_clearance and foot_slip together, so that the motion of the feet is computed only once."""
     clearance, slip = float(0.0), float(0.0)
     for foot in range(p.feet.shape[0]):
         x, v = foot_motion(s, p, foot)
@@ -368,9 +368,9 @@ def foot_slip(foot_clearance_and_slip: wp.vec2) -> float:
 
 @wp.func
 def single_stance(contact_time: Row[float], air_time: Row[float], longest_step: float, active: float) -> float:
-    """Return the least contact or air time of the feet, s, at most ``longest_step``; 0 unless one foot is in contact.
+    """Return the shortest time, s, for which a foot has been in contact or in the air, at most ``longest_step``.
 
-    Source: Isaac Lab, ``feet_air_time_positive_biped``.
+    The result is 0 unless exactly one foot is in contact. Source: Isaac Lab, ``feet_air_time_positive_biped``.
     """
     down, least = int(0), float(longest_step)
     for foot in range(contact_time.shape[0]):
