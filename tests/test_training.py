@@ -121,7 +121,7 @@ def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
         lw.load(six, which="worst")
 
 
-def test_best_policy_without_evaluations_sampled_the_best_iteration(tmp_path: Path) -> None:
+def test_without_evaluations_the_best_policy_is_the_one_that_sampled_the_best_iteration(tmp_path: Path) -> None:
     """The policy before an iteration's update samples that iteration's episodes."""
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), tmp_path / "run", iterations=4, keep_every=1)

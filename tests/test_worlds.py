@@ -170,7 +170,7 @@ def test_rollouts_and_plans_do_not_depend_on_success_steps() -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_captured_graphs_use_parameters_that_become_per_world(engine: str) -> None:
+def test_captured_graphs_use_new_parameters_that_differ_between_worlds(engine: str) -> None:
     env = lw.make("hopper", nworld=2, engine=engine)
     action = torch.ones(2, 3)
     for _ in range(3):

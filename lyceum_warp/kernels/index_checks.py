@@ -1,8 +1,8 @@
 """Check array indices in the instrumented copies of a task's functions that ``check_task`` runs.
 
-``report`` is (places, 3). Each row belongs to an index in the source, and holds how often it was out of range,
-the first bad index, and the size of the array. Functions are not inlined, because inlining would increase compile
-times.
+``report`` is (places, 3). Each row belongs to one place in the source where an array is indexed. The row holds the
+number of bad indices, the first bad index, and the size of the array. Functions are not inlined, because inlining would
+increase compile times.
 """
 
 from typing import Any

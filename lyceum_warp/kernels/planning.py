@@ -11,14 +11,15 @@ from lyceum_warp.kernels.random import stream, world_key
 
 ACTION = wp.constant(int(Done.ACTION))
 NOISE = wp.constant(-2)
-"""The number that replaces the episode in the noise's streams, which makes them independent of the worlds' streams."""
+"""The random streams of the noise use this number instead of an episode's index, so they differ from the worlds'
+streams."""
 DRAWS = wp.constant(-3)
-"""The number that replaces the episode in the samples' stream keys."""
+"""The stream keys of the samples use this number instead of an episode's index."""
 
 _TILES = f"{__name__}.tiles"
-"""The Warp module of the kernels with tiles. On the CPU all kernels of a module write a shared variable, the address of
-the tiles. Kernels without tiles need a separate module, because ``graphs.capture`` serialises only kernels with
-tiles."""
+"""The Warp module of the kernels with tiles. On the CPU, all kernels of a module write the same shared variable, which
+holds the address of the tiles. Kernels without tiles need a separate module, because ``graphs.capture`` serialises only
+kernels with tiles."""
 
 
 @wp.func

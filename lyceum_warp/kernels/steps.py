@@ -17,9 +17,9 @@ NAN = wp.constant(int(Done.NAN))
 ALL_FAULTS = wp.constant(int(FAULTS))
 
 EVENT = wp.constant(-2)
-"""Substream of a step's stream for events."""
+"""Events draw from the substream with this number of each step's random stream."""
 STARTUP = wp.constant(-1)
-"""The number that replaces the episode in the stream of ``startup``."""
+"""The random stream of ``startup`` uses this number instead of an episode's index."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -263,7 +263,7 @@ def shared_kernels(task: TaskCode) -> SharedKernels:
         sum_inout: wp.array[wp.int64],
         first: int,
     ):
-        """Add the tally of each world's transition, if it has no fault, to the sums; launched over (nworld,)."""
+        """Add each world's tally to the sums, if its transition has no fault; launched over (nworld,)."""
         w = first + wp.tid()
         for i in range(share_out.shape[1]):
             share_out[w, i] = 0.0
@@ -296,8 +296,8 @@ class Kernels(ActKernels, JudgeKernels, BeginKernels, RolloutKernels, SharedKern
     """The kernels of a step, and the structs of their arrays. Kernels that the task does not need are None."""
 
     views: Mapping[Any, wp.Function]
-    """Functions by the struct that they make: World from a batch and a world's index, and observation structs from a
-    row."""
+    """For each struct, the function that makes it. The function of World takes a batch and a world's index; the
+    functions of observation structs take a row."""
     terms: Mapping[str, wp.Function]
     """The generated functions of a task with terms: ``reward``, ``score`` and ``terminated``."""
     Batch: Any

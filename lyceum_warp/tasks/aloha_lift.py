@@ -113,7 +113,7 @@ class AlohaLift(lw.Task):
                 geom.rgba = (0.75, 0.77, 0.8, 1.0)
         spec.camera("collaborator_pov").mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK  # the camera of videos
         for light in spec.lights:
-            light.castshadow = False  # shadows slow rendering without a GPU down by a factor of 17
+            light.castshadow = False  # without a GPU, shadows make rendering 17 times slower
         child = lw.package_model("lyceum_warp", "tasks/aloha_lift.xml").spec()
         for part in child.worldbody.bodies:
             spec.body(part.name).add_frame().attach_body(part, "lift/", "")

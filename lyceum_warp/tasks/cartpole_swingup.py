@@ -65,5 +65,6 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class CartpoleSwingup(lw.Task):
     model = "cartpole.xml"
     obs = {"cart_position": 1, "pole_direction": 2, "cart_velocity": 1, "pole_velocity": 1}
-    physics = {"fast": lw.PhysicsOptions(integrator="euler")}  # 3 times faster than RK4; returns differ by up to 1.1 %
+    # Euler's method is 3 times faster than RK4; returns differ by up to 1.1 %
+    physics = {"fast": lw.PhysicsOptions(integrator="euler")}
     planning = lw.Planning(settings={"horizon": 100})

@@ -502,11 +502,11 @@ def test_hopper_hops_without_falling() -> None:
 
 
 def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
-    """Return the mean return over runs of 100 steps, and the mean's standard deviation if actions do not depend on
-    coins.
+    """Return the mean return over runs of 100 steps, and the standard deviation that this mean has if no action depends
+    on its coin.
 
-    Plant and planner have equal seeds. A return is the sum of action times coin. If no action depends on its coin, the
-    variance of the return is the sum of the squared actions.
+    Plant and planner have equal seeds. A reward is the product of action and coin, so the variance of the return is the
+    sum of the squared actions if no action depends on its coin.
     """
     plan = MPPI(task, engine="mujoco", horizon=4, noise=2.0, smoothing=(1, 0, 0))
     plant = lw.make(task, autoreset=False)

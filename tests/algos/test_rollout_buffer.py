@@ -75,7 +75,7 @@ class Settling(Metered):
 @pytest.mark.parametrize(("task", "engine", "spread"), [
     (Metered, "warp", True), (Settling, "mujoco", True), (Settling, "warp", False),
 ])  # fmt: skip
-def test_step_counters_are_not_staggered_if_all_worlds_wait_for_a_world_that_settles(
+def test_worlds_start_at_different_steps_unless_settling_one_world_delays_all_others(
     task: type[lw.Task], engine: str, spread: bool
 ) -> None:
     rollout = lw.Rollout(lw.make(task, nworld=4, horizon=50, engine=engine), 1)

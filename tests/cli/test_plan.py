@@ -97,7 +97,9 @@ def test_command_plan_makes_a_video_of_the_first_episode(tmp_path: Path, capsys:
     assert Path(video).read_bytes()[4:8] == b"ftyp"
 
 
-def test_plant_keeps_its_rate_with_real_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plant_runs_at_its_own_rate_if_the_flag_real_time_is_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert plan(tmp_path / "run", *QUIET, "--real-time") == 0
     assert "async" in capsys.readouterr().out
     report = json.loads((tmp_path / "run" / "report.json").read_text())

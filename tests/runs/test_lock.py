@@ -70,7 +70,9 @@ def test_resuming_a_run_that_another_process_writes_raises_an_error(
     assert len(metrics(run)) == 4 and not (run / "lock").exists()
 
 
-def test_option_take_over_without_resume_prints_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_flag_take_over_prints_an_error_if_the_flag_resume_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["train", "point_mass", "--take-over", "--out", str(tmp_path / "run")]) == 2
     refused(capsys, "--take-over has no effect without --resume")
 
