@@ -143,7 +143,7 @@ def load(name: str) -> Experiment:
 
 
 def choose(given: Sequence[str], known: Iterable[str], default: Sequence[str] = (), *, what: str) -> tuple[str, ...]:
-    """Return the given names. If there are none, return the default names; if there are none either, return all known
+    """Return the given names. Without given names, return the default names. Without default names, return all known
     names.
 
     Raises:

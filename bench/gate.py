@@ -78,7 +78,7 @@ class Options(experiment.Options):
     which: str = "last"
     """Policy of each run: last, best, or the number of a saved iteration."""
     task: str | None = None
-    """Velocity task to play instead of the run's task. It has its own parameters, not the run's."""
+    """Velocity task to play instead of the run's task. The task has its own parameters, not the run's."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -422,8 +422,8 @@ def interval(found: tuple[float, float], form: str = ",.0f") -> str:
 
 
 def agreement(task: str, same: dict[str, list[Row]]) -> Table | None:
-    """Compare the returns of both NPGs every 100,000 samples; return None if there is one seed, or if runs are shorter
-    than that."""
+    """Compare the returns of both NPGs every 100,000 samples; return None if there is only one seed, or if runs have
+    fewer samples."""
     ours, fed = (np.array([values_at(row, EVERY_100K) for row in same[name]]) for name in ("npg", "npg_gymnasium"))
     there = ~np.isnan(np.concatenate([ours, fed])).any(axis=0)
     if not there.any() or min(len(ours), len(fed)) < 2:

@@ -80,7 +80,7 @@ class Case:
 
 
 def cases(options: Options) -> list[Case]:
-    """List the runs of all tasks with a recipe for the device."""
+    """List the runs of all tasks that have training flags for the device."""
     kind = options.device.partition(":")[0]
     tasks = choose(options.tasks, RECORDS, ("hopper",) if options.short else (), what="task")
     for task in options.tasks:

@@ -51,12 +51,12 @@ from lyceum_warp.support.validate import whole_number
 PARTS = ("faults", "random", "memory", "kills")
 KINDS = {"state": Done.NAN, "speed": Done.NAN, "action": Done.ACTION, "reward": Done.REWARD,
          "observation": Done.OBSERVATION, "model": Done.MODEL}  # fmt: skip
-"""Kinds of faults, numbered from 1. A kind is named after the place of the injection, and has the reason that must be
-reported."""
+"""Each kind of fault, named after the place of its injection, with the reason that must be reported. Kinds are numbered
+from 1."""
 NBIT = len(Done)
 EVERY = 16
-"""Number of steps between writes of invalid states. A write affects this number of times as many worlds, so the number
-of faults does not depend on it."""
+"""Number of steps between writes of invalid states. If writes are less frequent, each write affects more worlds, so the
+number of faults stays the same."""
 SAMPLES = 5
 """Memory samples per chunk."""
 TASKS = {
