@@ -520,7 +520,7 @@ class Task:
     training: ClassVar[Training] = Training()
     """The task's settings for ``lyceum-warp train``, such as ``lw.Training(algorithm="ppo", settings={...})``."""
 
-    # the module's World, Params and Warp functions when the class was defined
+    # the World, the Params and the Warp functions that the module had when the class was defined
     scope: ClassVar[dict[str, Any]]
 
     @staticmethod

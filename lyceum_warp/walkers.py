@@ -252,7 +252,7 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
         found[:, :3] -= data.xanchor[_last_joint(model, foot)]
         spheres.append(found)
     most = max(map(len, spheres))
-    return np.array([np.resize(found, (most, 4)) for found in spheres])  # feet with fewer spheres repeat theirs
+    return np.array([np.resize(found, (most, 4)) for found in spheres])  # if a foot has fewer spheres, repeat them
 
 
 def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:

@@ -196,7 +196,7 @@ class WorldArrays:
             self.mask_view.copy_(mask)
 
     def pack_state(self, ended: wp.array) -> None:
-        """Write every world's state vector into ``state``, with ``ended``, (nworld,), as the part ``done_reason``."""
+        """Write every world's state vector into ``state``; its part ``done_reason`` is ``ended``, (nworld,)."""
         size = self.engine.state_size
         self.engine.get_state(self.state[:, :size])
         own = self.counters

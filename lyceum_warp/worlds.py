@@ -78,7 +78,7 @@ class Worlds(WorldArrays):
         self.step = self.programs.step
 
     def drop_programs(self) -> None:
-        """Delete the programs. They contain reference cycles, which would keep threads and memory alive."""
+        """Delete the programs, whose reference cycles would keep threads and memory alive."""
         self._programs.clear()
         del self.programs, self.step
 
@@ -353,7 +353,7 @@ class Worlds(WorldArrays):
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         """Compute observations, evaluations and terminations of the masked worlds' states, without a transition."""
-        # a state set without a check may be a fault; a world with a fault keeps the last valid observation
+        # a state that was set without a check may be invalid; a world with a fault keeps the last valid observation
         self.engine.find_faults(self.mask)
         keep_reason = keep_reason and not self.autoreset
         self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)

@@ -14,7 +14,7 @@ from lyceum_warp.viz.cameras import CameraChoice
 
 
 class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
-    """One world as a ``gymnasium.Env``, for evaluation, debugging and tools without support for vector environments.
+    """One world as a ``gymnasium.Env``, for evaluation, for debugging, and for tools that need a single environment.
 
     ``info`` holds ``eval``, ``done_reason`` and, if the task has them, ``success``, ``metrics`` and
     ``episode_metrics``. ``GymnasiumVectorEnv`` steps many worlds much faster.

@@ -86,8 +86,7 @@ def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict
     """Lay out the parts of each observation group, for given values of the task's parameters.
 
     Raises:
-        ValueError: The task's ``obs`` is neither a dict of sizes nor a dict of groups of sizes, or a struct has no
-            parts.
+        ValueError: The task's ``obs`` is neither a dict of sizes nor a dict of such dicts, or a struct has no parts.
     """
     task, name = source.task, source.name
     if not hasattr(task, "obs"):

@@ -237,7 +237,7 @@ class Parameters:
         return table
 
     def _indices(self, what: str, value: Any, field: str | None) -> Any:
-        """Replace elements of the model in a table by indices; with ``field``, replace names too."""
+        """In a table, replace elements of the model by their indices; if ``field`` is given, also replace names."""
         if isinstance(value, list | tuple):
             return [self._indices(what, entry, field) for entry in value]
         if isinstance(value, Element):

@@ -25,11 +25,11 @@ from lyceum_warp.task import Task
 _tasks: dict[str, type[Task]] = {}
 
 _loaded: dict[str, Stamps] = {}
-"""Stamps of each task module's file and of the modules beside it, as of their last run. A stamp is a modification time
-and a size."""
+"""For each task module, the stamps that its file and the modules beside it had when they last ran. A stamp is a
+modification time and a size."""
 
 _LOADING = threading.RLock()
-"""Held while a file is loaded, because imports and linecache are global to the process."""
+"""A lock that is held while a file is loaded, because imports and linecache are global to the process."""
 
 _PACKAGE = "lyceum_warp.tasks."
 _FILE = "lyceum_task_"

@@ -105,7 +105,7 @@ class Turns:
             wp.launch(kernels.return_rows, rows.shape, [self._world, self._left, rows, flat(target)])
 
     def give_bits(self, source: wp.array, target: wp.array) -> None:
-        """Combine the group's bits, (size,), with the bits of all worlds, (nworld,), by bitwise or."""
+        """Add the bits of the group's rows, (size,), to the bits of the same worlds, (nworld,), by bitwise or."""
         wp.launch(kernels.return_bits, self.size, [self._world, self._left, source, target])
 
 

@@ -94,7 +94,7 @@ def return_rows(
 
 @wp.kernel(enable_backward=False)
 def return_bits(world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array[int], target_inout: wp.array[int]):
-    """Set each bit that is set in a group's row in the row of the same world too; launched over (group size,)."""
+    """Add the bits of a group's rows to the bits of the same worlds, by bitwise or; launched over (group size,)."""
     place = wp.tid()
     if place < left_in[0]:
         world = world_in[place]

@@ -64,7 +64,8 @@ class FrameMaker:
 
         Args:
             live: The worlds.
-            main: All worlds. ``live`` is either the same object, or a plant that copies the shown world of ``main``.
+            main: All worlds. ``live`` is either ``main`` itself, or a plant, which is a copy of the shown world of
+                ``main``.
             traces: The paths of a planner's samples.
             status: A function that makes the complete status.
             paused: Whether the frame must show the present state; otherwise the frame may show the state at the time of
