@@ -253,8 +253,8 @@ def measure(case: Any, options: Options) -> dict[str, Any]:
 
 
 def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
-    """Write a variant of a task. It has one action more than the task, and this action requests a fault. Return the
-    variant, and the range of the other actions."""
+    """Write a variant of a task. The variant has one action more than the task, and this action requests a fault.
+    Return the variant, and the range of the other actions."""
     parent, plain = find_task(task), lw.make(task, nworld=1, engine="mujoco")
     own = TaskSource(parent, task)
     functions, nact = own.functions, plain.action.shape[1]

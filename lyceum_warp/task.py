@@ -385,8 +385,8 @@ class Training:
     algorithm: str = "npg"
     """Name of the algorithm: npg, ppo or sac."""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Hyperparameters of the algorithm, by the names of ``lw.NPGConfig``, ``lw.PPOConfig`` or ``lw.SACConfig``. They do
-    not apply if a flag chooses another algorithm."""
+    """Hyperparameters of the algorithm, by the names of ``lw.NPGConfig``, ``lw.PPOConfig`` or ``lw.SACConfig``. These
+    hyperparameters do not apply if a flag chooses another algorithm."""
     iterations: int = 100
     """Number of iterations."""
 

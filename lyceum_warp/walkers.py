@@ -342,7 +342,7 @@ def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.nd
 
 
 def spheres_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
-    """Compute a geom's spheres for ``soles``, in the world's axes, (spheres, 4)."""
+    """Compute the spheres that replace a geom in ``soles``, in the world's axes, (spheres, 4)."""
     size, kind = model.geom_size[geom], mujoco.mjtGeom
     radius, middle = 0.0, np.zeros(3)
     if model.geom_type[geom] == kind.mjGEOM_SPHERE:
@@ -482,7 +482,7 @@ def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.01
     not change.
 
     Args:
-        spec: The model after ``prepare_walker``. It is changed in place.
+        spec: The model after ``prepare_walker``. The model is changed in place.
         feet: Names of the sites of the feet.
         radius: Radius of the capsules, in m.
 

@@ -208,7 +208,7 @@ def join(device: str = "cpu") -> Iterator[Team]:
         yield Team(device=device)
         return
     # The first optimizer imports torch's compiler. If a process group exists during this import, the compiler keeps the
-    # group and its threads alive until Python exits. This sometimes aborts the process.
+    # group and its threads alive until Python exits. A thread that is still alive then sometimes aborts the process.
     torch.optim.SGD([torch.zeros(1)])
     place, neighbours = int(os.environ.get("LOCAL_RANK", "0")), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     if device.startswith("cuda"):

@@ -101,7 +101,7 @@ class SAC(Learner):
     target: TwinCritic
     """The target critics, which share the critics' normaliser."""
     config: Any
-    """Hyperparameters, an ``SACConfig`` without None."""
+    """Hyperparameters: an ``SACConfig`` in which defaults have replaced None."""
     replay: Replay
     """Replay buffer with the samples of this process's worlds."""
     generator: torch.Generator

@@ -67,8 +67,8 @@ class Parameters:
         self._check_tables()
         if taken := [name for name in (*struct.vars, *self._weights) if name in (*OPTIONS, "task", "options")]:
             raise ValueError(
-                f"the parameter {taken[0]!r} of the task {task_name!r} has the name of an option of make(), which "
-                "would get its value: rename it in Params"
+                f"the parameter {taken[0]!r} of the task {task_name!r} has the name of an option of make(), so "
+                f"make() would set the option: rename it in Params"
             )
         found = defaults(struct, owner) | self._weights | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
         self._computed = {name for name, value in found.items() if isinstance(value, FromModel)}

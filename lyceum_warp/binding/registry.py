@@ -38,7 +38,7 @@ _sources: "weakref.WeakKeyDictionary[type[Task], Mapping[Path, bytes]]" = weakre
 
 
 def register(task: type[Task]) -> type[Task]:
-    """Class decorator: register a task. Its name is the class name in snake_case.
+    """Class decorator: register a task. The task's name is the class name in snake_case.
 
     A class may replace an earlier one of the same file, for example if a notebook runs a cell again.
 

@@ -84,8 +84,8 @@ def height_scan(
     Args:
         row: A row, such as a part of an observation, with an element for each point.
         ground: The table of ``lw.height_field``.
-        points: Points relative to the base, m, with x forwards and y to the left. They turn with the base's yaw, but
-            not with its roll and pitch.
+        points: Points relative to the base, m, with x forwards and y to the left. The points turn with the base's yaw,
+            but not with its roll and pitch.
         base: Position of the base, m.
         orientation: Orientation of the base (w, x, y, z).
     """

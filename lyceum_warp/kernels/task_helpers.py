@@ -249,8 +249,8 @@ def grasp_terms(distance: float, finger: float, closed: float) -> tuple[float, f
     Args:
         distance: Distance from the point between the fingers to the target, m.
         finger: Position of a finger, m; it is 0 if the fingers meet.
-        closed: Largest position at which the fingers count as closed, m. They count as open if each finger is at least
-            2 cm further out.
+        closed: Largest position at which the fingers count as closed, m. The fingers count as open if each finger is at
+            least 2 cm further out.
     """
     near = tolerance(distance, wp.vec2(0.0, 0.01), 0.01)
     reach = tolerance(distance, wp.vec2(0.0, 0.005), 0.1, int(Sigmoid.RECIPROCAL), 0.2)

@@ -280,7 +280,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
 
 @dataclasses.dataclass(frozen=True)
 class RolloutKernels:
-    """Kernels for open-loop rollouts, which store their fields for all steps."""
+    """Kernels for open-loop rollouts. A rollout stores the fields of all steps."""
 
     judge_rows: wp.Kernel
     advance_rows: wp.Kernel | None

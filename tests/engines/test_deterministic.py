@@ -26,7 +26,8 @@ from lyceum_warp.fields import describe
 
 @pytest.fixture
 def without_allocators(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Remove Warp's custom allocators, so that the engine runs on the CPU. They exist only on CUDA devices."""
+    """Remove Warp's custom allocators, so that the engine runs on the CPU. Custom allocators exist only on CUDA
+    devices."""
     monkeypatch.setattr(wp, "ScopedAllocator", lambda *args: contextlib.nullcontext())
 
 

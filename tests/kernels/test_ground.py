@@ -14,7 +14,7 @@ OFFSET = (0.5, -0.25, 0.125)
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    """Make a height field with random heights and rectangular cells. Its geom is not at the origin."""
+    """Make a height field with random heights and rectangular cells. The geom of the field is not at the origin."""
     spec = mujoco.MjSpec()
     heights = np.random.default_rng(0).uniform(size=NROW * NCOL)
     spec.add_hfield(name="field", size=SIZE, nrow=NROW, ncol=NCOL, userdata=heights)

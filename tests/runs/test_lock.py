@@ -27,7 +27,7 @@ os.kill(os.getpid(), 9)
 
 
 def held(folder: Path, *, seconds: float = 0.0, **changes: Any) -> None:
-    """Write the lock of a running process. Its last heartbeat was the given number of seconds ago."""
+    """Write the lock of a running process. The last heartbeat of the lock was the given number of seconds ago."""
     pid = os.getppid()
     owner = {"host": platform.node(), "pid": pid, "started": lock._started(pid), "token": "theirs"}
     (folder / "lock").write_text(json.dumps(owner | changes))

@@ -53,7 +53,7 @@ COARSE = Setting("1 x 8 ms, implicitfast", "substeps",
                  {"frame_skip": 1, "timestep": 0.008, "integrator": "implicitfast"})  # fmt: skip
 
 
-def test_combined_setting_has_one_setting_of_each_group_without_conflicts() -> None:
+def test_combination_has_at_most_one_setting_of_each_group_and_no_conflicts() -> None:
     finer = Setting("2 x 4 ms", "substeps", {"frame_skip": 2, "timestep": 0.004})
     both = combined([COARSE, EULER, LIMITED, finer, SEARCH])
     assert both is not None and both.parts == (COARSE, LIMITED, SEARCH)

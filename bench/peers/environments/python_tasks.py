@@ -161,8 +161,8 @@ def dm_control_env(task: str, seed: int) -> Any:
             return 0.0 if ends and not self.env.is_healthy else None
 
     class FromStep(FromGymnasium):
-        """A task that computes observation and reward from the new state. It calls Gymnasium's step function with the
-        physics disabled."""
+        """A task that computes observation and reward from the new state. The task calls Gymnasium's step function with
+        the physics disabled."""
 
         def __init__(self, env: Any, physics: Any) -> None:
             super().__init__(env, physics)

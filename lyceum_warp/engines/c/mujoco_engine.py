@@ -82,7 +82,7 @@ class MujocoEngine(Engine):
         super().__init__(model, nworld, device, fields, dynamics, initial)
         quiet()
         self.nthread = whole_number("nthread", nthread, low=0)
-        # use one thread, because every thread would repeat a subclass's launches over all worlds
+        # use one thread: if a subclass launches kernels over all worlds, every thread would repeat these launches
         self.launch_threads = (self.nthread or cpu_cores()) if type(self) is MujocoEngine else 1
         self.native_model = copy.copy(model)
         """The model that the batch steps."""

@@ -112,10 +112,10 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
 
 
 class ModelRows:
-    """Make the model of a group of worlds. It has its own rows of the fields that differ, and shares all other fields.
+    """Make the model of a group of worlds.
 
-    With the model of all worlds, MuJoCo Warp would read a field's row ``world % rows``. This row belongs to another
-    world.
+    The group's model has its own rows of the fields that differ, and shares all other fields. With the model of all
+    worlds, MuJoCo Warp would read a field's row ``world % rows``. This row belongs to another world.
 
     Args:
         whole: The model of all worlds.

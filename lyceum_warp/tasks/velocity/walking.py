@@ -5,9 +5,10 @@ actuated joints and the feet, and sets parameters of the robot. Tables are compu
 rewards, commands, pushes and resets are taken from mjlab 1.6.0's velocity tasks.
 
 The robot's base is the body of the model's first joint, which is a free joint. Functions read the state after the last
-substep. Only the forces on the feet belong to the start of the last substep. They are 0 at the start of an episode.
-Positions and velocities of the feet are computed from the joints, which saves a forward pass. A foot is in contact if a
-sphere of its sole (``soles``) reaches the ground. Only ``ground`` and ``distance`` depend on the shape of the ground.
+substep. Only the forces on the feet belong to the start of the last substep. These forces are 0 at the start of an
+episode. Positions and velocities of the feet are computed from the joints, which saves a forward pass. A foot is in
+contact if a sphere of its sole (``soles``) reaches the ground. Only ``ground`` and ``distance`` depend on the shape of
+the ground.
 """
 
 import math

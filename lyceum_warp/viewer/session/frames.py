@@ -158,7 +158,7 @@ class FrameMaker:
 
     @functools.cached_property
     def _grid_step(self) -> float:
-        """The distance between the worlds of a grid, in m. It is slightly larger than the robot."""
+        """The distance between the worlds of a grid, in m. The distance is slightly larger than the robot."""
         model = self._env.task.model
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)

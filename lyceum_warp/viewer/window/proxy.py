@@ -57,8 +57,8 @@ PROTECTION = {
     "Cross-Origin-Embedder-Policy": "require-corp",  # browsers require this for memory that threads share
     "Document-Isolation-Policy": "isolate-and-require-corp",  # Chromium requires this in notebooks
 }
-"""The headers of every response. They stop other sites from reading or embedding the response, and from getting its
-address. Pages of this machine that know the token, such as notebooks, may embed a response."""
+"""The headers of every response. These headers stop other sites from reading or embedding the response, and from
+getting its address. Pages of this machine that know the token, such as notebooks, may embed a response."""
 SCRIPT = """<script>
 (() => {
   const path = location.pathname.slice(0, location.pathname.indexOf("/", 1));
