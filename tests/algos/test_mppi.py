@@ -283,7 +283,7 @@ def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("update", ["mppi", "cem", "predictive_sampling"])
-def test_plan_is_only_shifted_if_all_samples_fail(update: str, engine: str) -> None:
+def test_plan_is_shifted_in_time_but_keeps_its_actions_if_all_samples_fail(update: str, engine: str) -> None:
     plan = MPPI(Picky, engine=engine, horizon=5, samples=8, noise=0.1, limit=10.0, seed=3, update=update)
     plan(plan.state_of())
     for _ in range(3):

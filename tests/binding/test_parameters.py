@@ -108,7 +108,7 @@ def test_parameter_with_the_name_of_an_option_raises_an_error(name: str, model: 
 
 
 @pytest.mark.parametrize("values", [[1.0, 2.0], (1, 2), np.array([1.0, 2.0]), torch.tensor([1.0, 2.0])])
-def test_values_per_world_may_be_any_sequence(values: Any, model: mujoco.MjModel) -> None:
+def test_values_for_the_worlds_may_be_given_as_any_sequence(values: Any, model: mujoco.MjModel) -> None:
     np.testing.assert_array_equal(parameters(model, gain=values).values["gain"], [1.0, 2.0])
 
 

@@ -211,7 +211,7 @@ def test_captured_launches_share_scratch_memory(monkeypatch: pytest.MonkeyPatch)
     assert device.freed == [-300, -300] and scratch.peak == 4096 + 2048
 
 
-def test_scratch_size_is_extrapolated_from_few_worlds() -> None:
+def test_scratch_memory_for_many_worlds_is_extrapolated_from_few_worlds() -> None:
     def capture(nworld: int) -> Scratch:
         return types.SimpleNamespace(peak=1000 + 7 * nworld, largest=100 + 3 * nworld)  # type: ignore[return-value]
 

@@ -246,7 +246,9 @@ def evaluation(info: Mapping[str, Any]) -> float | None:
         ("inverted_double_pendulum", lambda data: data.site("tip").xpos[2]),
     ],
 )
-def test_evaluation_of_a_pendulum_is_its_angle_or_height(task: str, metric: Callable[[mujoco.MjData], float]) -> None:
+def test_evaluation_metric_of_a_pendulum_is_its_angle_or_height(
+    task: str, metric: Callable[[mujoco.MjData], float]
+) -> None:
     pair = Pair(make_ours(task), make_theirs(task))
     pair.put()
     for _ in range(20):

@@ -112,7 +112,7 @@ def test_a_held_lock_gets_a_heartbeat(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("content", ["host", "damaged"])
-def test_lock_of_another_host_is_taken_over_only_with_take_over(
+def test_lock_of_another_host_is_taken_over_only_with_the_flag_take_over(
     content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The age of the lock does not matter, because the clocks of two hosts may differ."""

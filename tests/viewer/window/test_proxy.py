@@ -420,7 +420,7 @@ def test_private_server_notices_a_tab_that_disappears(echo: Echo) -> None:
     wait_until(lambda: not opened)
 
 
-def test_a_silent_controlling_browser_is_reported(monkeypatch: pytest.MonkeyPatch, echo: Echo) -> None:
+def test_a_controlling_browser_that_sends_nothing_is_reported(monkeypatch: pytest.MonkeyPatch, echo: Echo) -> None:
     monkeypatch.setattr(module, "QUIET_SECONDS", 0.5)
     proxy, _, quiet = echo
     with open_tab(proxy) as tab:
