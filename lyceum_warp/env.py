@@ -105,7 +105,7 @@ class Env:
     episode_metrics: dict[str, torch.Tensor]
     """The task's metrics summed over the episode up to the last step, each (nworld,), float32."""
     episode_metric_sums: torch.Tensor
-    """``episode_metrics`` as one tensor, (nworld, number of metrics), in the order of ``metrics``."""
+    """``episode_metrics`` as one tensor (nworld, number of metrics) in the order of ``metrics``."""
     shared: dict[str, torch.Tensor]
     """The memory that all worlds share, by name; only ``update_shared`` changes the memory, by calling the task's
     ``share``."""

@@ -170,7 +170,7 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
     Args:
         model: The compiled model.
         values: Values by field name, each with one row per world or one row for all worlds.
-        columns: The columns of each model field that differs between worlds, (nworld, size), by the field's name.
+        columns: The columns of each model field that differs between worlds (nworld, size) by the field's name.
 
     Raises:
         ValueError: A field is unknown or the same in every world, or a value has the wrong size.

@@ -106,7 +106,7 @@ class WorldArrays:
         layouts = self.task.shared
         shared, sums = (sum(sizes(layouts.get(name, {})).values()) for name in ("Shared", "Sums"))
         self.shared, self.sums = wp.zeros((1, shared), dtype=float), wp.zeros(sums, dtype=wp.int64)
-        """Shared memory, (1, size), and sums in units of 1 / ``kernels.steps.UNIT``, (size of Sums,)."""
+        """Shared memory (1, size) and sums in units of 1 / ``kernels.steps.UNIT`` (size of Sums,)."""
         self._shares = wp.zeros((self.nworld, sums), dtype=float)
         if layouts:
             for batch in (self.after, self.before):

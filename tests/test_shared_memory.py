@@ -92,7 +92,7 @@ def env() -> Iterator[lw.Env]:
 
 
 def steps(env: lw.Env, count: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Take random steps; return the angles before resets, (count, nworld), and whether episodes ended."""
+    """Take random steps; return the angles before resets (count, nworld) and whether episodes ended."""
     generator = torch.Generator().manual_seed(3)
     angles, ended = [], []
     for _ in range(count):

@@ -300,7 +300,7 @@ class PPO(OnPolicyLearner):
 
         Args:
             samples: The part of the mini-batch that belongs to this process; arrays of shape (samples, ...).
-            weight: Weights of the samples, (samples,), which sum to 1 over all processes.
+            weight: Weights of the samples (samples,), which sum to 1 over all processes.
         """
         config, clip = self.config, self.config.clip
         if config.symmetry == "augment":

@@ -24,7 +24,7 @@ class Sampler(Protocol):
     """A policy with the method ``GaussianPolicy.sample``."""
 
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> Any:
-        """Write actions, (nworld, nact), into ``out``."""
+        """Write actions (nworld, nact) into ``out``."""
         ...
 
 
@@ -127,7 +127,7 @@ class Rollout:
         self._after_step = graphs.sequence([Phase("store outputs", self._launch_outputs)])
 
     def _stored(self, source: torch.Tensor, into: list["_Rows"]) -> torch.Tensor:
-        """Allocate storage, (steps, nworld, size), to fill before or after each step."""
+        """Allocate storage (steps, nworld, size) to fill before or after each step."""
         into.append(_Rows(source, self.steps, self.env.device))
         return into[-1].stored
 

@@ -350,7 +350,7 @@ class SAC(Learner):
 
         Args:
             batch: Transitions.
-            weight: Weights of the transitions, (batch,), which sum to 1 over all processes.
+            weight: Weights of the transitions (batch,), which sum to 1 over all processes.
             noise: Standard normal numbers for the actions of the next observations, (batch, nact).
         """
         group = self.value.group
@@ -384,7 +384,7 @@ class SAC(Learner):
         return (weight * loss).sum(), -(weight * log_prob.detach()).sum()
 
     def _bound(self, values: torch.Tensor) -> torch.Tensor:
-        """Combine the two critics' predictions, (2, rows), into the value of an action, (rows,)."""
+        """Combine the two critics' predictions (2, rows) into the value of an action (rows,)."""
         return values.amin(0) if self.config.critic_bound == "min" else values.mean(0)
 
     def state_dict(self) -> dict[str, Any]:

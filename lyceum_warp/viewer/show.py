@@ -38,11 +38,11 @@ def view(
 
     Args:
         env: The worlds, on any engine and device.
-        controllers: Controllers by name. A policy, such as the result of ``lw.load``, maps observations, (nworld,
-            nobs), to actions, (nworld, nact). A controller of one world is called with a state and an observation; see
+        controllers: Controllers by name. A policy, such as the result of ``lw.load``, maps observations (nworld, nobs)
+            to actions (nworld, nact). A controller of one world is called with a state and an observation; see
             ``lw.Controller``.
         episodes: Episodes to play back: one, a sequence, or a mapping from names to episodes. An episode is a
-            trajectory, the file of a trajectory, or a tensor of states, (steps + 1, state_space.size), in the format of
+            trajectory, the file of a trajectory, or a tensor of states (steps + 1, state_space.size) in the format of
             ``env.get_state()``.
         seed: The seed of a random reset at the start; by default there is no reset.
         paused: Whether to start paused.

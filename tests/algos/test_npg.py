@@ -62,7 +62,7 @@ def test_run_is_reproducible_and_resumes_bit_for_bit(env: lw.Env, rollout: str) 
 
 
 def learned(env: lw.Env, iterations: int, change: Callable[[torch.Tensor, int], object]) -> list[NPGIteration]:
-    """Run NPG on modified rewards; ``change`` gets the rewards, (steps, nworld), and the iteration's number."""
+    """Run NPG on modified rewards; ``change`` gets the rewards (steps, nworld), and the iteration's number."""
     env.rand_reset(3)
     config = dataclasses.replace(SMALL, value_epochs=20, value_rate=1e-2, mean_every=0)
     npg = lw.NPG(env, config=config, seed=0)

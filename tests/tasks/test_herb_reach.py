@@ -143,7 +143,7 @@ def test_one_motor_moves_both_joints_of_a_finger(shared_env: SharedEnv) -> None:
 
 
 def palms(env: lw.Env, qpos: np.ndarray) -> np.ndarray:
-    """Return both palms in each world, (nworld, 2, 3), from MuJoCo's kinematics in float64."""
+    """Return both palms in each world (nworld, 2, 3) from MuJoCo's kinematics in float64."""
     data, found = mujoco.MjData(env.model), []
     for row in qpos:
         data.qpos[:] = row

@@ -41,7 +41,7 @@ ENVPOOL = {
 
 
 def draw(low: np.ndarray, high: np.ndarray, envs: int, seed: int) -> np.ndarray:
-    """Draw actions, (steps, envs, nact), for several steps; the caller repeats them."""
+    """Draw actions (steps, envs, nact) for several steps; the caller repeats them."""
     return np.random.default_rng(seed).uniform(low, high, (max(16, KEPT_ACTIONS // envs), envs, *low.shape))
 
 

@@ -238,7 +238,7 @@ class PartialForward:
         Args:
             mask: The mask of the worlds, (nworld,) bool.
             forward: A function that computes the fields of a Data.
-            targets: Destinations of the fields, (nworld, ...), by their names in MuJoCo Warp's Data.
+            targets: Destinations of the fields (nworld, ...) by their names in MuJoCo Warp's Data.
         """
         group = self._group
 
