@@ -71,7 +71,7 @@ BESIDE = {
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Judge whether a robot walks under fixed commands, by limits."""
+    """Test whether a robot walks: measure its motion under fixed commands, and compare it with limits."""
 
     policy: tuple[Path, ...] = ()
     """Folders of runs on a velocity task, for example g1_velocity."""

@@ -320,7 +320,7 @@ def stable_baselines3(case: Case, options: Options, curve: Curve) -> dict[str, A
     def act(obs: np.ndarray) -> np.ndarray:
         return model.predict(envs.normalize_obs(obs), deterministic=True)[0]
 
-    agent(n_steps=64, batch_size=64)[0].learn(1)  # torch's first calls take longer
+    agent(n_steps=64, batch_size=64)[0].learn(1)  # torch's first calls take longer than later calls
     model, envs = agent(**({"n_steps": 256, "batch_size": 64} if case.short else {}))
     assert case.samples is not None
     curve.start(act)

@@ -347,7 +347,7 @@ def tally(
 
 
 def inject(case: Faults, options: Options) -> dict[str, Any]:
-    """Step a task for a chunk with injected faults, and a second environment without faults."""
+    """Step two environments of a task for a chunk: one with injected faults, and one without faults."""
     torch.set_num_threads(1)
     gc.collect()  # free the environments of the previous chunk
     before = case.state(options.work, case.chunk)

@@ -43,7 +43,7 @@ STATE_FIELDS = {
 """Fields of the integration state, each with its mjtState component."""
 
 INPUTS = ("ctrl", "xfrc_applied", "qfrc_applied", "mocap_pos", "mocap_quat", "userdata")
-"""State fields that the engine reads and never changes. A task may write these fields before a step."""
+"""Fields of the state that the engine reads but never changes. A task may write these fields before a step."""
 
 INITIAL = ("qpos", "qvel", "act", "eq_active", *INPUTS)
 """Fields that make up an initial state."""

@@ -172,7 +172,7 @@ class PPO(OnPolicyLearner):
         config, rollout, team = self.config, self.rollout, self.team
         timer = PhaseTimer(self.env.obs.device)
         with precision(tf32=config.tf32 and self._cuda):
-            # 1. Sample with the current policy.
+            # 1. Collect samples with the current policy.
             self.sample()
             self.env.update_shared(team.sum)
 

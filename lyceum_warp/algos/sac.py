@@ -293,7 +293,8 @@ class SAC(Learner):
         random: dict[str, Any] = dict(generator=self.generator, device=self._index.device)
         index = torch.randint(self.replay.count * nworld * team.size, shape, **random)
         noise = torch.randn((*shape, self._noise.shape[-1]), **random)
-        if team.size > 1:  # move own samples to the front, and drop samples beyond the capacity, as in Minibatches
+        # move this process's samples to the front, and drop samples beyond the capacity, as Minibatches does
+        if team.size > 1:
             index, own = team.locate(index, nworld)
             first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self._index.shape[1]]
             index, noise = index.gather(1, first), noise.gather(1, first[..., None].expand(-1, -1, noise.shape[-1]))

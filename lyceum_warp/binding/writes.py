@@ -170,7 +170,7 @@ class _Reader:
         self.writes[Write(place.position, place.field, target, self.source.name, where, replaced, use)] = None
 
     def _read(self, node: ast.AST) -> _Place | None:
-        """Note the writes in an expression or a statement; return the part of an argument that it refers to."""
+        """Record the writes in an expression or a statement; return the part of an argument to which it refers."""
         if isinstance(node, ast.Name):
             for name, place in self.places.items():
                 if place is not None and name.startswith(f"{node.id}."):  # the expression uses a whole local struct

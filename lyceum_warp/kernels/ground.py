@@ -55,7 +55,7 @@ def ground_distance(ground: wp.array2d[float], point: wp.vec3) -> float:
     """Return the distance of a point from the plane of the triangle below it, m; negative below the ground.
 
     A sphere touches the triangle if the distance of the sphere's centre is at most the radius. Another triangle may be
-    nearer.
+    nearer to the point.
     """
     t = _triangle(ground, point[0], point[1])
     return (point[2] - t[0]) / wp.length(wp.vec3(t[1], t[2], 1.0))

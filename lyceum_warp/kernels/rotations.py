@@ -34,7 +34,7 @@ def quat_inverse(q: wp.vec4) -> wp.vec4:
 def quat_rotate(q: wp.vec4, v: wp.vec3) -> wp.vec3:
     """Rotate a vector from the frame with orientation q into the world frame.
 
-    The result is v + 2 u x (w v + u x v) for q = (w, u), as from mju_rotVecQuat.
+    The result is v + 2 u x (w v + u x v) for q = (w, u), as mju_rotVecQuat computes it.
     """
     u = wp.vec3(q[1], q[2], q[3])
     return v + 2.0 * wp.cross(u, q[0] * v + wp.cross(u, v))
@@ -44,7 +44,7 @@ def quat_rotate(q: wp.vec4, v: wp.vec3) -> wp.vec3:
 def quat_rotate_inverse(q: wp.vec4, v: wp.vec3) -> wp.vec3:
     """Rotate a vector from the world frame into the frame with orientation q, such as a body's own frame.
 
-    The result is v - 2 u x (w v - u x v) for q = (w, u), as from mju_rotVecQuat with the inverse.
+    The result is v - 2 u x (w v - u x v) for q = (w, u), as mju_rotVecQuat computes it with the inverse.
     """
     u = wp.vec3(q[1], q[2], q[3])
     return v - 2.0 * wp.cross(u, q[0] * v - wp.cross(u, v))
@@ -54,7 +54,7 @@ def quat_rotate_inverse(q: wp.vec4, v: wp.vec3) -> wp.vec3:
 def quat_from_axis_angle(axis: wp.vec3, angle: float) -> wp.vec4:
     """Make the rotation by an angle, in rad, about a unit axis.
 
-    The result is (cos(angle / 2), sin(angle / 2) axis), as from mju_axisAngle2Quat.
+    The result is (cos(angle / 2), sin(angle / 2) axis), as mju_axisAngle2Quat computes it.
     """
     s = wp.sin(0.5 * angle)
     return wp.vec4(wp.cos(0.5 * angle), s * axis[0], s * axis[1], s * axis[2])

@@ -1,4 +1,4 @@
-"""Process rows with several threads per world: thread ``lane`` of ``lanes`` has the indices i % lanes == lane."""
+"""Divide a world's rows among threads: thread ``lane`` of ``lanes`` gets the indices i with i % lanes == lane."""
 
 import warp as wp
 

@@ -151,7 +151,7 @@ def angle_between(a: wp.vec3, b: wp.vec3) -> float:
 def body_velocity(cvel: wp.spatial_vector, com: wp.vec3, point: wp.vec3) -> wp.spatial_vector:
     """Return the velocity of a body at a point, as (angular, linear) in the world's axes, in rad/s and m/s.
 
-    The result is (w, v + w x (point - com)) for cvel = (w, v), as from mj_objectVelocity in the world's axes.
+    The result is (w, v + w x (point - com)) for cvel = (w, v), as mj_objectVelocity computes it in the world's axes.
 
     Args:
         cvel: The body's row of ``cvel``, (angular, linear), at the centre of mass of its kinematic tree.

@@ -1,4 +1,4 @@
-"""Time the contacts of feet, and compute reward terms for their swings, slips and landings.
+"""Measure how long feet are in contact, and compute reward terms for swings, slips and landings.
 
 The tables ``feet`` (sites), ``foot_velocities``, ``foot_forces`` and ``foot_contacts`` (sensors) list the feet in the
 same order, and so do the rows of memory with one element per foot. Call ``run_clocks`` in ``substep``, and

@@ -41,8 +41,8 @@ PARAMS: dict[str, dict[str, Any]] = {
     "go1_velocity": {"fall_angle": 0.5},
     "soft_ball": {"reach": 0.15},
 }
-"""Parameters by task. With these parameters, random field values end some episodes. Some robots get higher solver
-limits, because the engines agree up to rounding only if the solver converges."""
+"""Parameters by task. With these parameters, random field values end some episodes. For some robots, the solver's
+limits are raised, because the engines agree up to rounding only if the solver converges."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -48,7 +48,7 @@ def find_any(mask_in: wp.array[bool], any_out: wp.array[int]):
 
 @wp.kernel(enable_backward=False)
 def rank_worlds(mask_in: wp.array[bool], rank_out: wp.array[int], count_inout: wp.array[int]):
-    """Number the masked worlds from 0, in any order; launched over (nworld,)."""
+    """Give each masked world a number, from 0 and in any order; launched over (nworld,)."""
     w = wp.tid()
     if mask_in[w]:
         rank_out[w] = wp.atomic_add(count_inout, 0, 1)

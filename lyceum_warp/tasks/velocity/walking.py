@@ -95,7 +95,7 @@ class Params:
     # desired foot height in a swing (m), longest rewarded single stance (s)
     swing_target: float = 0.1
     longest_step: float = 0.4
-    least_command: float = 0.05  # if a command is smaller, the robot should stand
+    least_command: float = 0.05  # if the size of a command is below this number, the robot should stand
     fall_angle: float = math.radians(70.0)
     least_height: float = 0.0  # of the base, m
     # actions
