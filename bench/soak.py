@@ -160,7 +160,7 @@ class Faults:
     part: str = "faults"
 
     def state(self, work: Path, chunk: int) -> Path:
-        """Return the path of the state before a chunk."""
+        """Return the path of the file with the state from which a chunk starts."""
         where = f"{self.engine}-{self.device.partition(':')[0]}"
         run = f"{file_name(self.task)}-{where}-{self.nworld}-{self.steps}-{self.seed}"
         return work / f"{run}{'-same-bits' if self.compared else ''}-{chunk}.pt"

@@ -192,7 +192,8 @@ class Env:
                 self.engine.prepare_capture()
             self.engine.reset(worlds.everyone)
             probe = Probe(self.task, worlds.after, worlds.params, self.device)
-            probe.check_bounds()  # check writes before the task's functions write into the environment's arrays
+            # find faulty writes now, before the task's functions run on the environment's own arrays
+            probe.check_bounds()
             self.rand_reset(options.seed)
             if self.task.dynamics and not _replica:  # later resets report invalid values as faults
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])

@@ -278,7 +278,7 @@ def _sensed(model: mujoco.MjModel, name: str) -> bool:
 
 
 def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
-    """Get the rows of a named element of the model in a field of MjData or MjModel.
+    """Get the rows that a named element of the model has in a field of MjData or MjModel.
 
     The following objects may have several rows: a joint (coordinates in ``qpos``; degrees of freedom in ``qvel``,
     ``dof_damping`` and similar fields), a sensor (``sensordata``), an actuator (controls in ``ctrl``, activations in

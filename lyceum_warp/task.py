@@ -485,7 +485,7 @@ class Task:
     """Fields that keep the values left by ``mj_step``. These values lag one substep behind the state, as in some
     Gymnasium tasks."""
     cleared: ClassVar[tuple[str, ...]] = ()
-    """Fields left by the last substep, such as contact forces, that a reset clears before ``initialize``. If
+    """Fields of the last substep, such as contact forces, which a reset must clear before ``initialize`` runs. If
     ``cleared`` does not list such fields, a forward pass computes them in the worlds that restart."""
     actions: ClassVar[Mapping[str, int | str] | None] = None
     """Parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls; ``control``

@@ -280,8 +280,8 @@ def test_run_resumes_identically_from_the_last_complete_state(six: Path, tmp_pat
 def test_training_from_another_run_starts_with_its_policy(
     six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The new run has the old run's settings except for one parameter. The old run's policy takes the new run's first
-    samples."""
+    """The new run has the old run's settings except for one parameter. The old run's policy collects the new run's
+    first samples."""
     out = tmp_path / "out"
     arguments = ["train", "--from", str(six), "--which", "4", "--param", "success_distance=0.5", "--iterations", "1"]
     assert cli.main([*arguments, "--out", str(out), "--keep-every", "1", *QUIET]) == 0

@@ -26,7 +26,7 @@ EXACT = "exact"
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Difference:
-    """Difference of a mean over episodes between two simulations, with a 95 % confidence interval."""
+    """Mean over episodes in two simulations, and the difference of the two means with a 95 % confidence interval."""
 
     quantity: str
     """Name of the quantity: return, length (steps) or terminated (fraction of episodes that the task ended, for example

@@ -157,7 +157,8 @@ class _Reader:
         self.source = FunctionSource(function)
         # a key is a name, or "name.field" for a row in a local struct
         self.places: dict[str, _Place | None] = dict(zip(function.input_types, places, strict=True))
-        # read twice, because a loop may use a local struct above the line that puts a row into it
+        # read a loop's body twice, because the loop may use a local struct above the line that puts a row into the
+        # struct
         for _ in range(2):
             for statement in self.source.tree.body:
                 self._read(statement)

@@ -90,7 +90,7 @@ class CheckedController:
         return self.steps(now) - self.steps(before)
 
     def action(self, plan: torch.Tensor, plant_steps: int) -> torch.Tensor:
-        """Select the action for the plant ``plant_steps`` steps after the plan's initial state.
+        """Select the action that applies after ``plant_steps`` steps of the plant since the plan's initial state.
 
         If a plan's step covers several steps of the plant, all plant steps apply the same action; with
         ``between="linear"``, they interpolate to the next action. After the end of the plan, the plan's last action

@@ -137,8 +137,8 @@ def hold_success(
 ):
     """Report success only after ``needed`` successful steps in a row, in the masked worlds; launched over (nworld,).
 
-    ``count``, (nworld, 1), holds the successful steps so far. A transition increases or clears it; the evaluation of a
-    state alone does not change it.
+    ``count``, (nworld, 1), holds the successful steps so far. A transition increases or clears the count; the
+    evaluation of a state alone does not change the count.
     """
     w = first + wp.tid()
     if mask_in[w]:

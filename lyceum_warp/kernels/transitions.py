@@ -211,7 +211,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         out.truncated[w] = (reason & ~TERMINATED) != 0
         out.done[w] = reason != 0
         if transition:
-            # without automatic resets a world continues after its episode's end, but not after a fault
+            # without automatic resets, a world continues after its episode's end, but not after a fault
             restart_out[w] = wp.where(keep_reason, fault != 0, reason != 0)
             if fault != 0:
                 faults.count_faults(fault, fault_count_inout[w])

@@ -435,7 +435,8 @@ def keywords(task: str) -> dict[str, Any]:
 
 
 def variants(default: Any) -> list[Any]:
-    """Return values that differ from the default; for a range, return the sides to narrow."""
+    """Return values that differ from the default. If the default is a range, return the sides of the range to move
+    inwards."""
     if isinstance(default, bool):
         return [not default]
     if isinstance(default, tuple):
