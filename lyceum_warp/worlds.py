@@ -337,8 +337,7 @@ class Worlds(WorldArrays):
         self.engine.commit(self._physics_changed, state_fields)
 
     def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
-        """Mark the continuing worlds in which a field has changed; ``physics`` is False if the field is the task's
-        memory."""
+        """Mark the continuing worlds in which a field has changed; ``physics`` is False for the task's memory."""
         found = [self._physics_changed, self._changed, self._outdated]
         args = [self._continuing, flat(before), flat(after), physics, *found]
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
