@@ -127,14 +127,14 @@ class WorldArrays:
         self.outcome.metrics = self.metrics  # type: ignore[assignment]
         self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
         parts = int(transitions.OBSERVE_FIRST) + len(self.obs_spaces)
-        self._judging = parts if self.device.is_cuda else 1  # number of threads that judge a world
+        self._judging = parts if self.device.is_cuda else 1  # number of threads that evaluate a world's transition
         self._found = step_types.Findings()
         self._found.reward, self._found.eval = wp.zeros(n, dtype=float), wp.zeros(n, dtype=float)
         self._found.terminated, self._found.success = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
         self._found.fault = wp.zeros((parts, n), dtype=int)  # type: ignore[assignment]
         self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
         self._finite_obs = wp.zeros((len(self.obs_spaces), n), dtype=bool)
-        # number of threads per world for observing
+        # number of threads that write a world's observations
         self._observing = len(self.obs_spaces) if self.device.is_cuda else 1
         self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
         self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}

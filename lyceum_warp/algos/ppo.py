@@ -375,7 +375,7 @@ class PPO(OnPolicyLearner):
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
-        """Get the returns of counted episodes that ended in the iteration, from all processes, ordered by step."""
+        """Get the returns of the counted episodes that ended in the iteration in any process, ordered by step."""
         ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
         ended = self.team.gather(ended.T).T
         found: list[float] = ended[~ended.isnan()].tolist()

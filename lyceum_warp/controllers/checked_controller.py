@@ -64,7 +64,7 @@ class CheckedController:
         """
         action = self._controller(state, obs, **({"shift": shift} if self._takes_shift else {}))
         plan = getattr(self._controller, "actions", None)
-        # use the action in the plan, because copying both from a GPU would synchronise twice
+        # use the action in the plan, because copying plan and action from a GPU would synchronise twice
         return self._checked(action, 1, step)[None] if plan is None else self._checked(plan, 2, step)
 
     def reset(self, seed: int | None) -> None:

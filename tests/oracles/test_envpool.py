@@ -106,7 +106,7 @@ def test_a_step_has_envpools_observations_and_rewards(shared_env: SharedEnv, tas
     columns = np.delete(np.arange(env.obs_space.size), touch)  # the touch sensors belong to the last substep
     np.testing.assert_allclose(env.get_obs()[:, columns], before[:, columns], rtol=1e-6, atol=1e-6)
     env.action.copy_(torch.from_numpy(action))
-    if domain == "finger":  # MuJoCo 3.6 computes contacts with solimp[0] = 0 in another way than later releases
+    if domain == "finger":  # MuJoCo 3.6 computes contacts with solimp[0] = 0 in another way than later releases do
         set_states(env, domain, after.astype(float))
         found, rewards = env.get_obs(), env.get_reward(env.get_state(), env.action, env.get_state())
     else:

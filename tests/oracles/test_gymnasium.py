@@ -42,7 +42,7 @@ def has(task: str, function: str) -> bool:
     return function in find_task(task).scope
 
 
-# tasks with contact forces are compared with SensorStage
+# for tasks with contact forces, Gymnasium's class has the mixin SensorStage
 WITH_FORCES = [task for task in TASKS if "cfrc_ext" in fields(task)]
 
 
@@ -148,7 +148,7 @@ class Pair:
         for name in parts.keys() - {"step", "key", "episode", "done_reason", "metrics"}:
             # lagged fields come from the previous forward pass
             parts[name].copy_(torch.from_numpy(np.ravel(getattr(data, name))))
-        parts["done_reason"].zero_()  # the shared state is not terminal
+        parts["done_reason"].zero_()  # the state in which both start is not terminal
         self.ours.set_state(state)
 
     def action(self) -> np.ndarray:

@@ -78,7 +78,8 @@ def test_viewer_does_not_change_the_results_of_a_run(tmp_path: Path, capsys: pyt
             while not re.search(r"http://127\.0\.0\.1:\d+/", printed):  # the first iteration waits for the viewer
                 assert viewer.is_open and time.monotonic() < begun + 60, printed
                 time.sleep(0.1)
-                printed += capsys.readouterr().out  # this process prints the address above a live line
+                # this process prints the address above a progress line that is redrawn
+                printed += capsys.readouterr().out
 
         shown = trained(tmp_path / "shown", callback)
         assert viewer.is_open

@@ -10,7 +10,7 @@ import lyceum_warp as lw
 from lyceum_warp import Row, terms
 from lyceum_warp.tasks.dm import suite
 
-RESOLUTION = wp.constant(0.01)  # steps of the initial height, m
+RESOLUTION = wp.constant(0.01)  # distance between the initial heights that are tried, m
 
 
 def solid(model: mujoco.MjModel, p: Any) -> np.ndarray:

@@ -105,10 +105,10 @@ class Params:
     stages: wp.array2d[float] = [[0.0, -1.0, 1.0, 0.5], [120e3, -1.5, 2.0, 0.7], [240e3, -2.0, 3.0, 0.7]]
     lateral_velocity: float = 1.0
     command_seconds: wp.vec2 = wp.vec2(3.0, 8.0)
-    heading_share: float = 0.3  # fraction of commands with a heading
+    heading_share: float = 0.3  # fraction of commands that give a heading
     heading_gain: float = 0.5  # 1/s
     standing_share: float = 0.1
-    forward_share: float = 0.2  # fraction of commands straight forward
+    forward_share: float = 0.2  # fraction of commands that are straight forward
     least_forward_velocity: float = 0.3
     # bounds of the uniform noise on the policy's observations
     linear_velocity_noise: float = 0.5
