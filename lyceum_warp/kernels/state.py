@@ -104,7 +104,7 @@ def widen_bool(
 def narrow_bool(
     mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[bool], lanes: int, first: int
 ):
-    """Convert masked rows that ``widen_bool`` has written back to booleans; launched over (nworld, lanes)."""
+    """Convert masked rows of 0 and 1, which ``widen_bool`` writes, to booleans; launched over (nworld, lanes)."""
     k, lane = wp.tid()
     w = first + k
     if mask_in[w]:

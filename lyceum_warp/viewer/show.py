@@ -50,7 +50,7 @@ def view(
             reach.
         port: The port of the page; by default the first free port from 8080.
         watchers: Functions that are called about twice a second, and return a sequence of new messages.
-        block: Whether the call returns only when the user quits. With False, a thread steps the worlds, and the caller
+        block: Whether the call returns only when the user quits. If False, a thread steps the worlds, and the caller
             must not use them until the view is closed. The default is False in a notebook, which then shows the page
             and a link to it.
 
