@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from lyceum_warp.algos.distributed import Captured, Team
 from lyceum_warp.algos.evaluation import MeanPolicyEvaluation
@@ -147,6 +148,7 @@ class SAC(Learner):
         self._make_mirror(given)
         self.target = copy.deepcopy(self.value).requires_grad_(False)
         self.target.normalizer = self.value.normalizer
+        self._follow = get_ema_multi_avg_fn(1.0 - given.tau)
         self.log_temperature = torch.tensor(math.log(given.temperature), device=device, requires_grad=True)
         rate = given.learning_rate
         self.actor_step = GradientStep(self.policy.parameters(), rate, team)
@@ -323,9 +325,7 @@ class SAC(Learner):
                 # the temperature rises while the entropy is below its target
                 share = (entropy - config.target_entropy * nact) / self.team.size
                 self.temperature_step(self.log_temperature * share)
-            with torch.no_grad():
-                for target, own in zip(self.target.parameters(), self.value.parameters(), strict=True):
-                    target.lerp_(own, config.tau)
+            self._follow(list(self.target.parameters()), list(self.value.parameters()), None)
 
     def _with_images(self, batch: Transitions) -> Transitions:
         """Append the mirror images of transitions."""
