@@ -89,7 +89,7 @@ class Env:
     final_obs: torch.Tensor
     """Observations at the end of the last step, before any reset, (nworld, nobs), float32."""
     obs_groups: dict[str, torch.Tensor]
-    """Observations of each group, (nworld, size of the group), by name; ``policy`` is ``obs``."""
+    """Observations by group, each (nworld, size of the group); the group ``policy`` is ``obs``."""
     final_obs_groups: dict[str, torch.Tensor]
     """``final_obs`` of each group of observations, by the group's name."""
     reward: torch.Tensor
@@ -138,7 +138,7 @@ class Env:
     obs_space: Space
     """Parts of an observation and their columns."""
     obs_spaces: dict[str, Space]
-    """The spaces of all groups of observations; ``policy`` is ``obs_space``."""
+    """The spaces of all groups of observations; the space of ``policy`` is ``obs_space``."""
     action_space: Space
     """Names, columns and bounds of actions."""
     state_space: Space

@@ -132,7 +132,7 @@ class Worlds(WorldArrays):
         return Phase(every[0].name, partial(self.engine.run_for, mask, run), engine=True)
 
     def _transition_phases(self, substeps: int | None = None) -> list[Phase]:
-        """List the phases that advance to the next state and judge the transition."""
+        """List the phases that advance to the next state and evaluate the transition."""
         return [
             Phase("act", self.act, by_world=True),
             *self.physics_phases(substeps),
@@ -189,7 +189,7 @@ class Worlds(WorldArrays):
         return phases
 
     def _observe_phases(self) -> list[Phase]:
-        """List the phases that observe worlds that changed since the transition was judged."""
+        """List the phases that observe the worlds that have changed since the transition was evaluated."""
         changed = self.restarting if self.task.kernels.run_events is None else self._outdated
         return [Phase("observe", partial(self._observe, changed), by_world=True)]
 
@@ -242,7 +242,7 @@ class Worlds(WorldArrays):
         launch_worlds(kernel, self.nworld, args, self.device)
 
     def _judge_step(self) -> None:
-        """Find faults, advance the task's memory, and judge the transition."""
+        """Find faults, advance the task's memory, and evaluate the transition."""
         self.engine.find_faults(self.everyone)
         self.advance_memory()
         keep_reason = not self.autoreset
@@ -343,7 +343,7 @@ class Worlds(WorldArrays):
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
 
     def _observe(self, mask: wp.array) -> None:
-        """Observe the masked worlds; judging has already observed all other worlds."""
+        """Observe the masked worlds; the evaluation of the transition has already observed all other worlds."""
         kernels, finite, parts = self.task.kernels, self._finite_obs, self._observing
         args = [mask, self.after, self.params, self.counters, self.final_obs, finite, self.obs, parts]
         launch_parts(kernels.observe_worlds, parts, self.nworld, args, self.device)
@@ -365,7 +365,7 @@ class Worlds(WorldArrays):
     # for environments and rollouts
 
     def judge_transition(self, action: torch.Tensor) -> None:
-        """Judge the transition from ``before`` to the current state under given actions, ignoring engine faults."""
+        """Evaluate the transition from ``before`` to the current state under given actions, ignoring engine faults."""
         torch_view(self.safe_action).copy_(action)
         self._judged.zero_()  # will contain the transition's faults
         self._judge(self.everyone, self._judged, self._no_fault, transition=True)

@@ -52,9 +52,9 @@ class Rollout:
     final_obs: torch.Tensor
     """Observations after each step, before any reset, (steps, nworld, nobs)."""
     obs_groups: dict[str, torch.Tensor]
-    """Observations before each step by group; ``policy`` is ``obs``."""
+    """Observations before each step by group; the group ``policy`` is ``obs``."""
     final_obs_groups: dict[str, torch.Tensor]
-    """Observations after each step by group; ``policy`` is ``final_obs``."""
+    """Observations after each step by group; the group ``policy`` is ``final_obs``."""
     reward: torch.Tensor
     """Rewards, (steps, nworld)."""
     eval: torch.Tensor

@@ -1,4 +1,4 @@
-"""Make the kernels that judge transitions by a task's functions: rewards, ends of episodes, metrics, observations."""
+"""Make the kernels that evaluate a task's transitions: rewards, ends of episodes, metrics, observations."""
 
 import dataclasses
 
