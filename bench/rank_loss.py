@@ -2,11 +2,10 @@
 
     lyceum-warp bench rank_loss half_cheetah hopper
 
-Each line of results/rank-loss.jsonl holds the numbers of a task and a setting. These numbers are the rank correlations
-of ``lyceum-warp tune --planning``, and three returns of the same episodes in the task's own physics: with plans in
-these physics, with plans in the setting's physics, and without plans. With these three returns R_exact, R_setting and
-R_none, the loss is (R_exact - R_setting) / (R_exact
-- R_none). Episodes do not run in real time, so a busy machine changes no number.
+Each line of results/rank-loss.jsonl holds the numbers of a task and a setting. First come the rank correlations of
+``lyceum-warp tune --planning``. Then come three returns of the same episodes in the task's own physics: R_exact with
+plans in these physics, R_setting with plans in the setting's physics, and R_none without plans. The loss is
+(R_exact - R_setting) / (R_exact - R_none). Episodes do not run in real time, so a busy machine changes no number.
 """
 
 import dataclasses

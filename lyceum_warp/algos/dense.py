@@ -83,7 +83,7 @@ class DensePasses:
         return DensePasses(parameters, kind)
 
     def _allocate(self, rows: int) -> None:
-        """Allocate the results and derivatives of each layer for a number of rows."""
+        """Allocate the results and derivatives of each layer, for inputs of the given number of rows."""
         widths = [len(bias) for bias in self.biases]
         self._buffers = [[torch.empty(rows, n) for n in widths] for _ in range(2)]
 

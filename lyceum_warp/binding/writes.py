@@ -76,8 +76,8 @@ def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mappin
             place = f"{within} ({write.place})"
             if write.use is not None:
                 raise ValueError(
-                    f"{name} of the task {task!r} uses {write.target} as a whole in '{write.use}'{place}, which may "
-                    "write it: read and write its elements directly"
+                    f"{name} of the task {task!r} uses {write.target} as a whole in '{write.use}'{place}, and may "
+                    "write it there: read and write its elements directly"
                 )
             advice = _advice(write, name, rights)
             raise ValueError(f"{name} of the task {task!r} writes {write.target}{place}: {advice}")
