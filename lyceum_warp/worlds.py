@@ -104,7 +104,7 @@ class Worlds(WorldArrays):
         ]
 
     def _phases_of_a_graph(self) -> list[Phase]:
-        """List the phases of a step that is a single graph and skips parts that affect no world."""
+        """List the phases of a step as a single graph, which skips phases without any world to change."""
         if not self.engine.capturable:
             return self.step_phases()
         restart = self._restart_phases(self.restarting, randomly=True)

@@ -113,8 +113,8 @@ class Team:
     def copy_leader(self, tensors: Iterable[torch.Tensor]) -> None:
         """Broadcast tensors from rank 0, in place.
 
-        On different hardware, broadcasting the parameters prevents rounding errors from accumulating. On equal
-        hardware, all processes compute equal parameters.
+        If the processes run on different hardware, their parameters differ by rounding errors, and a broadcast prevents
+        these from accumulating. On equal hardware, all processes compute equal parameters.
         """
         if self.size > 1:
             tensors = list(tensors)

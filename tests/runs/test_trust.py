@@ -157,7 +157,7 @@ ATTACKS = [names_a_task, names_a_file_outside, names_an_absolute_file, brings_a_
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_run_that_was_edited_to_name_a_file_raises_an_error(
+def test_run_with_an_edited_path_raises_an_error(
     attack: Callable[[Path], Path], made: Path, witness: Path, tmp_path: Path
 ) -> None:
     """The run's folder was trusted before it was edited."""

@@ -94,7 +94,7 @@ class HerbReachEnv(MujocoEnv):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         self.do_simulation(action, self.frame_skip)
-        mujoco.mj_kinematics(self.model, self.data)  # mj_step leaves site positions at the previous state
+        mujoco.mj_kinematics(self.model, self.data)  # mj_step computes no site positions of the new state
         return self._get_obs(), self._get_rew(0.0, action)[0], False, False, {}
 
     def reset_model(self) -> np.ndarray:

@@ -161,7 +161,10 @@ def move_rows(
     source: Rows,
     target: Rows,
 ):
-    """Copy rows to their new indices, or unsorted if ``sort`` is false; launched over (nworld, njmax, lanes)."""
+    """Copy rows, in sorted order if ``sort`` is true.
+
+    Launched over (nworld, njmax, lanes).
+    """
     w, r, lane = wp.tid()
     if r >= int(wp.min(nrow_in[w], rank_in.shape[1])):
         return

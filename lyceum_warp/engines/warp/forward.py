@@ -51,8 +51,8 @@ def inertia(model: mjw.Model, data: mjw.Data) -> None:
 def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
     """Copy MuJoCo Warp's functions; the first forward pass of the copies skips the parts in ``done``.
 
-    The copies have some global names replaced, so that a step equals MuJoCo Warp's step, and other users of MuJoCo Warp
-    are not affected.
+    In the copies, some global names are replaced. A step of the copies equals a step of MuJoCo Warp, and nothing
+    changes for other users of MuJoCo Warp.
 
     For connect and weld constraints, ``mjw.make_constraint`` reads body velocities before MuJoCo Warp has computed
     them, so it reads stale values of the last forward pass or, after a fault, NaN. In the copies, ``com_vel`` runs

@@ -143,7 +143,7 @@ class ModelRows:
             setattr(self.model, name, wp.clone(getattr(whole, name)))
 
     def take(self, turns: Turns) -> None:
-        """Copy rows of all worlds into the rows of the group."""
+        """Copy into the group the rows of its worlds, from the rows of all worlds."""
         if self.model is not self.whole:
             for source, group in self._pairs.values():
                 turns.take(source, group)

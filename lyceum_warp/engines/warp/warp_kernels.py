@@ -76,7 +76,7 @@ def choose_group(mask_in: wp.array[bool], rank_in: wp.array[int], first_in: wp.a
 def take_rows(
     world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array2d[float], target_out: wp.array2d[float]
 ):
-    """Copy rows of all worlds into the rows of a group; launched over (group size, row length)."""
+    """Copy into a group the rows of its worlds, from the rows of all worlds; launched over (group size, row length)."""
     place, i = wp.tid()
     if place < left_in[0]:
         target_out[place, i] = source_in[world_in[place], i]

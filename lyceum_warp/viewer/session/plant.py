@@ -13,7 +13,7 @@ from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
 POLL = 0.005
 """The seconds between two polls of the window's commands."""
 
-_RESERVE = 0.0015  # no other work starts during these seconds before a step
+_RESERVE = 0.0015  # no other work starts in the last seconds before a step
 _PART = 10_000  # maximum steps of a run, because all states are stored
 _WARM_UP = 3  # no other work runs during this number of first calls, which may capture graphs
 
