@@ -246,7 +246,7 @@ class _Reader:
             self._read_all(node, given)
 
     def _call_helper(self, callee: wp.Function, node: ast.Call) -> None:
-        """Record which arguments of a call the helper writes to."""
+        """Record the arguments of a call that the called function writes."""
         expressions: dict[str, ast.expr] = dict(zip(callee.input_types, node.args, strict=False))
         expressions |= {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg}
         places = {name: place for name, given in expressions.items() if (place := self._read(given)) is not None}

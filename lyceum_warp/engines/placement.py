@@ -45,7 +45,7 @@ def find_device(device: str | None) -> wp.Device:
         ValueError: This machine has no such device.
     """
     name, error, remarks = str(device or "cpu"), None, start_warp()
-    if wp.is_cuda_available() or not name.startswith("cuda"):  # Warp would print a message if there is no driver
+    if wp.is_cuda_available() or not name.startswith("cuda"):  # without a driver, Warp would print a message
         try:
             found = wp.get_device(name)
         except (ValueError, RuntimeError) as cause:

@@ -89,8 +89,8 @@ class MujocoEngine(Engine):
         # autoreset would hide a fault, because MuJoCo would silently reset the world within a step
         self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         # The batch is not persistent. A persistent batch could reuse the stages computed after the last step, but one
-        # MjData per world does not fit into the CPU's caches: with it, the six tasks that need such stages were 4 to 33
-        # % slower (128 and 1,024 worlds on two cores).
+        # MjData per world does not fit into the CPU's caches: with a persistent batch, the six tasks that need such
+        # stages were 4 to 33 % slower (128 and 1,024 worlds on two cores).
         self.batch = Batch(self.native_model, nworld, self.nthread)
         self._errors_as_warnings = ErrorsAsWarnings(self.batch)
         self._rows = self._alias(self.batch.state)

@@ -143,7 +143,7 @@ _PARTS_OF_SENSOR = {
 
 
 def forward_parts(model: mujoco.MjModel, names: Collection[str]) -> tuple[Part, ...] | None:
-    """Return the parts of a forward pass that compute the named fields, in order, without collisions and constraints.
+    """Return the parts of a forward pass that compute the named fields, in order.
 
     For ``sensordata``, the parts compute the sensors of the position and velocity stages.
 
