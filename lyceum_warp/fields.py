@@ -128,8 +128,9 @@ _RANGES = (
     | {"sensordata": _SENSORS, "flexvert_xpos": _VERTICES}
     | dict.fromkeys(("flexedge_length", "flexedge_velocity"), _EDGES)
 )  # fmt: skip
-"""Describe the fields in which an object may have several rows, by the field's name or prefix: the kind of object, the
-MjModel array with the index of each object's first row, and the array of row counts or the total number of rows."""
+"""Describe the fields in which an object may have several rows, by the field's name or prefix. An entry holds the kind
+of object, the MjModel array with the index of each object's first row, and the array of row counts or the total number
+of rows."""
 
 _COUNTS = {
     _Kind.mjOBJ_ACTUATOR: "nactuator",

@@ -93,7 +93,7 @@ class BackgroundView:
     """A view that steps its worlds in a thread; ``lw.view`` returns a view if ``block`` is false.
 
     A notebook shows the page as the output of the cell, and a link that opens the page in a separate tab. If the
-    notebook is served by another machine, or the browser is Firefox or Safari, it shows only the link.
+    notebook is served by another machine, or the browser is Firefox or Safari, only the link is shown.
     """
 
     def __init__(self, session: Session, window: Window) -> None:

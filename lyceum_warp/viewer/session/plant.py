@@ -15,7 +15,7 @@ POLL = 0.005
 
 _RESERVE = 0.0015  # no other work starts in the last seconds before a step
 _PART = 10_000  # maximum steps of a run, because all states are stored
-_WARM_UP = 3  # no other work runs during this number of first calls, which may capture graphs
+_WARM_UP = 3  # number of first calls during which no other work runs, because they may capture graphs
 
 
 class InterruptedByCommand(BaseException):
