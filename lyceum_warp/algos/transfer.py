@@ -32,15 +32,15 @@ class Difference:
     """Name of the quantity: return, length (steps) or terminated (fraction of episodes that the task ended, for example
     by a fall)."""
     first: float
-    """The mean in the first simulation."""
+    """The quantity's mean in the first simulation."""
     second: float
-    """The mean in the second simulation."""
+    """The quantity's mean in the second simulation."""
     low: float
     """Lower end of the confidence interval of the difference (second mean minus first mean)."""
     high: float
     """Upper end of the confidence interval of the difference (second mean minus first mean)."""
     margin: float
-    """Largest irrelevant difference."""
+    """The largest difference that does not matter."""
 
     @property
     def verdict(self) -> str:

@@ -1,4 +1,4 @@
-"""Compute the layout of memory and observations: named parts, the fields of a struct, are slices of a row of floats."""
+"""Compute the layout of memory and observations: each field of a struct is a named slice of a row of floats."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -46,7 +46,7 @@ def draw(low: np.ndarray, high: np.ndarray, envs: int, seed: int) -> np.ndarray:
 
 
 class Gymnasium:
-    """Gymnasium's vector environments, or a single environment."""
+    """A vector environment of Gymnasium, or a single environment."""
 
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
         import gymnasium
