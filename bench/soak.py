@@ -265,7 +265,7 @@ def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
     fields = [f"    {name}: Row[float]\n" for name in ("userdata", "body_mass") if name not in own.world.vars]
     source = source.replace("class World:\n", "".join(["class World:\n", *fields]), 1)
     noisy = functions["observe"] is not None and len(functions["observe"].input_types) > 3
-    # a task of a module with several tasks has functions and structs with other names
+    # in a module with several tasks, a task's functions and structs may have other names
     names = {name: function.func.__name__ for name, function in functions.items() if function and function.func}
     world, params = (struct.cls.__name__ for struct in list(functions["observe"].func.__annotations__.values())[:2])
     copy = "for i in range(ctrl.shape[0]):\n        ctrl[i] = action[i]"

@@ -31,7 +31,7 @@ def _triangle(ground: wp.array2d[float], x: float, y: float) -> wp.vec3:
 
 @wp.func
 def ground_height(ground: wp.array2d[float], x: float, y: float) -> float:
-    """Return the height of the ground at a point, m, on the triangles with which MuJoCo collides.
+    """Return the height (m) of the ground at a point, on the triangles with which MuJoCo collides.
 
     Outside the field, the height is that of the nearest edge point, although MuJoCo has no ground there.
 

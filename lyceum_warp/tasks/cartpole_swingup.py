@@ -1,7 +1,7 @@
 """CartpoleSwingup: swing a pole up and balance it (dm_control's cartpole swingup, with Lyceum's reward).
 
-All sigmoids of Lyceum's reward are quadratic; dm_control's are Gaussian, except for the control. Episodes do not
-terminate.
+All sigmoids of Lyceum's reward are quadratic; in dm_control's reward, all sigmoids except the control's are Gaussian.
+Episodes do not terminate.
 """
 
 import warp as wp

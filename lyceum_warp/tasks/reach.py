@@ -13,7 +13,7 @@ from lyceum_warp import Row
 REMEMBERED = 10
 """The number of steps over which the distance is averaged."""
 FAR = 10.0
-"""The initial value of the distances in memory, m, so large that success is impossible before the tenth step."""
+"""The initial value of the distances in memory (m), so large that success is impossible before the tenth step."""
 
 
 @wp.struct

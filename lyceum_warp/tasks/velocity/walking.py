@@ -5,10 +5,10 @@ actuated joints and the feet, and sets parameters of the robot. Tables are compu
 rewards, commands, pushes and resets are taken from mjlab 1.6.0's velocity tasks.
 
 The robot's base is the body of the model's first joint, which is a free joint. Functions read the state after the last
-substep. Only the forces on the feet belong to the start of the last substep. These forces are 0 at the start of an
-episode. Positions and velocities of the feet are computed from the joints, which saves a forward pass. A foot is in
-contact if a sphere of its sole (``soles``) reaches the ground. Only ``ground`` and ``distance`` depend on the shape of
-the ground.
+substep. Only the forces on the feet are older: MuJoCo computes them at the start of the last substep. These forces are
+0 at the start of an episode. Positions and velocities of the feet are computed from the joints, which saves a forward
+pass. A foot is in contact if a sphere of its sole (``soles``) reaches the ground. Only ``ground`` and ``distance``
+depend on the shape of the ground.
 """
 
 import math
@@ -229,7 +229,7 @@ def stage(s: World, p: Params) -> int:  # of the curriculum
 
 @wp.func
 def command(s0: World, p: Params) -> wp.vec3:
-    """Return the commanded forward and lateral velocity, m/s, and yaw rate, rad/s, in the base's axes."""
+    """Return the commanded forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s), in the base's axes."""
     return terms.velocity_command(
         s0.drawn_velocity, s0.heading_target, s0.heading_controlled, s0.standing, terms.heading(s0.qpos),
         p.heading_gain, p.stages[stage(s0, p), 3],
@@ -369,7 +369,7 @@ def foot_slip(foot_clearance_and_slip: wp.vec2) -> float:
 
 @wp.func
 def single_stance(contact_time: Row[float], air_time: Row[float], longest_step: float, active: float) -> float:
-    """Return the shortest time, s, for which a foot has been in contact or in the air, at most ``longest_step``.
+    """Return the shortest time (s) for which a foot has been in contact or in the air, at most ``longest_step``.
 
     The result is 0 unless exactly one foot is in contact. Source: Isaac Lab, ``feet_air_time_positive_biped``.
     """
