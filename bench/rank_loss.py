@@ -2,10 +2,11 @@
 
     lyceum-warp bench rank_loss half_cheetah hopper
 
-Each line of results/rank-loss.jsonl holds the numbers of a task and a setting. First come the rank correlations of
-``lyceum-warp tune --planning``. Then come three returns of the same episodes in the task's own physics: R_exact with
-plans in these physics, R_setting with plans in the setting's physics, and R_none without plans. The loss is
-(R_exact - R_setting) / (R_exact - R_none). Episodes do not run in real time, so a busy machine changes no number.
+Each line of results/rank-loss.jsonl belongs to one task and one setting, and holds the rank correlations that
+``lyceum-warp tune --planning`` measures. The line also holds three returns of the same episodes in the task's own
+physics: R_exact with plans in these physics, R_setting with plans in the setting's physics, and R_none without plans.
+The loss is (R_exact - R_setting) / (R_exact - R_none). Episodes do not run in real time, so a busy machine changes no
+number.
 """
 
 import dataclasses
