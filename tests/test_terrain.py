@@ -49,7 +49,7 @@ def test_stones_have_gaps_of_the_given_width(width: float, cells: int) -> None:
 
 
 @pytest.mark.parametrize(("kind", "amount"), [("steps", 0.2), ("rough", 0.08), ("waves", 0.2)])
-def test_steps_waves_and_rough_patches_reach_their_full_height_and_depth(kind: str, amount: float) -> None:
+def test_patches_with_steps_waves_or_rough_ground_reach_their_full_height_and_depth(kind: str, amount: float) -> None:
     heights = patch(kind)
     assert -amount <= heights.min() < -0.9 * amount and 0.9 * amount < heights.max() <= amount
 

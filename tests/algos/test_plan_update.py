@@ -122,7 +122,7 @@ def test_planners_with_one_update_object_do_not_share_buffers() -> None:
     assert vars(update).keys() == {"elites", "min_noise", "smoothing"}
 
 
-def test_settings_show_a_user_written_update_with_its_attributes() -> None:
+def test_settings_show_the_attributes_of_an_update_that_the_user_wrote() -> None:
     plan = lw.Planner(update=EliteMean(3), **POINT)
     assert plan.settings["update"] == "EliteMean(elites=3)"
     assert plan.config.update is not None and type(plan).__name__ == "Planner"
