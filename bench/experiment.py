@@ -1,9 +1,9 @@
 """Run experiments: cases, stored results, tables and figures.
 
-An experiment is a module with an ``EXPERIMENT``: a function that lists cases, a function that measures a case, and
-functions that make tables and a figure from stored results. ``main`` prints the expected duration, and skips cases
-with stored results from the same hardware and software. Each result is written immediately: an interrupted run loses
-at most one case per job, and the same command continues it.
+An experiment is a module with an ``EXPERIMENT``, which consists of functions: one lists the cases, one measures a case,
+and others make tables and a figure from stored results. ``main`` prints the expected duration, and skips cases with
+stored results from the same hardware and software. Each result is written immediately: an interrupted run loses at most
+one case per job, and the same command continues it.
 """
 
 import concurrent.futures
@@ -143,7 +143,7 @@ def load(name: str) -> Experiment:
 
 
 def choose(given: Sequence[str], known: Iterable[str], default: Sequence[str] = (), *, what: str) -> tuple[str, ...]:
-    """Return the given names. If there are none, return the default names; if there are none either, return all known
+    """Return the given names. Without given names, return the default names. Without default names, return all known
     names.
 
     Raises:

@@ -4,12 +4,12 @@
     lyceum-warp bench gate --policy runs/go1-1 runs/go1-2
 
 The mean policy plays on the C engine under the task's exact physics. A Unitree G1 must pass nanoG1's gate
-(kingjulio8238/nanoG1, eval.py). The gate plays six commands of 20 s, each from four noisy starts. It also measures the
-gait in 2,000 steps at 0.5 m/s. The gate has no noise, no pushes and no differences between robots. In nanoG1, actions
-are clipped to 1 and multiplied by 0.25 rad. Here, the change of a servo's target, divided by 0.25 rad, counts as the
-change of the action. Other robots play 100 episodes of 20 s. Noise and differences between robots are the same as in
-training. These robots get ten commands from ten starts each, once without and once with pushes. After a fall, a world
-returns to its start.
+(kingjulio8238/nanoG1, eval.py). The gate plays six commands of 20 s, each from four noisy starts. The gate also
+measures the gait in 2,000 steps at 0.5 m/s. The gate has no noise, no pushes and no differences between robots. In
+nanoG1, actions are clipped to 1 and multiplied by 0.25 rad. Here, the change of a servo's target, divided by 0.25 rad,
+counts as the change of the action. Other robots play 100 episodes of 20 s. Noise and differences between robots are the
+same as in training. These robots get ten commands from ten starts each, once without and once with pushes. After a
+fall, a world returns to its start.
 """
 
 import dataclasses
@@ -71,14 +71,14 @@ BESIDE = {
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Judge whether a robot walks under fixed commands, by limits."""
+    """Test whether a robot walks: measure its motion under fixed commands, and compare it with limits."""
 
     policy: tuple[Path, ...] = ()
     """Folders of runs on a velocity task, for example g1_velocity."""
     which: str = "last"
     """Policy of each run: last, best, or the number of a saved iteration."""
     task: str | None = None
-    """Velocity task to play instead of the run's task. It has its own parameters, not the run's."""
+    """Velocity task to play instead of the run's task. The task has its own parameters, not the run's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +130,7 @@ def play(env: lw.Env, policy: Any, commands: Sequence[Sequence[float]], steps: i
     """Play from states with fixed commands; a world that fell returns to its start.
 
     Args:
-        env: Worlds without a horizon.
+        env: The environment, which must have no horizon.
         policy: Maps observations to actions.
         commands: The command of each world.
         steps: Number of steps.
@@ -152,7 +152,7 @@ def play(env: lw.Env, policy: Any, commands: Sequence[Sequence[float]], steps: i
 
 
 def worlds(folder: Path, nworld: int, options: Options, **params: Any) -> lw.Env:
-    """Make worlds of the run's task. They have the run's parameters and no time limit."""
+    """Make worlds of the run's task. The worlds have the run's parameters and no time limit."""
     place = {"engine": "mujoco", "device": "cpu", "nthread": options.threads, "physics": "exact"}
     words = place | {"horizon": 0, "seed": 1000}
     return run_worlds(Run.open(folder), words, params, nworld=nworld, task=options.task, trust=False)

@@ -110,7 +110,7 @@ def seconds(env: lw.Env, function: Callable[[], object]) -> float:
 
 
 def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **place: Any) -> dict[str, Any]:
-    """Time an environment and its bare engine on the same states; return medians over the blocks.
+    """Measure the step times of an environment and of its bare engine on the same states; return medians over blocks.
 
     Args:
         task: Name of a task.

@@ -34,8 +34,7 @@ COST = {
 """Microseconds per step of a sample on two cores, by task and planning physics. The tasks in the keys are the default
 tasks."""
 LONGEST = 0.2
-"""Maximum expected duration of a plan, in seconds; cells with longer plans run only if samples or horizons are
-given."""
+"""Maximum expected duration of a plan, in seconds; longer plans run only if samples or horizons are given."""
 SAMPLES, HORIZONS = (16, 64, 256, 1024), (16, 32, 64)
 CONTESTANTS = {"mujoco": "C engine", "warp": "Warp engine"}
 

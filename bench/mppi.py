@@ -206,7 +206,7 @@ def episodes_together(
 
 @functools.cache
 def states(task: str, seed: int, steps: int, threads: int) -> torch.Tensor:
-    """Return the states of an episode, (steps, state_size), from which all contestants plan."""
+    """Return the states of an episode (steps, state_size) from which all contestants plan."""
     return lw.control(plant(task, steps), planner(task, "mppi", threads, "cpu"), seed=seed).states[:-1]
 
 

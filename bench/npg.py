@@ -320,7 +320,7 @@ def stable_baselines3(case: Case, options: Options, curve: Curve) -> dict[str, A
     def act(obs: np.ndarray) -> np.ndarray:
         return model.predict(envs.normalize_obs(obs), deterministic=True)[0]
 
-    agent(n_steps=64, batch_size=64)[0].learn(1)  # torch's first calls take longer
+    agent(n_steps=64, batch_size=64)[0].learn(1)  # torch's first calls take longer than later calls
     model, envs = agent(**({"n_steps": 256, "batch_size": 64} if case.short else {}))
     assert case.samples is not None
     curve.start(act)
@@ -422,8 +422,8 @@ def interval(found: tuple[float, float], form: str = ",.0f") -> str:
 
 
 def agreement(task: str, same: dict[str, list[Row]]) -> Table | None:
-    """Compare the returns of both NPGs every 100,000 samples; return None if there is one seed, or if runs are shorter
-    than that."""
+    """Compare the returns of both NPGs every 100,000 samples; return None if there is only one seed, or if runs have
+    fewer samples."""
     ours, fed = (np.array([values_at(row, EVERY_100K) for row in same[name]]) for name in ("npg", "npg_gymnasium"))
     there = ~np.isnan(np.concatenate([ours, fed])).any(axis=0)
     if not there.any() or min(len(ours), len(fed)) < 2:

@@ -2,11 +2,11 @@
 
     lyceum-warp bench rank_loss half_cheetah hopper
 
-Each line of results/rank-loss.jsonl holds the numbers of a task and a setting. These numbers are the rank correlations
-of ``lyceum-warp tune --planning``, and three returns of the same episodes in the task's own physics: planned with these
-physics, planned with the setting, and without a plan. With these three returns R_exact, R_setting and R_none, the loss
-is (R_exact - R_setting) / (R_exact
-- R_none). Episodes do not run in real time, so a busy machine changes no number.
+Each line of results/rank-loss.jsonl belongs to one task and one setting, and holds the rank correlations that
+``lyceum-warp tune --planning`` measures. The line also holds three returns of the same episodes in the task's own
+physics: R_exact with plans in these physics, R_setting with plans in the setting's physics, and R_none without plans.
+The loss is (R_exact - R_setting) / (R_exact - R_none). Episodes do not run in real time, so a busy machine changes no
+number.
 """
 
 import dataclasses

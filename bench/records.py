@@ -80,7 +80,7 @@ class Case:
 
 
 def cases(options: Options) -> list[Case]:
-    """List the runs of all tasks with a recipe for the device."""
+    """List the runs of all tasks that have training flags for the device."""
     kind = options.device.partition(":")[0]
     tasks = choose(options.tasks, RECORDS, ("hopper",) if options.short else (), what="task")
     for task in options.tasks:
@@ -129,7 +129,8 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def cache(case: Case, options: Options, folder: Path) -> Iterator[dict[str, str]]:
-    """Return the command's environment variables. They contain the path of an empty or of a filled kernel cache."""
+    """Return the command's environment variables. One of the variables is the path of the kernel cache, which is empty
+    or filled."""
     if case.cache == "warm":
         if not folder.exists():
             with tempfile.TemporaryDirectory() as spare:

@@ -51,12 +51,12 @@ from lyceum_warp.support.validate import whole_number
 PARTS = ("faults", "random", "memory", "kills")
 KINDS = {"state": Done.NAN, "speed": Done.NAN, "action": Done.ACTION, "reward": Done.REWARD,
          "observation": Done.OBSERVATION, "model": Done.MODEL}  # fmt: skip
-"""Kinds of faults, numbered from 1. A kind is named after the place of the injection, and has the reason that must be
-reported."""
+"""Each kind of fault, named after the place of its injection, with the reason that must be reported. Kinds are numbered
+from 1."""
 NBIT = len(Done)
 EVERY = 16
-"""Number of steps between writes of invalid states. A write affects this number of times as many worlds, so the number
-of faults does not depend on it."""
+"""Number of steps between writes of invalid states. If writes are less frequent, each write affects more worlds, so the
+number of faults stays the same."""
 SAMPLES = 5
 """Memory samples per chunk."""
 TASKS = {
@@ -160,7 +160,7 @@ class Faults:
     part: str = "faults"
 
     def state(self, work: Path, chunk: int) -> Path:
-        """Return the path of the state before a chunk."""
+        """Return the path of the file with the state from which a chunk starts."""
         where = f"{self.engine}-{self.device.partition(':')[0]}"
         run = f"{file_name(self.task)}-{where}-{self.nworld}-{self.steps}-{self.seed}"
         return work / f"{run}{'-same-bits' if self.compared else ''}-{chunk}.pt"
@@ -253,8 +253,8 @@ def measure(case: Any, options: Options) -> dict[str, Any]:
 
 
 def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
-    """Write a variant of a task. It has one action more than the task, and this action requests a fault. Return the
-    variant, and the range of the other actions."""
+    """Write a variant of a task. The variant has one action more than the task, and this action requests a fault.
+    Return the variant, and the range of the other actions."""
     parent, plain = find_task(task), lw.make(task, nworld=1, engine="mujoco")
     own = TaskSource(parent, task)
     functions, nact = own.functions, plain.action.shape[1]
@@ -265,7 +265,7 @@ def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
     fields = [f"    {name}: Row[float]\n" for name in ("userdata", "body_mass") if name not in own.world.vars]
     source = source.replace("class World:\n", "".join(["class World:\n", *fields]), 1)
     noisy = functions["observe"] is not None and len(functions["observe"].input_types) > 3
-    # a task of a module with several tasks has functions and structs with other names
+    # in a module with several tasks, a task's functions and structs may have other names
     names = {name: function.func.__name__ for name, function in functions.items() if function and function.func}
     world, params = (struct.cls.__name__ for struct in list(functions["observe"].func.__annotations__.values())[:2])
     copy = "for i in range(ctrl.shape[0]):\n        ctrl[i] = action[i]"
@@ -326,7 +326,7 @@ def tally(
     clean_inout: wp.array[bool], injected_inout: wp.array2d[int], reasons_inout: wp.array2d[int],
     outcome_inout: wp.array2d[int],
 ):  # fmt: skip
-    """Count faults after a step, and compare clean worlds with the worlds of the twin; launched over (nworld,)."""
+    """Count faults after a step, and compare worlds without faults with their copies in the twin environment."""
     w = wp.tid()
     due = wp.where(pending_inout[w], 6, wp.where(kind_in[w] < 6, kind_in[w], 0))
     pending_inout[w] = kind_in[w] == 6 and not done_in[w]  # a world that restarts gets no event in this step
@@ -347,7 +347,7 @@ def tally(
 
 
 def inject(case: Faults, options: Options) -> dict[str, Any]:
-    """Step a task for a chunk with injected faults, and a second environment without faults."""
+    """Step two environments of a task for a chunk: one with injected faults, and one without faults."""
     torch.set_num_threads(1)
     gc.collect()  # free the environments of the previous chunk
     before = case.state(options.work, case.chunk)

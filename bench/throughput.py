@@ -46,7 +46,7 @@ PARTS = {
     "worlds": ("warp", "c"),
     "kept": ("c", "warp"),
 }
-"""Contestants of each part. The Warp engine runs only on a GPU, or if --contestants names it."""
+"""Contestants of each part. The Warp engine runs only on a GPU, unless --contestants names it."""
 UNITS = {"sampling": "native", "suite": "dm_control", "single": "gymnasium", "cores": "native"}
 """The reference contestant of each part."""
 WORLDS = {"warp": (1, 8, 64, 512, 2_048, 8_192, 16_384, 32_768, 65_536, 131_072), "c": (1, 8, 64, 512, 4_096)}

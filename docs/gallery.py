@@ -147,7 +147,8 @@ SHOWS = {
 }  # fmt: skip
 """The tasks that need other settings than the defaults of Show."""
 
-for _name in ("g1_full_velocity", "g1_rough_velocity"):  # no policy, and these robots soon fall under the planner
+# there is no policy for these tasks, and a planner lets the robots fall soon
+for _name in ("g1_full_velocity", "g1_rough_velocity"):
     _settings = {"horizon": 32, "samples": 48, "knots": 5, "noise": 0.1, "temperature": 0.02}
     SHOWS[_name] = dataclasses.replace(SHOWS[_name], settings=_settings, replan_every=2, start=0.0, seconds=1.6)
 

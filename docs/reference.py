@@ -165,7 +165,7 @@ def tasks(words: str) -> str:
 
 
 def task_section(name: str) -> str:
-    """Return the section of a task."""
+    """Make the section about a task on its page."""
     task = BoundTask(find_task(name))
     cls = task.task
     text = vars(cls).get("__doc__") or inspect.getdoc(sys.modules[cls.__module__]) or ""

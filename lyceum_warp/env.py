@@ -89,7 +89,7 @@ class Env:
     final_obs: torch.Tensor
     """Observations at the end of the last step, before any reset, (nworld, nobs), float32."""
     obs_groups: dict[str, torch.Tensor]
-    """Observations of each group, (nworld, size of the group), by name; ``policy`` is ``obs``."""
+    """Observations by group, each (nworld, size of the group); the group ``policy`` is ``obs``."""
     final_obs_groups: dict[str, torch.Tensor]
     """``final_obs`` of each group of observations, by the group's name."""
     reward: torch.Tensor
@@ -105,7 +105,7 @@ class Env:
     episode_metrics: dict[str, torch.Tensor]
     """The task's metrics summed over the episode up to the last step, each (nworld,), float32."""
     episode_metric_sums: torch.Tensor
-    """``episode_metrics`` as one tensor, (nworld, number of metrics), in the order of ``metrics``."""
+    """``episode_metrics`` as one tensor (nworld, number of metrics) in the order of ``metrics``."""
     shared: dict[str, torch.Tensor]
     """The memory that all worlds share, by name; only ``update_shared`` changes the memory, by calling the task's
     ``share``."""
@@ -138,7 +138,7 @@ class Env:
     obs_space: Space
     """Parts of an observation and their columns."""
     obs_spaces: dict[str, Space]
-    """The spaces of all groups of observations; ``policy`` is ``obs_space``."""
+    """The spaces of all groups of observations; the space of ``policy`` is ``obs_space``."""
     action_space: Space
     """Names, columns and bounds of actions."""
     state_space: Space
@@ -192,7 +192,8 @@ class Env:
                 self.engine.prepare_capture()
             self.engine.reset(worlds.everyone)
             probe = Probe(self.task, worlds.after, worlds.params, self.device)
-            probe.check_bounds()  # check writes before the task's functions write into the environment's arrays
+            # find faulty writes now, before the task's functions run on the environment's own arrays
+            probe.check_bounds()
             self.rand_reset(options.seed)
             if self.task.dynamics and not _replica:  # later resets report invalid values as faults
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])

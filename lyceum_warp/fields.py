@@ -43,7 +43,7 @@ STATE_FIELDS = {
 """Fields of the integration state, each with its mjtState component."""
 
 INPUTS = ("ctrl", "xfrc_applied", "qfrc_applied", "mocap_pos", "mocap_quat", "userdata")
-"""State fields that the engine reads and never changes. A task may write these fields before a step."""
+"""Fields of the state that the engine reads but never changes. A task may write these fields before a step."""
 
 INITIAL = ("qpos", "qvel", "act", "eq_active", *INPUTS)
 """Fields that make up an initial state."""
@@ -104,7 +104,7 @@ _KINDS = {
     "subtree_angmom".split(),
     _Kind.mjOBJ_BODY,
 ) | dict.fromkeys(("xanchor", "xaxis"), _Kind.mjOBJ_JOINT)  # fmt: skip
-"""Map the name or prefix of a field with one row per object to the kind of object."""
+"""For fields with one row per object: map the field's name or prefix to the kind of object."""
 
 _QPOS = (_Kind.mjOBJ_JOINT, "jnt_qposadr", "nq")
 _DOFS = (_Kind.mjOBJ_JOINT, "jnt_dofadr", "nv")
@@ -128,8 +128,9 @@ _RANGES = (
     | {"sensordata": _SENSORS, "flexvert_xpos": _VERTICES}
     | dict.fromkeys(("flexedge_length", "flexedge_velocity"), _EDGES)
 )  # fmt: skip
-"""Describe the fields in which an object may have several rows, by the field's name or prefix: the kind of object, the
-MjModel array with the index of each object's first row, and the array of row counts or the total number of rows."""
+"""Describe the fields in which an object may have several rows, by the field's name or prefix. An entry holds the kind
+of object, the MjModel array with the index of each object's first row, and the array of row counts or the total number
+of rows."""
 
 _COUNTS = {
     _Kind.mjOBJ_ACTUATOR: "nactuator",
@@ -278,7 +279,7 @@ def _sensed(model: mujoco.MjModel, name: str) -> bool:
 
 
 def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
-    """Get the rows of a named element of the model in a field of MjData or MjModel.
+    """Get the rows that a named element of the model has in a field of MjData or MjModel.
 
     The following objects may have several rows: a joint (coordinates in ``qpos``; degrees of freedom in ``qvel``,
     ``dof_damping`` and similar fields), a sensor (``sensordata``), an actuator (controls in ``ctrl``, activations in

@@ -31,7 +31,7 @@ class Mirror:
     parts: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        """Add the order to reflections that have only signs, and check all reflections."""
+        """If a reflection has only signs, add the order of its columns; then check all reflections."""
         parts = {name: _complete(part) for name, part in self.parts.items()}
         for name, (order, signs) in parts.items():
             places, factors = np.asarray(order), np.asarray(signs)

@@ -170,7 +170,7 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
     Args:
         model: The compiled model.
         values: Values by field name, each with one row per world or one row for all worlds.
-        columns: The columns of each model field that differs between worlds, (nworld, size), by the field's name.
+        columns: The columns of each model field that differs between worlds (nworld, size) by the field's name.
 
     Raises:
         ValueError: A field is unknown or the same in every world, or a value has the wrong size.
@@ -208,7 +208,7 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
 
     Args:
         model: The compiled model.
-        name: MuJoCo's name of the field, an attribute of MjModel or, like "gravity", of MjModel.opt.
+        name: MuJoCo's name of the field. A field is an attribute of MjModel or, as "gravity" is, of MjModel.opt.
         varies: Whether to accept only fields that can differ between worlds.
 
     Raises:

@@ -65,7 +65,7 @@ class OpenLoop:
     final_obs: torch.Tensor
     """Observations after the last step, (nworld, nobs)."""
     final_obs_groups: dict[str, torch.Tensor]
-    """Observations after the last step by group; ``policy`` is ``final_obs``."""
+    """Observations after the last step by group; the group ``policy`` is ``final_obs``."""
     fault: torch.Tensor
     """Faults of each world as bits of ``Done``, (nworld,) int32; ignore the rewards of a world with a fault."""
     phases: tuple[Phase, ...]

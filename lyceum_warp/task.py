@@ -385,8 +385,8 @@ class Training:
     algorithm: str = "npg"
     """Name of the algorithm: npg, ppo or sac."""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Hyperparameters of the algorithm, by the names of ``lw.NPGConfig``, ``lw.PPOConfig`` or ``lw.SACConfig``. They do
-    not apply if a flag chooses another algorithm."""
+    """Hyperparameters of the algorithm, by the names of ``lw.NPGConfig``, ``lw.PPOConfig`` or ``lw.SACConfig``. These
+    hyperparameters do not apply if a flag chooses another algorithm."""
     iterations: int = 100
     """Number of iterations."""
 
@@ -485,7 +485,7 @@ class Task:
     """Fields that keep the values left by ``mj_step``. These values lag one substep behind the state, as in some
     Gymnasium tasks."""
     cleared: ClassVar[tuple[str, ...]] = ()
-    """Fields left by the last substep, such as contact forces, that a reset clears before ``initialize``. If
+    """Fields of the last substep, such as contact forces, which a reset must clear before ``initialize`` runs. If
     ``cleared`` does not list such fields, a forward pass computes them in the worlds that restart."""
     actions: ClassVar[Mapping[str, int | str] | None] = None
     """Parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls; ``control``
@@ -520,7 +520,7 @@ class Task:
     training: ClassVar[Training] = Training()
     """The task's settings for ``lyceum-warp train``, such as ``lw.Training(algorithm="ppo", settings={...})``."""
 
-    # the module's World, Params and Warp functions when the class was defined
+    # the World, the Params and the Warp functions that the module had when the class was defined
     scope: ClassVar[dict[str, Any]]
 
     @staticmethod

@@ -122,7 +122,7 @@ class Terrain:
     seed: int = 0
     """Seed of all random heights."""
     scale: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Sizes at difficulty 1, by kind. They replace the sizes in the table."""
+    """Sizes at difficulty 1, by kind. These sizes replace the sizes in the table."""
 
     def __post_init__(self) -> None:
         """Check the description.
@@ -272,9 +272,9 @@ def height_field(name: str) -> Any:
     """Make a default for Params: the table of a model's height field.
 
     The table is for ``lw.ground_height`` and ``lw.height_scan``. The table has the shape (1 + points along y, 1 +
-    points along x). Its first row has the points' x coordinates, and its first column has their y coordinates. All
-    other elements are heights z. Coordinates are in the world's frame, in m. All worlds share the table. Declare the
-    table as in ``ground: wp.array2d[float] = lw.height_field("terrain")``.
+    points along x). The table's first row has the x coordinates of the points, and its first column the y coordinates.
+    All other elements are heights z. Coordinates are in the world's frame, in m. All worlds share the table. Declare
+    the table as in ``ground: wp.array2d[float] = lw.height_field("terrain")``.
 
     Args:
         name: Name of the height field in the model. ``lw.Terrain.add_to`` uses the name "terrain" by default.

@@ -252,7 +252,7 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
         found[:, :3] -= data.xanchor[_last_joint(model, foot)]
         spheres.append(found)
     most = max(map(len, spheres))
-    return np.array([np.resize(found, (most, 4)) for found in spheres])  # feet with fewer spheres repeat theirs
+    return np.array([np.resize(found, (most, 4)) for found in spheres])  # if a foot has fewer spheres, repeat them
 
 
 def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
@@ -342,7 +342,7 @@ def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.nd
 
 
 def spheres_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
-    """Compute a geom's spheres for ``soles``, in the world's axes, (spheres, 4)."""
+    """Compute the spheres that replace a geom in ``soles``, in the world's axes, (spheres, 4)."""
     size, kind = model.geom_size[geom], mujoco.mjtGeom
     radius, middle = 0.0, np.zeros(3)
     if model.geom_type[geom] == kind.mjGEOM_SPHERE:
@@ -419,8 +419,8 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
 
     Args:
         spec: The model.
-        feet: Map from the name of each new site to two values: the name of the site's body, or of a joint or geom of
-            this body; and the site's position in this body, in m.
+        feet: For each new site, by its name, an element and a position: the name of the site's body (or of one of the
+            body's joints or geoms), and the site's position in this body, in m.
 
     Raises:
         ValueError: The model has no element of this name.
@@ -482,7 +482,7 @@ def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.01
     not change.
 
     Args:
-        spec: The model after ``prepare_walker``. It is changed in place.
+        spec: The model after ``prepare_walker``. The model is changed in place.
         feet: Names of the sites of the feet.
         radius: Radius of the capsules, in m.
 

@@ -106,7 +106,7 @@ class WorldArrays:
         layouts = self.task.shared
         shared, sums = (sum(sizes(layouts.get(name, {})).values()) for name in ("Shared", "Sums"))
         self.shared, self.sums = wp.zeros((1, shared), dtype=float), wp.zeros(sums, dtype=wp.int64)
-        """Shared memory, (1, size), and sums in units of 1 / ``kernels.steps.UNIT``, (size of Sums,)."""
+        """Shared memory (1, size) and sums in units of 1 / ``kernels.steps.UNIT`` (size of Sums,)."""
         self._shares = wp.zeros((self.nworld, sums), dtype=float)
         if layouts:
             for batch in (self.after, self.before):
@@ -127,14 +127,14 @@ class WorldArrays:
         self.outcome.metrics = self.metrics  # type: ignore[assignment]
         self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
         parts = int(transitions.OBSERVE_FIRST) + len(self.obs_spaces)
-        self._judging = parts if self.device.is_cuda else 1  # number of threads that judge a world
+        self._judging = parts if self.device.is_cuda else 1  # number of threads that evaluate a world's transition
         self._found = step_types.Findings()
         self._found.reward, self._found.eval = wp.zeros(n, dtype=float), wp.zeros(n, dtype=float)
         self._found.terminated, self._found.success = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
         self._found.fault = wp.zeros((parts, n), dtype=int)  # type: ignore[assignment]
         self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
         self._finite_obs = wp.zeros((len(self.obs_spaces), n), dtype=bool)
-        # number of threads per world for observing
+        # number of threads that write a world's observations
         self._observing = len(self.obs_spaces) if self.device.is_cuda else 1
         self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
         self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}
@@ -196,7 +196,7 @@ class WorldArrays:
             self.mask_view.copy_(mask)
 
     def pack_state(self, ended: wp.array) -> None:
-        """Write every world's state vector into ``state``, with ``ended``, (nworld,), as the part ``done_reason``."""
+        """Write every world's state vector into ``state``; its part ``done_reason`` is ``ended``, (nworld,)."""
         size = self.engine.state_size
         self.engine.get_state(self.state[:, :size])
         own = self.counters

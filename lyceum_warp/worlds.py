@@ -78,7 +78,7 @@ class Worlds(WorldArrays):
         self.step = self.programs.step
 
     def drop_programs(self) -> None:
-        """Delete the programs. They contain reference cycles, which would keep threads and memory alive."""
+        """Delete the programs, whose reference cycles would keep threads and memory alive."""
         self._programs.clear()
         del self.programs, self.step
 
@@ -104,7 +104,7 @@ class Worlds(WorldArrays):
         ]
 
     def _phases_of_a_graph(self) -> list[Phase]:
-        """List the phases of a step that is a single graph and skips parts that affect no world."""
+        """List the phases of a step as a single graph, which skips phases without any world to change."""
         if not self.engine.capturable:
             return self.step_phases()
         restart = self._restart_phases(self.restarting, randomly=True)
@@ -132,7 +132,7 @@ class Worlds(WorldArrays):
         return Phase(every[0].name, partial(self.engine.run_for, mask, run), engine=True)
 
     def _transition_phases(self, substeps: int | None = None) -> list[Phase]:
-        """List the phases that advance to the next state and judge the transition."""
+        """List the phases that advance to the next state and evaluate the transition."""
         return [
             Phase("act", self.act, by_world=True),
             *self.physics_phases(substeps),
@@ -189,7 +189,7 @@ class Worlds(WorldArrays):
         return phases
 
     def _observe_phases(self) -> list[Phase]:
-        """List the phases that observe worlds that changed since the transition was judged."""
+        """List the phases that observe the worlds that have changed since the transition was evaluated."""
         changed = self.restarting if self.task.kernels.run_events is None else self._outdated
         return [Phase("observe", partial(self._observe, changed), by_world=True)]
 
@@ -242,7 +242,7 @@ class Worlds(WorldArrays):
         launch_worlds(kernel, self.nworld, args, self.device)
 
     def _judge_step(self) -> None:
-        """Find faults, advance the task's memory, and judge the transition."""
+        """Find faults, advance the task's memory, and evaluate the transition."""
         self.engine.find_faults(self.everyone)
         self.advance_memory()
         keep_reason = not self.autoreset
@@ -337,13 +337,13 @@ class Worlds(WorldArrays):
         self.engine.commit(self._physics_changed, state_fields)
 
     def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
-        """Mark continuing worlds in which a field changed; ``physics`` is False for the task's memory."""
+        """Mark the continuing worlds in which a field has changed; ``physics`` is False for the task's memory."""
         found = [self._physics_changed, self._changed, self._outdated]
         args = [self._continuing, flat(before), flat(after), physics, *found]
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
 
     def _observe(self, mask: wp.array) -> None:
-        """Observe the masked worlds; judging has already observed all other worlds."""
+        """Observe the masked worlds; the evaluation of the transition has already observed all other worlds."""
         kernels, finite, parts = self.task.kernels, self._finite_obs, self._observing
         args = [mask, self.after, self.params, self.counters, self.final_obs, finite, self.obs, parts]
         launch_parts(kernels.observe_worlds, parts, self.nworld, args, self.device)
@@ -353,7 +353,7 @@ class Worlds(WorldArrays):
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         """Compute observations, evaluations and terminations of the masked worlds' states, without a transition."""
-        # a state set without a check may be a fault; a world with a fault keeps the last valid observation
+        # a state that was set without a check may be invalid; a world with a fault keeps the last valid observation
         self.engine.find_faults(self.mask)
         keep_reason = keep_reason and not self.autoreset
         self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)
@@ -365,7 +365,7 @@ class Worlds(WorldArrays):
     # for environments and rollouts
 
     def judge_transition(self, action: torch.Tensor) -> None:
-        """Judge the transition from ``before`` to the current state under given actions, ignoring engine faults."""
+        """Evaluate the transition from ``before`` to the current state under given actions, ignoring engine faults."""
         torch_view(self.safe_action).copy_(action)
         self._judged.zero_()  # will contain the transition's faults
         self._judge(self.everyone, self._judged, self._no_fault, transition=True)

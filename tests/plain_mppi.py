@@ -37,7 +37,7 @@ class Grid:
         return self.now // self.distance - (self.spline == "cubic")
 
     def actions(self, knots: np.ndarray) -> np.ndarray:
-        """Interpolate the actions of all steps. The first row of ``knots``, (n, ...), is the knot with the index
+        """Interpolate the actions of all steps. The first row of ``knots`` (n, ...) is the knot with the index
         ``first()``."""
         result = []
         for t in range(self.horizon):

@@ -108,7 +108,7 @@ def test_engine_of_a_deleted_environment_is_freed_before_a_fork(engine: str) -> 
         gc.enable()
 
 
-def test_method_follow_copies_parameters_between_environments() -> None:
+def test_environment_copies_the_parameters_of_the_environment_that_it_follows() -> None:
     first = lw.make("hopper", nworld=2, healthy_reward=3.0)
     second = first.replicate(nworld=4, ctrl_cost_weight=0.5)
     second.follow(first)

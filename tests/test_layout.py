@@ -1,4 +1,5 @@
-"""Check that modules import only from lower rooms, that private names stay private, and that every room has tests."""
+"""Check that modules import only from lower layers, that private names stay private, and that every module or folder of
+the package has tests."""
 
 import ast
 import functools
@@ -36,7 +37,7 @@ LEVELS = {
     "adapters": 13, "viewer": 13,
     "cli": 14, "gym": 14,
 }  # fmt: skip
-"""Level of every room; a room imports only from lower levels and from itself."""
+"""Level of every room (a module or folder of the package); a room imports only from lower levels and from itself."""
 
 TESTED_BY = {
     "done": "test_faults.py", "task": "binding", "testing": "conformance",

@@ -19,7 +19,7 @@ def test_reflections_that_are_not_their_own_inverse_raise_an_error(part: tuple[o
         lw.Mirror({"x": part})
 
 
-def test_error_of_mirror_names_parts_without_a_reflection() -> None:
+def test_error_of_a_missing_reflection_names_the_part() -> None:
     with pytest.raises(ValueError, match="'walker' has no reflection for 'foot_height', which has 2 columns"):
         lw.Mirror({"gravity": (1, -1, 1)}).columns(PARTS, task="walker")
     with pytest.raises(ValueError, match="has a reflection of 2 columns for 'gravity', which has 3"):

@@ -231,7 +231,7 @@ def test_rollout_of_a_task_equals_steps(task: str, engine: str) -> None:
 
 @pytest.fixture
 def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Return a list that gets an entry for each rollout in one native call."""
+    """Return a list. Each rollout that runs as one native call adds an entry to it."""
     calls, original = [], NativeRollout.run
 
     def counting(self: NativeRollout, *args: Any) -> None:
@@ -286,7 +286,7 @@ def test_parameters_may_change_between_rollouts(engine: str) -> None:
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Forgetful, Servo])
 def test_worlds_draw_random_numbers_from_the_given_keys(task: type[lw.Task], engine: str) -> None:
-    """The random numbers equal those of steps from states with these keys."""
+    """Steps from states with these keys draw the same random numbers."""
     env = lw.make(task, engine=engine, nworld=4, autoreset=False)
     numbers = np.array([5, 2**32 - 1, 77, 1234567890], dtype=np.uint32)
     keys = wp.zeros(4, dtype=wp.uint32, device="cpu")

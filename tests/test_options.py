@@ -114,7 +114,7 @@ def test_replica_has_the_options_of_the_original_except_for_given_changes() -> N
         ("qqq", ""),
     ],
 )
-def test_suggestion_covers_every_option_and_names_of_other_packages(word: str, expected: str) -> None:
+def test_suggestion_for_a_misspelt_or_foreign_option_name_is_the_right_option(word: str, expected: str) -> None:
     assert suggestion(word) == expected
 
 

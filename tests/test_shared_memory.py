@@ -92,7 +92,7 @@ def env() -> Iterator[lw.Env]:
 
 
 def steps(env: lw.Env, count: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Take random steps; return the angles before resets, (count, nworld), and whether episodes ended."""
+    """Take random steps; return the angles before resets (count, nworld) and whether episodes ended."""
     generator = torch.Generator().manual_seed(3)
     angles, ended = [], []
     for _ in range(count):
@@ -102,7 +102,7 @@ def steps(env: lw.Env, count: int) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.stack(angles), torch.stack(ended)
 
 
-def test_function_share_receives_the_sums_over_worlds_and_steps(env: lw.Env) -> None:
+def test_shared_memory_is_updated_from_sums_over_worlds_and_steps(env: lw.Env) -> None:
     env.rand_reset(seed=1)
     env.set_shared(torch.zeros_like(env.get_shared()))
     level = env.state_space.split(env.get_state())["level"][:, 0].long()

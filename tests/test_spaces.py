@@ -31,7 +31,7 @@ def test_parts_of_a_space_are_consecutive() -> None:
     assert (space.size, space.shape) == (5, (5,))
 
 
-def test_method_split_returns_views_of_the_parts() -> None:
+def test_splitting_a_vector_returns_views_of_its_parts() -> None:
     values = torch.arange(10.0).view(2, 5)
     parts = Space.of({"position": 2, "velocity": 3}).split(values)
     assert [list(part.shape) for part in parts.values()] == [[2, 2], [2, 3]]

@@ -49,7 +49,7 @@ def test_stones_have_gaps_of_the_given_width(width: float, cells: int) -> None:
 
 
 @pytest.mark.parametrize(("kind", "amount"), [("steps", 0.2), ("rough", 0.08), ("waves", 0.2)])
-def test_steps_waves_and_rough_patches_reach_their_full_height_and_depth(kind: str, amount: float) -> None:
+def test_patches_with_steps_waves_or_rough_ground_reach_their_full_height_and_depth(kind: str, amount: float) -> None:
     heights = patch(kind)
     assert -amount <= heights.min() < -0.9 * amount and 0.9 * amount < heights.max() <= amount
 
@@ -67,7 +67,7 @@ def test_equal_seeds_give_equal_fields_and_a_new_column_does_not_change_others()
     np.testing.assert_array_equal(lw.Terrain({"rough": 1, "steps": 1}, levels=2, seed=3).heights, field)
     assert (lw.Terrain({"rough": 1, "steps": 1}, levels=2, seed=4).heights != field).any()
     more = lw.Terrain({"rough": 1, "steps": 1, "flat": 2}, levels=3, seed=3, scale={"rough": 0.12, "steps": 0.3})
-    # the amounts are scaled by 1.5, so levels 0 and 1 of three levels equal levels 0 and 1 of two levels
+    # the amounts are 1.5 times as large, so the first two of three levels equal the two levels without this change
     np.testing.assert_allclose(more.heights[40:200, 40:200], field[40:200, 40:200], atol=1e-12)
 
 

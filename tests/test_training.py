@@ -121,7 +121,7 @@ def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
         lw.load(six, which="worst")
 
 
-def test_best_policy_without_evaluations_sampled_the_best_iteration(tmp_path: Path) -> None:
+def test_without_evaluations_the_best_policy_is_the_one_that_sampled_the_best_iteration(tmp_path: Path) -> None:
     """The policy before an iteration's update samples that iteration's episodes."""
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), tmp_path / "run", iterations=4, keep_every=1)
@@ -280,8 +280,8 @@ def test_run_resumes_identically_from_the_last_complete_state(six: Path, tmp_pat
 def test_training_from_another_run_starts_with_its_policy(
     six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The new run has the old run's settings except for one parameter. The old run's policy takes the new run's first
-    samples."""
+    """The new run has the old run's settings except for one parameter. The old run's policy collects the new run's
+    first samples."""
     out = tmp_path / "out"
     arguments = ["train", "--from", str(six), "--which", "4", "--param", "success_distance=0.5", "--iterations", "1"]
     assert cli.main([*arguments, "--out", str(out), "--keep-every", "1", *QUIET]) == 0

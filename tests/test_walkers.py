@@ -40,8 +40,8 @@ XML = """
   <sensor><gyro site="ankle"/></sensor>
 </mujoco>
 """
-"""A robot with a leg of 3 joints and a leg of 1 joint. Two joints share a body. Neither is at
-the body's origin, and one has the attribute ``ref``. One body is fixed."""
+"""A robot with a leg of 3 joints and a leg of 1 joint. One body has two joints, which are not at the body's origin; one
+of these joints has the attribute ``ref``. Another body is fixed."""
 
 
 def made(shape: str = "box", feet: tuple[str, ...] = ("ankle", "peg_end")) -> tuple[mujoco.MjModel, SimpleNamespace]:

@@ -56,7 +56,9 @@ def outcomes_with_faults(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_rows_computed_by_several_lanes_equal_rows_of_one_lane(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_that_several_threads_compute_equal_rows_that_one_thread_computes(
+    engine: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """On a GPU, the lanes of a warp share a world's rows, and each observation group has its own threads.
 
     On the CPU, the lanes of a warp and the threads of a world run one after another.
@@ -170,7 +172,7 @@ def test_rollouts_and_plans_do_not_depend_on_success_steps() -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_captured_graphs_use_parameters_that_become_per_world(engine: str) -> None:
+def test_captured_graphs_use_new_parameters_that_differ_between_worlds(engine: str) -> None:
     env = lw.make("hopper", nworld=2, engine=engine)
     action = torch.ones(2, 3)
     for _ in range(3):

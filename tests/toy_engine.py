@@ -21,8 +21,8 @@ class ToyEngine(Engine):
 
     Each world has its own MjModel, and ``apply_model`` writes the world's fields into it.
 
-    All launches between two engine calls are captured in a graph, so ``reset``, ``commit``, ``find_faults`` and
-    ``get_state`` consist of Warp launches on these rows.
+    Other code captures all launches between two engine calls in a graph, so ``reset``, ``commit``, ``find_faults`` and
+    ``get_state`` only launch Warp kernels.
     """
 
     name = "toy"

@@ -44,7 +44,8 @@ class Numbers:
     def __init__(self) -> None:
         self.axes: dict[str, list[str]] = {}
         self.equal: list[tuple[str, str]] = []
-        """Pairs of prefixes; within the checkout, the arrays of both prefixes must be equal."""
+        """Pairs of prefixes of names. Arrays of this checkout whose names differ only by such prefixes must be
+        equal."""
         self._arrays: dict[str, Any] = {}
 
     def add(self, name: str, value: Any, *axes: str, along: str | None = None) -> None:

@@ -54,7 +54,7 @@ class Observations:
         return dict(zip(self._groups, values, strict=True)) if self.dict_obs else values[0]
 
     def rows(self, values: list[np.ndarray]) -> list[Any]:
-        """Split the groups' arrays, (worlds, group size), into one observation per world."""
+        """Split the groups' arrays (worlds, group size) into one observation per world."""
         return [self.formed(list(row)) for row in zip(*values, strict=True)]
 
 

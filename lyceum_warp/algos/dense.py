@@ -83,7 +83,7 @@ class DensePasses:
         return DensePasses(parameters, kind)
 
     def _allocate(self, rows: int) -> None:
-        """Allocate the results and derivatives of each layer for a number of rows."""
+        """Allocate the results and derivatives of each layer, for inputs of the given number of rows."""
         widths = [len(bias) for bias in self.biases]
         self._buffers = [[torch.empty(rows, n) for n in widths] for _ in range(2)]
 
@@ -96,7 +96,7 @@ class DensePasses:
         self._arrays = [result.numpy() for result in self.results]
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
-        """Compute outputs, (rows, outputs), from inputs, (rows, inputs). Keep the inputs for ``push`` and ``pull``."""
+        """Compute outputs (rows, outputs) from inputs (rows, inputs). Keep the inputs for ``push`` and ``pull``."""
         if len(x) != self._rows:
             self._resize(len(x))
         self._inputs = [x, *self.results[:-1]]
@@ -114,7 +114,7 @@ class DensePasses:
         return self.results[-1]
 
     def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Compute J v, (rows, outputs), at the last inputs, from v in tensors of the parameters' shapes."""
+        """Compute J v (rows, outputs) at the last inputs, from v in tensors of the parameters' shapes."""
         last = len(self.weights) - 1
         for i, derivative in enumerate(self.derivatives):
             torch.addmm(parts[2 * i + 1], self._inputs[i], parts[2 * i].t(), out=derivative)
@@ -125,7 +125,7 @@ class DensePasses:
         return self.derivatives[-1]
 
     def pull(self, u: torch.Tensor, out: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
-        """Compute J^T u at the last inputs, from u, (rows, outputs), into tensors of the parameters' shapes."""
+        """Compute J^T u at the last inputs, from u (rows, outputs) into tensors of the parameters' shapes."""
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
             # the transposed product is faster, because its result has longer rows
@@ -164,7 +164,7 @@ class DensePolicy:
         return None if passes is None else DensePolicy(policy, passes)
 
     def __call__(self, obs: torch.Tensor) -> torch.Tensor:
-        """Compute mean actions, (rows, nact), from observations, (rows, nobs)."""
+        """Compute mean actions (rows, nact) from observations (rows, nobs)."""
         normalizer = self.policy.normalizer
         if not isinstance(normalizer, Normalizer):
             return self.passes(obs)
@@ -209,7 +209,7 @@ class DenseValue:
         return None if passes is None else DenseValue(value, passes)
 
     def __call__(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Predict returns, (...,), from observations, (..., nobs), and steps since the reset, (...,)."""
+        """Predict returns (...,) from observations (..., nobs) and steps since the reset (...,)."""
         features = self.value.features(obs, step)
         output = self.passes(features.reshape(-1, features.shape[-1])).view(features.shape[:-1])
         return output * self.value.scale.float() + self.value.shift.float()

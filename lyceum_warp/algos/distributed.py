@@ -113,8 +113,8 @@ class Team:
     def copy_leader(self, tensors: Iterable[torch.Tensor]) -> None:
         """Broadcast tensors from rank 0, in place.
 
-        On different hardware, broadcasting the parameters prevents rounding errors from accumulating. On equal
-        hardware, all processes compute equal parameters.
+        If the processes run on different hardware, their parameters differ by rounding errors, and a broadcast prevents
+        these from accumulating. On equal hardware, all processes compute equal parameters.
         """
         if self.size > 1:
             tensors = list(tensors)
@@ -208,7 +208,7 @@ def join(device: str = "cpu") -> Iterator[Team]:
         yield Team(device=device)
         return
     # The first optimizer imports torch's compiler. If a process group exists during this import, the compiler keeps the
-    # group and its threads alive until Python exits. This sometimes aborts the process.
+    # group and its threads alive until Python exits. A thread that is still alive then sometimes aborts the process.
     torch.optim.SGD([torch.zeros(1)])
     place, neighbours = int(os.environ.get("LOCAL_RANK", "0")), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     if device.startswith("cuda"):

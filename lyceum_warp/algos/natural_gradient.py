@@ -75,7 +75,7 @@ class FisherProduct:
         self.jacobian = dense or AutogradJacobian(self.mean, network)
 
     def __call__(self, vector: torch.Tensor) -> torch.Tensor:
-        """Compute (F + damping) vector, (parameters,), from a vector, (parameters,)."""
+        """Compute (F + damping) vector (parameters,) from a vector (parameters,)."""
         parts = [
             part.view_as(p)
             for part, p in zip(vector.split([p.numel() for p in self.parameters]), self.parameters, strict=True)
@@ -106,7 +106,7 @@ class AutogradJacobian:
         self.pulled = torch.autograd.grad(mean, parameters, self.probe, create_graph=True)
 
     def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Compute J v, (samples, nact), from v in tensors of the parameters' shapes."""
+        """Compute J v (samples, nact) from v in tensors of the parameters' shapes."""
         return torch.autograd.grad(self.pulled, self.probe, parts, retain_graph=True)[0]
 
     def pull(self, u: torch.Tensor) -> list[torch.Tensor]:

@@ -131,7 +131,7 @@ class NPG(OnPolicyLearner):
         config, rollout, team = self.config, self.rollout, self.team
         timer = PhaseTimer(self.env.obs.device)
 
-        # 1. Sample with the current policy.
+        # 1. Collect samples with the current policy.
         if not self.segments:
             rollout.restart()
         elif self._least_restarts:

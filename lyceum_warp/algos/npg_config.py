@@ -48,8 +48,8 @@ class NPGConfig:
     lam: float = 0.97
     """Lambda of the generalised advantage estimate."""
     delta: float = 0.1
-    """Squared length of a step in the Fisher metric. It is twice the KL divergence between the old and the new
-    policy."""
+    """Squared length of a step in the Fisher metric. The squared length is twice the KL divergence between the old and
+    the new policy."""
     whiten: bool = True
     """Whether to normalise advantages to mean 0 and standard deviation 1 (as in mjrl, unlike Lyceum)."""
     cg_iterations: int = 10

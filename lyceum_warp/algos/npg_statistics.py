@@ -118,7 +118,7 @@ def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence
     """Summarise the numbers of all processes, by their names in ``NPGIteration``.
 
     Args:
-        processes: Numbers of each process, as floats.
+        processes: The ``ProcessNumbers`` of each process, as floats.
         samples: Number of samples of each process.
         metrics: Names of the task's metrics.
     """

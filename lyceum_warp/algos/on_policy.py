@@ -108,7 +108,7 @@ class OnPolicyLearner(Learner):
     def _estimate(
         self, reward: torch.Tensor, value: torch.Tensor, next_value: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Compute generalised advantages and discounted returns, (steps, nworld), with ``kernels/returns.py``."""
+        """Compute generalised advantages and discounted returns (steps, nworld) with ``kernels/returns.py``."""
         arrays = (reward, value, next_value, self.rollout.terminated, self.rollout.done)
         outputs = [wp.from_torch(self._advantage), wp.from_torch(self._return)]
         args = [*map(wp.from_torch, arrays), self.config.gamma, self.config.lam, *outputs]

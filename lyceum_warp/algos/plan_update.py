@@ -21,7 +21,8 @@ class PlanSamples:
     """The samples of one improvement of the plans, for an update to read and write.
 
     Plans and samples have one row per step of the horizon or, with knots, per knot. All tensors are float32 on the
-    device of the planner's worlds. Their addresses are fixed, so write into the tensors instead of replacing them.
+    device of the planner's worlds. The tensors' addresses are fixed, so write into the tensors instead of replacing
+    them.
     """
 
     returns: torch.Tensor

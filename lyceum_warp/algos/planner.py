@@ -120,7 +120,7 @@ class Planner:
     nominal: torch.Tensor
     """The plan from which the last improvement started, (horizon, nact)."""
     knot_actions: torch.Tensor
-    """The plan's knots, (nknot, nact). The last may lie beyond the horizon. Without knots, equal to ``actions``."""
+    """The plan's knots, (nknot, nact). The last knot may lie beyond the horizon. Without knots, this is ``actions``."""
     standard_noise: torch.Tensor
     """The last improvement's standard normal noise, (horizon, samples, nact) or (nknot, samples, nact)."""
     adapted_noise: torch.Tensor | None
@@ -496,8 +496,8 @@ class Planner:
 
         Model fields have nominal values unless given, as in ``body_mass=...``.
 
-        Fields that the last substep left, such as accelerations, affect only the first transition of a plan. ``time``
-        also sets the step counter, unless ``step`` is given.
+        Fields that belong to the last substep, such as accelerations, affect only the first transition of a plan.
+        ``time`` also sets the step counter, unless ``step`` is given.
 
         Args:
             parts: Values for parts of ``env.state_space``: qpos, qvel, time, mocap_pos, ...

@@ -28,8 +28,8 @@ class GaussianPolicy(Normalized):
         nobs: Length of an observation.
         nact: Length of an action.
         hidden: Widths of the hidden layers.
-        network: A module that replaces the default network. The network maps (normalised) observations, (..., nobs), to
-            mean actions, (..., nact), independently for each row, in float32. NPG also requires second derivatives.
+        network: A module that replaces the default network. The network maps (normalised) observations (..., nobs) to
+            mean actions (..., nact) independently for each row, in float32. NPG also requires second derivatives.
         activation: Activation of the hidden layers.
         log_std: Initial logarithm of the standard deviations.
         normalize: Whether to normalise observations by their running mean and variance.

@@ -16,8 +16,8 @@ _ROWS = 4
 def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
     """Check that an algorithm can train a policy in an environment.
 
-    The policy must be a ``GaussianPolicy``. It must map observations (..., nobs) to mean actions (..., nact)
-    deterministically, and independently for each row. It must be differentiable with respect to its trainable
+    The policy must be a ``GaussianPolicy``. The policy must map observations (..., nobs) to mean actions (..., nact)
+    deterministically, and independently for each row. The policy must be differentiable with respect to its trainable
     parameters.
 
     Args:

@@ -172,7 +172,7 @@ class PPO(OnPolicyLearner):
         config, rollout, team = self.config, self.rollout, self.team
         timer = PhaseTimer(self.env.obs.device)
         with precision(tf32=config.tf32 and self._cuda):
-            # 1. Sample with the current policy.
+            # 1. Collect samples with the current policy.
             self.sample()
             self.env.update_shared(team.sum)
 
@@ -300,7 +300,7 @@ class PPO(OnPolicyLearner):
 
         Args:
             samples: The part of the mini-batch that belongs to this process; arrays of shape (samples, ...).
-            weight: Weights of the samples, (samples,), which sum to 1 over all processes.
+            weight: Weights of the samples (samples,), which sum to 1 over all processes.
         """
         config, clip = self.config, self.config.clip
         if config.symmetry == "augment":
@@ -375,7 +375,7 @@ class PPO(OnPolicyLearner):
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
-        """Get the returns of counted episodes that ended in the iteration, from all processes, ordered by step."""
+        """Get the returns of the counted episodes that ended in the iteration in any process, ordered by step."""
         ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
         ended = self.team.gather(ended.T).T
         found: list[float] = ended[~ended.isnan()].tolist()

@@ -41,9 +41,9 @@ class Replay:
     """Ring buffer of the transitions of every world, on the device of the environment's observations.
 
     ``step`` steps the environment and stores its transitions; ``sample`` draws some of the stored transitions. Sampling
-    allocates no lasting memory, and the host does not wait for the device. A fault truncates an episode: the transition
-    has the reward 0 and the last valid observations as ``next_obs``. Non-finite actions are stored as 0, so all
-    contents are finite.
+    keeps no memory that it allocates, and the host does not wait for the device. A fault truncates an episode: the
+    transition has the reward 0 and the last valid observations as ``next_obs``. Non-finite actions are stored as 0, so
+    all contents are finite.
 
     Example:
         >>> replay = Replay(env)

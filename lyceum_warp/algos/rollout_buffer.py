@@ -24,7 +24,7 @@ class Sampler(Protocol):
     """A policy with the method ``GaussianPolicy.sample``."""
 
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> Any:
-        """Write actions, (nworld, nact), into ``out``."""
+        """Write actions (nworld, nact) into ``out``."""
         ...
 
 
@@ -52,9 +52,9 @@ class Rollout:
     final_obs: torch.Tensor
     """Observations after each step, before any reset, (steps, nworld, nobs)."""
     obs_groups: dict[str, torch.Tensor]
-    """Observations before each step by group; ``policy`` is ``obs``."""
+    """Observations before each step by group; the group ``policy`` is ``obs``."""
     final_obs_groups: dict[str, torch.Tensor]
-    """Observations after each step by group; ``policy`` is ``final_obs``."""
+    """Observations after each step by group; the group ``policy`` is ``final_obs``."""
     reward: torch.Tensor
     """Rewards, (steps, nworld)."""
     eval: torch.Tensor
@@ -127,7 +127,7 @@ class Rollout:
         self._after_step = graphs.sequence([Phase("store outputs", self._launch_outputs)])
 
     def _stored(self, source: torch.Tensor, into: list["_Rows"]) -> torch.Tensor:
-        """Allocate storage, (steps, nworld, size), to fill before or after each step."""
+        """Allocate storage (steps, nworld, size) to fill before or after each step."""
         into.append(_Rows(source, self.steps, self.env.device))
         return into[-1].stored
 

@@ -102,7 +102,7 @@ class SAC(Learner):
     target: TwinCritic
     """The target critics, which share the critics' normaliser."""
     config: Any
-    """Hyperparameters, an ``SACConfig`` without None."""
+    """Hyperparameters: an ``SACConfig`` in which defaults have replaced None."""
     replay: Replay
     """Replay buffer with the samples of this process's worlds."""
     generator: torch.Generator
@@ -295,7 +295,8 @@ class SAC(Learner):
         random: dict[str, Any] = dict(generator=self.generator, device=self._index.device)
         index = torch.randint(self.replay.count * nworld * team.size, shape, **random)
         noise = torch.randn((*shape, self._noise.shape[-1]), **random)
-        if team.size > 1:  # move own samples to the front, and drop samples beyond the capacity, as in Minibatches
+        # move this process's samples to the front, and drop samples beyond the capacity, as Minibatches does
+        if team.size > 1:
             index, own = team.locate(index, nworld)
             first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self._index.shape[1]]
             index, noise = index.gather(1, first), noise.gather(1, first[..., None].expand(-1, -1, noise.shape[-1]))
@@ -350,7 +351,7 @@ class SAC(Learner):
 
         Args:
             batch: Transitions.
-            weight: Weights of the transitions, (batch,), which sum to 1 over all processes.
+            weight: Weights of the transitions (batch,), which sum to 1 over all processes.
             noise: Standard normal numbers for the actions of the next observations, (batch, nact).
         """
         group = self.value.group
@@ -384,7 +385,7 @@ class SAC(Learner):
         return (weight * loss).sum(), -(weight * log_prob.detach()).sum()
 
     def _bound(self, values: torch.Tensor) -> torch.Tensor:
-        """Combine the two critics' predictions, (2, rows), into the value of an action, (rows,)."""
+        """Combine the two critics' predictions (2, rows) into the value of an action (rows,)."""
         return values.amin(0) if self.config.critic_bound == "min" else values.mean(0)
 
     def state_dict(self) -> dict[str, Any]:

@@ -26,7 +26,7 @@ _MANY: dict[str, Any] = {
     "batch": 8192, "actor_every": 4, "gamma": 0.97, "tau": 0.125, "temperature": 1e-3, "target_entropy": 0.0,
     "critic_bound": "mean", "hidden": (512, 256, 128), "value_hidden": (512, 512, 512),
 }  # fmt: skip
-"""Defaults for 256 worlds or more. They are close to the settings of Seo et al., 2025, for humanoids."""
+"""Defaults for 256 worlds or more. These defaults are close to the settings of Seo et al., 2025, for humanoids."""
 
 
 @document_attributes

@@ -115,7 +115,7 @@ class SquashedPolicy(Normalized):
         return self.scaled(torch.tanh(self(obs)[0]))
 
     def sample(self, obs: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw unit actions, (..., nact), and compute their log-densities, (...,).
+        """Draw unit actions (..., nact) and compute their log-densities (...,).
 
         Args:
             obs: Observations, (..., nobs).

@@ -26,21 +26,21 @@ EXACT = "exact"
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Difference:
-    """Difference of a mean over episodes between two simulations, with a 95 % confidence interval."""
+    """Mean over episodes in two simulations, and the difference of the two means with a 95 % confidence interval."""
 
     quantity: str
     """Name of the quantity: return, length (steps) or terminated (fraction of episodes that the task ended, for example
     by a fall)."""
     first: float
-    """The mean in the first simulation."""
+    """The quantity's mean in the first simulation."""
     second: float
-    """The mean in the second simulation."""
+    """The quantity's mean in the second simulation."""
     low: float
     """Lower end of the confidence interval of the difference (second mean minus first mean)."""
     high: float
     """Upper end of the confidence interval of the difference (second mean minus first mean)."""
     margin: float
-    """Largest irrelevant difference."""
+    """The largest difference that does not matter."""
 
     @property
     def verdict(self) -> str:

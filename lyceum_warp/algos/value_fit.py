@@ -54,7 +54,7 @@ class ValueFit:
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
             step: Steps since the reset, (samples,).
-            target: Returns, (samples,). They are clipped to the value function's shift plus or minus ``BOUND`` times
+            target: Returns, (samples,). Returns are clipped to the value function's shift plus or minus ``BOUND`` times
                 its scale.
             generator: Draws the order of the samples of all processes.
 

@@ -83,11 +83,10 @@ def check_field_name(name: str) -> None:
 
 
 def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict[str, int]]:
-    """Lay out the parts of each observation group, for given values of the task's parameters.
+    """Compute the layout of each observation group, for given values of the task's parameters.
 
     Raises:
-        ValueError: The task's ``obs`` is neither a dict of sizes nor a dict of groups of sizes, or a struct has no
-            parts.
+        ValueError: The task's ``obs`` is neither a dict of sizes nor a dict of such dicts, or a struct has no parts.
     """
     task, name = source.task, source.name
     if not hasattr(task, "obs"):
@@ -113,7 +112,7 @@ def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict
 
 
 def obs_slices(source: TaskSource, params: Mapping[str, Any]) -> dict[str, parts.Layout]:
-    """Lay out the observation groups that a task writes into structs; empty if the task has ``obs``.
+    """Compute the layouts of observation groups that a task writes into structs; empty if the task has ``obs``.
 
     Raises:
         ValueError: ``observe`` takes no struct, or a struct has no parts, or has fields that are not parts.

@@ -83,7 +83,7 @@ class TaskSource:
         return {group: list(function.input_types.values())[2] for group, function in functions.items()}
 
     def _observers(self, owner: type[Task]) -> list[str]:
-        """Return the names of functions that write groups: all in the class, and all unused ones in its module."""
+        """Return the names of the functions that write groups: those of the class, and uncalled ones of its module."""
         module = vars(sys.modules[owner.__module__])
         functions = {name: self._seen(value) for name, value in module.items() if isinstance(value, wp.Function)}
         tasks = [kind for kind in (owner, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
@@ -267,7 +267,7 @@ def draws_noise(observer: wp.Function) -> bool:
 
 
 def _may_list(task: type[Task], group: str) -> bool:
-    """Whether the ``obs`` of a class may have an observation group; an ``obs`` that is a method may have any."""
+    """Whether ``obs`` of a class may have the given observation group; always True if ``obs`` is a method."""
     obs = getattr(task, "obs", None)
     return callable(obs) or (isinstance(obs, Mapping) and isinstance(obs.get(group), Mapping))
 

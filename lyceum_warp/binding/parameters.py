@@ -67,8 +67,8 @@ class Parameters:
         self._check_tables()
         if taken := [name for name in (*struct.vars, *self._weights) if name in (*OPTIONS, "task", "options")]:
             raise ValueError(
-                f"the parameter {taken[0]!r} of the task {task_name!r} has the name of an option of make(), which "
-                "would get its value: rename it in Params"
+                f"the parameter {taken[0]!r} of the task {task_name!r} has the name of an option of make(), so "
+                f"make() would set the option: rename it in Params"
             )
         found = defaults(struct, owner) | self._weights | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
         self._computed = {name for name, value in found.items() if isinstance(value, FromModel)}
@@ -237,7 +237,7 @@ class Parameters:
         return table
 
     def _indices(self, what: str, value: Any, field: str | None) -> Any:
-        """Replace elements of the model in a table by indices; with ``field``, replace names too."""
+        """In a table, replace elements of the model by their indices; if ``field`` is given, also replace names."""
         if isinstance(value, list | tuple):
             return [self._indices(what, entry, field) for entry in value]
         if isinstance(value, Element):

@@ -1,4 +1,4 @@
-"""Lay out the named parts of memory and observations: each field of a struct is a slice of one row of floats."""
+"""Compute the layout of memory and observations: each field of a struct is a named slice of a row of floats."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -52,7 +52,7 @@ def parts_of(struct: Any, owner: str) -> dict[str, Part]:
 
 
 def layout(struct: Any, kind: str, params: Mapping[str, Any], owner: str) -> Layout:
-    """Lay out a struct's parts of one kind; a size may be the name of a table in ``params``.
+    """Compute the layout of a struct's parts of one kind; a size may be the name of a table in ``params``.
 
     Raises:
         ValueError: A size is neither a positive number nor the name of a table of Params.

@@ -25,11 +25,11 @@ from lyceum_warp.task import Task
 _tasks: dict[str, type[Task]] = {}
 
 _loaded: dict[str, Stamps] = {}
-"""Stamps of each task module's file and of the modules beside it, as of their last run. A stamp is a modification time
-and a size."""
+"""For each task module, the stamps that its file and the modules beside it had when they last ran. A stamp is a
+modification time and a size."""
 
 _LOADING = threading.RLock()
-"""Held while a file is loaded, because imports and linecache are global to the process."""
+"""A lock that is held while a file is loaded, because imports and linecache are global to the process."""
 
 _PACKAGE = "lyceum_warp.tasks."
 _FILE = "lyceum_task_"
@@ -38,7 +38,7 @@ _sources: "weakref.WeakKeyDictionary[type[Task], Mapping[Path, bytes]]" = weakre
 
 
 def register(task: type[Task]) -> type[Task]:
-    """Class decorator: register a task. Its name is the class name in snake_case.
+    """Class decorator: register a task. The task's name is the class name in snake_case.
 
     A class may replace an earlier one of the same file, for example if a notebook runs a cell again.
 

@@ -104,7 +104,7 @@ class Terms:
         return {term: float(weight) for term, weight in rewards.items()}
 
     def _names(self, attribute: str, names: Any, *, written: bool = False) -> tuple[str, ...]:
-        """Return the names in an attribute of the task; empty if the task defines the combined function."""
+        """Check the names in an attribute, and return them, or none if the task writes the function itself."""
         if not isinstance(names, tuple | list) or not all(isinstance(name, str) and name for name in names):
             raise ValueError(
                 f"{attribute} of the task {self._name!r} must be names, such as ('forward', 'cost'), not {names!r}"

@@ -143,7 +143,7 @@ def _home(function: wp.Function) -> str:
 
 
 def _values(module: types.ModuleType, owners: Sequence[type[Task]]) -> Iterator[Any]:
-    """Yield a module's current values, its values at the definition of its tasks, and the attributes of these tasks."""
+    """Yield the values of a module's names, now and at the definition of its tasks, and of these tasks' attributes."""
     for owner in owners:
         if owner.__module__ == module.__name__:
             own = (value.__func__ if isinstance(value, staticmethod) else value for value in vars(owner).values())

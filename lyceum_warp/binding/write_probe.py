@@ -26,7 +26,10 @@ write."""
 
 
 class GuardedRows:
-    """Holds rows, (n, ...), between guard memory. Rows contain sentinels, or the first n rows of ``values``."""
+    """Holds an array of n rows, with guard memory around each row.
+
+    Rows contain sentinels, or the first n rows of ``values``.
+    """
 
     def __init__(self, shape: Sequence[int], dtype: Any, device: wp.Device, values: wp.array | None = None) -> None:
         self.size = math.prod(shape[1:])

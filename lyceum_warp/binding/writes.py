@@ -76,8 +76,8 @@ def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mappin
             place = f"{within} ({write.place})"
             if write.use is not None:
                 raise ValueError(
-                    f"{name} of the task {task!r} uses {write.target} as a whole in '{write.use}'{place}, which may "
-                    "write it: read and write its elements directly"
+                    f"{name} of the task {task!r} uses {write.target} as a whole in '{write.use}'{place}, and may "
+                    "write it there: read and write its elements directly"
                 )
             advice = _advice(write, name, rights)
             raise ValueError(f"{name} of the task {task!r} writes {write.target}{place}: {advice}")
@@ -157,7 +157,8 @@ class _Reader:
         self.source = FunctionSource(function)
         # a key is a name, or "name.field" for a row in a local struct
         self.places: dict[str, _Place | None] = dict(zip(function.input_types, places, strict=True))
-        # read twice, because a loop may use a local struct above the line that puts a row into it
+        # read a loop's body twice, because the loop may use a local struct above the line that puts a row into the
+        # struct
         for _ in range(2):
             for statement in self.source.tree.body:
                 self._read(statement)
@@ -170,7 +171,7 @@ class _Reader:
         self.writes[Write(place.position, place.field, target, self.source.name, where, replaced, use)] = None
 
     def _read(self, node: ast.AST) -> _Place | None:
-        """Note the writes in an expression or a statement; return the part of an argument that it refers to."""
+        """Record the writes in an expression or a statement; return the part of an argument to which it refers."""
         if isinstance(node, ast.Name):
             for name, place in self.places.items():
                 if place is not None and name.startswith(f"{node.id}."):  # the expression uses a whole local struct
@@ -245,7 +246,7 @@ class _Reader:
             self._read_all(node, given)
 
     def _call_helper(self, callee: wp.Function, node: ast.Call) -> None:
-        """Record which arguments of a call the helper writes to."""
+        """Record the arguments of a call that the called function writes."""
         expressions: dict[str, ast.expr] = dict(zip(callee.input_types, node.args, strict=False))
         expressions |= {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg}
         places = {name: place for name, given in expressions.items() if (place := self._read(given)) is not None}

@@ -64,7 +64,7 @@ class CheckedController:
         """
         action = self._controller(state, obs, **({"shift": shift} if self._takes_shift else {}))
         plan = getattr(self._controller, "actions", None)
-        # use the action in the plan, because copying both from a GPU would synchronise twice
+        # use the action in the plan, because copying plan and action from a GPU would synchronise twice
         return self._checked(action, 1, step)[None] if plan is None else self._checked(plan, 2, step)
 
     def reset(self, seed: int | None) -> None:
@@ -90,7 +90,7 @@ class CheckedController:
         return self.steps(now) - self.steps(before)
 
     def action(self, plan: torch.Tensor, plant_steps: int) -> torch.Tensor:
-        """Select the action for the plant ``plant_steps`` steps after the plan's initial state.
+        """Select the action that applies after ``plant_steps`` steps of the plant since the plan's initial state.
 
         If a plan's step covers several steps of the plant, all plant steps apply the same action; with
         ``between="linear"``, they interpolate to the next action. After the end of the plan, the plan's last action

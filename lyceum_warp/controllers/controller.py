@@ -71,7 +71,7 @@ class PlanningController(Controller, Protocol):
 
     @property
     def between(self) -> Literal["hold", "linear"]:
-        """Action for plant steps between two actions of the plan; see ``MPPIConfig.between``."""
+        """Which action the plant applies between two actions of the plan; see ``MPPIConfig.between``."""
         ...
 
     @property

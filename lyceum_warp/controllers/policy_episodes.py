@@ -28,7 +28,7 @@ def policy_episodes(
 
     Args:
         env: An environment made with ``autoreset=False``; its worlds are reset.
-        policy: Function from observations, (nworld, nobs), to actions, (nworld, nact).
+        policy: Function from observations (nworld, nobs) to actions (nworld, nact).
         episodes: Number of episodes.
         seed: Seed of the initial states; by default the worlds continue their random streams.
         controller: Description of the policy; see ``Trajectory.controller``.

@@ -178,7 +178,7 @@ def _foreign(file: Path) -> str:
 
 
 def _is_private(group: int) -> bool:
-    """Check whether a group is root's, or has only this user as a member; many systems have one for each user."""
+    """Check whether a group is root's, or has only this user as a member, as many systems make for each user."""
     import grp
     import pwd
 

@@ -76,9 +76,9 @@ class Engine(abc.ABC):
     fault: wp.array
     """The faults of each world as bits of ``Done``, (nworld,), int32; set by ``find_faults``."""
     stage: Stage
-    """The last stage of MuJoCo's forward pass that must run after the substeps, so that fields match the new state."""
+    """The stage up to which MuJoCo's forward pass must run after the substeps, so that fields match the new state."""
     reset_stage: Stage
-    """The last stage of MuJoCo's forward pass that must run after a reset."""
+    """The stage up to which MuJoCo's forward pass must run after a reset."""
     snapshots: list[Field]
     """The fields that do not follow from the integration state, in the order of the state vector."""
     integration_size: int
@@ -204,7 +204,7 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def refresh_current(self, mask: wp.array) -> None:
-        """Compute the derived fields and sensors of the masked worlds, except in the acceleration stage.
+        """Compute the derived fields and sensors of the masked worlds, except those of the acceleration stage.
 
         Fields and sensors of the acceleration stage keep their values from the last substep. Other worlds do not
         change, nor do the histories of sensors.

@@ -31,8 +31,8 @@ break-even points are 27 samples per core on adroit_pen without noslip, 41 on re
 (bench/README.md)."""
 
 _MOST_CORES = 16
-"""The largest number of CPU cores that counts. More cores were not measured, and the rest of a plan's work runs on one
-core."""
+"""The maximum number of CPU cores that the choice takes into account. More cores were not measured, and the rest of a
+plan's work runs on one core."""
 
 _NOSLIP = 6
 """The factor on the break-even point if the model uses the noslip solver, which is slow on a GPU."""
@@ -45,7 +45,7 @@ def find_device(device: str | None) -> wp.Device:
         ValueError: This machine has no such device.
     """
     name, error, remarks = str(device or "cpu"), None, start_warp()
-    if wp.is_cuda_available() or not name.startswith("cuda"):  # Warp would print a message if there is no driver
+    if wp.is_cuda_available() or not name.startswith("cuda"):  # without a driver, Warp would print a message
         try:
             found = wp.get_device(name)
         except (ValueError, RuntimeError) as cause:

@@ -31,7 +31,7 @@ def _triangle(ground: wp.array2d[float], x: float, y: float) -> wp.vec3:
 
 @wp.func
 def ground_height(ground: wp.array2d[float], x: float, y: float) -> float:
-    """Return the height of the ground at a point, m, on the triangles with which MuJoCo collides.
+    """Return the height (m) of the ground at a point, on the triangles with which MuJoCo collides.
 
     Outside the field, the height is that of the nearest edge point, although MuJoCo has no ground there.
 
@@ -55,7 +55,7 @@ def ground_distance(ground: wp.array2d[float], point: wp.vec3) -> float:
     """Return the distance of a point from the plane of the triangle below it, m; negative below the ground.
 
     A sphere touches the triangle if the distance of the sphere's centre is at most the radius. Another triangle may be
-    nearer.
+    nearer to the point.
     """
     t = _triangle(ground, point[0], point[1])
     return (point[2] - t[0]) / wp.length(wp.vec3(t[1], t[2], 1.0))
@@ -84,7 +84,8 @@ def height_scan(
     Args:
         row: A row, such as a part of an observation, with an element for each point.
         ground: The table of ``lw.height_field``.
-        points: Points relative to the base, m, x forwards and y to the left; they turn with the base's yaw only.
+        points: Points relative to the base, m, with x forwards and y to the left. The points turn with the base's yaw,
+            but not with its roll and pitch.
         base: Position of the base, m.
         orientation: Orientation of the base (w, x, y, z).
     """
@@ -113,7 +114,7 @@ def next_level(level: int, walked: float, commanded: float, patch: float, levels
     Args:
         level: The level of the episode that ended, from 0.
         walked: Distance between the robot's positions at the start and the end of the episode, m.
-        commanded: Speed of the command times the duration of a whole episode, m; with 0 the level stays the same.
+        commanded: Commanded speed times the duration of a whole episode, m. If it is 0, the level does not fall.
         patch: Length of a patch's side, m: ``lw.Terrain.patch``.
         levels: Number of levels: ``lw.Terrain.levels``.
         rng: The world's random numbers.
@@ -137,16 +138,16 @@ def start_on_terrain(
     patch: float,
     rng: wp.array[wp.uint32],
 ) -> wp.vec3:
-    """Choose the patch of a new episode, and return its centre, m; for ``randomize``.
+    """Choose the patch of a new episode, and return its centre, m; call this in ``randomize``.
 
     A world's first episode is at level 0, in a random column. The column never changes, and ``next_level`` chooses
     later levels.
 
     Args:
-        level: Lasting memory of one number: the level, from 0.
-        column: Lasting memory of one number: the column, from 0.
-        walked: Lasting memory of one number, written by ``follow_walk``.
-        commanded: Lasting memory of one number, written by ``follow_walk``.
+        level: The level, from 0, in memory that resets keep (one number).
+        column: The column, from 0, in memory that resets keep (one number).
+        walked: Written by ``follow_walk``, in memory that resets keep (one number).
+        commanded: Written by ``follow_walk``, in memory that resets keep (one number).
         origins: ``lw.Terrain.origins``, (levels, columns).
         patch: Length of a patch's side, m: ``lw.Terrain.patch``.
         rng: The world's random numbers.
@@ -168,16 +169,16 @@ def follow_walk(
     position: wp.vec3,
     distance: float,
 ):
-    """Write the distances from which ``start_on_terrain`` chooses the next level; for ``advance``.
+    """Write the two distances that ``start_on_terrain`` needs for the next level; call this in ``advance``.
 
     Args:
         level: The level; see ``start_on_terrain``.
         column: The column.
-        walked: Output, the horizontal distance from the centre of the patch, m.
-        commanded: Output, the commanded distance, m.
+        walked: Output: the horizontal distance of the robot from the centre of the patch, m.
+        commanded: Output: the commanded distance, m.
         origins: ``lw.Terrain.origins``.
         position: Position of the robot.
-        distance: Speed of the command times the duration of a whole episode, m; with 0 the level stays the same.
+        distance: Commanded speed times the duration of a whole episode, m. If it is 0, the level does not fall.
     """
     way = position - origins[int(level[0]), int(column[0])]
     walked[0] = wp.length(wp.vec2(way[0], way[1]))

@@ -1,8 +1,8 @@
 """Check array indices in the instrumented copies of a task's functions that ``check_task`` runs.
 
-``report`` is (places, 3). Each row belongs to an index in the source, and holds how often it was out of range,
-the first bad index, and the size of the array. Functions are not inlined, because inlining would increase compile
-times.
+``report`` is (places, 3). Each row belongs to one place in the source where an array is indexed. The row holds the
+number of bad indices, the first bad index, and the size of the array. Functions are not inlined, because inlining would
+increase compile times.
 """
 
 from typing import Any
@@ -15,7 +15,7 @@ MOST_ROUNDS = wp.constant(1_000_000)
 
 @wp.func(inline=False)
 def note(report: wp.array2d[int], place: int, index: int, size: int):
-    """Count an index out of range in its row, and store the first one."""
+    """Count a bad index in row ``place`` of the report; store the index and the size if it is the first one."""
     if wp.atomic_add(report, place, 0, 1) == 0:
         report[place, 1] = index
         report[place, 2] = size
@@ -23,7 +23,7 @@ def note(report: wp.array2d[int], place: int, index: int, size: int):
 
 @wp.func(inline=False)
 def at(report: wp.array2d[int], place: int, index: Any, size: int) -> int:
-    """Return an index from 0 to size - 1 unchanged; note any other index and return 0."""
+    """Return a valid index unchanged; if the index is not from 0 to size - 1, report it and return 0."""
     i = int(index)
     if i < 0 or i >= size:
         note(report, place, i, size)
@@ -33,7 +33,7 @@ def at(report: wp.array2d[int], place: int, index: Any, size: int) -> int:
 
 @wp.func(inline=False)
 def from_end(report: wp.array2d[int], place: int, index: int, size: int) -> int:
-    """Convert a negative constant, which counts from the end as in Python, and check it."""
+    """Convert a negative index, which counts from the end of the array as in Python, and report it if it is too low."""
     if index < -size:
         note(report, place, index, size)
         return 0
@@ -42,7 +42,10 @@ def from_end(report: wp.array2d[int], place: int, index: int, size: int) -> int:
 
 @wp.func
 def element(report: wp.array2d[int], place: int, values: Any, index: Any):
-    """Return an element of a call's result. The call is an argument, so it is evaluated only once."""
+    """Return one element of the result of a function call.
+
+    The call is the argument ``values``, so the function is called only once.
+    """
     return values[at(report, place, index, len(values))]
 
 

@@ -29,7 +29,7 @@ def knot_count(horizon: int, knots: int, spline: str) -> int:
 def pass_knots(
     steps_in: wp.array[int], horizon: int, knots: int, phase_inout: wp.array[int], passed_out: wp.array[int]
 ):
-    """Advance the phases by some steps, and count the knots passed; launched over (nplant,)."""
+    """Advance each plan's phase by ``steps`` steps, and count the knots that it passes; launched over (nplant,)."""
     p = wp.tid()
     place = wp.int64(phase_inout[p]) + wp.int64(steps_in[p]) * wp.int64(knots)
     passed = place // wp.int64(horizon)
@@ -50,8 +50,8 @@ def interpolate(
     """Interpolate actions between knots and clip them to the bounds; launched over (horizon, nworld, nact).
 
     The worlds of a sample are consecutive, and so are the samples of a plant. Order 0 holds each knot until the next,
-    and order 1 interpolates linearly. Order 3 is a cubic Hermite spline, with half the difference of a knot's
-    neighbours as its slope (Catmull and Rom 1974), and with one more knot before the grid.
+    and order 1 interpolates linearly. Order 3 is a cubic Hermite spline (Catmull and Rom 1974): the slope at a knot is
+    half the difference between the next knot and the previous one, so one more knot precedes the grid.
     """
     t, w, i = wp.tid()
     k = w // (action_out.shape[1] // knot_in.shape[1])

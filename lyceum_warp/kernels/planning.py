@@ -11,27 +11,31 @@ from lyceum_warp.kernels.random import stream, world_key
 
 ACTION = wp.constant(int(Done.ACTION))
 NOISE = wp.constant(-2)
-"""The number that replaces the episode in the noise's streams, which makes them independent of the worlds' streams."""
+"""The random streams of the noise use this number instead of an episode's index, so they differ from the worlds'
+streams."""
 DRAWS = wp.constant(-3)
-"""The number that replaces the episode in the samples' stream keys."""
+"""The stream keys of the samples use this number instead of an episode's index."""
 
 _TILES = f"{__name__}.tiles"
-"""The Warp module of the kernels with tiles. On the CPU all kernels of a module write a shared variable, the address of
-the tiles. Kernels without tiles need a separate module, because ``graphs.capture`` serialises only kernels with
-tiles."""
+"""The Warp module of the kernels with tiles. On the CPU, all kernels of a module write the same shared variable, which
+holds the address of the tiles. Kernels without tiles need a separate module, because ``graphs.capture`` serialises only
+kernels with tiles."""
 
 
 @wp.func
 def plant_of(row: int, rows: int, plants: int) -> int:
-    """Return the plant of a row, such as a sample or a world; the rows of a plant are consecutive."""
-    if plants == 1:  # skip the division, which would double the time of a small kernel on the CPU
+    """Return the plant to which a row belongs.
+
+    A row is a sample or a world, and the rows of a plant are consecutive.
+    """
+    if plants == 1:  # the division would double the time of a small kernel on the CPU
         return 0
     return row // (rows // plants)
 
 
 @wp.func
 def first_row(plant: int, rows: int, plants: int) -> int:
-    """Return the first row of a plant."""
+    """Return the index of a plant's first row."""
     if plant == 0:
         return 0
     return plant * (rows // plants)
@@ -110,7 +114,7 @@ def shift_plan(
     plan_in: wp.array3d[float], steps_in: wp.array[int], fill_in: wp.array[float], repeat: bool,
     nominal_out: wp.array3d[float],
 ):  # fmt: skip
-    """Move plans forward in time and fill their ends; launched over (horizon, nplant, nact), or (knots, ...)."""
+    """Move plans forward in time and fill their ends; launched over (horizon or knots, nplant, nact)."""
     t, p, i = wp.tid()
     last = plan_in.shape[0] - 1
     if steps_in[p] <= last - t:
@@ -123,7 +127,7 @@ def shift_plan(
 def draw_noise(seed_in: wp.array[int], count_in: wp.array[int], noise_out: wp.array3d[float]):
     """Draw standard normal numbers by (seed, sample, count, action, step); launched over (nsample, nact).
 
-    Each plant has its own seed and count, and numbers its samples from 0.
+    Each plant has its own seed and count. The samples of each plant are numbered from 0.
     """
     k, i = wp.tid()
     nsample, plants = noise_out.shape[1], seed_in.shape[0]
@@ -161,8 +165,8 @@ def perturb(
     """Add correlated, smoothed noise to plans and clip the sum to the bounds; launched over (nsample, nact).
 
     ``scale_in`` is the lower Cholesky factor L of the noise covariance: n_t = L z_t for standard normal z_t. Smoothing
-    follows trajopt: e_t = n_t in the first two steps, then e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2). With
-    ``include_plan`` a plant's first sample is the plan without noise.
+    follows trajopt: e_t = n_t in the first two steps, then e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2). If ``include_plan``
+    is set, a plant's first sample is the plan without noise.
     """
     k, i = wp.tid()
     nsample, plants = noise_in.shape[1], nominal_in.shape[1]
@@ -224,8 +228,8 @@ def add_up(
 ):
     """Add up the worlds' discounted rewards and terminal values; launched over (nworld,).
 
-    With ``stop`` a sample gets no reward and no terminal value after its episode has terminated. Returns of samples
-    with a fault, and returns that are not finite, become minus infinity.
+    If ``stop`` is set, a sample gets no reward and no terminal value after its episode has terminated. The return is
+    minus infinity if the sample has a fault, or if the sum is not finite.
     """
     k = wp.tid()
     total = float(0.0)
@@ -299,7 +303,7 @@ def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[f
 
 @wp.kernel(enable_backward=False)
 def rank(return_in: wp.array[float], samples: int, rank_out: wp.array[int]):
-    """Rank the samples of each plant, with rank 0 for the best; of equal samples the lower index ranks first.
+    """Rank the samples of each plant, with rank 0 for the best; between equal samples, the lower index ranks first.
 
     Launched over (nsample,).
     """
@@ -323,7 +327,7 @@ def weigh_elites(
 ):
     """Weigh the best samples equally and the others by zero; launched as one block per plant.
 
-    The summary has the same entries as in ``weigh``. Failed samples have zero weight, even if fewer than ``elites``
+    ``weigh`` explains the entries of the summary. Failed samples have zero weight, even if fewer than ``elites``
     samples remain.
     """
     p, lane = wp.tid()
@@ -361,9 +365,9 @@ def fit_deviation(
 ):
     """Fit the standard deviation of the noise to the weighted samples; launched as one block per element of the plans.
 
-    The fit is the standard deviation of the samples from the plan, their mean, divided by ``spread``, the standard
-    deviation of smoothed standard normal noise in this step. The result is at least ``smallest``. If all samples
-    failed, the standard deviation does not change.
+    The plan is the weighted mean of the samples. The result is the samples' standard deviation around this mean,
+    divided by ``spread``, but at least ``smallest``. ``spread`` is the standard deviation that smoothing gives to
+    standard normal noise in each step. If all samples failed, the standard deviation does not change.
     """
     number, lane = wp.tid()
     nsample, plants, nact = weight_in.shape[0], plan_in.shape[1], plan_in.shape[2]

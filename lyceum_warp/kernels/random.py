@@ -11,13 +11,13 @@ from lyceum_warp.support.docstrings import document_overloads
 
 @wp.func
 def world_key(seed: int, world: int) -> wp.uint32:
-    """Return the key of a world's streams."""
+    """Return the key from which all random streams of a world are derived."""
     return wp.rand_init(seed, world)
 
 
 @wp.func
 def stream(key: wp.uint32, episode: int, step: int) -> wp.uint32:
-    """Return the start of the stream of a step in an episode; step 0 is the reset."""
+    """Return the start of the random stream for one step of an episode; step 0 is the reset."""
     return wp.rand_init(int(wp.rand_init(int(key), episode)), step)
 
 
@@ -31,8 +31,8 @@ def substream(base: wp.uint32, number: int) -> wp.uint32:
 def uniform(rng: wp.array[wp.uint32], low: float, high: float) -> float:
     """Draw from U(low, high) and advance the stream. Each element of a vector is drawn from its own range.
 
-    The stream is a row with one element, because Warp passes numbers by value, so the function could not advance a
-    number.
+    The stream is a row with one element, because Warp passes numbers by value: a function cannot change a number that
+    it gets.
     """
     state = rng[0]
     value = wp.randf(state, low, high)
@@ -75,7 +75,7 @@ def seed_worlds(
 ):
     """Seed the streams of the masked worlds, before their first episode; launched over (nworld,).
 
-    ``first`` is added to the worlds' numbers.
+    ``first`` is the number of the first world: the worlds have the numbers first, first + 1, and so on.
     """
     w = wp.tid()
     if mask_in[w]:

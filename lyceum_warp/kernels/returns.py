@@ -19,8 +19,8 @@ def advantages(
 
     Advantages are generalised advantage estimates (Schulman et al. 2016, "High-dimensional continuous control using
     generalized advantage estimation", eq. 16). ``next_value`` is the value of the state after a step, before any reset.
-    Episodes that the time limit or the end of the rollout truncates bootstrap from ``next_value``; terminated episodes
-    do not.
+    If the time limit or the end of the rollout truncates an episode, ``next_value`` replaces the missing rewards. After
+    a termination, there are no more rewards.
     """
     w = wp.tid()
     last = reward_in.shape[0] - 1

@@ -34,7 +34,7 @@ def quat_inverse(q: wp.vec4) -> wp.vec4:
 def quat_rotate(q: wp.vec4, v: wp.vec3) -> wp.vec3:
     """Rotate a vector from the frame with orientation q into the world frame.
 
-    The result is v + 2 u x (w v + u x v) for q = (w, u), as from mju_rotVecQuat.
+    The result is v + 2 u x (w v + u x v) for q = (w, u), as mju_rotVecQuat computes it.
     """
     u = wp.vec3(q[1], q[2], q[3])
     return v + 2.0 * wp.cross(u, q[0] * v + wp.cross(u, v))
@@ -44,7 +44,7 @@ def quat_rotate(q: wp.vec4, v: wp.vec3) -> wp.vec3:
 def quat_rotate_inverse(q: wp.vec4, v: wp.vec3) -> wp.vec3:
     """Rotate a vector from the world frame into the frame with orientation q, such as a body's own frame.
 
-    The result is v - 2 u x (w v - u x v) for q = (w, u), as from mju_rotVecQuat with the inverse.
+    The result is v - 2 u x (w v - u x v) for q = (w, u), as mju_rotVecQuat computes it with the inverse.
     """
     u = wp.vec3(q[1], q[2], q[3])
     return v - 2.0 * wp.cross(u, q[0] * v - wp.cross(u, v))
@@ -54,7 +54,7 @@ def quat_rotate_inverse(q: wp.vec4, v: wp.vec3) -> wp.vec3:
 def quat_from_axis_angle(axis: wp.vec3, angle: float) -> wp.vec4:
     """Make the rotation by an angle, in rad, about a unit axis.
 
-    The result is (cos(angle / 2), sin(angle / 2) axis), as from mju_axisAngle2Quat.
+    The result is (cos(angle / 2), sin(angle / 2) axis), as mju_axisAngle2Quat computes it.
     """
     s = wp.sin(0.5 * angle)
     return wp.vec4(wp.cos(0.5 * angle), s * axis[0], s * axis[1], s * axis[2])
@@ -91,7 +91,7 @@ def quat_to_rotvec(q: wp.vec4) -> wp.vec3:
 
 @wp.func
 def quat_difference(a: wp.vec4, b: wp.vec4) -> wp.vec3:
-    """Return the rotation vector r from b to a, in the frame of b, as mju_subQuat: a = b quat_from_rotvec(r)."""
+    """Return the rotation vector r from b to a, in the frame of b, as mju_subQuat does: a = b quat_from_rotvec(r)."""
     return quat_to_rotvec(quat_mul(quat_inverse(b), a))
 
 
@@ -114,7 +114,7 @@ def quat_to_mat(q: wp.vec4) -> wp.mat33:
 
 @wp.func
 def quat_from_mat(m: wp.mat33) -> wp.vec4:
-    """Convert a rotation matrix, such as a row of ``site_xmat``, to a quaternion, as mju_mat2Quat up to the sign.
+    """Convert a rotation matrix, such as a row of ``site_xmat``, to a quaternion: mju_mat2Quat's or its negative.
 
     The trace and the diagonal show which of w, x, y, z is large enough to divide by (Shepperd 1978,
     "Quaternion from rotation matrix").
@@ -161,8 +161,8 @@ def quat_to_euler(q: wp.vec4) -> wp.vec3:
     """Convert a rotation to the angles of ``quat_from_euler``, in rad; the second is from -pi / 2 to pi / 2.
 
     The angles of the matrix R are atan2(-R12, R22), atan2(R02, sqrt(R12^2 + R22^2)) and atan2(-R01, R00). If the second
-    angle is a right angle, only the sum or the difference of the first and the third is defined, and the first is set
-    to 0.
+    angle is a right angle, only the sum or the difference of the other two angles is defined. The first angle is then
+    set to 0.
     """
     m = quat_to_mat(q)
     cosine = wp.sqrt(m[1, 2] * m[1, 2] + m[2, 2] * m[2, 2])

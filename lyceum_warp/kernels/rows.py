@@ -1,11 +1,11 @@
-"""Process rows with several threads per world: thread ``lane`` of ``lanes`` has the indices i % lanes == lane."""
+"""Divide a world's rows among threads: thread ``lane`` of ``lanes`` gets the indices i with i % lanes == lane."""
 
 import warp as wp
 
 
 @wp.func
 def finite_row(row: wp.array[float], lane: int, lanes: int) -> bool:
-    """Return whether every element of a lane is finite."""
+    """Return whether every element that this thread reads is finite."""
     for i in range(lane, row.shape[0], lanes):  # noqa: SIM110 (Warp has no all())
         if not wp.isfinite(row[i]):
             return False
@@ -14,7 +14,7 @@ def finite_row(row: wp.array[float], lane: int, lanes: int) -> bool:
 
 @wp.func
 def restored_row(before: wp.array[float], after: wp.array[float], lane: int, lanes: int) -> bool:
-    """Replace elements of a lane that are not finite by those of ``before``; return whether all were finite."""
+    """Replace this thread's elements that are not finite by those of ``before``; return whether all were finite."""
     finite = bool(True)
     for i in range(lane, after.shape[0], lanes):
         if not wp.isfinite(after[i]):
@@ -25,7 +25,7 @@ def restored_row(before: wp.array[float], after: wp.array[float], lane: int, lan
 
 @wp.func
 def copy_row(source: wp.array[float], target: wp.array[float], lane: int, lanes: int):
-    """Copy the elements of a lane."""
+    """Copy the elements that belong to this thread."""
     for i in range(lane, source.shape[0], lanes):
         target[i] = source[i]
 
@@ -42,7 +42,10 @@ def mark_changes(
     lanes: int,
     first: int,
 ):
-    """Mark the masked worlds whose rows differ; ``physics`` marks a change of physics too. Over (nworld, lanes)."""
+    """Mark the masked worlds whose rows have changed; launched over (nworld, lanes).
+
+    If ``physics`` is set, the worlds are also marked in ``physics_changed``.
+    """
     k, lane = wp.tid()
     w = first + k
     if mask_in[w]:

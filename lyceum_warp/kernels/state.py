@@ -104,7 +104,7 @@ def widen_bool(
 def narrow_bool(
     mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[bool], lanes: int, first: int
 ):
-    """Convert the masked rows of ``widen_bool`` back to booleans; launched over (nworld, lanes)."""
+    """Convert masked rows of 0 and 1, which ``widen_bool`` writes, to booleans; launched over (nworld, lanes)."""
     k, lane = wp.tid()
     w = first + k
     if mask_in[w]:
@@ -190,7 +190,7 @@ def pack_counters(
     done_reason_in: wp.array[int],
     state_out: wp.array2d[wp.float64],
 ):
-    """Write step, stream key, episode and done reason exactly into four columns; launched over (nworld,)."""
+    """Write step, stream key, episode and done reason into four columns, without rounding; launched over (nworld,)."""
     w = wp.tid()
     state_out[w, 0] = wp.float64(step_in[w])
     state_out[w, 1] = wp.float64(key_in[w])

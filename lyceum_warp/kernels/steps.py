@@ -17,9 +17,9 @@ NAN = wp.constant(int(Done.NAN))
 ALL_FAULTS = wp.constant(int(FAULTS))
 
 EVENT = wp.constant(-2)
-"""Substream of a step's stream for events."""
+"""Events draw from the substream with this number of each step's random stream."""
 STARTUP = wp.constant(-1)
-"""The number that replaces the episode in the stream of ``startup``."""
+"""The random stream of ``startup`` uses this number instead of an episode's index."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,9 +135,10 @@ def hold_success(
     success_inout: wp.array[bool],
     first: int,
 ):
-    """Report success only after ``needed`` consecutive steps, in the masked worlds; launched over (nworld,).
+    """Report success only after ``needed`` successful steps in a row, in the masked worlds; launched over (nworld,).
 
-    A transition increases or clears the count, (nworld, 1). Judging a state without a transition keeps it.
+    ``count``, (nworld, 1), holds the successful steps so far. A transition increases or clears the count; the
+    evaluation of a state alone does not change the count.
     """
     w = first + wp.tid()
     if mask_in[w]:
@@ -219,7 +220,7 @@ def begin_kernels(task: TaskCode) -> BeginKernels:
         outdated_out: wp.array[bool],
         first: int,
     ):
-        """Run the events of the worlds that do not restart and set ``continuing_out``; launched over (nworld,)."""
+        """Set ``continuing_out`` for the worlds that do not restart, and run their events; launched over (nworld,)."""
         w = first + wp.tid()
         continuing_out[w] = not restarting_in[w]
         physics_changed_out[w] = False
@@ -262,7 +263,7 @@ def shared_kernels(task: TaskCode) -> SharedKernels:
         sum_inout: wp.array[wp.int64],
         first: int,
     ):
-        """Add the tally of each world's transition, if it has no fault, to the sums; launched over (nworld,)."""
+        """Add each world's tally to the sums, if its transition has no fault; launched over (nworld,)."""
         w = first + wp.tid()
         for i in range(share_out.shape[1]):
             share_out[w, i] = 0.0
@@ -295,8 +296,8 @@ class Kernels(ActKernels, JudgeKernels, BeginKernels, RolloutKernels, SharedKern
     """The kernels of a step, and the structs of their arrays. Kernels that the task does not need are None."""
 
     views: Mapping[Any, wp.Function]
-    """Functions by the struct that they make: World from a batch and a world's index, and observation structs from a
-    row."""
+    """For each struct, the function that makes it. The function of World takes a batch and a world's index; the
+    functions of observation structs take a row."""
     terms: Mapping[str, wp.Function]
     """The generated functions of a task with terms: ``reward``, ``score`` and ``terminated``."""
     Batch: Any

@@ -101,7 +101,7 @@ def put_upright(qpos: wp.array[float], at: int, position: wp.vec3, yaw: float) -
 
 @wp.func
 def sum_squares(row: wp.array[float], first: int, last: int) -> float:
-    """Sum the squares of a row's elements, numbers or vectors, with first <= i < last; by default of all elements."""
+    """Sum the squares of a row's elements with first <= i < last, or of all; elements are numbers or vectors."""
     total = float(0.0)
     for i in range(first, last):
         total += row[i] * row[i]
@@ -151,7 +151,7 @@ def angle_between(a: wp.vec3, b: wp.vec3) -> float:
 def body_velocity(cvel: wp.spatial_vector, com: wp.vec3, point: wp.vec3) -> wp.spatial_vector:
     """Return the velocity of a body at a point, as (angular, linear) in the world's axes, in rad/s and m/s.
 
-    The result is (w, v + w x (point - com)) for cvel = (w, v), as from mj_objectVelocity in the world's axes.
+    The result is (w, v + w x (point - com)) for cvel = (w, v), as mj_objectVelocity computes it in the world's axes.
 
     Args:
         cvel: The body's row of ``cvel``, (angular, linear), at the centre of mass of its kinematic tree.
@@ -164,7 +164,9 @@ def body_velocity(cvel: wp.spatial_vector, com: wp.vec3, point: wp.vec3) -> wp.s
 
 @wp.func
 def local_velocity(cvel: wp.spatial_vector, com: wp.vec3, point: wp.vec3, quat: wp.vec4) -> wp.spatial_vector:
-    """Return a body's velocity at a point, (angular, linear), in a frame's axes, as mj_objectVelocity with flg_local.
+    """Return a body's velocity at a point, as (angular, linear) in the axes of a frame, in rad/s and m/s.
+
+    The result equals mj_objectVelocity's with flg_local = 1.
 
     Args:
         cvel: See ``body_velocity``.
@@ -186,7 +188,7 @@ def tolerance(
     sigmoid: int = int(Sigmoid.GAUSSIAN),
     value_at_margin: float = 0.1,
 ) -> float:
-    """Return 1 within bounds, and a number that falls towards 0 outside them, as dm_control's ``tolerance``.
+    """Return 1 within bounds, and a number that falls towards 0 outside them, as dm_control's ``tolerance`` does.
 
     The number depends on d, the distance from the nearer bound divided by the margin, and v, the value at the margin:
 
@@ -204,8 +206,8 @@ def tolerance(
     Args:
         x: The number.
         bounds: The lowest and the highest number with value 1; both may be infinite.
-        margin: The distance from the bounds at which the value is ``value_at_margin``; with a margin of 0 the value
-            outside the bounds is 0.
+        margin: The distance from the bounds at which the value is ``value_at_margin``. If it is 0, the value is 0
+            everywhere outside the bounds.
         sigmoid: The shape of the fall, an ``lw.Sigmoid``.
         value_at_margin: The value at the margin.
     """
@@ -247,7 +249,8 @@ def grasp_terms(distance: float, finger: float, closed: float) -> tuple[float, f
     Args:
         distance: Distance from the point between the fingers to the target, m.
         finger: Position of a finger, m; it is 0 if the fingers meet.
-        closed: Largest position at which the fingers count as closed, m; they count as open from 2 cm more.
+        closed: Largest position at which the fingers count as closed, m. The fingers count as open if each finger is at
+            least 2 cm further out.
     """
     near = tolerance(distance, wp.vec2(0.0, 0.01), 0.01)
     reach = tolerance(distance, wp.vec2(0.0, 0.005), 0.1, int(Sigmoid.RECIPROCAL), 0.2)

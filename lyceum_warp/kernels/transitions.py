@@ -1,4 +1,4 @@
-"""Make the kernels that judge transitions by a task's functions: rewards, ends of episodes, metrics, observations."""
+"""Make the kernels that evaluate a task's transitions: rewards, ends of episodes, metrics, observations."""
 
 import dataclasses
 
@@ -17,7 +17,8 @@ OBSERVATION = wp.constant(int(Done.OBSERVATION))
 NAN = wp.constant(int(Done.NAN))
 
 OBSERVE = wp.constant(-1)
-"""Substream of a step's stream for the noise of observations; ``advance`` draws from the stream itself."""
+"""Each step has a random stream. ``advance`` draws from it, and observation noise draws from its substream with this
+number."""
 
 # the parts that ``judge`` computes; the observation groups follow
 ENDS = wp.constant(0)
@@ -154,10 +155,11 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
 
         Writes the reward, the metrics and their sums, the evaluation, the end of the episode, success and the
         observations. A transition with a fault has reward 0, metrics 0, the evaluation of the state before it, and the
-        last good observations. It counts as truncated, so that learners bootstrap from those observations.
+        last good observations. A transition with a fault counts as truncated, so that learners bootstrap from those
+        observations.
 
-        Only a transition ends an episode. For a state without a transition, ``keep_reason`` keeps the saved reason, and
-        ``found.terminated`` shows whether the task's ``terminated`` holds.
+        Only a transition ends an episode. If a state is evaluated without a transition, ``keep_reason`` keeps the saved
+        reason, and ``found.terminated`` is the result of the task's ``terminated``.
         """
         k, lane = wp.tid()
         w = first + k
@@ -209,7 +211,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         out.truncated[w] = (reason & ~TERMINATED) != 0
         out.done[w] = reason != 0
         if transition:
-            # without automatic resets a world continues after its episode's end, but not after a fault
+            # without automatic resets, a world continues after its episode's end, but not after a fault
             restart_out[w] = wp.where(keep_reason, fault != 0, reason != 0)
             if fault != 0:
                 faults.count_faults(fault, fault_count_inout[w])
@@ -228,7 +230,8 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
     ):
         """Observe the masked worlds, and find the groups that are finite; launched over (parts, nworld).
 
-        With one part it also replaces observations that are not finite; else ``replace_observations`` must follow.
+        If there is only one part, this kernel also replaces observations that are not finite. Otherwise, launch
+        ``replace_observations`` after it.
         """
         start, k = wp.tid()
         w = first + k
@@ -267,7 +270,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
     def measure_worlds(
         batch: Batch, params: wp.array[Params], action_in: wp.array2d[float], metrics_out: wp.array2d[float], first: int
     ):
-        """Measure transitions from states to themselves; launched over (nworld,)."""
+        """Compute the metrics of states without transitions: each state is its own next state. Over (nworld,)."""
         w = first + wp.tid()
         s = view(batch, w)
         measure(s, action_in[w], s, params[w % params.shape[0]], metrics_out[w])
@@ -277,7 +280,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
 
 @dataclasses.dataclass(frozen=True)
 class RolloutKernels:
-    """Kernels for open-loop rollouts, which store their fields for all steps."""
+    """Kernels for open-loop rollouts. A rollout stores the fields of all steps."""
 
     judge_rows: wp.Kernel
     advance_rows: wp.Kernel | None

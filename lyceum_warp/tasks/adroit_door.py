@@ -1,9 +1,10 @@
 """AdroitDoor: turn a latch with the hand and pull the door open (Gymnasium-Robotics' AdroitHandDoor-v1).
 
-The hand's model needs the extra "hand". The door's frame is a mocap body, so that its position is part of the state.
-The contact pair of ring and little fingertip, which the model lists twice, is used once. As in Gymnasium-Robotics, site
-positions are one substep old after ``mj_step``. The reward grows with the palm's distance from the handle. This is a
-mistake of gymnasium-robotics 1.2.1 to 1.4.2. ``palm_weight=-0.1`` corrects the mistake, as in version 1.2.0.
+Install the extra "hand" to get the hand's model. The door's frame is a mocap body, so that its position is part of the
+state. The model lists the contact pair of ring and little fingertip twice; the task uses it once. As in
+Gymnasium-Robotics, site positions are one substep old after ``mj_step``. The reward grows with the palm's distance from
+the handle, by a mistake in gymnasium-robotics 1.2.1 to 1.4.2. ``palm_weight=-0.1`` corrects the mistake, as in version
+1.2.0.
 """
 
 import mujoco

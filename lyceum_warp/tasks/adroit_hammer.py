@@ -1,9 +1,9 @@
 """AdroitHammer: pick up a hammer and drive a nail into a board (Gymnasium-Robotics' AdroitHandHammer-v1).
 
-The hand's model needs the extra "hand". The board is a mocap body, so that its height is part of the state. The contact
-pair of ring and little fingertip, which the model lists twice, is used once. As in Gymnasium-Robotics, positions and
-the force on the nail are one substep old after ``mj_step``. The reward grows with the palm's distance from the
-hammer. This is a mistake of gymnasium-robotics 1.2.1 to 1.4.2. ``palm_weight=-0.1`` corrects the mistake, as in
+Install the extra "hand" to get the hand's model. The board is a mocap body, so that its height is part of the state.
+The model lists the contact pair of ring and little fingertip twice; the task uses it once. As in Gymnasium-Robotics,
+positions and the force on the nail are one substep old after ``mj_step``. The reward grows with the palm's distance
+from the hammer, by a mistake in gymnasium-robotics 1.2.1 to 1.4.2. ``palm_weight=-0.1`` corrects the mistake, as in
 version 1.2.0.
 """
 

@@ -56,7 +56,8 @@ def evaluate(s: World, p: Params) -> float:  # the height of the pot above the t
 @wp.func
 def arm(s: World, grip: int, handle: int, finger: int) -> wp.vec4:
     near, reach, grasp = lw.grasp_terms(wp.length(s.site_xpos[grip] - s.site_xpos[handle]), s.qpos[finger], 0.015)
-    # the grip is best if the fingers slide (y of the gripper) perpendicularly to the handle's bar (x of the pot)
+    # the grip is best if the gripper's y axis, along which the fingers slide, is perpendicular to the handle's bar,
+    # which is parallel to the pot's x axis
     orient = 1.0 - wp.abs(wp.dot(s.site_xmat[grip][:, 1], s.site_xmat[handle][:, 0]))
     return wp.vec4(reach, orient, grasp, near)
 
@@ -112,7 +113,7 @@ class AlohaLift(lw.Task):
                 geom.rgba = (0.75, 0.77, 0.8, 1.0)
         spec.camera("collaborator_pov").mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK  # the camera of videos
         for light in spec.lights:
-            light.castshadow = False  # shadows slow rendering without a GPU down by a factor of 17
+            light.castshadow = False  # without a GPU, shadows make rendering 17 times slower
         child = lw.package_model("lyceum_warp", "tasks/aloha_lift.xml").spec()
         for part in child.worldbody.bodies:
             spec.body(part.name).add_frame().attach_body(part, "lift/", "")

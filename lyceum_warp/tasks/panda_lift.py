@@ -1,9 +1,9 @@
 """PandaLift: grasp a cube on a table and lift it (a Franka Panda with its gripper, as in robosuite's Lift).
 
-The arm needs the extra "robots" and has no gripper. Hand, table and cube are in MJCF files of the package. Actions are
-velocities of the position servos' targets. The arm compensates gravity, as the real robot does. Meshes are visual
-only, and capsules fitted to the arm collide with table and cube. Success: the cube has been above the goal height for
-ten consecutive steps.
+The arm's model, which the extra "robots" installs, has no gripper. Hand, table and cube are in MJCF files of the
+package. Actions are velocities of the position servos' targets. The arm compensates gravity, as the real robot does.
+Meshes are visual only, and capsules fitted to the arm collide with table and cube. Success: the cube has been above the
+goal height for ten consecutive steps.
 """
 
 import mujoco

@@ -49,18 +49,20 @@ def heading(qpos: Row[float]) -> float:
 
 @wp.func
 def track_linear_velocity(command: wp.vec3, linear_velocity: wp.vec3, linear_velocity_variance: float) -> float:
-    """Reward following the commanded velocity without bouncing: exp(-(|c_xy - v_xy|^2 + v_z^2) / variance).
+    """Reward a robot that follows the commanded velocity and does not bounce.
 
-    Source: mjlab 1.6.0, ``track_linear_velocity``, with variance = std^2.
+    The term is exp(-(|c_xy - v_xy|^2 + v_z^2) / variance). Source: mjlab 1.6.0, ``track_linear_velocity``, with
+    variance = std^2.
     """
     return wp.exp(-wp.length_sq(wp.vec3(command[0], command[1], 0.0) - linear_velocity) / linear_velocity_variance)
 
 
 @wp.func
 def track_angular_velocity(command: wp.vec3, angular_velocity: wp.vec3, angular_velocity_variance: float) -> float:
-    """Reward following the yaw rate without roll and pitch rates: exp(-((c_yaw - w_z)^2 + w_x^2 + w_y^2) / variance).
+    """Reward a robot that follows the commanded yaw rate and does not roll or pitch.
 
-    Source: mjlab 1.6.0, ``track_angular_velocity``, with variance = std^2.
+    The term is exp(-((c_yaw - w_z)^2 + w_x^2 + w_y^2) / variance). Source: mjlab 1.6.0, ``track_angular_velocity``,
+    with variance = std^2.
     """
     return wp.exp(-wp.length_sq(wp.vec3(0.0, 0.0, command[2]) - angular_velocity) / angular_velocity_variance)
 
@@ -79,7 +81,7 @@ def yaw_rate_error(command: wp.vec3, angular_velocity: wp.vec3) -> float:
 
 @wp.func
 def track_planar_velocity(command: wp.vec3, linear_velocity: wp.vec3, linear_velocity_variance: float) -> float:
-    """Reward following the commanded horizontal velocity: exp(-|c_xy - v_xy|^2 / variance).
+    """Reward a robot that follows the commanded horizontal velocity: exp(-|c_xy - v_xy|^2 / variance).
 
     Source: legged_gym (Rudin et al. 2022, "Learning to walk in minutes using massively parallel deep reinforcement
     learning").
@@ -90,7 +92,7 @@ def track_planar_velocity(command: wp.vec3, linear_velocity: wp.vec3, linear_vel
 
 @wp.func
 def track_yaw_rate(command: wp.vec3, angular_velocity: wp.vec3, angular_velocity_variance: float) -> float:
-    """Reward following the commanded yaw rate: exp(-(c_yaw - w_z)^2 / variance).
+    """Reward a robot that follows the commanded yaw rate: exp(-(c_yaw - w_z)^2 / variance).
 
     Source: legged_gym (Rudin et al. 2022).
     """
@@ -157,7 +159,7 @@ def alive() -> float:
 
 @wp.func
 def fell_over(gravity: wp.vec3, fall_angle: float) -> bool:
-    """Return whether the base is tilted by more than an angle, arccos(-g_z) > angle; for a termination.
+    """Return whether the base is tilted by more than ``fall_angle``: arccos(-g_z) > fall_angle.
 
     Source: mjlab 1.6.0, ``bad_orientation``.
     """
@@ -166,7 +168,7 @@ def fell_over(gravity: wp.vec3, fall_angle: float) -> bool:
 
 @wp.func
 def too_low(base_height: float, least_height: float) -> bool:
-    """Return whether the base is below a height; for a termination.
+    """Return whether the base is below ``least_height``.
 
     Source: mjlab 1.6.0, ``root_height_below_minimum``.
     """

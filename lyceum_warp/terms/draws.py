@@ -19,26 +19,26 @@ def log_uniform(rng: Row[wp.uint32], low: float, high: float) -> float:
 
 @wp.func
 def uniform_int(rng: Row[wp.uint32], least: int, most: int) -> int:
-    """Draw an integer with least <= n <= most."""
+    """Draw an integer n from U{least, ..., most}."""
     return least + wp.min(int(uniform(rng, 0.0, float(most - least + 1))), most - least)
 
 
 @wp.func
 def chosen(rng: Row[wp.uint32], share: float) -> bool:
-    """Draw True with a probability."""
+    """Return True with the given probability, and otherwise False."""
     return uniform(rng, 0.0, 1.0) < share
 
 
 @wp.func
 def draw_row(row: Row[float], low: float, high: float, rng: Row[wp.uint32]):
-    """Draw every element of a row from U(low, high), such as the biases of encoders."""
+    """Draw every element of a row from U(low, high), for example the biases of encoders."""
     for i in range(row.shape[0]):
         row[i] = uniform(rng, low, high)
 
 
 @wp.func
 def draw_delay(delay: Row[float], least: int, most: int, rng: Row[wp.uint32]):
-    """Draw a delay of a whole number of steps, least <= n <= most, for ``delayed_action``."""
+    """Draw the delay of ``delayed_action``: a whole number of steps from ``least`` to ``most``."""
     delay[0] = float(uniform_int(rng, least, most))
 
 
@@ -58,7 +58,10 @@ def draw_friction(
     rolling_friction: wp.vec2,
     rng: Row[wp.uint32],
 ):
-    """Draw one friction for all listed geoms: ``uniform`` for sliding, ``log_uniform`` for spinning and rolling."""
+    """Draw friction coefficients that all listed geoms share.
+
+    The sliding friction is drawn by ``uniform``, the spinning and the rolling friction by ``log_uniform``.
+    """
     sliding = uniform(rng, sliding_friction[0], sliding_friction[1])
     spinning = log_uniform(rng, spinning_friction[0], spinning_friction[1])
     rolling = log_uniform(rng, rolling_friction[0], rolling_friction[1])

@@ -1,4 +1,4 @@
-"""Time the contacts of feet, and compute reward terms for their swings, slips and landings.
+"""Measure how long feet are in contact, and compute reward terms for swings, slips and landings.
 
 The tables ``feet`` (sites), ``foot_velocities``, ``foot_forces`` and ``foot_contacts`` (sensors) list the feet in the
 same order, and so do the rows of memory with one element per foot. Call ``run_clocks`` in ``substep``, and
@@ -28,8 +28,8 @@ def ground_speed(velocity: wp.vec3) -> float:
 def run_clocks(foot: int, touching: bool, contact_time: Row[float], air_time: Row[float], substep_dt: float):
     """Advance a foot's contact time or air time by a substep, and set the other to 0.
 
-    With ``swing_time``, a landing stores the duration of the swing that it ends. Source: mjlab 1.6.0,
-    ``ContactSensor``.
+    When the foot lands, the duration of its swing is stored in ``swing_time``, if this argument is given. Source: mjlab
+    1.6.0, ``ContactSensor``.
     """
     contact_time[foot] = wp.where(touching, contact_time[foot] + substep_dt, 0.0)
     air_time[foot] = wp.where(touching, 0.0, air_time[foot] + substep_dt)
@@ -75,7 +75,10 @@ def follow_swing(
     swing_height: Row[float],
     dt: float,
 ):
-    """Track a swing's greatest height in ``peak_height``, and move it to ``swing_height`` when the foot lands."""
+    """Track the greatest height of a foot's swing in ``peak_height``.
+
+    When the foot lands, move the height to ``swing_height``.
+    """
     if landed(contact_time[foot], dt):
         swing_height[foot] = peak_height[foot]
         peak_height[foot] = 0.0
@@ -148,10 +151,10 @@ def soft_landing(
     substep_dt: float,
     active: float,
 ) -> float:
-    """Return the sum of |force| over the feet that had ``landed`` one substep ago, times ``active``, N.
+    """Return the sum of |force| over the feet that have just landed, times ``active``, N.
 
-    The forces belong to the start of the last substep, when each contact was shorter by one substep. Source: mjlab
-    1.6.0, ``soft_landing``.
+    The sensors hold the forces at the start of the last substep, so a foot counts if it had ``landed`` at that time.
+    Source: mjlab 1.6.0, ``soft_landing``.
     """
     total = float(0.0)
     for foot in range(foot_forces.shape[0]):

@@ -31,7 +31,8 @@ def push_history(history: Row[float], value: Row[float]):
 def read_history(history: Row[float], width: int, age: int, i: int) -> float:
     """Get element i of a value in a history.
 
-    ``age`` counts back from the last value. A shorter history gives its first value, and an empty history gives 0.
+    ``age`` counts back from the last value. If the history holds no value of this age, the result is from its first
+    value, or 0 if the history is empty.
     """
     pushes = int(history[0])
     if pushes == 0:
@@ -52,9 +53,10 @@ def put_history(target: Row[float], history: Row[float], width: int):
 
 @wp.func
 def delayed_action(action: Row[float], history: Row[float], delay: Row[float], i: int) -> float:
-    """Get element i of the action ``delay`` steps ago, or of the episode's first action; for ``control``.
+    """Get element i of the action that was chosen ``delay`` steps ago; call this in ``control``.
 
-    ``advance`` appends every action: ``terms.push_history(s1.history, action)``.
+    In the first ``delay`` steps of an episode, the result is from the episode's first action. ``advance`` must append
+    every action: ``terms.push_history(s1.history, action)``.
     """
     age = int(delay[0])
     if age == 0 or history[0] == 0.0:

@@ -14,7 +14,7 @@ from lyceum_warp.terms.velocity_commands import command_size
 def posture(
     qpos: Row[float], joint_qpos: wp.array[int], default_pose: wp.array[float], pose_std: wp.array[float]
 ) -> float:
-    """Reward joints near the default pose: exp(-mean(((q - q_0) / std)^2)) over the joints.
+    """Reward a pose near the default pose: exp(-mean(((q - q_0) / std)^2)), with the mean over the joints.
 
     Source: mjlab 1.6.0, ``posture``.
     """
@@ -57,7 +57,7 @@ def gait_pose(
     least_command: float,
     running_command: float,
 ) -> float:
-    """Compute ``pose`` with additional standard deviations for running, at a ``command_size`` from ``running_command``.
+    """Compute ``pose``, with other standard deviations for a running robot: ``command_size`` >= ``running_command``.
 
     Source: mjlab 1.6.0, ``variable_posture``.
     """
@@ -79,7 +79,7 @@ def pose_l1(qpos: Row[float], joint_qpos: wp.array[int], default_pose: wp.array[
 def joint_limits(
     qpos: Row[float], joint_qpos: wp.array[int], jnt_range: Row[wp.vec2], joints: wp.array[int], soft_limit: float
 ) -> float:
-    """Sum the distances of the joints beyond soft limits, max(|q - middle| - soft_limit * half range, 0), rad.
+    """Sum how far joints exceed their soft limits: max(|q - middle| - soft_limit * half range, 0), rad.
 
     Source: mjlab 1.6.0, ``joint_pos_limits``.
     """

@@ -16,11 +16,11 @@ def servo_torque(joint_target: float, joint_position: float, joint_velocity: flo
 def dc_motor_torque(
     torque: float, joint_velocity: float, saturation_torque: float, velocity_limit: float, effort_limit: float
 ) -> float:
-    """Clip a torque to the range of a DC motor at a velocity.
+    """Clip a torque to the range that a DC motor has at the given velocity.
 
     The range is max(sat (-1 - qdot / limit), -effort) <= torque <= min(sat (1 - qdot / limit), effort), with qdot
-    clipped to +-limit (1 + effort / sat). Above the limit, its no-load speed, the motor brakes. Source: mjlab 1.6.0,
-    ``dc_motor_clip``.
+    clipped to +-limit (1 + effort / sat). ``limit`` is the motor's no-load speed, above which the motor brakes. Source:
+    mjlab 1.6.0, ``dc_motor_clip``.
     """
     corner = velocity_limit * (1.0 + effort_limit / saturation_torque)
     slope = wp.clamp(joint_velocity, -corner, corner) / velocity_limit

@@ -24,7 +24,7 @@ def gather_positions(
 ):
     """Write joint positions relative to the default pose, as encoders measure them: q + bias - q_0.
 
-    The bias is 0 without ``encoder_bias``. Source: mjlab 1.6.0, ``joint_pos_rel``.
+    If ``encoder_bias`` is not given, the bias is 0. Source: mjlab 1.6.0, ``joint_pos_rel``.
     """
     for j in range(joint_qpos.shape[0]):
         target[j] = qpos[joint_qpos[j]] + encoder_bias[j] - default_pose[j]
@@ -38,7 +38,7 @@ def gather_positions(target: Row[float], qpos: Row[float], joint_qpos: wp.array[
 
 @wp.func
 def add_uniform_noise(row: Row[float], noise: float, rng: Row[wp.uint32]):
-    """Add U(-noise, noise) to every element of a row, of numbers or of vectors."""
+    """Add noise from U(-noise, noise) to every element of a row; the elements are numbers or vectors."""
     for i in range(row.shape[0]):
         row[i] = row[i] + uniform(rng, -noise, noise)
 
@@ -51,7 +51,7 @@ def add_uniform_noise(row: Row[wp.vec3], noise: float, rng: Row[wp.uint32]):
 
 @wp.func
 def add_normal_noise(row: Row[float], noise: float, rng: Row[wp.uint32]):
-    """Add N(0, noise^2) to every element of a row, of numbers or of vectors."""
+    """Add noise from N(0, noise^2) to every element of a row; the elements are numbers or vectors."""
     for i in range(row.shape[0]):
         row[i] = row[i] + noise * normal(rng)
 

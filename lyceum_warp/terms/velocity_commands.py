@@ -27,19 +27,19 @@ def draw_timer(timer: Row[float], seconds: wp.vec2, rng: Row[wp.uint32]):
 
 @wp.func
 def run_timer(timer: Row[float], dt: float):
-    """Decrease a timer by dt seconds; for ``advance``."""
+    """Decrease a timer by dt seconds; call this in ``advance``."""
     timer[0] = timer[0] - dt
 
 
 @wp.func
 def is_due(timer: Row[float]) -> bool:
-    """Return whether a timer has run out, with a tolerance of 1e-6 s; for ``event``."""
+    """Return whether a timer has run out, with a tolerance of 1e-6 s; call this in ``event``."""
     return timer[0] < 1e-6
 
 
 @wp.func
 def draw_flag(flag: Row[float], share: float, rng: Row[wp.uint32]):
-    """Set a flag to 1 with a probability, and otherwise to 0."""
+    """Set a flag to 1 with the given probability, and otherwise to 0."""
     flag[0] = wp.where(chosen(rng, share), 1.0, 0.0)
 
 
@@ -60,14 +60,14 @@ def draw_heading(heading_target: Row[float], heading_controlled: Row[float], hea
 def draw_forward_only(
     drawn_velocity: Row[wp.vec3], forward_share: float, least_forward_velocity: float, rng: Row[wp.uint32]
 ):
-    """With a probability, replace a drawn velocity by (max(|v_x|, least), 0, 0)."""
+    """With the given probability, replace a drawn velocity by (max(|v_x|, least), 0, 0)."""
     if chosen(rng, forward_share):
         drawn_velocity[0] = wp.vec3(wp.max(wp.abs(drawn_velocity[0][0]), least_forward_velocity), 0.0, 0.0)
 
 
 @wp.func
 def heading_yaw_rate(target_heading: float, heading: float, heading_gain: float, fastest_yaw_rate: float) -> float:
-    """Return clip(gain * (target - heading), -fastest, fastest), rad/s, with a difference from -pi to pi."""
+    """Return clip(gain * (target - heading), -fastest, fastest), rad/s; the difference is wrapped to [-pi, pi]."""
     error = target_heading - heading
     return wp.clamp(heading_gain * wp.atan2(wp.sin(error), wp.cos(error)), -fastest_yaw_rate, fastest_yaw_rate)
 
@@ -82,9 +82,9 @@ def velocity_command(
     heading_gain: float,
     fastest_yaw_rate: float,
 ) -> wp.vec3:
-    """Compute the command: 0 for standing, otherwise the drawn velocity, with a yaw rate that may follow the heading.
+    """Compute the command: 0 for a standing robot, otherwise the drawn velocity.
 
-    Source: mjlab 1.6.0, ``UniformVelocityCommand``.
+    If ``heading_controlled`` is 1, the yaw rate follows the heading. Source: mjlab 1.6.0, ``UniformVelocityCommand``.
     """
     if standing[0] > 0.0:
         return wp.vec3(0.0)

@@ -189,7 +189,7 @@ class _Rewriter(ast.NodeTransformer):
         return visited
 
     def _refused(self, node: ast.Name | ast.Attribute) -> ast.AST:
-        """Refuse a function used as a value, because its copy has an additional argument."""
+        """Refuse a function that is used as a value, because its copy has an additional argument."""
         function = self.source.value(node)
         if isinstance(function, wp.Function) and function.func is not None:
             raise Unchecked(

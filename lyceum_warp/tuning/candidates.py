@@ -55,7 +55,7 @@ def candidates(env: Env) -> list[Setting]:
         words = {"frame_skip": substeps, "timestep": timestep}
         name = f"{substeps} x {1e3 * timestep:.4g} ms"
         found.append(Setting(name, "substeps", words))
-        if integrator != "implicitfast":  # implicitfast is stable with longer time steps
+        if integrator != "implicitfast":  # implicitfast stays stable with long time steps
             found.append(Setting(f"{name}, implicitfast", "substeps", {**words, "integrator": "implicitfast"}))
     found += [Setting(f"jacobian {name}", "jacobian", {"jacobian": name}) for name in _other_jacobian(env)]
     if cone == "elliptic" and option.impratio != 1.0:

@@ -236,7 +236,7 @@ class Trials:
         return difference(*np.concatenate(pairs, axis=1)), faults, steps
 
     def _episodes(self, env: Env, source: str, batch: int) -> tuple[np.ndarray, int, int]:
-        """Compute the returns of one episode per world, (nworld,), and the numbers of faults and of steps.
+        """Compute the returns of one episode per world (nworld,) and the numbers of faults and of steps.
 
         Episodes of the same batch have equal initial states, random streams and, without a policy, random actions.
         """

@@ -88,12 +88,13 @@ class SetGhosts:
     """Choose the ghosts to draw."""
 
     worlds: int = 0
-    """The number of worlds to draw as ghosts, at most ``MOST_GHOSTS``. The first is the world after the shown world."""
+    """The number of worlds to draw as ghosts, at most ``MOST_GHOSTS``. The first ghost is the world whose number
+    follows the shown world's."""
     grid: bool = False
     """Whether to draw the other worlds beside each other, in the model's colours."""
     episodes: int = 0
-    """The number of episodes to draw as ghosts, all at the same step as the shown episode. The first is the episode
-    after the shown episode."""
+    """The number of episodes to draw as ghosts, all at the same step as the shown episode. The first ghost is the
+    episode that follows the shown episode."""
     burst: int = 0
     """The number of past (red) and future (blue) states to draw along the trajectory, at most ``MOST_BURST``."""
     plan: bool = True

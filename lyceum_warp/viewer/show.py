@@ -38,11 +38,11 @@ def view(
 
     Args:
         env: The worlds, on any engine and device.
-        controllers: Controllers by name. A policy, such as the result of ``lw.load``, maps observations, (nworld,
-            nobs), to actions, (nworld, nact). A controller of one world is called with a state and an observation; see
+        controllers: Controllers by name. A policy, such as the result of ``lw.load``, maps observations (nworld, nobs)
+            to actions (nworld, nact). A controller of one world is called with a state and an observation; see
             ``lw.Controller``.
         episodes: Episodes to play back: one, a sequence, or a mapping from names to episodes. An episode is a
-            trajectory, the file of a trajectory, or a tensor of states, (steps + 1, state_space.size), in the format of
+            trajectory, the file of a trajectory, or a tensor of states (steps + 1, state_space.size) in the format of
             ``env.get_state()``.
         seed: The seed of a random reset at the start; by default there is no reset.
         paused: Whether to start paused.
@@ -50,7 +50,7 @@ def view(
             reach.
         port: The port of the page; by default the first free port from 8080.
         watchers: Functions that are called about twice a second, and return a sequence of new messages.
-        block: Whether the call returns only when the user quits. With False, a thread steps the worlds, and the caller
+        block: Whether the call returns only when the user quits. If False, a thread steps the worlds, and the caller
             must not use them until the view is closed. The default is False in a notebook, which then shows the page
             and a link to it.
 
@@ -93,7 +93,7 @@ class BackgroundView:
     """A view that steps its worlds in a thread; ``lw.view`` returns a view if ``block`` is false.
 
     A notebook shows the page as the output of the cell, and a link that opens the page in a separate tab. If the
-    notebook is served by another machine, or the browser is Firefox or Safari, it shows only the link.
+    notebook is served by another machine, or the browser is Firefox or Safari, only the link is shown.
     """
 
     def __init__(self, session: Session, window: Window) -> None:

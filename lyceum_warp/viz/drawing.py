@@ -72,7 +72,7 @@ class DrawingProcess:
         self._ends = contextlib.ExitStack()
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: Any = None
-        self._lock = threading.Lock()  # the lock is needed because other threads may call abandon
+        self._lock = threading.Lock()  # the lock is needed, because other threads may call `abandon`
         self._abandoned = False
 
     def __enter__(self) -> Self:

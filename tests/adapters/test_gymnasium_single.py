@@ -37,7 +37,7 @@ def draws() -> bool:
 
 
 THEIRS = ("is -infinity. This is probably too low", "is infinity. This is probably too high")
-"""Warnings of Gymnasium's checker about unbounded observations, which its own robots also cause."""
+"""Gymnasium's checker warns about unbounded observations. Gymnasium's own robots cause the same warnings."""
 
 
 def test_gymnasium_env_checker_accepts_the_adapter(hopper: gymnasium.Env, draws: bool) -> None:

@@ -132,7 +132,7 @@ def test_results_of_a_step_do_not_change_in_the_next_step(hopper: GymnasiumVecto
     assert not np.shares_memory(first[0], second[0])
 
 
-def test_step_without_copies_returns_the_buffers(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_step_returns_the_buffers_themselves_if_copies_are_disabled(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector(torch=True, copy=False)
     obs, _ = envs.reset(seed=0)
     assert obs["policy"].data_ptr() == envs.env.obs.data_ptr()

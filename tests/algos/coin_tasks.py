@@ -67,7 +67,7 @@ class TossedAfter(lw.Task):
 
 
 class TossedAfterWithControl(TossedAfter):
-    """``TossedAfter`` with a ``control`` function, so that rollouts run step by step."""
+    """``TossedAfter`` with a ``control`` function, which makes the engine run rollouts step by step."""
 
     control = copied
 

@@ -70,7 +70,7 @@ def test_samples_and_predictions_equal_those_of_torch_modules() -> None:
 
 
 class Own(nn.Sequential):
-    """A user's network class. It may compute anything."""
+    """A user's network class, whose output may be any function of its input."""
 
 
 def hooked(network: nn.Module) -> nn.Module:

@@ -151,7 +151,7 @@ def test_two_processes_make_the_same_updates_of_sac_as_one(tmp_path: Path) -> No
 @pytest.mark.gpu
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
 @pytest.mark.parametrize("algorithm", ["npg", "ppo", "sac"])
-def test_gpu_two_processes_make_the_same_update_as_one_and_end(algorithm: str, tmp_path: Path) -> None:
+def test_gpu_two_processes_make_the_same_update_as_one_process(algorithm: str, tmp_path: Path) -> None:
     """NCCL calls are captured in the graphs of the value fit and of PPO's epochs."""
     two, one = tmp_path / "two", tmp_path / "one"
     options = {"npg": OPTIONS, "ppo": PPO, "sac": SAC}[algorithm]

@@ -57,7 +57,7 @@ def test_evaluate_needs_automatic_resets_and_a_horizon() -> None:
         lw.evaluate(lw.make("point_mass", horizon=0), policy, 1)
 
 
-def test_worlds_of_the_mean_policy_get_the_parameters_of_each_world() -> None:
+def test_mean_policy_is_evaluated_with_the_current_parameters_of_each_world() -> None:
     env = lw.make("point_mass", nworld=4, horizon=12, success_distance=[0.0, 9.0, 0.0, 9.0])
     config = lw.NPGConfig(samples=320, hidden=(8, 8), value_hidden=(16,), mean_every=1, mean_episodes=6)
     npg = lw.NPG(env, config=config)

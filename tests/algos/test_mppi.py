@@ -283,7 +283,7 @@ def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("update", ["mppi", "cem", "predictive_sampling"])
-def test_plan_is_only_shifted_if_all_samples_fail(update: str, engine: str) -> None:
+def test_plan_is_shifted_in_time_but_keeps_its_actions_if_all_samples_fail(update: str, engine: str) -> None:
     plan = MPPI(Picky, engine=engine, horizon=5, samples=8, noise=0.1, limit=10.0, seed=3, update=update)
     plan(plan.state_of())
     for _ in range(3):
@@ -502,11 +502,11 @@ def test_hopper_hops_without_falling() -> None:
 
 
 def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
-    """Return the mean return over runs of 100 steps, and the mean's standard deviation if actions do not depend on
-    coins.
+    """Return the mean return over runs of 100 steps, and the standard deviation that this mean has if no action depends
+    on its coin.
 
-    Plant and planner have equal seeds. A return is the sum of action times coin. If no action depends on its coin, the
-    variance of the return is the sum of the squared actions.
+    Plant and planner have equal seeds. A reward is the product of action and coin, so the variance of the return is the
+    sum of the squared actions if no action depends on its coin.
     """
     plan = MPPI(task, engine="mujoco", horizon=4, noise=2.0, smoothing=(1, 0, 0))
     plant = lw.make(task, autoreset=False)

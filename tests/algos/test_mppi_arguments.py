@@ -185,7 +185,7 @@ def test_discount_defaults_to_the_discount_of_the_value_function(
     assert arguments(planned(settings={"discount": 0.8}), value=value, **words)[0].discount == expected
 
 
-def test_given_update_ignores_settings_for_the_update_that_the_task_suggests() -> None:
+def test_settings_that_a_task_suggests_for_one_update_do_not_apply_to_another_update() -> None:
     task = planned(settings={"update": "cem", "elites": 5, "min_noise": 0.1, "samples": 20})
     assert (arguments(task)[0].elites, arguments(task)[0].min_noise) == (5, 0.1)
     other = arguments(task, update="predictive_sampling")[0]

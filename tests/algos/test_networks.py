@@ -8,7 +8,7 @@ from lyceum_warp.algos.networks import Activation, Normalizer, mlp
 
 
 @pytest.mark.parametrize("name", get_args(Activation))
-def test_activations_follow_only_hidden_layers(name: Activation) -> None:
+def test_only_hidden_layers_are_followed_by_an_activation(name: Activation) -> None:
     network, obs = mlp([3, 5, 4, 2], activation=name), torch.randn(7, 3)
     function = getattr(torch.nn.functional, name) if name != "tanh" else torch.tanh
     expected = obs

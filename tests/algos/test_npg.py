@@ -24,7 +24,7 @@ def env() -> lw.Env:
     return lw.make("point_mass", nworld=16, horizon=12, nthread=1)
 
 
-def test_step_has_the_kl_divergence_that_delta_sets(env: lw.Env) -> None:
+def test_policy_step_has_the_kl_divergence_that_the_setting_delta_gives(env: lw.Env) -> None:
     env.rand_reset(0)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=3200, delta=1e-3, normalize=False), seed=0)
     before = torch.cat([p.detach().flatten() for p in npg.policy.parameters()])
@@ -62,7 +62,7 @@ def test_run_is_reproducible_and_resumes_bit_for_bit(env: lw.Env, rollout: str) 
 
 
 def learned(env: lw.Env, iterations: int, change: Callable[[torch.Tensor, int], object]) -> list[NPGIteration]:
-    """Run NPG on modified rewards; ``change`` gets the rewards, (steps, nworld), and the iteration's number."""
+    """Run NPG on modified rewards; ``change`` gets the rewards (steps, nworld), and the iteration's number."""
     env.rand_reset(3)
     config = dataclasses.replace(SMALL, value_epochs=20, value_rate=1e-2, mean_every=0)
     npg = lw.NPG(env, config=config, seed=0)

@@ -93,7 +93,7 @@ def test_user_written_cem_in_torch_gives_the_same_plans(more: dict[str, Any], en
 
 
 @pytest.mark.parametrize("knots", [None, 3])
-def test_method_fit_may_change_the_plan(knots: int | None) -> None:
+def test_plan_update_may_change_the_plan_in_its_method_fit(knots: int | None) -> None:
     half, whole = (lw.Planner(update=kind(3), knots=knots, **POINT) for kind in (HalfWay, EliteMean))
     state = half.state_of(qpos=[0.1, 0.2, -0.5, 0.3])
     torch.testing.assert_close(half(state), 0.5 * whole(state))  # the first plan starts from zero actions
@@ -122,7 +122,7 @@ def test_planners_with_one_update_object_do_not_share_buffers() -> None:
     assert vars(update).keys() == {"elites", "min_noise", "smoothing"}
 
 
-def test_settings_show_a_user_written_update_with_its_attributes() -> None:
+def test_settings_show_the_attributes_of_an_update_that_the_user_wrote() -> None:
     plan = lw.Planner(update=EliteMean(3), **POINT)
     assert plan.settings["update"] == "EliteMean(elites=3)"
     assert plan.config.update is not None and type(plan).__name__ == "Planner"

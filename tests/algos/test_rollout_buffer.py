@@ -8,7 +8,7 @@ import lyceum_warp as lw
 
 
 @pytest.mark.parametrize("graphs", [True, False])  # graphs are captured in the second step
-def test_method_collect_stores_inputs_and_results_of_each_step(graphs: bool) -> None:
+def test_rollout_buffer_stores_inputs_and_results_of_each_step(graphs: bool) -> None:
     """Observation groups that were not requested are not stored."""
     env, plain = (lw.make(Metered, nworld=3, horizon=4, seed=2, graphs=g) for g in (graphs, True))
     rollout = lw.Rollout(env, 6, groups=("critic",))
@@ -37,7 +37,7 @@ def test_method_collect_stores_inputs_and_results_of_each_step(graphs: bool) -> 
     torch.testing.assert_close(rollout.episode_metrics["effort"][5], rollout.action.square().sum(-1)[4:].sum(0))
 
 
-def test_method_collect_counts_only_the_first_episode_of_each_world_on_request() -> None:
+def test_rollout_buffer_counts_only_the_first_episode_of_each_world_on_request() -> None:
     env = lw.make("hopper", nworld=8)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
     noise = torch.randn(200, 8, 3, generator=torch.Generator().manual_seed(0))
@@ -75,7 +75,7 @@ class Settling(Metered):
 @pytest.mark.parametrize(("task", "engine", "spread"), [
     (Metered, "warp", True), (Settling, "mujoco", True), (Settling, "warp", False),
 ])  # fmt: skip
-def test_step_counters_are_not_staggered_if_all_worlds_wait_for_a_world_that_settles(
+def test_worlds_start_at_different_steps_unless_settling_one_world_delays_all_others(
     task: type[lw.Task], engine: str, spread: bool
 ) -> None:
     rollout = lw.Rollout(lw.make(task, nworld=4, horizon=50, engine=engine), 1)

@@ -37,7 +37,7 @@ def numbers(it: SACIteration) -> dict[str, Any]:
 
 
 def test_sac_learns_for_a_fixed_seed(shared_env: SharedEnv) -> None:
-    """With random actions, the pole falls after about 5 steps. After these updates, it falls after 45 to 75 steps
+    """With random actions, the pole falls after about 5 steps. After these updates, the pole falls after 45 to 75 steps
     (measured for other seeds)."""
     config = lw.SACConfig(
         hidden=(32, 32), value_hidden=(32, 32), num_steps=50, warmup=300, updates=4, batch=128, n_step=3,

@@ -34,7 +34,7 @@ def test_both_engines_play_the_same_episodes(shared_env: SharedEnv) -> None:
     assert found.to_dict()["comparisons"][0]["differences"][0]["verdict"] == "same"
 
 
-def test_each_physics_of_the_task_is_compared_with_the_exact_physics() -> None:
+def test_each_set_of_physics_options_is_compared_with_the_exact_physics() -> None:
     env = lw.make(Coarse, horizon=200)
     found = lw.transfer(env, still, 8, warp=False)
     ((exact, coarse),) = [(pair.first, pair.second) for pair in found.comparisons]

@@ -12,7 +12,7 @@ from lyceum_warp.algos.value_fit import ValueFit
 
 
 @pytest.mark.parametrize("activation", ["tanh", "relu", "elu"])
-def test_hand_written_value_steps_equal_autograd(activation: Any) -> None:
+def test_value_fit_with_hand_written_gradients_equals_a_fit_with_autograd(activation: Any) -> None:
     """The second fit continues with the optimizer moments of the first fit."""
     generator = torch.Generator().manual_seed(2)
     data = [torch.randn(50, 6, generator=generator) for _ in range(2)]  # the last mini-batch is smaller than the others

@@ -41,7 +41,7 @@ def test_short_mppi_run_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert max(returns) - min(returns) < 0.2 * abs(min(returns))  # both contestants have the same planner and plant
 
 
-def test_episode_in_two_blocks_counts_once() -> None:
+def test_episode_that_was_measured_in_two_blocks_counts_once() -> None:
     def block(contestant: str, first: int, seconds: list[float]) -> Any:
         each = [[first + i, i != 1, -100.0, value] for i, value in enumerate(seconds)]
         where = {"part": "episodes", "task": "reach", "contestant": contestant, "repeat": 1, "threads": 2}

@@ -105,7 +105,9 @@ def test_memory_growth_excludes_the_first_sample() -> None:
     assert soak.slope([[100, 9**9], [200, 3000], [300, 5000], [400, 7000]], 1) == pytest.approx(20.0)
 
 
-def test_part_random_counts_faults_without_injecting_any(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_soak_run_with_random_actions_counts_faults_without_injecting_any(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ("--short", "--parts", "random", "--threads", "1", "--nworld", "16", "--steps", "1600")
     (result,) = run(tmp_path / "soak.jsonl", *words)
     assert result["steps"] == 1600 and result["first"] is None and not any(result["faults"].values())

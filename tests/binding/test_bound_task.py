@@ -77,7 +77,7 @@ def test_observation_size_that_differs_from_obs_raises_an_error(case: str, task_
 CONTROL = "def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):\n"
 
 
-def test_checking_control_does_not_change_the_inputs(tmp_path: Path) -> None:
+def test_checking_the_control_function_does_not_change_the_inputs(tmp_path: Path) -> None:
     source = tiny_task.changed(
         ("qpos: Row[float]", "qpos: Row[float]\n    qfrc_applied: Row[float]"),
         ("class Tiny", f"@wp.func\n{CONTROL}    s.qfrc_applied[0] = 1.0\n\nclass Tiny"),

@@ -43,7 +43,9 @@ def test_relative_model_path_starts_at_the_folder_of_the_task_file(
     assert task_spec(find_task(file)).modelname == "hopper"
 
 
-def test_current_folder_is_searched_only_for_the_option_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_current_folder_is_searched_only_for_a_model_that_is_given_as_an_option(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     spec = lw.gymnasium_model("hopper.xml").spec()
     spec.geom("torso_geom").density = 5000
     (tmp_path / "hopper.xml").write_text(spec.to_xml())

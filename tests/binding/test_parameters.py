@@ -108,7 +108,7 @@ def test_parameter_with_the_name_of_an_option_raises_an_error(name: str, model: 
 
 
 @pytest.mark.parametrize("values", [[1.0, 2.0], (1, 2), np.array([1.0, 2.0]), torch.tensor([1.0, 2.0])])
-def test_values_per_world_may_be_any_sequence(values: Any, model: mujoco.MjModel) -> None:
+def test_values_for_the_worlds_may_be_given_as_any_sequence(values: Any, model: mujoco.MjModel) -> None:
     np.testing.assert_array_equal(parameters(model, gain=values).values["gain"], [1.0, 2.0])
 
 
@@ -258,8 +258,8 @@ def test_functions_read_new_tables_after_graphs_are_captured(engine: str) -> Non
 
 
 def test_replicas_planners_and_evaluations_get_the_tables() -> None:
-    """The tables reach a larger replica, scratch worlds, environments that call ``follow``, a planner, and the
-    evaluation of a policy."""
+    """Changed tables take effect in a larger replica, in scratch worlds, in environments that called ``follow``, in a
+    planner, and in the evaluation of a policy."""
     motion = np.array([[0.25, 0.0]])
     env = lw.make(Follow, motion=motion, gain=[1.0, 2.0], nworld=2)
     motion[:] = 9.0  # changing the array has no effect, because the environment has a copy

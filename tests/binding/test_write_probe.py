@@ -24,8 +24,8 @@ ROWS = {
     "randomize": (11, 6, "qpos", "the model has 6"),
     "randomize of a stream": (12, 1, "rng", "a stream has 1"),
 }
-"""By function: its number in the task, the size and name of the row that it writes, and the words of the error about
-this size."""
+"""For each function: its number in the task, the size and name of the row that it writes, and the words of the error
+about this size."""
 
 PROGRAM = """
 import sys

@@ -297,8 +297,8 @@ REFUSED = {
     "a table": ("initialize", table_row, r"writes p\.table \(.*\): parameters are changed with env\.set_params"),
     "a native function": (
         "observe", to_native,
-        r"observe of the task 'mine' uses s\.qpos as a whole in 'poke\(s\.qpos\)' \(test_writes\.py, line \d+\), which "
-        "may write it: read and write its elements directly",
+        r"observe of the task 'mine' uses s\.qpos as a whole in 'poke\(s\.qpos\)' \(test_writes\.py, line \d+\), and "
+        "may write it there: read and write its elements directly",
     ),
 }  # fmt: skip
 

@@ -37,7 +37,7 @@ pytestmark = pytest.mark.browser
 SECONDS = 120.0
 """Time limit for a page, in seconds; without a GPU, a browser draws only a few frames per second."""
 INPUT_SECONDS = 6.0
-"""Seconds to wait for the effect of a key or click before the test repeats it. A busy browser may lose an input."""
+"""A busy browser may lose a key or a click. If it has no effect after this number of seconds, the test repeats it."""
 VIEW = {"width": 1000, "height": 640}
 FLAGS = (
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
@@ -284,7 +284,7 @@ def tab(shared_tab: Tab) -> Tab:
 
 
 @pytest.mark.long
-def test_keys_and_buttons_pause_step_and_choose_a_controller(tab: Tab) -> None:
+def test_keys_and_buttons_can_pause_make_a_step_and_choose_a_controller(tab: Tab) -> None:
     viewer = tab.viewer
     before = viewer.session.stage.env.get_state()
     tab.press("Shift+ArrowRight", lambda: viewer.status.step >= 50)

@@ -123,7 +123,7 @@ def test_a_narrow_terminal_shows_fewer_columns(width: int, absent: set[str], fir
 
 
 @pytest.mark.parametrize("width", [60, 80])
-def test_narrow_tables_wrap_their_first_column_and_omit_others(width: int) -> None:
+def test_narrow_table_wraps_the_first_column_and_omits_optional_columns(width: int) -> None:
     names = ["evaluation at the end", "track_linear_velocity_of_the_base", "return"]
     columns = {"": names, **{name: ["-1.23457e-05"] * 3 for name in ("mean", "std", "min", "max")}}
     console = Console(file=io.StringIO(), width=width)

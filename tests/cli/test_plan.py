@@ -97,7 +97,9 @@ def test_command_plan_makes_a_video_of_the_first_episode(tmp_path: Path, capsys:
     assert Path(video).read_bytes()[4:8] == b"ftyp"
 
 
-def test_plant_keeps_its_rate_with_real_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plant_runs_at_its_own_rate_if_the_flag_real_time_is_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert plan(tmp_path / "run", *QUIET, "--real-time") == 0
     assert "async" in capsys.readouterr().out
     report = json.loads((tmp_path / "run" / "report.json").read_text())
@@ -110,7 +112,7 @@ def measured_by(microseconds: float) -> Any:
     return lambda plant, planner: 1e-6 * microseconds * planner.samples * planner.horizon
 
 
-def test_real_time_leaves_given_settings_unchanged(
+def test_flag_real_time_leaves_given_settings_unchanged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plan_command, "planning_time", measured_by(30.0))
@@ -128,7 +130,7 @@ def test_real_time_leaves_given_settings_unchanged(
         assert json.loads((out / "report.json").read_text())["deadline_ms"] == pytest.approx(20.0)
 
 
-def test_real_time_shortens_the_horizon_and_replans_less_often(
+def test_flag_real_time_shortens_the_horizon_and_makes_plans_less_frequent(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plan_command, "planning_time", measured_by(250.0))
@@ -183,7 +185,7 @@ def test_value_function_of_a_run_changes_the_plans(tmp_path: Path, capsys: pytes
     refused(capsys, f"--value {run} is a run of the task 'point_mass', not of 'reach'")
 
 
-def test_planner_param_changes_only_the_planner_worlds(tmp_path: Path) -> None:
+def test_flag_planner_param_changes_only_the_planner_worlds(tmp_path: Path) -> None:
     options = ["--param", "success_distance=0.2", "--planner-param", "success_distance=0.1"]
     assert plan(tmp_path / "run", *QUIET, *options) == 0
     config = json.loads((tmp_path / "run" / "config.json").read_text())
@@ -342,7 +344,7 @@ def test_every_planner_setting_has_a_flag() -> None:
     assert given.on_top_of(lw.MPPIConfig(samples=3)) == lw.MPPIConfig(samples=3, noise=0.25, fill=0.5, horizon=4)
 
 
-def test_param_sets_a_task_parameter_with_the_name_of_a_setting(task_file: TaskFile, tmp_path: Path) -> None:
+def test_flag_param_sets_a_task_parameter_that_has_the_name_of_a_setting(task_file: TaskFile, tmp_path: Path) -> None:
     origin = Path(inspect.getfile(find_task("point_mass")))
     source = origin.read_text().replace('"point_mass.xml"', repr(str(origin.with_name("point_mass.xml"))))
     source = source.replace("@lw.register\n", "").replace("success_distance", "temperature")
@@ -354,7 +356,7 @@ def test_param_sets_a_task_parameter_with_the_name_of_a_setting(task_file: TaskF
     assert Trajectory.load(tmp_path / "run" / "episode-000.npz").params["temperature"] == 0.5
 
 
-def test_nthread_sets_the_number_of_planner_threads(tmp_path: Path, made_envs: list[lw.Env]) -> None:
+def test_flag_nthread_sets_the_number_of_planner_threads(tmp_path: Path, made_envs: list[lw.Env]) -> None:
     assert plan(tmp_path / "run", *QUIET, "--steps", "1", "--nthread", "2", "--engine", "mujoco") == 0
     assert [env.options.nthread for env in made_envs] == [1, 2]
     config = json.loads((tmp_path / "run" / "config.json").read_text())

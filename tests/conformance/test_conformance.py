@@ -67,7 +67,7 @@ def test_task_follows_the_quick_rules(task: str, engine: str) -> None:
     done = OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
     checks = [check for check in CHECKS if check not in done]
     if engine == "warp" and "rough" in task:
-        # this rule compares with the C engine, which creates more contacts with a height field than MuJoCo Warp
+        # this rule compares with the C engine, which creates more contacts with a height field than MuJoCo Warp does
         checks.remove(check_dynamics)
     check_task(task, engine=engine, checks=checks, **options(task, engine))
 

@@ -67,7 +67,7 @@ def test_progress_includes_the_step_and_counts_the_plans(
 
 @BOTH
 @pytest.mark.parametrize("kind", [KeyboardInterrupt, RuntimeError])
-def test_callback_on_abort_receives_the_complete_steps(run: Run, kind: type[BaseException], env: lw.Env) -> None:
+def test_abort_callback_receives_the_complete_steps(run: Run, kind: type[BaseException], env: lw.Env) -> None:
     def stop(progress: ControlProgress) -> None:
         if progress.step == 5:
             raise kind
@@ -84,7 +84,7 @@ def test_callback_on_abort_receives_the_complete_steps(run: Run, kind: type[Base
 
 
 @BOTH
-def test_callback_on_abort_is_not_called_before_the_first_step(run: Run, env: lw.Env) -> None:
+def test_abort_callback_is_not_called_before_the_first_step(run: Run, env: lw.Env) -> None:
     def fails(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         raise ZeroDivisionError
 

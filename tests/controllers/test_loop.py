@@ -29,7 +29,7 @@ def test_each_action_comes_from_a_plan_for_its_state(env: lw.Env) -> None:
     assert float(episode.plan_times.sum()) < episode.wall_seconds
 
 
-def test_callback_on_step_is_called_after_each_step(env: lw.Env) -> None:
+def test_step_callback_is_called_after_each_step(env: lw.Env) -> None:
     seen: list[ControlProgress] = []
     episode = control(env, towards, seed=3, on_step=seen.append)
     assert [progress.step for progress in seen] == list(range(1, 41))

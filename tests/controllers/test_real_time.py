@@ -146,7 +146,7 @@ def test_an_exception_of_the_plant_ends_the_thread(env: lw.Env, kind: type[BaseE
     assert not planner_threads() and sys.getswitchinterval() == interval
 
 
-def test_an_exception_does_not_wait_for_an_unfinished_plan(env: lw.Env) -> None:
+def test_an_exception_is_raised_without_waiting_for_an_unfinished_plan(env: lw.Env) -> None:
     released = threading.Event()
 
     class Slow(SamplingPlanner):

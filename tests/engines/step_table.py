@@ -293,7 +293,7 @@ def singles() -> Iterator[Case]:
 
 @functools.cache
 def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
-    """Return cases that together contain each combination of a given number of levels of different factors.
+    """Return cases that together contain every combination of ``strength`` levels of different factors.
 
     The search is greedy: each case starts with a missing combination, and the other factors take the levels that add
     the most missing combinations. Combinations that an engine rejects are omitted.

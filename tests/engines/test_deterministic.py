@@ -26,7 +26,8 @@ from lyceum_warp.fields import describe
 
 @pytest.fixture
 def without_allocators(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Remove Warp's custom allocators, so that the engine runs on the CPU. They exist only on CUDA devices."""
+    """Remove Warp's custom allocators, so that the engine runs on the CPU. Custom allocators exist only on CUDA
+    devices."""
     monkeypatch.setattr(wp, "ScopedAllocator", lambda *args: contextlib.nullcontext())
 
 
@@ -210,7 +211,7 @@ def test_captured_launches_share_scratch_memory(monkeypatch: pytest.MonkeyPatch)
     assert device.freed == [-300, -300] and scratch.peak == 4096 + 2048
 
 
-def test_scratch_size_is_extrapolated_from_few_worlds() -> None:
+def test_scratch_memory_for_many_worlds_is_extrapolated_from_few_worlds() -> None:
     def capture(nworld: int) -> Scratch:
         return types.SimpleNamespace(peak=1000 + 7 * nworld, largest=100 + 3 * nworld)  # type: ignore[return-value]
 

@@ -135,7 +135,7 @@ def test_derived_constants_equal_those_of_a_recompiled_model(engine: type[Engine
 
 
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
-def test_worlds_step_like_plain_mujoco_with_their_models(engine: type[Engine]) -> None:
+def test_worlds_with_their_own_models_step_like_plain_mujoco(engine: type[Engine]) -> None:
     made, plain = make(engine, *DRAWN), make(ToyEngine, *DRAWN)
     draw(made)
     draw(plain)

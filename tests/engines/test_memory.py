@@ -27,7 +27,7 @@ def test_error_of_too_many_worlds_contains_the_largest_number_that_fits(monkeypa
     check_fit(1000, 10**9, CPU)
 
 
-def test_check_fit_first_frees_gpu_memory_that_torch_has_cached(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_check_first_frees_the_gpu_memory_that_torch_has_cached(monkeypatch: pytest.MonkeyPatch) -> None:
     free, gpu = [1000], types.SimpleNamespace(is_cuda=True, alias="cuda:0")
     monkeypatch.setattr(memory, "free_memory", lambda device: free[0])
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: free.__setitem__(0, 5000))
@@ -37,7 +37,8 @@ def test_check_fit_first_frees_gpu_memory_that_torch_has_cached(monkeypatch: pyt
 
 
 def test_memory_estimate_of_the_warp_engine_covers_its_arrays() -> None:
-    """The estimate includes MuJoCo Warp's data, the refresh group, and temporary arrays."""
+    """The estimate includes MuJoCo Warp's data of all worlds, its data of the few worlds that are refreshed together,
+    and temporary arrays."""
     for task in ("hopper", "humanoid"):
         env = lw.make(task, engine="warp", nworld=64)
         engine: Any = env.engine
@@ -63,7 +64,7 @@ def resident() -> int:
 
 
 @pytest.mark.parametrize("fields", [(), ("xpos",)])
-def test_memory_estimate_of_the_c_engine_covers_a_world_without_an_mjdata(fields: tuple[str, ...]) -> None:
+def test_memory_estimate_of_the_c_engine_covers_worlds_without_their_own_mjdata(fields: tuple[str, ...]) -> None:
     """An MjData takes 165 kB even for a small model."""
     env = lw.make("hopper", fields=fields, nthread=2)
     own = 4 * (2 * env.obs_space.size + 2 * env.action_space.size) + 8 * env.state_space.size

@@ -129,13 +129,13 @@ def test_step_equals_that_of_mujoco_warp_bit_for_bit(case: Case, device: wp.Devi
 
 @pytest.mark.long
 @pytest.mark.parametrize("case", table.covering(2), ids=table.title)
-def test_step_with_any_two_levels_equals_that_of_mujoco_warp(case: Case, device: wp.Device) -> None:
+def test_step_with_any_two_model_features_equals_that_of_mujoco_warp(case: Case, device: wp.Device) -> None:
     check_or_refuse(case, device)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("part", range(PARTS))
-def test_step_with_any_three_levels_equals_that_of_mujoco_warp(part: int, device: wp.Device) -> None:
+def test_step_with_any_three_model_features_equals_that_of_mujoco_warp(part: int, device: wp.Device) -> None:
     for case in table.covering(3)[part::PARTS]:
         try:
             check_or_refuse(case, device)
@@ -164,7 +164,7 @@ OF_ANOTHER_MODEL = {
     "tendon_solref_fri": {"tendons": "friction"}, "tendon_solimp_fri": {"tendons": "friction"},
     "pair_solreffriction": {"cone": "elliptic"},
 }  # fmt: skip
-"""For some fields: levels with which the field has an effect, in addition to those in ``DRAWN``."""
+"""Some fields have an effect only with these levels, in addition to the levels in ``DRAWN``."""
 
 
 def touching(model: mujoco.MjModel) -> np.ndarray:

@@ -172,7 +172,7 @@ def test_deterministic_runs_are_equal_bit_for_bit(task: str) -> None:
         assert torch.equal(a, b)
 
 
-def test_deterministic_mode_uses_the_memory_that_was_measured_in_advance() -> None:
+def test_deterministic_mode_takes_as_much_memory_as_its_estimate() -> None:
     def free() -> int:
         gc.collect()
         torch.cuda.empty_cache()

@@ -1,4 +1,4 @@
-"""Test that a rehearsal lists the kernels that a function would launch, and that Warp has the names that it needs."""
+"""Test which kernels a rehearsal lists for a function, and whether Warp has the names that rehearsals replace."""
 
 import inspect
 import subprocess

@@ -14,7 +14,7 @@ OFFSET = (0.5, -0.25, 0.125)
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    """Make a height field with random heights and rectangular cells. Its geom is not at the origin."""
+    """Make a height field with random heights and rectangular cells. The geom of the field is not at the origin."""
     spec = mujoco.MjSpec()
     heights = np.random.default_rng(0).uniform(size=NROW * NCOL)
     spec.add_hfield(name="field", size=SIZE, nrow=NROW, ncol=NCOL, userdata=heights)
@@ -59,7 +59,7 @@ def looked_up(ground: wp.array, points: np.ndarray) -> np.ndarray:
 
 
 def cells() -> tuple[np.ndarray, np.ndarray]:
-    """Return the minimum corner of each cell, (cells, 2), and the side lengths of a cell, (2,)."""
+    """Return the minimum corner of each cell (cells, 2) and the side lengths of a cell (2,)."""
     x = OFFSET[0] + np.linspace(-SIZE[0], SIZE[0], NCOL)
     y = OFFSET[1] + np.linspace(-SIZE[1], SIZE[1], NROW)
     corners = np.stack(np.meshgrid(x[:-1], y[:-1]), axis=-1).reshape(-1, 2)

@@ -126,7 +126,7 @@ def test_plan_with_high_temperature_is_the_mean_of_all_samples(temperature: floa
     assert plan.summary["effective_samples"] == pytest.approx(plan.samples)
 
 
-def test_sample_weights_are_exponentials_of_returns_over_temperature() -> None:
+def test_sample_weights_are_exponentials_of_returns_divided_by_the_temperature() -> None:
     plan = MPPI("reach", temperature=3.0)
     plan(first_state(0))
     ratio = ((plan.returns[0] - plan.returns[1]) / 3.0).exp()

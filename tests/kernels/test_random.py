@@ -82,7 +82,7 @@ def test_draws_are_independent_along_every_counter(counter: str) -> None:
     check_uniform(np.stack([values[:-1, 0], values[1:, 0]], axis=1))
 
 
-def test_kernel_seed_worlds_seeds_masked_worlds_by_their_index_plus_an_offset() -> None:
+def test_seeds_of_masked_worlds_depend_on_their_index_plus_an_offset() -> None:
     mask = wp.array([True, False, True], dtype=bool, device="cpu")
     seed = wp.array([5], dtype=int, device="cpu")
     keys, episodes = [], []

@@ -107,7 +107,7 @@ def struct(rows: dict[str, np.ndarray]) -> Rows:
     return made
 
 
-def test_function_put_writes_numbers_vectors_and_rows_in_sequence(rows: dict[str, np.ndarray], struct: Rows) -> None:
+def test_numbers_vectors_and_rows_are_written_in_sequence_by_put(rows: dict[str, np.ndarray], struct: Rows) -> None:
     out, last = wp.zeros(80, dtype=float, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
     wp.launch(write_rows, 1, [struct, out, last], device="cpu")
     parts = [
@@ -120,7 +120,7 @@ def test_function_put_writes_numbers_vectors_and_rows_in_sequence(rows: dict[str
     np.testing.assert_array_equal(out.numpy(), np.concatenate([wanted, np.zeros(80 - len(wanted))]))
 
 
-def test_function_sum_squares_accepts_numbers_and_vectors(rows: dict[str, np.ndarray], struct: Rows) -> None:
+def test_sum_of_squares_accepts_numbers_and_vectors(rows: dict[str, np.ndarray], struct: Rows) -> None:
     out = wp.zeros(4, dtype=float, device="cpu")
     wp.launch(sum_rows, 1, [struct, out], device="cpu")
     parts = [rows["numbers"], rows["numbers"][1:3], rows["vectors"], rows["spatial"][1]]
@@ -134,7 +134,7 @@ def bound(x: wp.array[float], limits: wp.vec2, one: wp.array[bool], every: wp.ar
     every[i] = lw.all_inside(x, i, x.shape[0], limits)
 
 
-def test_function_inside_is_false_at_the_bounds_and_for_nan() -> None:
+def test_number_at_a_bound_and_nan_are_not_inside_the_bounds() -> None:
     x = np.array([np.nan, -1.0, INF, -INF, 2.0, 1.999, 0.0], dtype=np.float32)
     one, every = (wp.zeros(len(x), dtype=bool, device="cpu") for _ in range(2))
     wp.launch(bound, len(x), [wp.array(x, dtype=float, device="cpu"), wp.vec2(-1.0, 2.0), one, every], device="cpu")
@@ -148,7 +148,7 @@ def angles(a: wp.array[wp.vec3], b: wp.array[wp.vec3], out: wp.array[float]):
     out[i] = lw.angle_between(a[i], b[i])
 
 
-def test_function_angle_between_is_exact_for_angles_near_zero_and_pi() -> None:
+def test_angle_between_two_vectors_is_exact_near_zero_and_pi() -> None:
     """An arc cosine in float32 would return 0 for angles below 2e-4."""
     wanted = np.array([0.0, 1e-5, 1e-3, 0.5, np.pi / 2, 3.0, np.pi - 1e-5, np.pi])
     a = np.tile([2.0, 0.0, 0.0], (len(wanted), 1))
@@ -225,7 +225,7 @@ def stand_up(yaw: wp.array[float], qpos: wp.array2d[float], after: wp.array[int]
     after[i] = lw.put_upright(qpos[i], 1, wp.vec3(0.1, -0.2, 0.3), yaw[i])
 
 
-def test_function_put_upright_rotates_a_free_body_about_the_vertical() -> None:
+def test_upright_free_body_is_rotated_about_the_vertical() -> None:
     """The first coordinate of qpos belongs to another joint and does not change."""
     spec = mujoco.MjSpec.from_string(
         "<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body>"

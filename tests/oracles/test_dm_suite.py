@@ -117,7 +117,7 @@ def test_model_equals_the_model_that_dm_control_makes(shared_env: SharedEnv, tas
             np.testing.assert_allclose(named[0][name], named[1][name], rtol=1e-9, atol=1e-12, err_msg=f"{field} {name}")
     for field in ("dof_armature", "dof_frictionloss", "dof_M0", "qpos0", "qpos_spring"):
         np.testing.assert_allclose(getattr(ours, field), getattr(theirs, field), rtol=1e-9, atol=1e-12, err_msg=field)
-    # the package's model may have additional keyframes, which probe the sizes of MuJoCo Warp's buffers
+    # the package's model may have additional keyframes, from which the sizes of MuJoCo Warp's buffers are probed
     np.testing.assert_allclose(ours.key_qpos[: theirs.nkey], theirs.key_qpos, rtol=1e-9, atol=1e-12)
     damping = theirs.dof_damping.copy()
     if task == "dm/finger_spin":  # dm_control sets this field at each reset

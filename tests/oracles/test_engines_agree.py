@@ -41,14 +41,14 @@ PARAMS: dict[str, dict[str, Any]] = {
     "go1_velocity": {"fall_angle": 0.5},
     "soft_ball": {"reach": 0.15},
 }
-"""Parameters by task. With these parameters, random field values end some episodes. Some robots get higher solver
-limits, because the engines agree up to rounding only if the solver converges."""
+"""Parameters by task. With these parameters, random field values end some episodes. For some robots, the solver's
+limits are raised, because the engines agree up to rounding only if the solver converges."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """Bounds on the difference between the engines after one substep: the maximum over coordinates, as quantiles over
-    worlds."""
+    """Bounds on the difference between the engines after one substep. The difference in a world is the maximum over
+    coordinates; the bounds apply to its quantiles over the worlds."""
 
     qpos_median: float
     qpos_p95: float
@@ -81,6 +81,7 @@ ONE_STEP = {  #                         measured: median and 95 % quantile of qp
     "go1_velocity": Bounds(4e-7, 1.5e-6, 4e-5, 3e-4),  # 9.8e-8, 4.4e-7; 1.1e-5, 8.7e-5
     "half_cheetah": Bounds(1e-7, 1e-6, 1e-5, 1e-4),  # 3.2e-8, 2.9e-7; 3.0e-6, 2.9e-5
     # contacts of arms and fingers are rare; MuJoCo Warp finds fewer contact points between two boxes than the C engine
+    # does
     "herb_reach": Bounds(4e-7, 8e-7, 5e-5, 2e-4),  # 1.1e-7, 2.2e-7; 1.3e-5, 4.8e-5
     "hopper": Bounds(1e-7, 2e-7, 1e-6, 5e-6),  # 3.0e-8, 5.5e-8; 2.9e-7, 1.6e-6
     "humanoid": Bounds(2e-7, 4e-7, 3e-5, 1.2e-4),  # 5.6e-8, 1.1e-7; 8.8e-6, 3.9e-5

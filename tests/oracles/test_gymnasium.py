@@ -42,7 +42,7 @@ def has(task: str, function: str) -> bool:
     return function in find_task(task).scope
 
 
-# tasks with contact forces are compared with SensorStage
+# for tasks with contact forces, Gymnasium's class has the mixin SensorStage
 WITH_FORCES = [task for task in TASKS if "cfrc_ext" in fields(task)]
 
 
@@ -148,7 +148,7 @@ class Pair:
         for name in parts.keys() - {"step", "key", "episode", "done_reason", "metrics"}:
             # lagged fields come from the previous forward pass
             parts[name].copy_(torch.from_numpy(np.ravel(getattr(data, name))))
-        parts["done_reason"].zero_()  # the shared state is not terminal
+        parts["done_reason"].zero_()  # the state in which both start is not terminal
         self.ours.set_state(state)
 
     def action(self) -> np.ndarray:
@@ -246,7 +246,9 @@ def evaluation(info: Mapping[str, Any]) -> float | None:
         ("inverted_double_pendulum", lambda data: data.site("tip").xpos[2]),
     ],
 )
-def test_evaluation_of_a_pendulum_is_its_angle_or_height(task: str, metric: Callable[[mujoco.MjData], float]) -> None:
+def test_evaluation_metric_of_a_pendulum_is_its_angle_or_height(
+    task: str, metric: Callable[[mujoco.MjData], float]
+) -> None:
     pair = Pair(make_ours(task), make_theirs(task))
     pair.put()
     for _ in range(20):
@@ -317,7 +319,8 @@ RANGES = [(task, name) for task in HEALTHY for name in inspect.signature(unchang
 
 @pytest.mark.parametrize(("task", "bounded"), [*((task, None) for task in HEALTHY), *RANGES])
 def test_terminal_states_are_those_of_gymnasium(task: str, bounded: str | None) -> None:
-    """Random states lie on both sides of all bounds, or on both sides of one range while the other ranges are wide."""
+    """Random states lie on both sides of the bounds of termination. A case checks either all bounds, or one range while
+    the other ranges are too wide to matter."""
     wide = {name: (-1e6, 1e6) for other, name in RANGES if other == task and bounded not in (None, name)}
     if bounded is not None and math.isinf(max(keywords(task)[bounded])):
         wide[bounded] = (keywords(task)[bounded][0], 2.0)
@@ -432,7 +435,8 @@ def keywords(task: str) -> dict[str, Any]:
 
 
 def variants(default: Any) -> list[Any]:
-    """Return values that differ from the default; for a range, return the sides to narrow."""
+    """Return values that differ from the default. If the default is a range, return the sides of the range to move
+    inwards."""
     if isinstance(default, bool):
         return [not default]
     if isinstance(default, tuple):

@@ -86,7 +86,7 @@ class Pair:
         self.theirs.reset(seed=0)
         self.rng = np.random.default_rng(0)
         self.goals = 0
-        """Number of steps of the episode in which Gymnasium-Robotics reports the goal as achieved."""
+        """Number of steps of the current episode in which Gymnasium-Robotics has reported the goal as achieved."""
         self._simulate, self.theirs.do_simulation = self.theirs.do_simulation, self._with_our_controls
 
     def _with_our_controls(self, ctrl: np.ndarray, frames: int) -> None:
@@ -250,8 +250,8 @@ def pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
 
 
 def test_unchanged_gymnasium_robotics_environment_agrees_until_contacts_differ(make_pair: MakePair, task: str) -> None:
-    """Compare with the unchanged model until a contact occurs that the package's model lacks or the unchanged model
-    counts twice."""
+    """Compare with the unchanged model. The comparison ends at the first contact that the package's model lacks, or
+    that the unchanged model counts twice."""
     pair = make_pair(registered(task))
     ours, theirs = pair.ours.model, pair.theirs.model
     ghosts = set(np.flatnonzero(ours.geom_contype != theirs.geom_contype))

@@ -74,8 +74,8 @@ def stored(name: str) -> torch.Tensor:
 
 
 def mjlabs_states(env: lw.Env, *, heading: bool) -> torch.Tensor:
-    """Return the stored states. With ``heading``, they contain headings that determine the commands; otherwise they
-    contain the commands."""
+    """Return the stored states. If ``heading`` is set, the states contain headings from which the commands follow;
+    otherwise, they contain the commands."""
     state = env.get_state()
     parts = env.state_space.split(state)
     parts["qpos"].copy_(stored("qpos"))

@@ -121,7 +121,7 @@ def test_a_policy_of_any_class_is_saved_without_a_value_function(tmp_path: Path)
 
 
 def test_network_of_the_package_is_recreated_from_its_class_and_shape(tmp_path: Path) -> None:
-    """A value function that is stored as a policy represents an unknown policy class of a later release."""
+    """A value function, stored as a policy, stands in for a policy class that a later release adds."""
     run = Run.create(tmp_path / "run", {})
     run.save(policy_content(1, ValueFunction(3, (4,))), {})
     loaded = load(run)

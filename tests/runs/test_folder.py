@@ -48,7 +48,7 @@ def test_run_has_the_name_of_its_task(tmp_path: Path, config: dict[str, object],
     assert Run.create(tmp_path / "run", config).task_name == name
 
 
-def test_create_in_a_folder_with_content_raises_an_error(run: Run, tmp_path: Path) -> None:
+def test_creating_a_run_in_a_folder_with_content_raises_an_error(run: Run, tmp_path: Path) -> None:
     before = {path: path.read_bytes() for path in run.folder.iterdir()}
     with pytest.raises(ValueError, match=r"contains a run: use another folder, or continue the run"):
         Run.create(run.folder, {})
@@ -59,7 +59,7 @@ def test_create_in_a_folder_with_content_raises_an_error(run: Run, tmp_path: Pat
             Run.create(place, {})
 
 
-def test_create_with_an_invalid_configuration_leaves_no_folder(tmp_path: Path) -> None:
+def test_creating_a_run_with_an_invalid_configuration_leaves_no_folder(tmp_path: Path) -> None:
     with pytest.raises(TypeError):
         Run.create(tmp_path / "run", {"task": object()})
     assert not (tmp_path / "run").exists()
@@ -78,7 +78,7 @@ Run.create(sys.argv[1], {}, files={"old.py": b"old"})
 """
 
 
-def test_run_can_be_created_in_the_folder_of_a_killed_creation(tmp_path: Path) -> None:
+def test_run_can_be_created_in_a_folder_that_a_killed_process_left(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     assert subprocess.run([sys.executable, "-c", KILLED, str(folder)], check=False).returncode == -9
     assert list(folder.iterdir())
@@ -87,7 +87,7 @@ def test_run_can_be_created_in_the_folder_of_a_killed_creation(tmp_path: Path) -
     assert [path.name for path in run.task_folder.iterdir()] == ["mine.py"]
 
 
-def test_create_in_a_folder_with_temporary_files_of_other_programs_raises_an_error(tmp_path: Path) -> None:
+def test_creating_a_run_in_a_folder_with_temporary_files_of_other_programs_raises_an_error(tmp_path: Path) -> None:
     (tmp_path / "mine.tmp").write_text("")
     with pytest.raises(ValueError, match="is not an empty folder"):
         Run.create(tmp_path, {})

@@ -27,7 +27,7 @@ os.kill(os.getpid(), 9)
 
 
 def held(folder: Path, *, seconds: float = 0.0, **changes: Any) -> None:
-    """Write the lock of a running process. Its last heartbeat was the given number of seconds ago."""
+    """Write the lock of a running process. The last heartbeat of the lock was the given number of seconds ago."""
     pid = os.getppid()
     owner = {"host": platform.node(), "pid": pid, "started": lock._started(pid), "token": "theirs"}
     (folder / "lock").write_text(json.dumps(owner | changes))
@@ -70,7 +70,9 @@ def test_resuming_a_run_that_another_process_writes_raises_an_error(
     assert len(metrics(run)) == 4 and not (run / "lock").exists()
 
 
-def test_option_take_over_without_resume_prints_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_flag_take_over_prints_an_error_if_the_flag_resume_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["train", "point_mass", "--take-over", "--out", str(tmp_path / "run")]) == 2
     refused(capsys, "--take-over has no effect without --resume")
 
@@ -110,7 +112,7 @@ def test_a_held_lock_gets_a_heartbeat(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("content", ["host", "damaged"])
-def test_lock_of_another_host_is_taken_over_only_with_take_over(
+def test_lock_of_another_host_is_taken_over_only_with_the_flag_take_over(
     content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The age of the lock does not matter, because the clocks of two hosts may differ."""

@@ -36,7 +36,7 @@ def test_numbers_of_metrics_rows_are_read_exactly(table: Path) -> None:
     assert [row["mean"] for row in read] == [None, 1e-30, None]
 
 
-def test_function_cut_rows_removes_rows_after_the_checkpoint(table: Path) -> None:
+def test_metrics_rows_after_the_checkpoint_are_removed(table: Path) -> None:
     cut_rows(table, 2)  # without a table
     for i in (1, 2, 3):
         append_row(table, {"iteration": i, "value": 0.5})

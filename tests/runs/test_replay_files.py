@@ -46,7 +46,8 @@ class Killed(BaseException):
 def test_run_continues_identically_after_its_save_was_killed_at_any_file(
     owner: Any, name: str, calls: int, whole: list[dict[str, Any]], tmp_path: Path
 ) -> None:
-    """Each iteration overwrites 12 of 20 steps, so a save replaces files of the last checkpoint when it is killed."""
+    """Each iteration overwrites 12 of 20 steps, so a save has begun to replace files of the last checkpoint when the
+    process is killed."""
     sac, function = made(), getattr(owner, name)
     left = [calls]
 

@@ -157,7 +157,7 @@ ATTACKS = [names_a_task, names_a_file_outside, names_an_absolute_file, brings_a_
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_edited_run_that_names_a_file_raises_an_error(
+def test_run_with_an_edited_path_raises_an_error(
     attack: Callable[[Path], Path], made: Path, witness: Path, tmp_path: Path
 ) -> None:
     """The run's folder was trusted before it was edited."""
@@ -174,7 +174,9 @@ def test_edited_run_that_names_a_file_raises_an_error(
 
 
 @pytest.mark.parametrize("link", ["file", "folder"])
-def test_link_out_of_the_run_folder_raises_an_error(link: str, made: Path, witness: Path, tmp_path: Path) -> None:
+def test_link_that_points_outside_the_run_folder_raises_an_error(
+    link: str, made: Path, witness: Path, tmp_path: Path
+) -> None:
     folder = Path(shutil.copytree(made / "own", tmp_path / "own"))
     change(folder, task="/home/other/told.py:Told")
     kept = folder / "task" / "told.py"

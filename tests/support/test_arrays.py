@@ -26,14 +26,14 @@ def test_torch_view_shares_memory_with_the_warp_array() -> None:
     assert array.numpy().tolist() == [[2.0] * 3] * 2
 
 
-def test_function_launch_rows_writes_only_masked_rows() -> None:
+def test_launch_over_rows_writes_only_masked_rows() -> None:
     source, target = (wp.full((3, 4), value, dtype=float, device="cpu") for value in (1.0, 2.0))
     mask = wp.array([True, False, True], dtype=bool, device="cpu")
     launch_rows(state.copy_rows, mask, source, target)
     assert torch_view(target)[:, 0].tolist() == [1.0, 2.0, 1.0]
 
 
-def test_function_launch_rows_launches_nothing_for_an_empty_array() -> None:
+def test_launch_over_an_empty_array_does_nothing() -> None:
     empty = wp.zeros((3, 0), dtype=float, device="cpu")
     launch_rows(state.copy_rows, wp.full(3, True, dtype=bool, device="cpu"), empty, empty)
     assert torch.equal(torch_view(empty), torch.zeros(3, 0))

@@ -7,7 +7,7 @@ import pytest
 from lyceum_warp.support.files import replaced
 
 
-def test_context_replaced_writes_the_whole_file(tmp_path: Path) -> None:
+def test_a_file_is_replaced_only_after_it_is_written_completely(tmp_path: Path) -> None:
     path = tmp_path / "file.txt"
     path.write_text("old")
     with replaced(path) as temporary:
@@ -16,7 +16,7 @@ def test_context_replaced_writes_the_whole_file(tmp_path: Path) -> None:
     assert path.read_text() == "new" and list(tmp_path.iterdir()) == [path]
 
 
-def test_context_replaced_leaves_the_old_file_intact_after_an_exception(tmp_path: Path) -> None:
+def test_an_exception_while_writing_leaves_the_old_file_intact(tmp_path: Path) -> None:
     path = tmp_path / "file.txt"
     path.write_text("old")
     with pytest.raises(KeyboardInterrupt), replaced(path) as temporary:
@@ -26,7 +26,7 @@ def test_context_replaced_leaves_the_old_file_intact_after_an_exception(tmp_path
 
 
 @pytest.mark.parametrize("failures", [1, 2])
-def test_context_replaced_retries_after_a_failure(
+def test_replacing_a_file_is_tried_again_after_a_failure(
     failures: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A network drive, or a program that has the file open, may cause the first failure."""

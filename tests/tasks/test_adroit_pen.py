@@ -49,7 +49,7 @@ def test_every_threshold_changes_rewards_or_terminations() -> None:
 
 
 def test_task_succeeds_after_more_than_20_steps_at_the_goal() -> None:
-    """A reset clears the count of steps at the goal, which is part of the state."""
+    """The count of steps at the goal is part of the state, and a reset clears it."""
     env = lw.make("adroit_pen", engine="mujoco", nworld=3, horizon=0, goal_similarity=-2.0, goal_distance=10.0)
     still = torch.zeros(3, 24)
     for i in range(25):

@@ -9,7 +9,7 @@ import lyceum_warp as lw
 from lyceum_warp.tasks.balance.humanoid_balance import JOINTS
 
 
-def test_motors_are_servos_within_the_torques_of_the_model(shared_env: SharedEnv) -> None:
+def test_motors_act_as_servos_within_the_torque_limits_of_the_model(shared_env: SharedEnv) -> None:
     env = shared_env("humanoid_stand", nworld=2, autoreset=False, fields=["ctrl"])
     before, action = env.field("qpos").clone(), torch.zeros(2, 17)
     action[0], action[1] = 0.01, 100.0
@@ -39,7 +39,7 @@ def test_push_changes_the_momentum_by_its_impulse_at_the_given_time() -> None:
     assert directions.min() < -1.0 and directions.max() > 1.0
 
 
-def test_metric_capture_is_the_distance_between_capture_point_and_feet(shared_env: SharedEnv) -> None:
+def test_capture_metric_is_the_distance_between_capture_point_and_feet(shared_env: SharedEnv) -> None:
     env = shared_env("humanoid_stand", nworld=2, autoreset=False, fields=["qvel"])
     env.reset()
     state = env.get_state()
@@ -63,7 +63,7 @@ def test_humanoid_stands_with_a_planner_and_falls_without_one(shared_env: Shared
     assert fallen.steps < 120
 
 
-def test_humanoid_get_up_starts_lying_and_does_not_terminate_while_lying(shared_env: SharedEnv) -> None:
+def test_humanoid_that_must_get_up_starts_lying_and_does_not_terminate_while_lying(shared_env: SharedEnv) -> None:
     env = shared_env("humanoid_get_up", nworld=16, autoreset=False)
     qpos = env.field("qpos")
     assert (qpos[:, 2] < 0.4).all()

@@ -28,7 +28,7 @@ def test_the_clock_turns_at_the_gait_frequency(g1: lw.Env) -> None:
     assert begin[:, 0].std() > 0.3, "worlds start at different phases"
 
 
-def test_term_gait_clock_is_the_share_of_feet_that_follow_the_clock(g1: lw.Env) -> None:
+def test_gait_clock_reward_is_the_share_of_feet_that_follow_the_clock(g1: lw.Env) -> None:
     g1.rand_reset(seed=0)
     state = g1.get_state()
     parts = g1.state_space.split(state)

@@ -143,7 +143,7 @@ def test_one_motor_moves_both_joints_of_a_finger(shared_env: SharedEnv) -> None:
 
 
 def palms(env: lw.Env, qpos: np.ndarray) -> np.ndarray:
-    """Return both palms in each world, (nworld, 2, 3), from MuJoCo's kinematics in float64."""
+    """Return both palms in each world (nworld, 2, 3) from MuJoCo's kinematics in float64."""
     data, found = mujoco.MjData(env.model), []
     for row in qpos:
         data.qpos[:] = row
@@ -246,7 +246,8 @@ def reachable(model: mujoco.MjModel, goals: np.ndarray, start: np.ndarray) -> bo
 
 
 def test_task_succeeds_after_both_hands_are_at_their_targets_for_ten_steps() -> None:
-    """Both hands must be at their targets; a step off a target and a reset clear the count."""
+    """Both hands must be at their targets. A reset clears the count of steps, and so does a step in which a hand is off
+    its target."""
     env = lw.make("herb_reach", engine="mujoco", nworld=4, autoreset=False, horizon=0)
     offset = np.array([[0.0, 0.0], [0.06, 0.0], [0.0, 0.06], [0.045, -0.045]])
     put_targets(env, offset)

@@ -98,8 +98,8 @@ def test_reward_is_a_weighted_sum_of_terms_between_0_and_1(
 
 
 def test_task_succeeds_after_ten_consecutive_steps_above_the_goal() -> None:
-    """A falling cube is above the goal for 7 steps from 0.5 m and for 13 steps from 1.6 m; the count is part of the
-    state."""
+    """A cube that falls from 0.5 m is above the goal for 7 steps, and a cube that falls from 1.6 m for 13 steps. The
+    count is part of the state."""
     env = lw.make("panda_lift", engine="mujoco", nworld=1, autoreset=False, horizon=0)
     for height, steps in ((0.5, 0), (1.6, 4)):
         env.rand_reset(0)

@@ -164,8 +164,8 @@ def put_targets(env: lw.Env, distance: np.ndarray) -> None:
 
 
 def test_task_succeeds_after_ten_steps_at_the_target() -> None:
-    """Even with a larger success distance, success takes ten steps. A reset clears the count of steps at the target,
-    which is part of the state."""
+    """Even with a larger success distance, success takes ten steps. The count of steps at the target is part of the
+    state, and a reset clears it."""
     env = lw.make("reach", engine="mujoco", nworld=3, success_distance=np.array([0.05, 0.05, 0.99]), horizon=0)
     put_targets(env, np.array([0.0, 0.06, 0.0]))
     still = torch.zeros(3, 7)

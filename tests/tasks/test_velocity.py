@@ -110,7 +110,7 @@ def test_resets_put_the_robot_above_the_ground(task: str, env: lw.Env) -> None:
 
 
 @pytest.mark.parametrize("task", ["go1_velocity"])
-def test_robots_with_equal_sizes_share_their_kernels(task: str, shared_env: SharedEnv) -> None:
+def test_robots_with_tables_of_equal_sizes_share_their_kernels(task: str, shared_env: SharedEnv) -> None:
     go1, spot = (shared_env(name, nworld=NWORLD, autoreset=False, push_seconds=(1e6, 1e6)) for name in
               (task, "spot_velocity"))  # fmt: skip
     assert go1.task.kernels is spot.task.kernels

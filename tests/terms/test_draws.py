@@ -23,14 +23,14 @@ def test_random_numbers_have_their_distributions() -> None:
     check_uniform(centred(row, -0.1, 0.3))
 
 
-def test_function_scale_elements_changes_only_the_listed_elements() -> None:
+def test_only_the_listed_elements_are_scaled() -> None:
     row = RNG.uniform(1.0, 2.0, (N, 5))
     ratio = call("scale_elements", row=row, indices=[3, 1], scale=[0.5, 2.0]).after["row"] / row
     check_uniform(centred(ratio[:, [1, 3]], 0.5, 2.0))
     np.testing.assert_allclose(ratio[:, [0, 2, 4]], 1.0, rtol=1e-6)
 
 
-def test_function_draw_friction_gives_all_listed_geoms_the_same_friction() -> None:
+def test_all_listed_geoms_get_the_same_random_friction() -> None:
     ranges = {"sliding_friction": [0.3, 1.5], "spinning_friction": [1e-4, 2e-2], "rolling_friction": [1e-5, 5e-3]}
     found = call("draw_friction", geom_friction=np.full((4, 3), 7.0), geoms=[3, 1], **ranges).after["geom_friction"]
     assert (found[:, [0, 2]] == 7.0).all() and (found[:, 1] == found[:, 3]).all()
@@ -41,7 +41,7 @@ def test_function_draw_friction_gives_all_listed_geoms_the_same_friction() -> No
     check_uniform(np.stack(columns, axis=1))
 
 
-def test_function_scale_mass_scales_mass_and_inertia_by_the_same_factor() -> None:
+def test_randomized_mass_and_inertia_are_scaled_by_the_same_factor() -> None:
     mass, inertia = RNG.uniform(1.0, 2.0, (N, 4)), RNG.uniform(1.0, 2.0, (N, 4, 3))
     after = call("scale_mass", body_mass=mass, body_inertia=inertia, bodies=[1, 3], scale=[0.8, 1.2]).after
     factor = after["body_mass"] / mass
@@ -50,14 +50,14 @@ def test_function_scale_mass_scales_mass_and_inertia_by_the_same_factor() -> Non
     np.testing.assert_allclose(factor[:, [0, 2]], 1.0, rtol=1e-6)
 
 
-def test_function_shift_center_of_mass_stays_within_bounds() -> None:
+def test_shifted_centre_of_mass_stays_within_its_bounds() -> None:
     ipos, offset = RNG.standard_normal((N, 3, 3)), np.array([0.1, 0.2, 0.3])
     moved = call("shift_center_of_mass", body_ipos=ipos, body=1, offset=offset).after["body_ipos"] - ipos
     check_uniform(np.stack([centred(moved[:, 1, i], -x, x) for i, x in enumerate(offset)], axis=1))
     assert np.abs(moved[:, [0, 2]]).max() < 1e-6
 
 
-def test_function_scale_gains_changes_gainprm_and_biasprm_consistently() -> None:
+def test_randomized_gains_are_consistent_in_gainprm_and_biasprm() -> None:
     gain, bias = np.zeros((N, 3, 10)), np.zeros((N, 3, 10))
     gain[..., 0], bias[..., 1], bias[..., 2], bias[..., 0] = 30.0, -30.0, -2.0, 0.5
     after = call(

@@ -213,7 +213,7 @@ def test_term_equals_its_formula(name: str) -> None:
     np.testing.assert_allclose(call(name, **values).result, wanted, rtol=2e-5, atol=2e-6)
 
 
-def test_dc_motor_brakes_above_its_no_load_speed_and_is_unlimited_below_its_limits() -> None:
+def test_dc_motor_brakes_above_its_no_load_speed_and_gives_any_torque_within_its_limits() -> None:
     found = {
         (torque, velocity): call(
             "dc_motor_torque", torque=torque, joint_velocity=velocity,

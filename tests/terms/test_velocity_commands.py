@@ -24,7 +24,7 @@ def test_velocity_command_is_drawn_from_its_ranges() -> None:
     assert {*standing.ravel()} == {0.0, 1.0} and near(standing, 0.1)
 
 
-def test_given_share_of_commands_is_forward_only() -> None:
+def test_the_given_share_of_commands_has_only_a_forward_velocity() -> None:
     before = np.random.default_rng(0).uniform(-1.0, 1.0, (N, 1, 3))
     drawn = call("draw_forward_only", drawn_velocity=before, forward_share=0.2, least_forward_velocity=0.3)
     after = drawn.after["drawn_velocity"][:, 0]

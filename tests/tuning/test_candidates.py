@@ -10,7 +10,7 @@ from lyceum_warp.cli.arguments import Physics, given
 from lyceum_warp.tuning.candidates import Setting, candidates, combined, flags, not_tried, task_line
 
 
-def test_settings_for_hopper_lower_its_limits_and_keep_its_control_time_step(shared_env: SharedEnv) -> None:
+def test_settings_to_try_for_hopper_have_lower_limits_and_the_same_control_time_step(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", solver={"iterations": 3})  # hopper uses RK4 and 4 substeps of 2 ms
     settings = candidates(env)
     names = [setting.name for setting in settings]
@@ -29,7 +29,7 @@ def test_settings_for_hopper_lower_its_limits_and_keep_its_control_time_step(sha
     assert not {"noslip", "impratio", "room"} & {setting.group for setting in settings}
 
 
-def test_elliptic_cone_and_noslip_add_settings(shared_env: SharedEnv) -> None:
+def test_elliptic_cone_and_noslip_add_settings_to_try(shared_env: SharedEnv) -> None:
     spec = lw.gymnasium_model("hopper.xml").spec()
     spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10
     spec.option.noslip_iterations = 5
@@ -53,7 +53,7 @@ COARSE = Setting("1 x 8 ms, implicitfast", "substeps",
                  {"frame_skip": 1, "timestep": 0.008, "integrator": "implicitfast"})  # fmt: skip
 
 
-def test_combined_setting_has_one_setting_of_each_group_without_conflicts() -> None:
+def test_combination_has_at_most_one_setting_of_each_group_and_no_conflicts() -> None:
     finer = Setting("2 x 4 ms", "substeps", {"frame_skip": 2, "timestep": 0.004})
     both = combined([COARSE, EULER, LIMITED, finer, SEARCH])
     assert both is not None and both.parts == (COARSE, LIMITED, SEARCH)

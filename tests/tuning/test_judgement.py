@@ -20,7 +20,7 @@ def test_interval_covers_the_difference_of_returns_and_shrinks_with_more_episode
     assert episodes_needed(few, (many.high - many.low) / 2) == pytest.approx(2000, rel=0.5)
 
 
-def test_equal_returns_differ_by_zero_even_if_all_are_zero() -> None:
+def test_difference_of_equal_returns_is_zero_even_if_all_returns_are_zero() -> None:
     for returns in (np.zeros(5), np.arange(5.0)):
         assert difference(returns, returns) == Difference(0.0, 0.0, 0.0, 5)
 

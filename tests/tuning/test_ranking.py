@@ -31,7 +31,7 @@ def test_rank_correlation_of_unchanged_physics_is_one(rankings: Rankings) -> Non
     assert row["plan_ms"] > 0.0
 
 
-def test_sparse_jacobian_keeps_the_ranks_and_coarse_physics_change_them(rankings: Rankings) -> None:
+def test_sparse_jacobian_keeps_the_ranks_of_samples_but_coarse_physics_change_them(rankings: Rankings) -> None:
     sparse = rankings.measure(Setting("", "", {"jacobian": "sparse"}))
     assert all(found["low"] > 0.999 for found in sparse["ranks"].values())
     crude = rankings.measure(Setting("", "", {"frame_skip": 1, "timestep": 0.05, "solver": {"iterations": 1}}))

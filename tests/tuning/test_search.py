@@ -53,7 +53,7 @@ def test_a_stopped_search_resumes_from_its_file(tuned: lw.Tuning, no_measuring: 
         file.write('{"name": "cut off by a ki')
     again = lw.tune("half_cheetah", out=tuned.path, tolerance="loose", **QUICK)
     assert again == tuned
-    # results are only judged again, but not measured again
+    # the results get new verdicts without new measurements
     rows = lw.tune("half_cheetah", out=tuned.path, tolerance="strict", **QUICK).rows
     assert len(rows) <= len(tuned.rows)
 

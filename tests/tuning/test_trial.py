@@ -39,7 +39,7 @@ def test_returns_of_the_unchanged_task_differ_by_exactly_zero() -> None:
     assert row["faults_per_million"] == row["reference_faults_per_million"] == 0.0
 
 
-def test_coarse_physics_alter_the_returns_and_diverge_faster_than_chaos() -> None:
+def test_coarse_physics_change_returns_and_states_more_than_a_perturbation_does() -> None:
     own = trials(policy=True)
     row = own.measure(CRUDE)
     assert verdict({**row, "speedup_low": 2.0}, "loose") in ("different", "faults")

@@ -78,7 +78,8 @@ def test_viewer_does_not_change_the_results_of_a_run(tmp_path: Path, capsys: pyt
             while not re.search(r"http://127\.0\.0\.1:\d+/", printed):  # the first iteration waits for the viewer
                 assert viewer.is_open and time.monotonic() < begun + 60, printed
                 time.sleep(0.1)
-                printed += capsys.readouterr().out  # this process prints the address above a live line
+                # this process prints the address above a progress line that is redrawn
+                printed += capsys.readouterr().out
 
         shown = trained(tmp_path / "shown", callback)
         assert viewer.is_open
@@ -105,7 +106,7 @@ def runs(process: int) -> bool:
 
 
 @pytest.mark.long
-def test_viewer_that_waits_for_a_run_ends_with_its_program(tmp_path: Path) -> None:
+def test_viewer_that_still_waits_for_a_run_ends_when_its_program_ends(tmp_path: Path) -> None:
     command = [sys.executable, "-c", PROGRAM, str(tmp_path / "run")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None
@@ -117,7 +118,7 @@ def test_viewer_that_waits_for_a_run_ends_with_its_program(tmp_path: Path) -> No
     assert not runs(viewer)
 
 
-def test_viewer_that_is_closed_immediately_ends(tmp_path: Path) -> None:
+def test_viewer_ends_if_it_is_closed_right_after_its_start(tmp_path: Path) -> None:
     with lw.RunViewer(tmp_path / "run") as viewer:
         assert viewer.is_open and runs(viewer._process.pid)
     assert not viewer.is_open and not runs(viewer._process.pid)

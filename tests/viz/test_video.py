@@ -58,7 +58,7 @@ def episode(env: lw.Env, policy: Callable[[torch.Tensor], torch.Tensor], **words
     return found.states
 
 
-def test_episode_returns_all_states(env: lw.Env) -> None:
+def test_all_states_of_a_policy_episode_are_returned(env: lw.Env) -> None:
     states = episode(env, still, seed=4)
     assert states.shape == (21, env.state_space.size)
     assert torch.equal(states[0, env.state_space.parts["step"]], torch.zeros(1, dtype=torch.float64))

@@ -34,7 +34,7 @@ GYMNASIUM = {
 """Gymnasium's names of the tasks."""
 
 JUDGE_NEW_STATE = {"humanoid_standup", "reacher", "pusher", "inverted_pendulum", "inverted_double_pendulum"}
-"""Tasks for which Gymnasium's step reads only the state after the physics."""
+"""Tasks for which Gymnasium's step reads only the state at the end of the step."""
 
 
 class CartpoleEnv(MujocoEnv):
@@ -94,7 +94,7 @@ class HerbReachEnv(MujocoEnv):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         self.do_simulation(action, self.frame_skip)
-        mujoco.mj_kinematics(self.model, self.data)  # mj_step leaves site positions at the previous state
+        mujoco.mj_kinematics(self.model, self.data)  # mj_step computes no site positions of the new state
         return self._get_obs(), self._get_rew(0.0, action)[0], False, False, {}
 
     def reset_model(self) -> np.ndarray:
@@ -161,8 +161,8 @@ def dm_control_env(task: str, seed: int) -> Any:
             return 0.0 if ends and not self.env.is_healthy else None
 
     class FromStep(FromGymnasium):
-        """A task that computes observation and reward from the new state. It calls Gymnasium's step function with the
-        physics disabled."""
+        """A task that computes observation and reward from the new state. The task calls Gymnasium's step function with
+        the physics disabled."""
 
         def __init__(self, env: Any, physics: Any) -> None:
             super().__init__(env, physics)

@@ -41,12 +41,12 @@ ENVPOOL = {
 
 
 def draw(low: np.ndarray, high: np.ndarray, envs: int, seed: int) -> np.ndarray:
-    """Draw actions, (steps, envs, nact), for several steps; the caller repeats them."""
+    """Draw actions (steps, envs, nact) for several steps; the caller repeats them."""
     return np.random.default_rng(seed).uniform(low, high, (max(16, KEPT_ACTIONS // envs), envs, *low.shape))
 
 
 class Gymnasium:
-    """Gymnasium's vector environments, or a single environment."""
+    """A vector environment of Gymnasium, or a single environment."""
 
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
         import gymnasium
@@ -203,7 +203,7 @@ def timed(
     """Return the number of steps and the seconds that they took.
 
     Args:
-        step: Function that takes a step. Its argument, from 0 to ``period`` - 1, selects the actions.
+        step: Function that takes a step. The function's argument, from 0 to ``period`` - 1, selects the actions.
         period: Number of steps after which the actions repeat.
         warm: Number of steps before the clock starts.
         seconds: Duration of the measurement.

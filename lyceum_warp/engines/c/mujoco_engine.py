@@ -49,7 +49,7 @@ _MOST_MASKS = 16
 
 
 class MujocoEngine(Engine):
-    """Steps worlds in ``mujoco.batch.Batch``, which stores float64 states, and copies fields to float32 arrays.
+    """Steps worlds in float64 in ``mujoco.batch.Batch``, and copies its fields to float32 arrays.
 
     Args:
         model, nworld, fields, dynamics: See ``Engine``.
@@ -82,15 +82,15 @@ class MujocoEngine(Engine):
         super().__init__(model, nworld, device, fields, dynamics, initial)
         quiet()
         self.nthread = whole_number("nthread", nthread, low=0)
-        # use one thread, because every thread would repeat a subclass's launches over all worlds
+        # use one thread: if a subclass launches kernels over all worlds, every thread would repeat these launches
         self.launch_threads = (self.nthread or cpu_cores()) if type(self) is MujocoEngine else 1
         self.native_model = copy.copy(model)
         """The model that the batch steps."""
         # autoreset would hide a fault, because MuJoCo would silently reset the world within a step
         self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         # The batch is not persistent. A persistent batch could reuse the stages computed after the last step, but one
-        # MjData per world does not fit into the CPU's caches: the six tasks that need such stages became 4 to 33 %
-        # slower (128 and 1,024 worlds on two cores).
+        # MjData per world does not fit into the CPU's caches: with a persistent batch, the six tasks that need such
+        # stages were 4 to 33 % slower (128 and 1,024 worlds on two cores).
         self.batch = Batch(self.native_model, nworld, self.nthread)
         self._errors_as_warnings = ErrorsAsWarnings(self.batch)
         self._rows = self._alias(self.batch.state)

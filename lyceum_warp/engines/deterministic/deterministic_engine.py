@@ -52,8 +52,8 @@ class DeterministicEngine(WarpEngine):
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
         """Make another Model and Data with the same options and sizes, to benchmark MuJoCo Warp alone.
 
-        A graph of a step of this Model and Data takes about a hundred times as much memory as a graph of this engine,
-        because its launches do not share scratch memory.
+        The launches of this engine share scratch memory, but those of a bare Model and Data do not, so a graph of their
+        step takes about a hundred times as much memory.
         """
         model, data = super().bare()
         with wp.ScopedDevice(self.device):

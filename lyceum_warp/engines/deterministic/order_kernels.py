@@ -67,7 +67,7 @@ def _move(source: wp.array2d[int], i: int, target: wp.array2d[int], j: int):
 def gather_contacts(
     ncontact_in: wp.array[int], place_in: wp.array[int], sort: bool, nmax: int, source: Contacts, target: Contacts
 ):
-    """Copy contacts in their new order, or unsorted if ``sort`` is false; launched over (naconmax,)."""
+    """Copy contacts, in sorted order if ``sort`` is true; launched over (naconmax,)."""
     c = wp.tid()
     if c >= wp.min(ncontact_in[0], nmax):
         return
@@ -161,7 +161,10 @@ def move_rows(
     source: Rows,
     target: Rows,
 ):
-    """Copy rows to their new indices, or unsorted if ``sort`` is false; launched over (nworld, njmax, lanes)."""
+    """Copy rows, in sorted order if ``sort`` is true.
+
+    Launched over (nworld, njmax, lanes).
+    """
     w, r, lane = wp.tid()
     if r >= int(wp.min(nrow_in[w], rank_in.shape[1])):
         return

@@ -12,8 +12,8 @@ LARGEST_BUFFER = 2**31 - 1
 """The size of the largest byte array that Warp can make, because an axis has fewer than 2**31 elements."""
 
 _PROBED = 1024, 2048
-"""Memory is extrapolated from these two numbers of worlds. With so many worlds, all of Warp's buffers exceed their
-minimum size."""
+"""Memory is extrapolated from these two numbers of worlds. With either number of worlds, all of Warp's buffers exceed
+their minimum size."""
 
 
 class Scratch(Reserve):
@@ -65,7 +65,7 @@ class Scratch(Reserve):
 
 @dataclasses.dataclass(frozen=True)
 class ScratchSizes:
-    """Holds the scratch memory that worlds need, and the largest possible number of worlds."""
+    """Holds two results: the scratch memory that worlds need, and the largest possible number of worlds."""
 
     fixed: int
     """The bytes that do not depend on the number of worlds."""

@@ -51,8 +51,8 @@ def inertia(model: mjw.Model, data: mjw.Data) -> None:
 def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
     """Copy MuJoCo Warp's functions; the first forward pass of the copies skips the parts in ``done``.
 
-    The copies have some global names replaced, so that a step equals MuJoCo Warp's step, and other users of MuJoCo Warp
-    are not affected.
+    In the copies, some global names are replaced. A step of the copies equals a step of MuJoCo Warp, and nothing
+    changes for other users of MuJoCo Warp.
 
     For connect and weld constraints, ``mjw.make_constraint`` reads body velocities before MuJoCo Warp has computed
     them, so it reads stale values of the last forward pass or, after a fault, NaN. In the copies, ``com_vel`` runs
@@ -143,7 +143,7 @@ _PARTS_OF_SENSOR = {
 
 
 def forward_parts(model: mujoco.MjModel, names: Collection[str]) -> tuple[Part, ...] | None:
-    """Return the parts of a forward pass that compute the named fields, in order, without collisions and constraints.
+    """Return the parts of a forward pass that compute the named fields, in order.
 
     For ``sensordata``, the parts compute the sensors of the position and velocity stages.
 
@@ -238,7 +238,7 @@ class PartialForward:
         Args:
             mask: The mask of the worlds, (nworld,) bool.
             forward: A function that computes the fields of a Data.
-            targets: Destinations of the fields, (nworld, ...), by their names in MuJoCo Warp's Data.
+            targets: Destinations of the fields (nworld, ...) by their names in MuJoCo Warp's Data.
         """
         group = self._group
 

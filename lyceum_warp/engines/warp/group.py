@@ -93,7 +93,7 @@ class Turns:
                 wp.capture_while(self._left, while_body=body)
 
     def take(self, source: wp.array, target: wp.array) -> None:
-        """Copy rows of all worlds, (nworld, ...), into the rows of the group, (size, ...)."""
+        """Copy rows of all worlds (nworld, ...) into the rows of the group (size, ...)."""
         rows = flat(target)
         if rows.size:
             wp.launch(kernels.take_rows, rows.shape, [self._world, self._left, flat(source), rows])
@@ -105,7 +105,7 @@ class Turns:
             wp.launch(kernels.return_rows, rows.shape, [self._world, self._left, rows, flat(target)])
 
     def give_bits(self, source: wp.array, target: wp.array) -> None:
-        """Combine the group's bits, (size,), with the bits of all worlds, (nworld,), by bitwise or."""
+        """Add the bits of the group's rows (size,) to the bits of the same worlds (nworld,) by bitwise or."""
         wp.launch(kernels.return_bits, self.size, [self._world, self._left, source, target])
 
 

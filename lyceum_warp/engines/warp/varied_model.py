@@ -112,10 +112,10 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
 
 
 class ModelRows:
-    """Make the model of a group of worlds. It has its own rows of the fields that differ, and shares all other fields.
+    """Make the model of a group of worlds.
 
-    With the model of all worlds, MuJoCo Warp would read a field's row ``world % rows``. This row belongs to another
-    world.
+    The group's model has its own rows of the fields that differ, and shares all other fields. With the model of all
+    worlds, MuJoCo Warp would read a field's row ``world % rows``. This row belongs to another world.
 
     Args:
         whole: The model of all worlds.
@@ -143,7 +143,7 @@ class ModelRows:
             setattr(self.model, name, wp.clone(getattr(whole, name)))
 
     def take(self, turns: Turns) -> None:
-        """Copy rows of all worlds into the rows of the group."""
+        """Copy into the group the rows of its worlds, from the rows of all worlds."""
         if self.model is not self.whole:
             for source, group in self._pairs.values():
                 turns.take(source, group)

@@ -158,7 +158,7 @@ class WarpEngine(Engine):
     # fields
 
     def _alias_model(self, field: ModelField) -> wp.array:
-        """Return a view of a model field's memory with the type in ``model_fields``."""
+        """Return a model field's memory as an array of the type in ``model_fields``."""
         source = getattr(owner(self.m, field.name), field.name)
         if not field.size:
             return wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)

@@ -48,7 +48,7 @@ def find_any(mask_in: wp.array[bool], any_out: wp.array[int]):
 
 @wp.kernel(enable_backward=False)
 def rank_worlds(mask_in: wp.array[bool], rank_out: wp.array[int], count_inout: wp.array[int]):
-    """Number the masked worlds from 0, in any order; launched over (nworld,)."""
+    """Give each masked world a number, from 0 and in any order; launched over (nworld,)."""
     w = wp.tid()
     if mask_in[w]:
         rank_out[w] = wp.atomic_add(count_inout, 0, 1)
@@ -56,7 +56,7 @@ def rank_worlds(mask_in: wp.array[bool], rank_out: wp.array[int], count_inout: w
 
 @wp.kernel(enable_backward=False)
 def next_group(count_in: wp.array[int], step: int, first_inout: wp.array[int], left_out: wp.array[int]):
-    """Advance to the next group, by ``step`` worlds, and count the remaining worlds; launched over (1,)."""
+    """Advance to the next group of ``step`` worlds, and count the worlds that remain; launched over (1,)."""
     first = first_inout[0] + step
     first_inout[0] = first
     left_out[0] = wp.max(0, count_in[0] - first)
@@ -64,7 +64,7 @@ def next_group(count_in: wp.array[int], step: int, first_inout: wp.array[int], l
 
 @wp.kernel(enable_backward=False)
 def choose_group(mask_in: wp.array[bool], rank_in: wp.array[int], first_in: wp.array[int], world_out: wp.array[int]):
-    """Assign the worlds of this turn to rows of the group; launched over (nworld,)."""
+    """Choose the worlds of the current group, one for each of its rows; launched over (nworld,)."""
     w = wp.tid()
     if mask_in[w]:
         place = rank_in[w] - first_in[0]
@@ -76,7 +76,7 @@ def choose_group(mask_in: wp.array[bool], rank_in: wp.array[int], first_in: wp.a
 def take_rows(
     world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array2d[float], target_out: wp.array2d[float]
 ):
-    """Copy rows of all worlds into the rows of a group; launched over (group size, row length)."""
+    """Copy into a group the rows of its worlds, from the rows of all worlds; launched over (group size, row length)."""
     place, i = wp.tid()
     if place < left_in[0]:
         target_out[place, i] = source_in[world_in[place], i]
@@ -94,7 +94,7 @@ def return_rows(
 
 @wp.kernel(enable_backward=False)
 def return_bits(world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array[int], target_inout: wp.array[int]):
-    """Combine a group's bits with the bits of all worlds by bitwise or; launched over (group size,)."""
+    """Add the bits of a group's rows to the bits of the same worlds, by bitwise or; launched over (group size,)."""
     place = wp.tid()
     if place < left_in[0]:
         world = world_in[place]
@@ -127,8 +127,8 @@ def correct_weights(
 ):
     """Correct inverse weights so that they match mj_setConst's; launched over (nworld, nbody).
 
-    MuJoCo Warp replaces a translational or rotational weight of 0 by the other weight. MuJoCo Warp also lacks the
-    special case of simple bodies that only slide, whose weight is the inverse of their mass.
+    If the translational or the rotational weight is 0, MuJoCo Warp replaces it by the other weight. If a simple body
+    only slides, its weight should be 1 / mass, but MuJoCo Warp lacks this special case.
     """
     w, body = wp.tid()
     if sliding_in[body]:

@@ -101,7 +101,7 @@ def velocity_l2(velocity: wp.vec2) -> float:
 
 @wp.func
 def capture_l2(velocity: wp.vec2, s1: World, p: Params) -> float:
-    """Return the capture point's squared distance from the line between the feet, without its ends, at most 1 m^2."""
+    """Return the capture point's squared distance from the middle 60 % of the line between the feet, at most 1 m^2."""
     com, a, b = s1.subtree_com[0], s1.geom_xpos[p.right_foot], s1.geom_xpos[p.left_foot]
     seconds = wp.sqrt(wp.max(com[2], 0.1) / 9.81)  # the time constant of a linear inverted pendulum
     point = wp.vec2(com[0] - a[0], com[1] - a[1]) + seconds * velocity

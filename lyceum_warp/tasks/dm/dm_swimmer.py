@@ -18,7 +18,7 @@ class World:
     xmat: Row[wp.mat33]
     geom_xpos: Row[wp.vec3]
     mocap_pos: Row[wp.vec3]
-    sensordata: Row[float]  # each link's velocimeter and gyroscope follow 12 other numbers
+    sensordata: Row[float]  # 12 other numbers, then each link's velocimeter and gyroscope
 
 
 @wp.struct

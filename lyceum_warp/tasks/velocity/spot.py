@@ -32,5 +32,5 @@ class SpotVelocity(walking.Velocity):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Make the feet determine the friction with the ground, and set the physics options of the humanoids."""
+        """Let the feet determine the friction with the ground, and set the same physics options as the humanoids."""
         walkers.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))

@@ -5,9 +5,10 @@ actuated joints and the feet, and sets parameters of the robot. Tables are compu
 rewards, commands, pushes and resets are taken from mjlab 1.6.0's velocity tasks.
 
 The robot's base is the body of the model's first joint, which is a free joint. Functions read the state after the last
-substep. Only the forces on the feet belong to the start of the last substep. They are 0 at the start of an episode.
-Positions and velocities of the feet are computed from the joints, which saves a forward pass. A foot is in contact if a
-sphere of its sole (``soles``) reaches the ground. Only ``ground`` and ``distance`` depend on the shape of the ground.
+substep. Only the forces on the feet are older: MuJoCo computes them at the start of the last substep. These forces are
+0 at the start of an episode. Positions and velocities of the feet are computed from the joints, which saves a forward
+pass. A foot is in contact if a sphere of its sole (``soles``) reaches the ground. Only ``ground`` and ``distance``
+depend on the shape of the ground.
 """
 
 import math
@@ -94,7 +95,7 @@ class Params:
     # desired foot height in a swing (m), longest rewarded single stance (s)
     swing_target: float = 0.1
     longest_step: float = 0.4
-    least_command: float = 0.05  # if a command is smaller, the robot should stand
+    least_command: float = 0.05  # if the size of a command is below this number, the robot should stand
     fall_angle: float = math.radians(70.0)
     least_height: float = 0.0  # of the base, m
     # actions
@@ -104,10 +105,10 @@ class Params:
     stages: wp.array2d[float] = [[0.0, -1.0, 1.0, 0.5], [120e3, -1.5, 2.0, 0.7], [240e3, -2.0, 3.0, 0.7]]
     lateral_velocity: float = 1.0
     command_seconds: wp.vec2 = wp.vec2(3.0, 8.0)
-    heading_share: float = 0.3  # fraction of commands with a heading
+    heading_share: float = 0.3  # fraction of commands that give a heading
     heading_gain: float = 0.5  # 1/s
     standing_share: float = 0.1
-    forward_share: float = 0.2  # fraction of commands straight forward
+    forward_share: float = 0.2  # fraction of commands that are straight forward
     least_forward_velocity: float = 0.3
     # bounds of the uniform noise on the policy's observations
     linear_velocity_noise: float = 0.5
@@ -168,7 +169,7 @@ def distance(x: wp.vec3, s: World, p: Params) -> float:
 
 @wp.func
 def last_joint(s: World, p: Params, foot: int) -> tuple[wp.vec3, lw.quat, wp.vec3, wp.vec3]:
-    """Return the position, the rotation, the velocity and the angular velocity of the last joint before a foot."""
+    """Return position, rotation, velocity and angular velocity of the last joint in the leg of a foot."""
     turn = terms.orientation(s.qpos)
     x, v = wp.vec3(s.qpos[0], s.qpos[1], s.qpos[2]), wp.vec3(s.qvel[0], s.qvel[1], s.qvel[2])
     w = lw.quat_rotate(turn, terms.angular_velocity(s.qvel))
@@ -197,7 +198,7 @@ def height(x: wp.vec3, s: World, p: Params) -> float:  # clipped at 1 m, the ran
 
 @wp.func
 def sole_touches(x: wp.vec3, turn: lw.quat, s: World, p: Params, foot: int) -> bool:
-    """Return whether a foot touches the ground, given the position and the rotation of its last joint."""
+    """Return whether a foot touches the ground, from the position and the rotation of the last joint in its leg."""
     touching = bool(False)
     for i in range(p.soles.shape[1]):
         sphere = p.soles[foot, i]
@@ -228,7 +229,7 @@ def stage(s: World, p: Params) -> int:  # of the curriculum
 
 @wp.func
 def command(s0: World, p: Params) -> wp.vec3:
-    """Return the commanded forward and lateral velocity, m/s, and yaw rate, rad/s, in the base's axes."""
+    """Return the commanded forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s), in the base's axes."""
     return terms.velocity_command(
         s0.drawn_velocity, s0.heading_target, s0.heading_controlled, s0.standing, terms.heading(s0.qpos),
         p.heading_gain, p.stages[stage(s0, p), 3],
@@ -257,7 +258,7 @@ def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
 
 @wp.func
 def observe_robot(s: World, p: Params, obs: Any):
-    """Write the parts that both observation groups have, except the positions of the joints."""
+    """Write the observations that policy and critic share, except the joint positions."""
     obs.angular_velocity[0] = terms.angular_velocity(s.qvel)
     obs.linear_velocity[0] = terms.linear_velocity(s.qpos, s.qvel) + wp.cross(obs.angular_velocity[0], p.imu)
     obs.gravity[0] = terms.gravity(s.qpos)
@@ -346,7 +347,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 @wp.func
 def foot_clearance_and_slip(active: float, s: World, p: Params) -> wp.vec2:
-    """Return the terms foot_clearance and foot_slip, so that the motion of the feet is computed once."""
+    """Return the terms foot_clearance and foot_slip together, so that the motion of the feet is computed only once."""
     clearance, slip = float(0.0), float(0.0)
     for foot in range(p.feet.shape[0]):
         x, v = foot_motion(s, p, foot)
@@ -368,9 +369,9 @@ def foot_slip(foot_clearance_and_slip: wp.vec2) -> float:
 
 @wp.func
 def single_stance(contact_time: Row[float], air_time: Row[float], longest_step: float, active: float) -> float:
-    """Return the least contact or air time of the feet, s, at most ``longest_step``; 0 unless one foot is in contact.
+    """Return the shortest time (s) for which a foot has been in contact or in the air, at most ``longest_step``.
 
-    Source: Isaac Lab, ``feet_air_time_positive_biped``.
+    The result is 0 unless exactly one foot is in contact. Source: Isaac Lab, ``feet_air_time_positive_biped``.
     """
     down, least = int(0), float(longest_step)
     for foot in range(contact_time.shape[0]):

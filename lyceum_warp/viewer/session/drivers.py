@@ -46,7 +46,7 @@ class PolicyControl:
 
     Args:
         name: The policy's name in the viewer.
-        policy: A function, or an object with a method ``act``, that maps observations, (nworld, nobs), to actions,
+        policy: A function, or an object with a method ``act``, that maps observations (nworld, nobs) to actions
             (nworld, nact).
         env: The worlds.
 

@@ -15,7 +15,7 @@ from lyceum_warp.viewer.session.live import Live
 
 _MEMORY = ("drawn_velocity", "heading_target", "heading_controlled", "standing", "command_timer")
 _NEVER = 1e9  # seconds until the task would draw a command
-_HEIGHT, _SECONDS = 0.25, 0.4  # height of arrows above the base, in m; an arrow shows the motion during this time, in s
+_HEIGHT, _SECONDS = 0.25, 0.4  # height of arrows above the base, m, and duration of the motion that an arrow shows, s
 _COMMANDED, _MEASURED = (0.1, 0.35, 0.95, 1.0), (0.1, 0.85, 0.55, 1.0)
 
 

@@ -64,7 +64,8 @@ class FrameMaker:
 
         Args:
             live: The worlds.
-            main: All worlds. ``live`` is either the same object, or a plant that copies the shown world of ``main``.
+            main: All worlds. ``live`` is either ``main`` itself, or a plant, which is a copy of the shown world of
+                ``main``.
             traces: The paths of a planner's samples.
             status: A function that makes the complete status.
             paused: Whether the frame must show the present state; otherwise the frame may show the state at the time of
@@ -157,7 +158,7 @@ class FrameMaker:
 
     @functools.cached_property
     def _grid_step(self) -> float:
-        """The distance between the worlds of a grid, in m. It is slightly larger than the robot."""
+        """The distance between the worlds of a grid, in m. The distance is slightly larger than the robot."""
         model = self._env.task.model
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)

@@ -7,7 +7,7 @@ from lyceum_warp.algos.planner import Planner
 from lyceum_warp.env import Env
 
 _SETTINGS = ("noise", "temperature", "horizon", "samples")
-_OF_THE_PLANNER = ("nworld", "autoreset", "horizon", "seed", "first_world")  # a planner sets these options
+_OF_THE_PLANNER = ("nworld", "autoreset", "horizon", "seed", "first_world")  # a planner sets these options itself
 
 Numbers = tuple[tuple[str, float], ...]
 """Names and values."""

@@ -13,9 +13,9 @@ from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
 POLL = 0.005
 """The seconds between two polls of the window's commands."""
 
-_RESERVE = 0.0015  # seconds before a step in which no work starts
+_RESERVE = 0.0015  # no other work starts in the last seconds before a step
 _PART = 10_000  # maximum steps of a run, because all states are stored
-_WARM_UP = 3  # first calls without other work, because they may capture graphs
+_WARM_UP = 3  # number of first calls during which no other work runs, because they may capture graphs
 
 
 class InterruptedByCommand(BaseException):

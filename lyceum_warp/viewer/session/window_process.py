@@ -110,7 +110,7 @@ class Window:
 
     @property
     def wants_frame(self) -> bool:
-        """Whether the window can draw another frame. If not, the caller need not make one.
+        """Whether the window can draw another frame now; if it cannot, the caller need not make a frame.
 
         The window draws about 60 frames per second while a page is open, and otherwise four.
         """

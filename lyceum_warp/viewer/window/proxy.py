@@ -57,8 +57,8 @@ PROTECTION = {
     "Cross-Origin-Embedder-Policy": "require-corp",  # browsers require this for memory that threads share
     "Document-Isolation-Policy": "isolate-and-require-corp",  # Chromium requires this in notebooks
 }
-"""The headers of every response. They stop other sites from reading or embedding the response, and from getting its
-address. Pages of this machine that know the token, such as notebooks, may embed a response."""
+"""The headers of every response. These headers stop other sites from reading or embedding the response, and from
+getting its address. Pages of this machine that know the token, such as notebooks, may embed a response."""
 SCRIPT = """<script>
 (() => {
   const path = location.pathname.slice(0, location.pathname.indexOf("/", 1));
@@ -296,7 +296,8 @@ class Proxy:
         if not _is_cross_site(request):
             return web.Response(status=303, headers={**headers, "Location": target})
         # If the user follows a link on another site, browsers do not send a SameSite=Strict cookie, not even after a
-        # redirect. They do send the cookie if a page of the proxy leads to the next request, so send such a page.
+        # redirect. If the next request comes from a page of the proxy, browsers send the cookie, so answer with such a
+        # page.
         page = f'<!doctype html><meta http-equiv="refresh" content="0; url={target}">'
         return web.Response(text=page, content_type="text/html", headers=headers)
 

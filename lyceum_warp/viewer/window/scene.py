@@ -92,7 +92,7 @@ class ExtraGeoms:
             for geom in scene.geoms[begin : scene.ngeom]:
                 if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and same[geom.objid] and not beside:
                     continue  # two surfaces in the same place would flicker
-                geom.size *= SHRUNK  # turned about its own axis, a geom would flicker, too
+                geom.size *= SHRUNK  # a geom that is only turned about its own axis would flicker, too
                 geom.pos[:2] += ghost.shift
                 if colour is not None:
                     geom.rgba = colour

@@ -18,7 +18,7 @@ from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viz.video import Recorder
 
 
-def test_session_obeys_set_speed_and_set_paused(shared_env: SharedEnv) -> None:
+def test_session_obeys_the_commands_set_speed_and_set_paused(shared_env: SharedEnv) -> None:
     window = run(
         Session(shared_env("point_mass")),
         [protocol.SetSpeed(8.0)],

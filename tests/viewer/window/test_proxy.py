@@ -236,7 +236,7 @@ def test_other_sites_cannot_read_or_embed_the_page_and_studio_sets_no_cookies(pr
     assert b"\r\nCache-Control: no-cache\r\n" in get(proxy, "/PATH/model")
 
 
-def test_page_of_this_host_can_embed_the_viewer_with_its_token(proxy: Proxy, upstream: Upstream) -> None:
+def test_page_of_this_host_can_embed_the_viewer_if_it_knows_the_token(proxy: Proxy, upstream: Upstream) -> None:
     frame = ("Sec-Fetch-Site: same-site", "Sec-Fetch-Mode: navigate", "Sec-Fetch-Dest: iframe")
     assert re.search(rb'<meta http-equiv="refresh" content="0; url=/[\w-]{43}/">', get(proxy, "/?token=TOKEN", *frame))
     assert status(get(proxy, "/?token=WRONG", *frame)) == status(get(proxy, "/PATH/", *frame, cookie="")) == 403
@@ -420,7 +420,7 @@ def test_private_server_notices_a_tab_that_disappears(echo: Echo) -> None:
     wait_until(lambda: not opened)
 
 
-def test_a_silent_controlling_browser_is_reported(monkeypatch: pytest.MonkeyPatch, echo: Echo) -> None:
+def test_a_controlling_browser_that_sends_nothing_is_reported(monkeypatch: pytest.MonkeyPatch, echo: Echo) -> None:
     monkeypatch.setattr(module, "QUIET_SECONDS", 0.5)
     proxy, _, quiet = echo
     with open_tab(proxy) as tab:

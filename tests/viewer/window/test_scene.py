@@ -20,7 +20,7 @@ def ghost(x: float, opacity: float = 0.3) -> Ghost:
     return Ghost(pose(x), (0.2, 0.4, 0.6, opacity))
 
 
-def test_ghost_has_the_moving_geoms_of_the_model_in_its_colour() -> None:
+def test_ghost_draws_the_moving_geoms_of_the_model_in_its_own_colour() -> None:
     geoms = ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(2.0)])
     assert [geom.type for geom in geoms] == [int(mujoco.mjtGeom.mjGEOM_SPHERE)]  # no static plane
     np.testing.assert_allclose(geoms[0].pos, [2, 0, 1])
