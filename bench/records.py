@@ -42,7 +42,7 @@ RECORDS: dict[str, tuple[float, dict[str, tuple[str, ...]]]] = {
     "go1_velocity": (80.0, {"cuda": WALKING}),
     "spot_velocity": (95.0, {"cuda": WALKING}),
     "h1_velocity": (100.0, {"cuda": (*WALKING, "--log-std", "-0.7")}),
-    "g1_velocity": (165.0, {"cuda": WALKING}),
+    "g1_velocity": (150.0, {"cuda": ("--mean-every", "0")}),
     "t1_velocity": (60.0, {"cuda": (*WALKING, "--log-std", "-0.7")}),
     "swimmer": (150.0, {"cpu": NPG}),
     "hopper": (1500.0, {"cpu": NPG, "cuda": (*NPG, *LARGE)}),
