@@ -177,7 +177,7 @@ def timed(
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    """Make a table with a line for each task, cache and set of flags. A line combines all seeds."""
+    """Make a table with one line for each combination of task, cache and flags. A line combines all seeds."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         kind = tuple(row.case[name] for name in ("task", "target", "device", "cache", "flags"))

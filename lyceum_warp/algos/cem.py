@@ -8,8 +8,8 @@ samples (the elites) u_t^1, ..., u_t^n determine the next plan and its noise:
 CEM was proposed by Rubinstein (1999, "The cross-entropy method for combinatorial and continuous optimization"). Here,
 as in hydrax, judo and MuJoCo MPC, the covariance is diagonal. When the planner shifts the plan in time, it also shifts
 the standard deviations, and appends initial values at the end. If the noise is smoothed over time, s_t is the standard
-deviation before smoothing. This s_t is the elites' standard deviation, divided by the standard deviation of smoothed
-standard normal noise.
+deviation before smoothing. To find this s_t, the elites' standard deviation is divided by the factor by which the
+smoothing scales a standard deviation.
 """
 
 from collections.abc import Sequence

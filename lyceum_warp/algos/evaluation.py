@@ -20,7 +20,7 @@ MEAN_SEED = 2**31 - 1
 
 
 def evaluation_seed(seed: int) -> int:
-    """Derive an evaluation's seed, so that training with the same seed draws different initial states."""
+    """Derive another seed for an evaluation, so that its initial states differ from those of training."""
     return whole_number("seed", seed, low=0) ^ 0x5A17C3E9
 
 

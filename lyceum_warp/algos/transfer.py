@@ -181,7 +181,7 @@ def _show(progress: Callable[[int, int], object] | None, play: int, plays: int, 
 
 
 def task_physics(env: Env) -> tuple[dict[str, PhysicsOptions], str]:
-    """Get the physics options of a task and its environment by name, and the name of the environment's options.
+    """Get a task's physics options by name, including the environment's own options, and the name of the latter.
 
     Options that only the Warp engine has are omitted.
     """

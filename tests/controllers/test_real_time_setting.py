@@ -33,7 +33,7 @@ def test_largest_number_of_samples_that_meets_the_deadline_is_chosen(microsecond
     assert len(machine.measured) == len(set(machine.measured)) <= 5
 
 
-def test_chosen_setting_is_printed_with_the_next_larger_number_of_samples() -> None:
+def test_message_names_the_chosen_and_the_next_larger_number_of_samples() -> None:
     choice = choose_setting(SAMPLES, [32], ["fast"], Machine(3.5), deadline=0.015)
     assert str(choice) == "64 samples, horizon 32, physics fast: 8.17 ms of 15 ms; 128 would take 15.3 ms"
     assert str(choose_setting([64], [8], [None], Machine(1.0), deadline=0.02)) == (

@@ -271,7 +271,7 @@ def test_run_saves_a_model_that_was_made_in_python(tmp_path: Path, capsys: pytes
 
 
 def test_resuming_in_python_reports_a_changed_task_and_model(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Training uses the changed files, because the algorithm was made from them."""
+    """Training uses the changed files, because the algorithm was constructed after the change."""
     file, table, out = folder / "mine" / "slide.py", folder / "mine" / "goal.npy", folder / "run"
 
     def train(iterations: int, **words: Any) -> None:

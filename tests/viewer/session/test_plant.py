@@ -104,7 +104,7 @@ def test_a_slow_plan_does_not_delay_commands(shared_env: SharedEnv) -> None:
         lambda frame: frame.status.speed == 2.0,
     )
     calls = len(slow.log)
-    assert slow.inside == 1  # the controller is still in the same call
+    assert slow.inside == 1  # the controller has not returned from the call yet
     slow.release.set()
     while slow.inside:
         time.sleep(0.01)
