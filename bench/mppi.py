@@ -7,9 +7,9 @@
 ``plans``: the time of a plan from given states.
 
 The Python planner (python_mppi.py) sends one message per plan to each process. All planners control the same plant, and
-take turns in blocks of episodes. The contestants named "a set at a time" run last: one planner controls the plants of all
-episodes in a set. With --jobs, blocks run at the same time, each in a subprocess on separate cores. ``mppi_fast`` plans
-with the physics that a task names "fast"; the plant keeps the exact physics.
+take turns in blocks of episodes. The contestants named "a set at a time" run last: one planner controls the plants of
+all episodes in a set. With --jobs, blocks run at the same time, each in a subprocess on separate cores. ``mppi_fast``
+plans with the physics that a task names "fast"; the plant keeps the exact physics.
 """
 
 import dataclasses

@@ -19,7 +19,7 @@ EVERY_RULE = {
 }
 """Tasks for which all rules are checked, by engine; together they use most features of models."""
 OF_THE_TASK = tuple(check for check in CHECKS if check not in (check_memory, check_not_finite))
-"""Rules for other tasks on the C engine; two slow rules are omitted, because their results hardly depend on the task."""
+"""Rules for other tasks on the C engine; two slow rules whose results hardly depend on the task are omitted."""
 OF_THE_STATE = (
     buffers.check_addresses, buffers.check_getters, state.check_restoring, state.check_purity, state.check_determinism,
     state.check_reset,
