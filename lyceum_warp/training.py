@@ -17,7 +17,7 @@ from lyceum_warp.algos.transfer import transfer as judge_transfer
 from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.runs.configuration import Configuration, describe
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.lock import RunLock
+from lyceum_warp.runs.lock import run_lock
 from lyceum_warp.runs.metrics_table import cut_rows
 from lyceum_warp.runs.replay_files import read_replay
 from lyceum_warp.runs.saving import Saver
@@ -159,11 +159,11 @@ def train(
                     kept, files = task_copy(env)
                     device = env.options.device or "cpu"
                     run = Run.create(folder, run.config | {"kept": kept}, device=device, files=files)
-            lock = shown.enter_context(RunLock(run.folder, take_over=take_over, note=display.note)) if leads else None
+            check = shown.enter_context(run_lock(run.folder, take_over=take_over)) if leads else None
             if resume:
                 _load_checkpoint(run, learner, settings, display.note if leads else log.debug)
         saver = Saver(
-            run if leads else None, lock, learner, keep_every=keep_every, save_every=save_every,
+            run if leads else None, check, learner, keep_every=keep_every, save_every=save_every,
             saved=learner.iteration if resume else -1, note=display.note,
         )  # fmt: skip
         callbacks: list[Callback] = []

@@ -6,18 +6,17 @@ has grown gets a new file name. The old files are deleted after the checkpoint h
 contain the checkpoint's steps.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.replay import Replay
 from lyceum_warp.runs.checkpoints import FORMAT, read_checkpoint, write_content
-from lyceum_warp.runs.lock import RunLock
 
 _PARTS = 64
 
 
-def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, lock: RunLock | None) -> None:
+def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, check: Callable[[], None] | None) -> None:
     """Write the parts of the replay buffer that have grown; all ranks must call this function.
 
     Args:
@@ -25,7 +24,7 @@ def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, lo
         replay: The replay buffer.
         team: The processes.
         since: Number of stored steps at the last save.
-        lock: The run's lock, which is checked before each write; None if ``folder`` is None.
+        check: Function that checks the run's lock before each write; None if ``folder`` is None.
     """
     oldest = replay.stored - replay.count
     for start, end in _parts(replay, max(since, oldest), replay.stored):
@@ -35,8 +34,8 @@ def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, lo
             for name, part in replay.rows(first, end).items()
         }
         with team.together():
-            if folder is not None and lock is not None:
-                lock.check()
+            if folder is not None and check is not None:
+                check()
                 folder.mkdir(exist_ok=True)
                 content = {"lyceum_warp": FORMAT, "first": first, "rows": rows}
                 write_content(folder / _name(start, end), content, durable=True)

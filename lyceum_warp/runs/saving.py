@@ -8,7 +8,6 @@ from collections.abc import Callable
 from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.runs.checkpoints import policy_content, write_content
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.lock import RunLock
 from lyceum_warp.runs.metrics_table import append_row
 from lyceum_warp.runs.replay_files import clean_replay, write_replay
 
@@ -37,7 +36,7 @@ class Saver:
 
     Args:
         run: The run; None on ranks that do not write.
-        lock: The run's lock, which is checked before every write; None if ``run`` is None.
+        check: Function that checks the run's lock before every write; None if ``run`` is None.
         learner: The algorithm.
         keep_every: Iterations between two policies that are saved in numbered files; 0 saves none.
         save_every: Iterations between two saves; 0 to save by time.
@@ -51,7 +50,7 @@ class Saver:
     def __init__(
         self,
         run: Run | None,
-        lock: RunLock | None,
+        check: Callable[[], None] | None,
         learner: Learner,
         *,
         keep_every: int = 0,
@@ -60,7 +59,7 @@ class Saver:
         note: Callable[[str], None] = log.warning,
     ) -> None:
         self.run, self.learner, self.keep_every, self.save_every = run, learner, keep_every, save_every
-        self.saved, self._lock = saved, lock
+        self.saved, self._check = saved, check
         best = None if run is None else run.best_score(note=note)
         self._best = -math.inf if best is None else best[1]
         self._before = policy_content(learner.iteration, learner.policy, learner.value)
@@ -73,8 +72,8 @@ class Saver:
         Returns:
             The return that selects the best policy; None if the iteration has no return.
         """
-        assert self.run is not None and self._lock is not None
-        self._lock.check()
+        assert self.run is not None and self._check is not None
+        self._check()
         append_row(self.run.metrics, iteration.row())
         learner, name = self.learner, self.learner.best_by
         score = getattr(iteration, name)
@@ -109,10 +108,10 @@ class Saver:
         learner, run, replay = self.learner, self.run, self.learner.replay
         state = learner.state_dict()  # all ranks call state_dict, which gathers the worlds
         if replay is not None:
-            write_replay(None if run is None else run.replay, replay, learner.team, self._stored, self._lock)
+            write_replay(None if run is None else run.replay, replay, learner.team, self._stored, self._check)
         with learner.team.together():
-            if run is not None and self._lock is not None:
-                self._lock.check()
+            if run is not None and self._check is not None:
+                self._check()
                 run.save(policy_content(learner.iteration, learner.policy, learner.value), state)
                 if replay is not None:
                     clean_replay(run.replay, replay)

@@ -14,7 +14,7 @@ from training_runs import QUIET, algorithm, metrics, refused, six_iterations
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.lock import RunLock
+from lyceum_warp.runs.lock import run_lock
 from lyceum_warp.runs.saving import LONG, SAVE_SECONDS, SHARE, Saver
 
 
@@ -33,8 +33,8 @@ def test_saving_takes_a_small_fraction_of_the_training_time(
     seconds: float, wait: float, npg: lw.NPG, tmp_path: Path
 ) -> None:
     run = Run.create(tmp_path / "run", {})
-    with RunLock(run.folder) as lock:
-        saver = Saver(run, lock, npg)
+    with run_lock(run.folder) as check:
+        saver = Saver(run, check, npg)
         saver.save()
     assert saver.saved == 0 and not saver.due()
     saver._seconds = seconds  # a save with more worlds would take so long
