@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any
 
-from lyceum_warp.cli.arguments import given, optional_flags
+from lyceum_warp.cli.arguments import OptionFlags, given
 from lyceum_warp.runs.configuration import ALGORITHMS
 
 _DEFAULTS: dict[str, list[str]] = {}
@@ -14,11 +14,11 @@ for _algorithm, (_, _config) in ALGORITHMS.items():
         _DEFAULTS.setdefault(_name, []).append(f"{_algorithm} {_words}".strip())
 
 
-@optional_flags(
-    *(config for _, config in ALGORITHMS.values()),
+class Hyperparameters(
+    OptionFlags,
+    options=[config for _, config in ALGORITHMS.values()],
     default={name: f"({', '.join(words)})" for name, words in _DEFAULTS.items()},
-)
-class Hyperparameters:
+):
     """Hyperparameters. For each flag, the help lists the algorithms that have it, with their defaults."""
 
     def on_top_of(self, config: Any, algorithm: str) -> Any:

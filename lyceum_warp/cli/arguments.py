@@ -3,10 +3,10 @@
 import ast
 import dataclasses
 import typing
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import tyro
 
@@ -54,18 +54,14 @@ TaskWord = Annotated[
 ]
 """The argument TASK."""
 
-Class = TypeVar("Class")
-
 _UNIONS = (UnionType, type(typing.Union[int, str]))  # noqa: UP007 (the type of such a hint)
 
 
 @typing.dataclass_transform(kw_only_default=True, frozen_default=True)
-def optional_flags(
-    *options: type, omit: Collection[str] = (), default: str | Mapping[str, str] | None = None
-) -> Callable[[type[Class]], type[Class]]:
-    """Class decorator: add the fields of dataclasses as flags, with their docstrings as help text.
+class OptionFlags:
+    """Base class that adds the fields of dataclasses to its subclass as flags, with their docstrings as help text.
 
-    The class itself declares fields that need a different type or help text on the command line, and all fields with
+    The subclass itself declares fields that need a different type or help text on the command line, and all fields with
     union types. Values are validated when the options are made, because the parser would print errors in a multi-line
     box.
 
@@ -77,7 +73,11 @@ def optional_flags(
             to None. Without a text, flags have the dataclass's defaults.
     """
 
-    def decorated(cls: type[Class]) -> type[Class]:
+    def __init_subclass__(
+        cls, *, options: Sequence[type] = (), omit: Collection[str] = (), default: str | Mapping[str, str] | None = None
+    ) -> None:
+        if not options:  # the help shows subclasses with fewer flags
+            return
         own = dict(vars(cls).get("__annotations__", {}))
         flags: dict[str, Any] = {}
         for kind in options:
@@ -97,9 +97,7 @@ def optional_flags(
                 help_text, hint = " ".join(docs.get(name, "").split()), text if value is None else None
                 flags[name] = Annotated[flag, tyro.conf.arg(help=help_text, help_behavior_hint=hint)]
         cls.__annotations__ = flags | own
-        return dataclasses.dataclass(frozen=True, kw_only=True)(cls)
-
-    return decorated
+        dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
 
 def given(flags: Any) -> dict[str, Any]:
@@ -119,8 +117,7 @@ NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "model", "fi
 ``Physics`` declares the flags of ``physics``. All other options without a flag are only for Python."""
 
 
-@optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"))
-class Placement:
+class Placement(OptionFlags, options=[EnvOptions], omit=(*NO_FLAGS, "horizon")):
     """Where the worlds run."""
 
     engine: str = "auto"
@@ -129,8 +126,7 @@ class Placement:
     """cpu, or a CUDA device such as cuda:0."""
 
 
-@optional_flags(EnvOptions, omit=NO_FLAGS, default="")
-class EnvFlags:
+class EnvFlags(OptionFlags, options=[EnvOptions], omit=NO_FLAGS, default=""):
     """Where the worlds run, and the length of their episodes. The defaults come from the run, if there is one."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
@@ -140,8 +136,7 @@ class EnvFlags:
     the CPU, where a few worlds step fastest."""
 
 
-@optional_flags(PhysicsOptions, omit=("base",), default="")
-class Physics:
+class Physics(OptionFlags, options=[PhysicsOptions], omit=["base"], default=""):
     """Physics options of the worlds. The defaults come from the run, the task or its model."""
 
     physics: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None

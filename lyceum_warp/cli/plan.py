@@ -20,13 +20,13 @@ from lyceum_warp.algos.planner import MPPI
 from lyceum_warp.binding.registry import file_name, find_task, snake_case, spelled_task, task_name
 from lyceum_warp.cli.arguments import (
     CameraWords,
+    OptionFlags,
     ParamWords,
     Physics,
     Placement,
     Repeated,
     TaskWord,
     given,
-    optional_flags,
     parameters,
 )
 from lyceum_warp.cli.display import PlanDisplay, make_console, report_table, tried
@@ -47,8 +47,7 @@ from lyceum_warp.viz.control_plot import control_plot
 from lyceum_warp.viz.video import write_video
 
 
-@optional_flags(MPPIConfig, default="(default: the task's)")
-class Settings:
+class Settings(OptionFlags, options=[MPPIConfig], default="(default: the task's)"):
     """Settings of the planner. The defaults come from the task."""
 
     noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None

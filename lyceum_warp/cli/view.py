@@ -15,7 +15,7 @@ import tyro
 
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.planner import MPPI
-from lyceum_warp.cli.arguments import NO_FLAGS, ParamWords, Physics, Trust, given, optional_flags, parameters
+from lyceum_warp.cli.arguments import NO_FLAGS, OptionFlags, ParamWords, Physics, Trust, given, parameters
 from lyceum_warp.cli.display import note
 from lyceum_warp.cli.evaluate import run_worlds
 from lyceum_warp.cli.plan import Settings
@@ -38,8 +38,9 @@ _LONG = 1e9
 _NICE = 10  # the niceness of the subprocess of `lw.RunViewer`
 
 
-@optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)")
-class Place:
+class Place(
+    OptionFlags, options=[EnvOptions], omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)"
+):
     """Engine and device of the displayed worlds; with --mppi, of the planner's worlds."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None

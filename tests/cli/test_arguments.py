@@ -7,11 +7,11 @@ import tyro
 from lyceum_warp.cli.arguments import (
     NO_FLAGS,
     EnvFlags,
+    OptionFlags,
     Physics,
     Placement,
     Repeated,
     given,
-    optional_flags,
     parameter,
     parameters,
 )
@@ -52,8 +52,7 @@ class Options:
     limits: tuple[float, ...] = (1.0,)
 
 
-@optional_flags(Options, default="(default: the best)")
-class Flags:
+class Flags(OptionFlags, options=[Options], default="(default: the best)"):
     limits: Annotated[Repeated, tyro.conf.arg(metavar="NUMBER")] = ()
     extra: int = 4
 
