@@ -116,8 +116,8 @@ class Run:
     ) -> "Run":
         """Create a run folder with the versions, the copy of the task, and the configuration.
 
-        A failure leaves no files in the folder. The run is recorded as trusted in the user's state directory
-        (``lyceum_warp.runs.trust``), so later calls can execute the run's task without ``trust=True``.
+        A failure leaves no files in the folder. A run that has files of the user is recorded as trusted in the user's
+        state directory (``lyceum_warp.runs.trust``), so later calls can execute the run's task without ``trust=True``.
 
         Args:
             folder: A new or empty folder.
@@ -148,7 +148,8 @@ class Run:
         except BaseException:  # for example a full disk, missing permissions or a signal
             shutil.rmtree(folder, ignore_errors=True)
             raise
-        remember(folder, run.config)
+        if files or "model" in run.config.get("options", {}):
+            remember(folder, run.config)
         return run
 
     @classmethod

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tiny_task
-from training_runs import QUIET, TINY, refused
+from training_runs import QUIET, TINY, refused, train
 
 import lyceum_warp as lw
 import lyceum_warp.cli.view
@@ -92,10 +92,8 @@ def test_run_of_another_user_raises_an_error_until_it_is_trusted(
     assert before == {path: path.read_bytes() for path in theirs.rglob("*.*") if path.is_file()}
     assert cli.main([*command, "--trust"]) == 0
     assert witness.exists()
-    (record,) = {path.read_text().splitlines()[0] for path in (tmp_path / "state").rglob("trusted/*")} - {
-        str(tmp_path / "out")
-    }
-    assert record == str(theirs)
+    records = {path.read_text().splitlines()[0] for path in (tmp_path / "state").rglob("trusted/*")}
+    assert records - {str(tmp_path / "out")} == {str(theirs)}
     shutil.rmtree(tmp_path / "out", ignore_errors=True)
     arguments = [word if word != "2" else "3" for word in command]
     assert cli.main(arguments) == 0  # the run is trusted from now on
@@ -206,11 +204,11 @@ def test_runs_of_this_user_stay_trusted_after_a_move_and_a_task_edit(made: Path,
         file.write_text(SOURCE)
 
 
-def test_run_of_a_task_of_the_package_needs_no_trust(
-    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    assert cli.main(["eval", str(made / "named"), "--episodes", "1"]) == 0
+def test_run_of_a_task_of_the_package_needs_no_trust(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    assert train(tmp_path / "run", "--iterations", "1", "--horizon", "8") == 0
+    assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "1"]) == 0
+    assert not (tmp_path / "state").exists()
 
 
 def test_policy_of_an_untrusted_run_is_loaded_and_exported_without_the_task(
@@ -226,7 +224,7 @@ def test_training_continues_with_a_message_if_the_run_cannot_be_added_to_trusted
 ) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
-    Run.create(tmp_path / "run", {"task": "mine.py"})
+    Run.create(tmp_path / "run", {"task": "mine.py"}, files={"mine.py": b""})
     (line,) = caplog.messages
     assert f"need --trust for the run in {tmp_path / 'run'}" in line
 
