@@ -34,6 +34,7 @@ def store(folder: Path, which: str) -> Path:
     kept = {name: value for name, value in run.config["kept"].items() if name in ("name", "model_hash")}
     config = {name: run.config[name] for name in KEPT} | {
         algorithm: run.config[algorithm], "engine": "auto", "device": "cpu", "kept": kept,
+        "versions": {"mujoco": run.config["versions"]["mujoco"]},
     }  # fmt: skip
     out.mkdir(parents=True, exist_ok=True)
     write_content(
@@ -41,7 +42,6 @@ def store(folder: Path, which: str) -> Path:
         {"lyceum_warp": content["lyceum_warp"], "iteration": content["iteration"], "policy": saved | {"state": state}},
     )
     (out / "config.json").write_text(json.dumps(config, indent=1))
-    (out / "versions.json").write_text(json.dumps({"mujoco": run.versions()["mujoco"]}))
     stored = Run.open(out)
     env = run_worlds(stored, {}, {}, nworld=EPISODES, task=None, trust=False)
     if env.horizon == 0:

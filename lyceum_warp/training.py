@@ -272,9 +272,12 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
         raise ValueError(f"{run.checkpoint} does not fit the run's configuration: {text}") from error
     if learner.team.leads:
         cut_rows(run.metrics, done)  # a killed run may have written rows of unsaved iterations
-        if changed := run.changed(versions(run.config["device"])):
-            text = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
+        now = versions(run.config["device"])
+        then = run.config.get("versions", now)  # runs of earlier releases have no versions in config.json
+        if changed := {name: value for name, value in now.items() if then.get(name) != value}:
+            text = ", ".join(f"{name} {then.get(name)} then, {value} now" for name, value in changed.items())
             note(f"versions have changed, so numbers may differ from an uninterrupted run's: {text}")
+            settings = settings | {"resumed": [*run.config.get("resumed", []), changed]}
         run.amend(**settings)
 
 

@@ -41,11 +41,19 @@ def test_training_in_python_and_on_the_command_line_gives_equal_metrics(six: Pat
     assert configs[0] == configs[1] | {"threads": 1}
 
 
-def test_run_started_in_python_is_evaluated_and_resumed_on_the_command_line(six: Path, tmp_path: Path) -> None:
-    run = Path(shutil.copytree(six, tmp_path / "run"))
-    assert cli.main(["eval", str(run), "--episodes", "2", "--which", "best"]) == 0
-    assert cli.main(["train", "--resume", str(run), "--iterations", "7", *QUIET]) == 0
-    assert metrics(run)[:6] == metrics(six)
+def test_run_started_in_python_is_evaluated_and_resumed_on_the_command_line(
+    six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A message tells that the version of a package has changed."""
+    folder = Path(shutil.copytree(six, tmp_path / "run"))
+    run = Run.open(folder)
+    run.amend(versions=run.config["versions"] | {"torch": "2.0"})
+    assert cli.main(["eval", str(folder), "--episodes", "2", "--which", "best"]) == 0
+    capsys.readouterr()
+    assert cli.main(["train", "--resume", str(folder), "--iterations", "7", *QUIET]) == 0
+    assert metrics(folder)[:6] == metrics(six)
+    refused(capsys, f"numbers may differ from an uninterrupted run's: torch 2.0 then, {torch.__version__} now")
+    assert Run.open(folder).config["resumed"] == [{"torch": torch.__version__}]
 
 
 def test_run_resumed_in_python_gives_identical_metrics(six: Path, tmp_path: Path) -> None:

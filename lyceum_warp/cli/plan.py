@@ -91,7 +91,7 @@ class Plan:
     tries a shorter horizon and then other physics of the task. Values of --samples, --horizon and --physics that you
     give are never changed.
 
-    The command writes config.json, versions.json, report.json, plan.png, a video of the first episode (video.mp4), and
+    The command writes config.json, report.json, plan.png, a video of the first episode (video.mp4), and
     one file per episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy) into a
     folder. After Ctrl-C, the interrupted episode is saved, too, but is not part of the report.
 

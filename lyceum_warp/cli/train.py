@@ -59,7 +59,7 @@ _KEPT = {
 class Train:
     """Train a policy on a task, with the natural policy gradient, PPO or SAC.
 
-    The command writes config.json, versions.json, metrics.csv (one row per iteration), policy.pt, best.pt,
+    The command writes config.json, metrics.csv (one row per iteration), policy.pt, best.pt,
     checkpoint.pt, curve.png and video.mp4 into the run's folder. Ctrl-C saves and ends the run after the current
     iteration; a second Ctrl-C ends it immediately.
 

@@ -18,6 +18,7 @@ _ENTRIES: dict[str, Any] = {
     "reached": {"iteration": _COUNT, "return": float | int},
     "kept": {"name": str, "file": str, "model": str, "model_given": bool, "source_hash": str, "model_hash": str,
              "modules": dict, "program": bool},
+    "versions": dict, "resumed": list,
 }  # fmt: skip
 """Map each entry to a type, ``_COUNT``, or a dict of entries. All entries are optional."""
 

@@ -26,8 +26,8 @@ from lyceum_warp.support.files import replaced
 from lyceum_warp.support.validate import check_kind
 from lyceum_warp.support.versions import versions
 
-_CONFIG, _VERSIONS, _TASK = "config.json", "versions.json", "task"
-_UNFINISHED = {f"{name}.tmp" for name in (_CONFIG, _VERSIONS, _TASK)}
+_CONFIG, _TASK = "config.json", "task"
+_UNFINISHED = {f"{_CONFIG}.tmp", f"{_TASK}.tmp"}
 """Files that may remain in the folder if a process is killed while it creates a run. A new run replaces these files."""
 
 log = logging.getLogger(__name__)
@@ -38,8 +38,8 @@ class Run:
     """The folder of a training run.
 
     =================== ======================================================================================
-    ``config.json``     the task, its parameters, the engine, its physics, the seed and all hyperparameters
-    ``versions.json``   versions of the packages and of Python, the machine, the commit
+    ``config.json``     the task, its parameters, the engine, its physics, the seed and all hyperparameters; the
+                        versions of the packages and of Python, the machine, the commit
     ``metrics.csv``     one row per iteration
     ``policy.pt``       the last policy and the value function
     ``best.pt``         the policy with the best return
@@ -114,7 +114,7 @@ class Run:
         device: str = "cpu",
         files: Mapping[str, Path | bytes] | None = None,
     ) -> "Run":
-        """Create a run folder with the versions, the copy of the task, and the configuration.
+        """Create a run folder with the copy of the task, the configuration and the versions.
 
         A failure leaves no files in the folder. A run that has files of the user is recorded as trusted in the user's
         state directory (``lyceum_warp.runs.trust``), so later calls can execute the run's task without ``trust=True``.
@@ -122,7 +122,7 @@ class Run:
         Args:
             folder: A new or empty folder.
             config: The configuration, which consists of JSON values.
-            device: Device of the run; ``versions.json`` names the device's hardware.
+            device: Device of the run; the entry ``versions`` names the device's hardware.
             files: Contents of the folder ``task`` by path; each is a file to copy, or bytes.
 
         Raises:
@@ -130,9 +130,8 @@ class Run:
         """
         folder = Path(folder)
         cls.check_free(folder)
-        run = cls(folder, {"format": FORMAT, **config})
+        run, task = cls(folder, {"format": FORMAT, **config, "versions": versions(device)}), folder / f"{_TASK}.tmp"
         text = json.dumps(run.config, indent=2)  # conversion may fail, so create the folder afterwards
-        task, now = folder / f"{_TASK}.tmp", json.dumps(versions(device), indent=2)
         try:
             shutil.rmtree(task, ignore_errors=True)
             folder.mkdir(parents=True, exist_ok=True)
@@ -140,9 +139,8 @@ class Run:
                 path = task / name
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(content if isinstance(content, bytes) else content.read_bytes())
-            with replaced(folder / _CONFIG) as config_file, replaced(folder / _VERSIONS) as versions_file:
-                config_file.write_text(text)
-                versions_file.write_text(now)
+            with replaced(folder / _CONFIG) as temporary:
+                temporary.write_text(text)
                 if files:
                     task.rename(run.task_folder)
         except BaseException:  # for example a full disk, missing permissions or a signal
@@ -172,14 +170,6 @@ class Run:
         with replaced(self.folder / _CONFIG) as temporary:
             temporary.write_text(json.dumps(self.config, indent=2))
 
-    def versions(self) -> dict[str, Any]:
-        """Read ``versions.json``; an empty dict if the file is damaged."""
-        try:
-            then = json.loads((self.folder / _VERSIONS).read_text())
-        except (OSError, ValueError, RecursionError):
-            then = None
-        return then if isinstance(then, dict) else {}
-
     @contextlib.contextmanager
     def settings(self) -> Iterator[None]:
         """Add the path of ``config.json`` to errors that the run's settings may cause within the with block.
@@ -195,28 +185,6 @@ class Run:
                 raise
             kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
             raise kind(f"{error} (with the settings in {self.folder / _CONFIG})") from error
-
-    def changed(self, now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-        """Compare versions with the versions at the start of the run, and add changes to ``versions.json``.
-
-        Args:
-            now: The current versions, from ``versions()``.
-
-        Returns:
-            The changed entries, each as a pair of the old and the new version. ``versions.json`` lists the changed
-            entries under "resumed".
-        """
-        then = self.versions()
-        changed, noted = {}, {}
-        for name, value in now.items():
-            if then.get(name) != value:
-                changed[name], noted[name] = (then.get(name), value), value
-        if changed:
-            resumed = then.get("resumed")
-            then["resumed"] = [*(resumed if isinstance(resumed, list) else []), noted]
-            with replaced(self.folder / _VERSIONS) as temporary:
-                temporary.write_text(json.dumps(then, indent=2))
-        return changed
 
     def rows(self) -> list[dict[str, float | None]]:
         """Read the rows of the metrics table. Empty cells become None.

@@ -231,8 +231,10 @@ def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
 
 def _model_changed(run: Run, env: Env) -> bool:
     """Check whether the model has changed since the run started; False with a different version of MuJoCo."""
-    known = run.config.get("kept", {}).get("model_hash")
-    return run.versions().get("mujoco") == mujoco.__version__ and known not in (None, _model_hash(env))
+    known, version = run.config.get("kept", {}).get("model_hash"), mujoco.__version__
+    # runs of earlier releases have no versions in config.json
+    same_version = run.config.get("versions", {}).get("mujoco", version) == version
+    return same_version and known not in (None, _model_hash(env))
 
 
 def _digest(content: bytes) -> str:

@@ -50,7 +50,7 @@ def test_command_plan_writes_episodes_and_a_report(tmp_path: Path, capsys: pytes
     assert "episode 1/2" in shown and "episode 2/2" in shown
     assert "planning time p50" in shown and "real-time factor" in shown
     assert sorted(path.name for path in out.iterdir()) == [
-        "config.json", "episode-000.npz", "episode-001.npz", "plan.png", "report.json", "versions.json",
+        "config.json", "episode-000.npz", "episode-001.npz", "plan.png", "report.json",
     ]  # fmt: skip
     config = json.loads((out / "config.json").read_text())
     assert config["planner"]["horizon"] == 10 and config["planner"]["noise"] == 0.3 and config["seed"] == 3

@@ -97,7 +97,6 @@ KINDS = {
     "kept config.json": Kind(
         "kept/config.json", mutations.mutated_json, ("eval kept", "resume kept", "from kept"), ("trained by",)
     ),
-    "versions.json": Kind("run/versions.json", mutations.mutated_json, ("eval", "resume")),
     "metrics.csv": Kind("run/metrics.csv", mutations.mutated_csv, ("open", "resume")),
     "policy.pt": Kind("run/policy.pt", _checkpoint, ("load", "load", "eval", "view", "from")),
     "best.pt": Kind("run/best.pt", _checkpoint, ("load best", "resume", "from best")),

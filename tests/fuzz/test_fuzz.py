@@ -14,7 +14,7 @@ from minimal_cases import COMMANDS, FILES, KEYWORDS
 
 FEW = {
     "file_attacks.py": {
-        "config.json": 1, "kept config.json": 1, "versions.json": 1, "metrics.csv": 1, "policy.pt": 1, "best.pt": 1,
+        "config.json": 1, "kept config.json": 1, "metrics.csv": 1, "policy.pt": 1, "best.pt": 1,
         "checkpoint.pt": 1, "previous.pt": 1, "episode.npz": 1, "kept model": 1, "kept table": 1, "model.xml": 1,
         "table.npy": 1,
     },

@@ -24,6 +24,7 @@ from lyceum_warp.runs.folder import Run
         ({"target_return": "1"}, "target_return must be of type"),
         ({"reached": {"iteration": 1, "return": None}}, "return must be of type"),
         ({"algorithm": "mine", "mine": 3}, "mine must be of type dict"),
+        ({"versions": []}, "versions must be of type dict"),
         ({"algorithm": "npg", "npg_seed": -1}, "npg_seed must be a whole number"),
     ],
 )
@@ -58,7 +59,6 @@ def test_damaged_metrics_table_raises_an_error_before_anything_is_written(
 ) -> None:
     run = lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run", iterations=2)
     run.metrics.write_text(run.metrics.read_text().replace("\n1,", "\none,"))
-    (run.folder / "versions.json").write_text("[]")
     before = {path: path.read_bytes() for path in run.folder.iterdir()}
     assert cli.main(["train", "--resume", str(run.folder), "--iterations", "3", *QUIET]) == 2
     refused(capsys, f"{run.metrics} is not a table of metrics: line 2")

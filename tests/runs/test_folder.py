@@ -21,7 +21,7 @@ def run(tmp_path: Path) -> Run:
 
 
 def test_new_run_folder_contains_the_package_versions(run: Run) -> None:
-    versions = json.loads((run.folder / "versions.json").read_text())
+    versions = Run.open(run.folder).config["versions"]
     assert versions["torch"] == torch.__version__
     packages = {"lyceum_warp", "mujoco", "mujoco_warp", "warp_lang", "numpy"}
     assert packages | {"python", "platform", "cpu"} <= versions.keys()
@@ -31,12 +31,7 @@ def test_run_reads_back_the_saved_state(run: Run) -> None:
     state = Run.open(run.folder).read()["state"]
     assert state["counter"] == 5
     assert state["tensor"].tolist() == [0, 1, 2]
-    assert {path.name for path in run.folder.iterdir()} == {
-        "config.json",
-        "versions.json",
-        "policy.pt",
-        "checkpoint.pt",
-    }
+    assert {path.name for path in run.folder.iterdir()} == {"config.json", "policy.pt", "checkpoint.pt"}
 
 
 @pytest.mark.parametrize(
@@ -83,7 +78,7 @@ def test_run_can_be_created_in_a_folder_that_a_killed_process_left(tmp_path: Pat
     assert subprocess.run([sys.executable, "-c", KILLED, str(folder)], check=False).returncode == -9
     assert list(folder.iterdir())
     run = Run.create(folder, {"task": "mine.py"}, files={"mine.py": b"new"})
-    assert sorted(path.name for path in folder.iterdir()) == ["config.json", "task", "versions.json"]
+    assert sorted(path.name for path in folder.iterdir()) == ["config.json", "task"]
     assert [path.name for path in run.task_folder.iterdir()] == ["mine.py"]
 
 
@@ -149,10 +144,3 @@ def test_previous_checkpoint_remains_after_a_save(run: Run, caplog: pytest.LogCa
     run.previous.write_bytes(b"PK half")
     with pytest.raises(FileNotFoundError, match=r"there is no checkpoint .*checkpoint\.pt"):
         run.read()
-
-
-def test_changed_package_versions_are_returned_and_logged(run: Run) -> None:
-    now = json.loads((run.folder / "versions.json").read_text())
-    assert run.changed(now) == {}
-    assert run.changed(now | {"torch": "9.9"}) == {"torch": (torch.__version__, "9.9")}
-    assert json.loads((run.folder / "versions.json").read_text())["resumed"] == [{"torch": "9.9"}]
