@@ -13,7 +13,7 @@ from lyceum_warp.binding.registry import spelled_task
 from lyceum_warp.done import Done
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.files import newer_format, replaced
+from lyceum_warp.support.files import replaced, unknown_format
 from lyceum_warp.support.versions import versions
 
 FORMAT = 1
@@ -197,7 +197,7 @@ class Trajectory:
         except Exception as error:  # numpy and zipfile raise many types of errors
             text = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise ValueError(f"{path} is broken, or is not a trajectory of lyceum_warp ({text[:200]})") from error
-        raise newer_format(path, info["format"], FORMAT)
+        raise unknown_format(path, info["format"], FORMAT)
 
 
 def _check(arrays: Mapping[str, torch.Tensor]) -> None:

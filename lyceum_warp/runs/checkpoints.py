@@ -13,7 +13,7 @@ from torch import nn
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env
-from lyceum_warp.support.files import newer_format, replaced
+from lyceum_warp.support.files import replaced, unknown_format
 
 FORMAT = 1
 """Format version of run folders and their files. The version increases when older releases cannot read new files."""
@@ -106,7 +106,7 @@ def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | No
         module.load_state_dict(saved["state"])
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    except (KeyError, TypeError, RuntimeError, NotImplementedError) as error:
+    except (KeyError, TypeError, AttributeError, RuntimeError, NotImplementedError) as error:
         raise ValueError(f"{path} contains no {name} of lyceum_warp ({_first_sentence(error)}): {_FIX}") from error
     return module
 
@@ -188,7 +188,8 @@ def read_checkpoint(
         ) from error
     if not isinstance(content, dict) or "lyceum_warp" not in content:
         raise ValueError(f"the checkpoint {path} was not written by lyceum_warp: {_FIX}")
-    check_format(path, content["lyceum_warp"])
+    if not isinstance(number := content["lyceum_warp"], int) or number != FORMAT:
+        raise unknown_format(path, number, FORMAT)
     if missing := set(parts) - content.keys():
         raise ValueError(f"the checkpoint {path} lacks {', '.join(sorted(missing))}: {_FIX}")
     if wrong := [name for name, value in content.items() if not _KINDS.get(name, lambda value: True)(value)]:
@@ -198,40 +199,13 @@ def read_checkpoint(
     return content
 
 
-def _is_network(saved: Any) -> bool:
-    """Check whether a value has the structure of a saved network."""
-    return (
-        isinstance(saved, dict)
-        and isinstance(saved.get("shape", ""), dict | None)
-        and isinstance(saved.get("class", ""), str)
-        and isinstance(saved.get("state"), dict)
-        and all(isinstance(name, str) and type(part) is torch.Tensor for name, part in saved["state"].items())
-    )
-
-
 _KINDS: dict[str, Callable[[Any], bool]] = {
     "iteration": lambda value: type(value) is int and value >= 0,
-    "policy": _is_network, "value": _is_network,
+    "policy": lambda value: isinstance(value, dict) and isinstance(value.get("shape"), dict | None),
     "state": lambda value: isinstance(value, dict) and type(value.get("iteration", 0)) is int,
     "score": lambda value: isinstance(value, dict) and isinstance(value.get("value"), int | float),
 }  # fmt: skip
 """Map entries of a checkpoint to functions that check their values."""
-
-
-def check_format(path: Path, number: Any) -> None:
-    """Check that this release can read a file.
-
-    Args:
-        path: The file.
-        number: The format number in the file.
-
-    Raises:
-        ValueError: This release does not know the format.
-    """
-    if not isinstance(number, int) or number < 1:
-        raise ValueError(f"{path} was not written by lyceum_warp: its format is {number!r}")
-    if number > FORMAT:
-        raise newer_format(path, number, FORMAT)
 
 
 def _first_sentence(error: BaseException) -> str:

@@ -168,7 +168,7 @@ def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, 
     """
     path = run.policy_file("last" if which is None else which)
     content = read_checkpoint(path, parts=("iteration", "policy"))
-    if which is None and "from" not in run.config and "limit" not in (content["policy"]["shape"] or {}):
+    if which is None and "from" not in run.config and "limit" not in (content["policy"].get("shape") or {}):
         return None, None, content["iteration"]
     value = value_of(content, path) if "value" in content else None
     return policy_of(content, path), value, content["iteration"]

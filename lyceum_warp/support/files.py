@@ -1,4 +1,4 @@
-"""Replace files atomically, and refuse file formats of newer releases."""
+"""Replace files atomically, and refuse unknown file formats."""
 
 import contextlib
 import os
@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 
 @contextlib.contextmanager
@@ -47,8 +48,8 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
             temporary.unlink(missing_ok=True)
 
 
-def newer_format(path: Path, number: int, known: int) -> ValueError:
-    """Return the error for a file that a newer release wrote.
+def unknown_format(path: Path, number: Any, known: int) -> ValueError:
+    """Return the error for a file whose format this release does not know.
 
     Args:
         path: The file.
@@ -56,6 +57,6 @@ def newer_format(path: Path, number: int, known: int) -> ValueError:
         known: The newest format that this release can read.
     """
     return ValueError(
-        f"{path} was written by a newer lyceum_warp (format {number}, this one reads up to {known}): "
+        f"{path} has format {number!r}, and this lyceum_warp reads formats up to {known}: "
         "pip install --upgrade lyceum-warp"
     )

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.policy import acting
-from lyceum_warp.runs.checkpoints import read_checkpoint
+from lyceum_warp.runs.checkpoints import policy_of, read_checkpoint
 from lyceum_warp.runs.folder import Run, load
 
 
@@ -50,8 +50,8 @@ class Follower:
             return []
         try:
             content = self._read()
-            self.policy.load_state_dict(content["policy"]["state"])
-        except (FileNotFoundError, ValueError, RuntimeError) as error:  # the file may be changing
+            policy_of(content, self.run.policy, self.policy)
+        except (FileNotFoundError, ValueError) as error:  # the file may be changing
             self._seen = stamp
             return [f"the policy of {self.run.folder} was not read: {str(error).splitlines()[0]}"]
         self._seen, self.iteration = stamp, content["iteration"]

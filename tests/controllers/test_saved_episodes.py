@@ -119,7 +119,7 @@ def test_missing_damaged_and_newer_files_raise_a_one_line_error(folder: Path, tm
     for given, kind, message in (
         (tmp_path / "none.npz", FileNotFoundError, f"^there is no file {tmp_path / 'none.npz'}$"),
         (empty, FileNotFoundError, f"there is no episode in the folder {empty}: it contains no .npz file"),
-        (newer, ValueError, rf"{newer} was written by a newer lyceum_warp \(format 2, this one reads up to 1\)"),
+        (newer, ValueError, rf"{newer} has format 2, and this lyceum_warp reads formats up to 1"),
         (broken, ValueError, f"{broken} is broken, or is not a trajectory"),
     ):
         with pytest.raises(kind, match=message) as caught:

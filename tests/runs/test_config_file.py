@@ -14,9 +14,8 @@ from lyceum_warp.runs.folder import Run
     ("entries", "words"),
     [
         ({"task": 3}, "task must be"),
-        ({"kept": []}, r"\[\] is not a dict of name, file"),
+        ({"kept": []}, r"kept must be of type dict, not \[\]"),
         ({"kept": {"file": 3}}, "file must be of type str, not 3"),
-        ({"kept": {"modules": {"terms.py": 1}}}, "terms.py must be of type str, not 1"),
         ({"params": None}, "params must be of type dict"),
         ({"seed": 2**63}, "seed must be a whole number from 0"),
         ({"nworld": True}, "nworld must be a whole number"),
