@@ -21,7 +21,7 @@ from lyceum_warp.runs.lock import run_lock
 from lyceum_warp.runs.metrics_table import cut_rows
 from lyceum_warp.runs.replay_files import read_replay
 from lyceum_warp.runs.saving import Saver
-from lyceum_warp.runs.task_copy import note_changes, run_params, task_copy
+from lyceum_warp.runs.task_copy import note_changes, task_copy
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.interrupts import Interrupted, postponed
 from lyceum_warp.support.validate import check_flag, check_function, check_kind, positive_number, whole_number
@@ -289,7 +289,7 @@ def _check_equal(run: Run, learner: Learner) -> None:
     own = {"engine": engine_name(old.engine, old.device), "algorithm": algorithm, "nworld": old.nworld}
     # omit options that do not affect results; omit the model, because note_changes compares it
     options = {"horizon": old.horizon, "fields": old.fields, "dynamics": old.dynamics}
-    params = dict.fromkeys(now["params"]) | run_params(run, then.params)
+    params = dict.fromkeys(now["params"]) | dict(then.params)
     # runs of earlier releases lack the newest hyperparameters
     hyperparameters = run.config.get(algorithm, {}), json.loads(json.dumps(learner.settings()))
     for before, after in (

@@ -183,8 +183,12 @@ def run_worlds(
     known = known.changed({"nworld": nworld} | words)
     if "device" not in words:
         known = known.changed(options_for_few_worlds(known.engine, known.device))
-    with run.settings():
+    try:
         env = run_env(run, known, own | params, note=note, task=task, trust=trust)
+    except (ValueError, FileNotFoundError) as error:
+        if str(run.folder) not in str(error):
+            error.add_note(f"with the settings in {run.folder / 'config.json'}")
+        raise
     if task is None:
         note_changes(run, env, note=note, model=env.options.physics == saved.options.physics)
     return env

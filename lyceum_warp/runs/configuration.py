@@ -1,6 +1,5 @@
 """Convert between a learner and the config.json of its run."""
 
-import contextlib
 import dataclasses
 import logging
 from collections.abc import Callable, Mapping
@@ -23,7 +22,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import policy_of, read_checkpoint, value_of
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.task_copy import json_value, run_env
+from lyceum_warp.runs.task_copy import TABLES, is_table, json_value, run_env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.machine import cpu_cores
 
@@ -84,7 +83,7 @@ class Configuration:
 
     @classmethod
     def of(cls, run: Run) -> "Configuration":
-        """Read a run's configuration.
+        """Read a run's configuration, with the run's copies in place of missing tables.
 
         Raises:
             ValueError: A value is missing or not valid.
@@ -98,6 +97,10 @@ class Configuration:
                 engine=config["engine"], device=config["device"], nworld=config["nworld"], seed=config["seed"]
             )  # fmt: skip
             options, params = EnvOptions.split(words, base)
+            for param, value in params.items():
+                copy = run.task_folder / TABLES / f"{param}.npy"
+                if is_table(value) and not Path(value).is_file() and copy.is_file():
+                    params[param] = str(copy)
             name: str = config["algorithm"]
             return cls(
                 task=config["task"], params=params, options=options, algorithm=name,
@@ -132,7 +135,7 @@ class Configuration:
             ValueError: A value is not valid, or ``run`` is not trusted.
             FileNotFoundError: The task or its model is missing.
         """
-        with contextlib.nullcontext() if run is None else run.settings():
+        try:
             if self.threads < 1:
                 raise ValueError(f"threads must be at least 1, not {self.threads}")
             torch.set_num_threads(self.threads)
@@ -151,6 +154,10 @@ class Configuration:
             seed = self.options.seed if self.seed is None else self.seed
             learner: Learner = ALGORITHMS[self.algorithm][0](env, *networks, self.hyperparameters, seed=seed, team=team)
             return learner
+        except (ValueError, FileNotFoundError) as error:
+            if run is not None and str(run.folder) not in str(error):
+                error.add_note(f"with the settings in {run.folder / 'config.json'}")
+            raise
 
 
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:

@@ -4,7 +4,7 @@ import contextlib
 import json
 import logging
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -169,22 +169,6 @@ class Run:
         self.config = {**self.config, **changes}
         with replaced(self.folder / _CONFIG) as temporary:
             temporary.write_text(json.dumps(self.config, indent=2))
-
-    @contextlib.contextmanager
-    def settings(self) -> Iterator[None]:
-        """Add the path of ``config.json`` to errors that the run's settings may cause within the with block.
-
-        Raises:
-            ValueError: The settings are not valid for an environment or a learner.
-            FileNotFoundError: A file named in the settings is missing.
-        """
-        try:
-            yield
-        except (ValueError, FileNotFoundError) as error:
-            if str(self.folder) in str(error):
-                raise
-            kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
-            raise kind(f"{error} (with the settings in {self.folder / _CONFIG})") from error
 
     def rows(self) -> list[dict[str, float | None]]:
         """Read the rows of the metrics table. Empty cells become None.

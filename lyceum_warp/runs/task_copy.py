@@ -28,7 +28,7 @@ Note = Callable[[str], None]
 Files = dict[Path, Path | bytes]
 """Map files to their contents, or to the paths from which they are copied."""
 
-_MODEL, _TABLES = "model", "tables"
+_MODEL, TABLES = "model", "tables"
 _APART = 2
 """Maximum depth of a task's file below the common folder of task and model; deeper files get a separate folder."""
 _LARGEST = 512 * 2**20
@@ -64,7 +64,7 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
         files = {names[path]: content for path, content in {**sources, **model}.items()}
     for name, value in env.given_params.items():
         if (table := _table(value)) is not None:
-            files[f"{_TABLES}/{name}.npy"] = table if isinstance(table, Path) else _npy(table)
+            files[f"{TABLES}/{name}.npy"] = table if isinstance(table, Path) else _npy(table)
     return kept, files
 
 
@@ -79,13 +79,13 @@ def json_value(name: str, value: Any) -> Any:
 
 def _table(value: Any) -> Any:
     """Get the file or the array of a table parameter; None for any other parameter."""
-    if _is_table(value):
+    if is_table(value):
         return Path(value)
     array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
     return array if array.dtype.kind in "fiu" and array.size > 64 else None
 
 
-def _is_table(value: Any) -> bool:
+def is_table(value: Any) -> bool:
     """Check whether a parameter is the path of a ``.npy`` file."""
     return isinstance(value, str | Path) and str(value).endswith(".npy")
 
@@ -138,8 +138,11 @@ def run_env(
         FileNotFoundError: The task or its model is missing, and the run has no copy.
     """
     kept, chosen = run.config.get("kept", {}), run.config["task"]
-    saved = run.config["params"].items()
-    read: list[str | Path] = [value for name, value in saved if params.get(name, "") is value and _is_table(value)]
+    saved, tables = run.config["params"], run.task_folder / TABLES
+    read: list[str | Path] = [
+        value for name, value in params.items()
+        if is_table(value) and (value is saved.get(name) or tables in Path(value).parents)
+    ]  # fmt: skip
     read += [options.model] if isinstance(options.model, str) else []
     if task is not None:
         if read:
@@ -163,7 +166,7 @@ def run_env(
         new = f"; give {path} as the task to use the new version" if Path(path).is_file() else ""
         note(f"{changes[0]}: the run's own copy is used, {copy}{new}")
         chosen = f"{copy}{colon}{attribute}"
-    params, copy = run_params(run, params), run.task_folder / kept.get("model", "")
+    copy = run.task_folder / kept.get("model", "")
     if not copy.is_file():
         return Env(chosen, options, **params)
     if kept.get("model_given") and not isinstance(options.model, str):  # the run's model was made in Python
@@ -217,16 +220,6 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = 
         note(f"{change}: it is used as it is now" if "changed" in change else change)
     if model and _model_changed(run, env):
         note(f"the model of the task {env.task.name!r} has changed since the run began: it is used as it is now")
-
-
-def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
-    """Get the task parameters, with the run's copies in place of missing tables."""
-    found = dict(params)
-    for name, value in params.items():
-        copy = run.task_folder / _TABLES / f"{name}.npy"
-        if _is_table(value) and not Path(value).is_file() and copy.is_file():
-            found[name] = str(copy)
-    return found
 
 
 def _model_changed(run: Run, env: Env) -> bool:

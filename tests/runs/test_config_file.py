@@ -50,7 +50,7 @@ def test_error_of_an_invalid_setting_names_the_file(
     arguments = {"eval": ["eval", str(run.folder)],
                  "resume": ["train", "--resume", str(run.folder), "--iterations", "2", *QUIET]}  # fmt: skip
     assert cli.main(arguments[command]) == 2
-    refused(capsys, "'x'", f"(with the settings in {run.folder / 'config.json'})")
+    refused(capsys, "'x'", f"with the settings in {run.folder / 'config.json'}")
 
 
 def test_damaged_metrics_table_raises_an_error_before_anything_is_written(
