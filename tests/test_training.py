@@ -44,7 +44,7 @@ def test_training_in_python_and_on_the_command_line_gives_equal_metrics(six: Pat
 def test_run_started_in_python_is_evaluated_and_resumed_on_the_command_line(
     six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A message tells that the version of a package has changed."""
+    """A message reports that the version of a package has changed."""
     folder = Path(shutil.copytree(six, tmp_path / "run"))
     run = Run.open(folder)
     run.amend(versions=run.config["versions"] | {"torch": "2.0"})

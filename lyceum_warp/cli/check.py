@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from lyceum_warp.cli.arguments import ParamWords, Physics, Placement, TaskWord, given, parameters
-from lyceum_warp.cli.display import make_console
+from lyceum_warp.cli.display import console
 from lyceum_warp.testing import CHECKS, Context, check_task
 
 
@@ -45,7 +45,6 @@ class Check:
         """Run the command, and return the exit code."""
         words = vars(self.env) | given(self.physics) | parameters(self.param, self)
         checks = [_check(name) for name in self.rule] or CHECKS
-        console = make_console()
         try:
             report = check_task(self.task, nworld=self.nworld, steps=self.steps, seed=self.seed, checks=checks, **words)
         except AssertionError as error:

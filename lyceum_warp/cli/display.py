@@ -25,9 +25,8 @@ from lyceum_warp.viz.policy_videos import one_line
 _TABLE_ROWS = 15
 
 
-def make_console() -> Console:
-    """Make a console; if stdout is not a terminal, it has 120 columns, so that tables are not wrapped."""
-    return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=120)
+console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
+"""The standard output; if it is not a terminal, it has 120 columns, so that tables are not wrapped."""
 
 
 def note(line: str) -> None:

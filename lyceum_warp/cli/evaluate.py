@@ -13,7 +13,7 @@ from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.algos.transfer import Transfer, transfer
 from lyceum_warp.binding.registry import file_name, find_task, task_name
 from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, Trust, given, parameters
-from lyceum_warp.cli.display import fitting_table, make_console, note, tried
+from lyceum_warp.cli.display import console, fitting_table, note, tried
 from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.controllers.trajectory import source
 from lyceum_warp.engines.placement import options_for_few_worlds
@@ -106,7 +106,7 @@ class Eval:
         policy = load(run, which=self.which, device=env.obs.device)
         check_sizes(policy, env, path)
         try:
-            with LongWork("evaluating the policy", "steps", make_console()) as work:
+            with LongWork("evaluating the policy", "steps", console) as work:
                 episodes = evaluate(env, policy, self.episodes, seed=self.seed, progress=work).first(self.episodes)
         except Interrupted as signalled:
             name = signal.Signals(signalled.number).name
@@ -120,7 +120,6 @@ class Eval:
             cells = (name, *(f"{number.item():.6g}" for number in numbers))
             for column, cell in zip(columns.values(), cells, strict=True):
                 column.append(cell)
-        console = make_console()
         which = "the mean policy" if self.which == "last" else f"the mean policy {self.which!r}"
         where = pretrained_text(run) if self.pretrained else f"in {self.folder}"
         text = f"{env.task.name}: {self.episodes} episodes of {which} {where}"
@@ -129,7 +128,7 @@ class Eval:
         if env.task.functions["success"] is not None:
             console.print(f"success: {episodes.success.mean().item():.0%}")
         if self.transfer:
-            with LongWork("judging the policy's transfer", "steps", make_console()) as work:
+            with LongWork("judging the policy's transfer", "steps", console) as work:
                 verdict = transfer(
                     env, policy, max(2, self.episodes), seed=self.seed, device=self.env.device, progress=work
                 )
@@ -198,7 +197,7 @@ def _save_episodes(env: Env, policy: Policy, options: Eval, run: Run, source: di
     """Run the same episodes again, write one file per episode, and return a glob pattern of the files."""
     assert options.episodes_to is not None
     whose = {"name": type(policy).__name__, "run": str(run.folder.resolve()), "which": options.which}
-    with LongWork("running the episodes that are saved", "steps", make_console()) as work:
+    with LongWork("running the episodes that are saved", "steps", console) as work:
         episodes = policy_episodes(
             env.replicate(autoreset=False), acting(policy), options.episodes, seed=evaluation_seed(options.seed),
             controller=whose, progress=work,

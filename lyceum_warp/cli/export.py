@@ -8,7 +8,7 @@ import tyro
 
 from lyceum_warp.algos.policy_export import check_export, export_policy
 from lyceum_warp.cli.arguments import Trust
-from lyceum_warp.cli.display import make_console, note
+from lyceum_warp.cli.display import console, note
 from lyceum_warp.engines.placement import options_on_cores
 from lyceum_warp.env import Env
 from lyceum_warp.runs.configuration import Configuration
@@ -44,7 +44,7 @@ class Export:
         policy = load(run, which=self.which)
         export_policy(policy, path, env=self._env(run) if path.suffix == ".onnx" else None)
         text = f"{path}: {policy.nobs} observations, {policy.nact} actions, {path.stat().st_size / 1e3:.1f} kB"
-        make_console().print(text, soft_wrap=True, markup=False)
+        console.print(text, soft_wrap=True, markup=False)
         return 0
 
     def _env(self, run: Run) -> Env | None:

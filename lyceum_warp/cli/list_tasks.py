@@ -17,7 +17,7 @@ from lyceum_warp.binding.models import compile_model, find_model
 from lyceum_warp.binding.parameters import defaults
 from lyceum_warp.binding.parts import length
 from lyceum_warp.binding.registry import find_task, task_names
-from lyceum_warp.cli.display import make_console
+from lyceum_warp.cli.display import console
 from lyceum_warp.model_files import ModelFile
 from lyceum_warp.options import PhysicsOptions
 from lyceum_warp.task import Task
@@ -56,7 +56,7 @@ class Tasks:
             raise ValueError(
                 f"no task has {self.word!r} in its name, description or model: list all tasks with lyceum-warp tasks"
             )
-        console, table = make_console(), [_HEADINGS, *map(_cells, entries)]
+        table = [_HEADINGS, *map(_cells, entries)]
         widths = [max(len(row[i]) for row in table) for i in range(len(_HEADINGS))]
         fits = sum(widths) + 2 * len(widths) - 2 <= console.width
         shown = len(_HEADINGS) - (not fits)  # in a narrow console, the model gets its own line

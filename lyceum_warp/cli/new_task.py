@@ -13,7 +13,7 @@ import tyro
 
 from lyceum_warp.binding.models import compile_model
 from lyceum_warp.binding.registry import find_task, package_task_names, snake_case
-from lyceum_warp.cli.display import make_console
+from lyceum_warp.cli.display import console
 from lyceum_warp.cli.task_text import literal, task_text
 from lyceum_warp.cli.velocity_text import TRAINING, Walker, velocity_text
 from lyceum_warp.model_files import ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, read_spec
@@ -93,7 +93,6 @@ class New:
                 f"{sum(task.obs.values())} observations, {model.nu} actions, "
                 f"{1000 * task.frame_skip * model.opt.timestep:.3g} ms in a step"
             )
-        console = make_console()
         console.print(f"{path}: {sizes}; check and train it with", soft_wrap=True, markup=False)
         for command in ("check", "train"):
             options = f" {TRAINING}" if (self.template, command) == ("velocity", "train") else ""

@@ -29,7 +29,7 @@ from lyceum_warp.cli.arguments import (
     given,
     parameters,
 )
-from lyceum_warp.cli.display import PlanDisplay, make_console, report_table, tried
+from lyceum_warp.cli.display import PlanDisplay, console, report_table, tried
 from lyceum_warp.controllers.checked_controller import CheckedController
 from lyceum_warp.controllers.control_report import ControlReport, control_report
 from lyceum_warp.controllers.loop import control
@@ -174,7 +174,7 @@ class Plan:
         choice = _choice(self, plant, make_planner) if self.real_time else None
         if choice is not None:
             every = round(choice.deadline / plant.timestep) * choice.replan_every
-            make_console().print(str(choice), soft_wrap=True, markup=False)
+            console.print(str(choice), soft_wrap=True, markup=False)
         planner = make_planner(None if choice is None else choice.setting)
         CheckedController(planner, plant).check_horizon(planner.horizon, every)
         config = {
@@ -296,7 +296,7 @@ def _model(path: Path) -> Path:
 
 
 def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
-    console, simulated, update = make_console(), planner.env, planner.settings["update"]
+    simulated, update = planner.env, planner.settings["update"]
     name = {"mppi": "MPPI", "cem": "CEM", "predictive_sampling": "predictive sampling"}.get(update, update)
     physics = ", ".join(f"{option} {value}" for option, value in simulated.options.physics.given().items())
     console.print(
@@ -360,8 +360,7 @@ def _summary(done: list[Trajectory], options: Plan) -> ControlReport:
 
 def _report(run: Run, plant: Env, done: list[Trajectory], options: Plan) -> int:
     """Print the report, make the plot and the video, and list the files."""
-    console, camera = make_console(), parsed_camera(options.camera)
-    report = _summary(done, options)
+    camera, report = parsed_camera(options.camera), _summary(done, options)
     console.print(report_table(report, success=plant.task.functions["success"] is not None))
     paths = [("episodes", str(run.folder / "episode-*.npz")), ("report", str(run.folder / "report.json"))]
     if options.plot:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 
 from lyceum_warp.algos.distributed import Team, join
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
@@ -26,7 +25,7 @@ from lyceum_warp.cli.arguments import (
     given,
     parameters,
 )
-from lyceum_warp.cli.display import Display, curve_table, make_console, note, tried
+from lyceum_warp.cli.display import Display, console, curve_table, note, tried
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import read_checkpoint
 from lyceum_warp.runs.configuration import ALGORITHMS, Configuration, saved_networks
@@ -180,7 +179,7 @@ class Train:
         with join(self.env.device or saved.get("device", "cpu")) as team:
             with team.together():  # all options are checked before the folder is created
                 learner, folder, entries = self._learner(source, team)
-            console, leads, total = make_console(), learner.team.leads, settings["iterations"]
+            leads, total = learner.team.leads, settings["iterations"]
             try:
                 with RunViewer(folder, port=self.port) if self.view and leads else contextlib.nullcontext():
                     run = train(
@@ -209,7 +208,7 @@ class Train:
                 text = f"{self.minutes:g} minutes are over after {learner.iteration} of {total} iterations; continue "
                 text += f"with\n  lyceum-warp train --resume {folder} --iterations {total}"
                 console.print(text, soft_wrap=True, markup=False)
-            return self._report(run, learner, console)
+            return self._report(run, learner)
 
     def _suggestion(self) -> Training:
         """Return the settings that the task suggests, or none of them if a flag gives another algorithm."""
@@ -289,7 +288,7 @@ class Train:
         name = f"{file_name(learner.env.task.name)}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         return learner, self.resume or self.out or Path("runs", name), entries
 
-    def _report(self, run: Run, learner: Learner, console: Console) -> int:
+    def _report(self, run: Run, learner: Learner) -> int:
         """Print the table of iterations, evaluate the policy, make the plot and the video, and return the exit code."""
         env, policy, seed = learner.env, learner.policy, learner.env.options.seed + 1
         console.print(curve_table(run.rows(), console))

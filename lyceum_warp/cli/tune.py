@@ -9,7 +9,7 @@ import torch
 import tyro
 
 from lyceum_warp.cli.arguments import ParamWords, Placement, TaskWord, parameters
-from lyceum_warp.cli.display import fitting_table, make_console, note
+from lyceum_warp.cli.display import console, fitting_table, note
 from lyceum_warp.tuning.judgement import Difference
 from lyceum_warp.tuning.search import Tuning, tune
 from lyceum_warp.tuning.trial import DIVERGENCE_STEPS, NUDGE
@@ -85,7 +85,7 @@ def _progress(row: dict[str, Any]) -> None:
 
 def _report(tuning: Tuning, options: Tune) -> None:
     """Print the table of all settings, the best setting, and the settings that were not tried."""
-    console, reference = make_console(), tuning.reference
+    reference = tuning.reference
 
     def line(text: str) -> None:
         console.print(text, soft_wrap=True, markup=False)

@@ -11,7 +11,7 @@ from torch import nn
 
 import lyceum_warp as lw
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.cli.display import Display, curve_table, make_console
+from lyceum_warp.cli.display import Display, console, curve_table
 from lyceum_warp.runs.folder import Run
 
 
@@ -73,8 +73,8 @@ def test_a_minimal_learner_resumes_bit_for_bit(env: lw.Env) -> None:
 
 def test_policy_that_is_not_gaussian_is_saved_and_exported(env: lw.Env, tmp_path: Path) -> None:
     drift, shown = Drift(env), []
-    run = lw.train(drift, tmp_path / "run", iterations=2, callback=shown.append, display=Display(make_console()))
-    assert len(shown) == 2 and len(list(curve_table(run.rows(), make_console()).columns)) == 2
+    run = lw.train(drift, tmp_path / "run", iterations=2, callback=shown.append, display=Display(console))
+    assert len(shown) == 2 and len(list(curve_table(run.rows(), console).columns)) == 2
     assert run.config["drift"] == {"size": 0.1} and Run.open(run.folder).best_score() is None
     again = lw.train(Drift(env), run.folder, iterations=4, resume=True)
     assert [row["iteration"] for row in again.rows()] == [1, 2, 3, 4]

@@ -56,7 +56,7 @@ def test_tasks_are_listed_with_their_sizes_and_models(capsys: pytest.CaptureFixt
 def test_narrow_terminal_lists_models_below_the_numbers(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(list_tasks, "make_console", lambda: Console(width=60, highlight=False))
+    monkeypatch.setattr(list_tasks, "console", Console(width=60, highlight=False))
     assert cli.main(["tasks", "adroit"]) == 0
     table = capsys.readouterr().out.partition("\n\n")[0]
     assert max(map(len, table.splitlines())) <= 60
