@@ -65,7 +65,9 @@ def test_run_that_another_process_writes_is_resumed_only_with_take_over(
     assert len(metrics(run)) == 4 and not (run / "lock").exists()
 
 
-def test_option_take_over_without_resume_prints_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_flag_take_over_prints_an_error_if_the_flag_resume_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["train", "point_mass", "--take-over", "--out", str(tmp_path / "run")]) == 2
     refused(capsys, "--take-over has no effect without --resume")
 
@@ -81,7 +83,9 @@ def test_lock_of_a_killed_process_is_free(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content, who", [('{"host": "far", "pid": 3}', "process 3 on far"), ("half", "another process")]
 )
-def test_lock_of_another_host_is_taken_over_only_with_take_over(content: str, who: str, tmp_path: Path) -> None:
+def test_lock_of_another_host_is_taken_over_only_with_the_flag_take_over(
+    content: str, who: str, tmp_path: Path
+) -> None:
     (tmp_path / "lock").write_text(content)
     with pytest.raises(ValueError, match=f"is being written by {who}"), run_lock(tmp_path):
         pass
