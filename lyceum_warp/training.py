@@ -24,7 +24,7 @@ from lyceum_warp.runs.saving import Saver
 from lyceum_warp.runs.task_copy import note_changes, task_copy
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.interrupts import Interrupted, postponed
-from lyceum_warp.support.validate import check_flag, check_function, check_kind, positive_number, whole_number
+from lyceum_warp.support.validate import check_flag, check_kind, positive_number, whole_number
 from lyceum_warp.support.versions import versions
 from lyceum_warp.viz.cameras import CameraChoice, find_camera
 from lyceum_warp.viz.policy_videos import Videos, one_line
@@ -126,7 +126,7 @@ def train(
     """
     check_kind("learner", learner, Learner, "as lw.NPG(env)")
     check_kind("folder", folder, str | Path, "as 'runs/mine'")
-    check_function("callback", callback)
+    check_kind("callback", callback, Callable | None, "a function")
     check_flag("resume", resume)
     check_flag("take_over", take_over)
     check_flag("tensorboard", tensorboard)

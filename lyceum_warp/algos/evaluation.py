@@ -13,7 +13,7 @@ from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_function, check_kind, described, whole_number
+from lyceum_warp.support.validate import check_kind, described, whole_number
 
 MEAN_SEED = 2**31 - 1
 """Seed of the initial states for evaluations of the mean policy during training."""
@@ -81,7 +81,7 @@ def evaluate(
     if not callable(policy):
         raise ValueError(f"policy must be a function of observations, not {described(policy)}")
     episodes = whole_number("episodes", episodes, low=1)
-    check_function("progress", progress)
+    check_kind("progress", progress, Callable | None, "a function")
     if env.horizon == 0:
         raise ValueError(f"episodes of {env.task.name!r} never end without a horizon: give make() a horizon")
     if not env.autoreset:

@@ -10,7 +10,7 @@ from lyceum_warp.controllers.checked_controller import CheckedController
 from lyceum_warp.controllers.trajectory import Trajectory, provenance
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_flag, check_function, check_kind, whole_number
+from lyceum_warp.support.validate import check_flag, check_kind, whole_number
 
 
 @document_attributes
@@ -55,8 +55,8 @@ def check_arguments(env: Env, *, reset: bool, on_step: OnStep | None, on_abort: 
     """Check the arguments that both control loops share."""
     check_kind("env", env, Env, "as lw.make(..., autoreset=False) makes it")
     check_flag("reset", reset)
-    check_function("on_step", on_step)
-    check_function("on_abort", on_abort)
+    check_kind("on_step", on_step, Callable | None, "a function")
+    check_kind("on_abort", on_abort, Callable | None, "a function")
 
 
 def begin_episode(

@@ -46,16 +46,6 @@ def check_kind(name: str, value: Any, kind: Any, example: str) -> None:
         raise ValueError(f"{name} must be of type {wanted}, {example}, not {described(value)}")
 
 
-def check_function(name: str, value: Any) -> None:
-    """Check that an optional value can be called.
-
-    Raises:
-        ValueError: The value is neither callable nor None.
-    """
-    if value is not None and not callable(value):
-        raise ValueError(f"{name} must be a function, or None, not {described(value)}")
-
-
 def check_flag(name: str, value: Any) -> None:
     """Check that a value is True or False.
 

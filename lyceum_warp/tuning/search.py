@@ -14,7 +14,7 @@ from lyceum_warp.runs.checkpoints import check_sizes
 from lyceum_warp.runs.configuration import Configuration
 from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_flag, check_function, check_word, whole_number
+from lyceum_warp.support.validate import check_flag, check_kind, check_word, whole_number
 from lyceum_warp.task import Task
 from lyceum_warp.tuning.candidates import Setting, candidates, combined, flags, not_tried, task_line
 from lyceum_warp.tuning.judgement import TOLERANCES, verdict
@@ -112,7 +112,7 @@ def tune(
     check_word("tolerance", tolerance, list(TOLERANCES))
     for name, flag in (("short", short), ("planning", planning)):
         check_flag(name, flag)
-    check_function("progress", progress)
+    check_kind("progress", progress, Callable | None, "a function")
     if episodes is not None:
         whole_number("episodes", episodes, low=1)
     kind = find_task(task)
