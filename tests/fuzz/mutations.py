@@ -86,7 +86,8 @@ def mutated_csv(data: bytes, random: Random) -> bytes:
     long_cell = "1" * 200_000
     rows = mutated_value(list(csv.reader(io.StringIO(data.decode()))), random, (*NUMBERS, *TEXTS, long_cell))
     text = io.StringIO()
-    csv.writer(text).writerows([row if isinstance(row, list) else [row] for row in rows] if rows else [])
+    rows = rows if isinstance(rows, list) else [rows]  # the mutation may replace the whole table
+    csv.writer(text).writerows(row if isinstance(row, list) else [row] for row in rows)
     return text.getvalue().encode()
 
 
