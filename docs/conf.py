@@ -41,7 +41,7 @@ myst_heading_anchors = 4
 nb_execution_mode, nb_execution_raise_on_error = "force", True
 nb_execution_timeout = 900  # time limit of a cell in seconds; compiling kernels may take minutes
 nb_merge_streams = nb_execution_in_temp = True
-KernelManager.transport_encryption.default_value = "auto"  # other values make Jupyter kernels warn
+KernelManager.transport_encryption.default_value = "auto"  # with any other value, Jupyter kernels print a warning
 
 add_module_names, python_use_unqualified_type_names, python_maximum_signature_line_length = True, True, 100
 autodoc_member_order, autodoc_typehints = "bysource", "none"

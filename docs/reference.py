@@ -32,11 +32,11 @@ ALIASES = {
     "quat": ("class", "A quaternion in MuJoCo's order w, x, y, z: ``wp.vec4``."),
     "vec10": ("class", "The ten numbers of a contact's or a geom's row that Warp has no name for."),
 }
-"""Public names of Warp's objects, with their kinds and meanings."""
+"""Public names of the package that refer to Warp objects, with their kinds and descriptions."""
 
 TYPES = {"float32": "float", "int32": "int", "vec2f": "wp.vec2", "vec3f": "wp.vec3", "vec4f": "lw.quat",
          "mat33f": "wp.mat33", "spatial_vectorf": "wp.spatial_vector", "Any": "Any"}  # fmt: skip
-"""Names of Warp's types in task files."""
+"""Warp's names of types, and the names that task files use."""
 
 METHODS = (types.FunctionType, property, classmethod, staticmethod)
 
@@ -115,7 +115,7 @@ def converted(text: str) -> list[str]:
 
 
 def short_signature(app: Any, what: str, name: str, obj: Any, options: Any, signature: str, result: str) -> Any:
-    """Remove the fields of a dataclass and of default objects; a dataclass's fields are documented as members."""
+    """Omit the fields from a dataclass's signature, because members document them, and shorten default objects."""
     if what == "class" and dataclasses.is_dataclass(obj):
         return "", result
     return signature and re.sub(r"(PhysicsOptions)\(.*?\)", r"\1()", signature), result
@@ -137,7 +137,7 @@ def warp_function(function: Any, name: str) -> list[str]:
         result = f" -> {spelled['return']}" if spelled["return"] else ""
         heads.append(f"{name}({', '.join(f'{each}: {spelled[each]}' for each in arguments)}){result}")
     text = inspect.getdoc(function) or ""
-    if text.startswith(f"{function.key}("):  # the text begins with one line for each overload
+    if text.startswith(f"{function.key}("):  # the text begins with a signature for each overload
         text = text.partition("\n\n")[2]
     lines = [f".. py:function:: {heads[0]}", *(f"                 {head}" for head in heads[1:]), ""]
     return [*lines, *(f"   {line}" for line in converted(text)), ""]
@@ -195,7 +195,7 @@ def task_section(name: str) -> str:
 
 
 def facts(task: BoundTask) -> list[str]:
-    """Return a table of a task's lengths, physics and planner settings."""
+    """Return a table of a task's step and episode lengths, physics and planner settings."""
     cls, seconds = task.task, task.timestep
     rows = [
         ("step", f"{seconds:g} s, {count(task.frame_skip, 'substep')} of {1000 * task.model.opt.timestep:g} ms"),
@@ -214,7 +214,7 @@ def facts(task: BoundTask) -> list[str]:
 
 
 def shortened(value: Any) -> str:
-    """Format a setting, and a long list by its length."""
+    """Format a setting; of a long list, give only the length."""
     return f"({len(value)} numbers)" if isinstance(value, list | tuple) and len(value) > 3 else f"{value}"
 
 
@@ -273,7 +273,7 @@ def spelled(default: Any, value: Any) -> str:
 
 
 def comments(task: type) -> dict[str, str]:
-    """Return the comments behind the fields of ``Params``, from the files of a task and of its base classes."""
+    """Return the comments after the fields of ``Params``, from the files of a task and of its base classes."""
     found: dict[str, str] = {}
     for cls in reversed(task.__mro__[:-1]):
         lines = inspect.getsource(sys.modules[cls.__module__]).splitlines()
@@ -302,7 +302,7 @@ def count(number: int, noun: str) -> str:
 
 
 def folded(title: str, lines: list[str]) -> list[str]:
-    """Return lines that a reader can unfold."""
+    """Put lines into a block that a reader can unfold."""
     return [f"<details><summary>{title}</summary>", "", *lines, "", "</details>", ""]
 
 

@@ -16,7 +16,7 @@ def job(path: Path) -> str:
 
 
 def rows(folder: Path, prefix: str = "") -> list[str]:
-    """List the rows of a folder's modules. A subfolder gets a row, followed by its modules. All tasks share a row."""
+    """Return a row for each module in a folder, and for each subfolder. All tasks share a row."""
     found = []
     for path in sorted(folder.iterdir(), key=lambda path: (path.is_dir(), path.name)):
         if path.is_dir() and (path / "__init__.py").exists():

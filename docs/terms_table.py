@@ -27,7 +27,7 @@ def functions() -> list[str]:
             function = getattr(terms, name)
             text, _, _ = inspect.getdoc(function).partition("\n\nArgs:")
             signatures = [f"`{name}({', '.join(function.input_types)})`"]
-            if text.startswith(f"{name}("):  # the text begins with one line for each overload
+            if text.startswith(f"{name}("):  # the text begins with a signature for each overload
                 head, _, text = text.partition("\n\n")
                 signatures = [f"`{line}`" for line in head.splitlines()]
             lines.append(f"| {'<br>'.join(signatures)} | {cell(text)} |")
