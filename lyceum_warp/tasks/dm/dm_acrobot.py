@@ -118,7 +118,7 @@ class AcrobotSwingup(lw.Task):
     obs = {"orientations": 4, "velocity": 2}
     # the motor is too weak to lift the arms at once, so the planner is rewarded for the energy that it pumps in
     planning = lw.Planning(
-        settings={"horizon": 25, "samples": 48, "noise": 2.0, "temperature": 0.2},
+        settings={"horizon": 25, "samples": 24, "noise": 2.0, "temperature": 0.2},
         options={"timestep": 0.04, "integrator": "rk4"},
         params={"margin": 2.0, "energy_weight": 2.0, "balance_weight": 4.0},
     )
