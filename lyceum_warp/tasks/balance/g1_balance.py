@@ -1,0 +1,111 @@
+"""G1Stand: a Unitree G1 with a rigid upper body stands, and steps to keep its balance when it is pushed.
+
+Actions are offsets of the leg joints' targets. The targets pass through a default pose with bent knees; in G1Walk, they
+also lift the feet in time with a gait clock, so that the robot steps in place under a plan of zeros. Gains are those of
+unitree_rl_gym, which also keeps waist and arms rigid. The upper body's 17 joints and the dry friction of the leg joints
+would make a step of the physics twice as expensive.
+"""
+
+import mujoco
+import numpy as np
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row, walkers
+from lyceum_warp.tasks.balance import balance
+from lyceum_warp.tasks.balance.balance import World
+from lyceum_warp.tasks.velocity.g1 import FEET, G1, LEGS, OTHERS
+
+GAINS = {"hip": (100.0, 2.0), "knee": (150.0, 4.0), "ankle": (40.0, 2.0)}  # N m / rad, N m s / rad
+
+
+@wp.struct
+class Params(balance.Params):
+    joint_qpos: wp.array[int] = lw.qposes(*LEGS)
+    joint_dof: wp.array[int] = lw.dofs(*LEGS)
+    motors: wp.array[int] = lw.actuators(*LEGS)
+    default_pose: wp.array[float] = 2 * [-0.312, 0.0, 0.0, 0.669, -0.363, 0.0]  # rad
+    action_scale: wp.array[float] = 2 * [1.0, 0.5, 0.5, 1.0, 0.5, 0.25]  # rad
+    target_height: float = 0.75  # of the pelvis, m
+    start_height: float = 0.755
+    # gait
+    gait_frequency: float = 1.25  # Hz
+    stance_share: float = 0.6
+    swing: wp.array[float] = 2 * [-0.3, 0.0, 0.0, 0.6, -0.3, 0.0]  # largest change of the targets in a swing, rad
+    swing_share: float = 0.0  # of ``swing`` that is used
+
+
+@wp.func
+def target(joint: int, time: float, p: Params) -> float:
+    """Return a joint's target without an action, in rad."""
+    cycles = time * p.gait_frequency + 0.5 * float(joint // 6)  # the feet are half a cycle apart
+    progress = (cycles - wp.floor(cycles) - p.stance_share) / (1.0 - p.stance_share)
+    lift = wp.where(progress > 0.0, wp.sin(wp.pi * progress), 0.0)
+    return p.default_pose[joint] + p.swing_share * lift * p.swing[joint]
+
+
+@wp.func
+def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
+    for j in range(p.motors.shape[0]):
+        ctrl[p.motors[j]] = target(j, s.time, p) + p.action_scale[j] * action[j]
+
+
+@wp.func
+def pose_l2(s1: World, p: Params) -> float:
+    total = float(0.0)
+    for j in range(p.joint_qpos.shape[0]):
+        error = s1.qpos[p.joint_qpos[j]] - target(j, s1.time, p)
+        total += error * error
+    return total
+
+
+@lw.register
+class G1Stand(balance.Balance):
+    model, frame_skip, horizon = G1.model, 4, 1000  # 20 s
+    obs, actions = {"position": 17, "velocity": 18}, {"joint_target": "motors"}
+    physics = {
+        "fast": lw.PhysicsOptions(timestep=0.01, frame_skip=2, solver={"iterations": 4, "ls_iterations": 5}),
+    }  # fmt: skip
+    planning = lw.Planning(
+        settings=dict(horizon=30, samples=16, knots=6, noise=0.08, temperature=0.0075), options={"physics": "fast"}
+    )
+
+    @staticmethod
+    def edit_model(spec: mujoco.MjSpec) -> None:
+        """Make the upper body rigid in the pose of the keyframe knees_bent, and set the gains of the legs."""
+        walkers.prepare_walker(spec, FEET, timestep=0.005, iterations=(10, 10))
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        model = spec.copy().compile()
+        pose = model.key("knees_bent").qpos
+        for element in (*spec.sensors, *spec.keys, *(servo for servo in spec.actuators if servo.target in OTHERS)):
+            spec.delete(element)
+        for name in OTHERS:
+            joint, turn, turned = spec.joint(name), np.zeros(4), np.zeros(4)
+            mujoco.mju_axisAngle2Quat(turn, joint.axis, pose[model.joint(name).qposadr[0]])
+            mujoco.mju_mulQuat(turned, joint.parent.quat, turn)
+            joint.parent.quat = turned
+            spec.delete(joint)
+        spec.compiler.fusestatic = True
+        for servo in spec.actuators:
+            stiffness, damping = next(gains for part, gains in GAINS.items() if part in servo.target)
+            servo.set_to_position(kp=stiffness, kv=0.0)
+            joint = spec.joint(servo.target)
+            joint.damping, joint.frictionloss = [damping, 0.0, 0.0], 0.0
+
+
+@wp.struct
+class WalkParams(Params):
+    forward_speed: float = 0.6
+    swing_share: float = 1.0
+
+
+@wp.func
+def evaluate_distance(s: World, p: Params) -> float:
+    return s.qpos[0]
+
+
+@lw.register
+class G1Walk(G1Stand):
+    """A Unitree G1 with a rigid upper body walks forward, and keeps its balance when it is pushed."""
+
+    Params, evaluate = WalkParams, evaluate_distance
