@@ -32,7 +32,6 @@ class Params(balance.Params):
     gait_frequency: float = 1.25  # Hz
     stance_share: float = 0.6
     swing: wp.array[float] = 2 * [-0.3, 0.0, 0.0, 0.6, -0.3, 0.0]  # largest change of the targets in a swing, rad
-    swing_share: float = 0.0  # of ``swing`` that is used
 
 
 @wp.func
@@ -41,7 +40,7 @@ def target(joint: int, time: float, p: Params) -> float:
     cycles = time * p.gait_frequency + 0.5 * float(joint // 6)  # the feet are half a cycle apart
     progress = (cycles - wp.floor(cycles) - p.stance_share) / (1.0 - p.stance_share)
     lift = wp.where(progress > 0.0, wp.sin(wp.pi * progress), 0.0)
-    return p.default_pose[joint] + p.swing_share * lift * p.swing[joint]
+    return p.default_pose[joint] + lift * p.swing[joint]
 
 
 @wp.func
@@ -67,7 +66,7 @@ class G1Stand(balance.Balance):
         "fast": lw.PhysicsOptions(timestep=0.01, frame_skip=2, solver={"iterations": 4, "ls_iterations": 5}),
     }  # fmt: skip
     planning = lw.Planning(
-        settings=dict(horizon=30, samples=16, knots=6, noise=0.08, temperature=0.0075), options={"physics": "fast"}
+        settings=dict(horizon=30, samples=12, knots=6, noise=0.08, temperature=0.0075), options={"physics": "fast"}
     )
 
     @staticmethod
@@ -77,8 +76,15 @@ class G1Stand(balance.Balance):
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model = spec.copy().compile()
         pose = model.key("knees_bent").qpos
-        for element in (*spec.sensors, *spec.keys, *(servo for servo in spec.actuators if servo.target in OTHERS)):
+        servos = [servo for servo in spec.actuators if servo.target in OTHERS]
+        hands = [pair for pair in spec.pairs if "hand" in pair.geomname1 + pair.geomname2]
+        for element in (*spec.sensors, *spec.keys, *servos, *hands):
             spec.delete(element)
+        for body in spec.bodies:  # most meshes are drawn twice, and every geom costs time in each substep
+            meshes = [geom.meshname for geom in body.geoms]
+            for i, geom in enumerate(body.geoms):
+                if geom.meshname and geom.meshname in meshes[:i]:
+                    spec.delete(geom)
         for name in OTHERS:
             joint, turn, turned = spec.joint(name), np.zeros(4), np.zeros(4)
             mujoco.mju_axisAngle2Quat(turn, joint.axis, pose[model.joint(name).qposadr[0]])
@@ -96,7 +102,6 @@ class G1Stand(balance.Balance):
 @wp.struct
 class WalkParams(Params):
     forward_speed: float = 0.6
-    swing_share: float = 1.0
 
 
 @wp.func
