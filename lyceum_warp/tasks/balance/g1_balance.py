@@ -1,9 +1,9 @@
-"""G1Stand: a Unitree G1 with a rigid upper body stands, and steps to keep its balance when it is pushed.
+"""G1Stand: a Unitree G1 with a rigid upper body steps in place, and keeps its balance when it is pushed.
 
-Actions are offsets of the leg joints' targets. The targets pass through a default pose with bent knees; in G1Walk, they
-also lift the feet in time with a gait clock, so that the robot steps in place under a plan of zeros. Gains are those of
-unitree_rl_gym, which also keeps waist and arms rigid. The upper body's 17 joints and the dry friction of the leg joints
-would make a step of the physics twice as expensive.
+Actions are offsets of the leg joints' targets. The targets lift the feet in time with a gait clock, so that the robot
+steps in place under a plan of zeros until it falls after about a second. A planner thus only needs to find corrections
+of a step, not the step itself. The gains of the servos are those of unitree_rl_gym, which also keeps waist and arms
+rigid. The 17 joints of the upper body and the dry friction of the legs' joints would double the time of a substep.
 """
 
 import mujoco
@@ -62,9 +62,7 @@ def pose_l2(s1: World, p: Params) -> float:
 class G1Stand(balance.Balance):
     model, frame_skip, horizon = G1.model, 4, 1000  # 20 s
     obs, actions = {"position": 17, "velocity": 18}, {"joint_target": "motors"}
-    physics = {
-        "fast": lw.PhysicsOptions(timestep=0.01, frame_skip=2, solver={"iterations": 4, "ls_iterations": 5}),
-    }  # fmt: skip
+    physics = {"fast": lw.PhysicsOptions(timestep=0.01, frame_skip=2, solver={"iterations": 4, "ls_iterations": 5})}
     planning = lw.Planning(
         settings=dict(horizon=30, samples=12, knots=6, noise=0.08, temperature=0.0075), options={"physics": "fast"}
     )
