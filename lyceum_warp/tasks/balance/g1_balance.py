@@ -12,15 +12,16 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp import Row, walkers
-from lyceum_warp.tasks.balance import balance
-from lyceum_warp.tasks.balance.balance import World
-from lyceum_warp.tasks.velocity.g1 import FEET, G1, LEGS, OTHERS
+from lyceum_warp.tasks.balance import balancing
+from lyceum_warp.tasks.balance.balancing import World
 
+LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
+LEGS = [f"{side}_{joint}_joint" for side in ("left", "right") for joint in LEG]
 GAINS = {"hip": (100.0, 2.0), "knee": (150.0, 4.0), "ankle": (40.0, 2.0)}  # N m / rad, N m s / rad
 
 
 @wp.struct
-class Params(balance.Params):
+class Params(balancing.Params):
     joint_qpos: wp.array[int] = lw.qposes(*LEGS)
     joint_dof: wp.array[int] = lw.dofs(*LEGS)
     motors: wp.array[int] = lw.actuators(*LEGS)
@@ -59,8 +60,9 @@ def pose_l2(s1: World, p: Params) -> float:
 
 
 @lw.register
-class G1Stand(balance.Balance):
-    model, frame_skip, horizon = G1.model, 4, 1000  # 20 s
+class G1Stand(balancing.Balance):
+    model = lw.playground_model("locomotion/g1/xmls/scene_mjx_feetonly_flat_terrain.xml")
+    frame_skip, horizon = 4, 1000  # 20 s
     obs, actions = {"position": 17, "velocity": 18}, {"joint_target": "motors"}
     physics = {"fast": lw.PhysicsOptions(timestep=0.01, frame_skip=2, solver={"iterations": 4, "ls_iterations": 5})}
     planning = lw.Planning(
@@ -70,11 +72,12 @@ class G1Stand(balance.Balance):
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Make the upper body rigid in the pose of the keyframe knees_bent, and set the gains of the legs."""
-        walkers.prepare_walker(spec, FEET, timestep=0.005, iterations=(10, 10))
+        walkers.prepare_walker(spec, ("left_foot", "right_foot"), timestep=0.005, iterations=(10, 10))
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model = spec.copy().compile()
         pose = model.key("knees_bent").qpos
-        servos = [servo for servo in spec.actuators if servo.target in OTHERS]
+        others = [joint for joint in spec.joints if joint.name not in LEGS][1:]  # without the floating base
+        servos = [servo for servo in spec.actuators if servo.target not in LEGS]
         hands = [pair for pair in spec.pairs if "hand" in pair.geomname1 + pair.geomname2]
         for element in (*spec.sensors, *spec.keys, *servos, *hands):
             spec.delete(element)
@@ -83,9 +86,9 @@ class G1Stand(balance.Balance):
             for i, geom in enumerate(body.geoms):
                 if geom.meshname and geom.meshname in meshes[:i]:
                     spec.delete(geom)
-        for name in OTHERS:
-            joint, turn, turned = spec.joint(name), np.zeros(4), np.zeros(4)
-            mujoco.mju_axisAngle2Quat(turn, joint.axis, pose[model.joint(name).qposadr[0]])
+        for joint in others:
+            turn, turned = np.zeros(4), np.zeros(4)
+            mujoco.mju_axisAngle2Quat(turn, joint.axis, pose[model.joint(joint.name).qposadr[0]])
             mujoco.mju_mulQuat(turned, joint.parent.quat, turn)
             joint.parent.quat = turned
             spec.delete(joint)

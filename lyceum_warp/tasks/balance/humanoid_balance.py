@@ -9,8 +9,8 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp import Row, terms
-from lyceum_warp.tasks.balance import balance
-from lyceum_warp.tasks.balance.balance import World
+from lyceum_warp.tasks.balance import balancing
+from lyceum_warp.tasks.balance.balancing import World
 
 LEG = ("hip_x", "hip_z", "hip_y", "knee")
 ARM = ("shoulder1", "shoulder2", "elbow")
@@ -19,7 +19,7 @@ JOINTS = ("abdomen_z", "abdomen_y", "abdomen_x", *(f"{side}_{name}" for name_of 
 
 
 @wp.struct
-class Params(balance.Params):
+class Params(balancing.Params):
     joint_qpos: wp.array[int] = lw.qposes(*JOINTS)
     joint_dof: wp.array[int] = lw.dofs(*JOINTS)
     motors: wp.array[int] = lw.actuators(*JOINTS)
@@ -44,7 +44,7 @@ def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
 
 
 @lw.register
-class HumanoidStand(balance.Balance):
+class HumanoidStand(balancing.Balance):
     model, frame_skip, horizon = "humanoid.xml", 5, 1333  # 20 s
     obs, actions = {"position": 22, "velocity": 23}, {"joint_target": "motors"}
     physics = {"fast": lw.PhysicsOptions(integrator="implicitfast", timestep=0.015, frame_skip=1)}
