@@ -67,12 +67,12 @@ class TossedAfter(lw.Task):
 
 
 class TossedAfterWithControl(TossedAfter):
-    """``TossedAfter`` with a ``control`` function, which makes the engine run rollouts step by step."""
+    """``TossedAfter`` with a ``control`` function, so that the engine must run rollouts step by step."""
 
     control = copied
 
 
 class TossedBefore(TossedAfter):
-    """The reward's coin is tossed in the previous step, and stored in memory."""
+    """The reward's coin is tossed in the previous step and stored in the world's memory, so the planner can see it."""
 
     reward = paid_by_coin_before_action

@@ -44,7 +44,7 @@ def states_of(task: Any, count: int) -> torch.Tensor:
 
 @pytest.mark.quick(*(f"{case}-mujoco" for case in CASES))
 @pytest.mark.parametrize("case, engine", [*((c, "mujoco") for c in CASES), *((c, "warp") for c in ON_WARP)])
-def test_plans_for_several_plants_equal_single_planners(case: str, engine: str) -> None:
+def test_one_planner_for_several_plants_equals_one_planner_per_plant(case: str, engine: str) -> None:
     settings = dict(horizon=6, samples=8, temperature=0.5, engine=engine) | CASES[case]
     states = states_of(settings["task"], 3)
     together = lw.MPPI(**settings, seed=5, plants=3)

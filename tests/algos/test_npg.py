@@ -24,7 +24,7 @@ def env() -> lw.Env:
     return lw.make("point_mass", nworld=16, horizon=12, nthread=1)
 
 
-def test_policy_step_has_the_kl_divergence_that_the_setting_delta_gives(env: lw.Env) -> None:
+def test_policy_step_has_a_kl_divergence_of_half_delta(env: lw.Env) -> None:
     env.rand_reset(0)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=3200, delta=1e-3, normalize=False), seed=0)
     before = torch.cat([p.detach().flatten() for p in npg.policy.parameters()])

@@ -29,7 +29,7 @@ RUNS = pytest.mark.parametrize(("name", "run"), [("policy.onnx", run_onnx), ("po
 
 
 def trained(**options: object) -> lw.GaussianPolicy:
-    """Make a policy with non-trivial weights and statistics."""
+    """Make a policy with random weights and non-trivial observation statistics."""
     torch.manual_seed(0)
     policy = lw.GaussianPolicy(5, 2, (16, 8), **options)
     with torch.no_grad():

@@ -73,7 +73,7 @@ def test_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], en
 
 
 def test_reported_statistics_equal_the_statistics_of_the_samples(shared_env: SharedEnv) -> None:
-    """Every episode has 10 steps; an episode with a random start does not count."""
+    """Every episode has 10 steps; an episode that starts at a random step does not count."""
     ppo = made(shared_env(Metered, nworld=4, horizon=10, far=1e3))
     found: list[float] = []
     for _ in range(3):
