@@ -1,5 +1,4 @@
-"""Define tasks for tests of the planner: the reward is the action times a coin, which is -1 or 1 with equal
-probability."""
+"""Define tasks for tests of the planner: the reward is the action times a fair coin (-1 or 1)."""
 
 import warp as wp
 from rail_task import rail

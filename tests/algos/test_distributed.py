@@ -213,8 +213,7 @@ sys.exit(main())
 
 @pytest.mark.long
 def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
-    """If the signal comes during training, all processes end after the iteration; if it comes earlier, they leave no
-    files."""
+    """After a signal during training, all processes end with the iteration; after an earlier one, without any files."""
     program, run = tmp_path / "interrupted.py", tmp_path / "learning"
     program.write_text(INTERRUPTED)
     arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations", "100000", "--out"]

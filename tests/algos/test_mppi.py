@@ -349,8 +349,7 @@ def test_plans_shift_by_the_elapsed_steps(fill: Any) -> None:
 @pytest.mark.parametrize("spline", ["zero", "linear", "cubic"])
 @pytest.mark.parametrize("knots", [1, 3, 5, 8, 12])
 def test_shifted_plan_with_knots_keeps_its_actions(knots: int, spline: Any) -> None:
-    """The actions of the remaining steps do not change, even if the shift is smaller than the distance between two
-    knots."""
+    """Remaining actions do not change, even if the shift is smaller than the distance between two knots."""
     plan = MPPI("point_mass", horizon=12, samples=4, knots=knots, spline=spline, fill="repeat", noise=0.3, seed=1)
     plan(plan.state_of())
     for shift in (0, 1, 1, 1, 2, 7, 1):
@@ -502,8 +501,7 @@ def test_hopper_hops_without_falling() -> None:
 
 
 def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
-    """Return the mean return over runs of 100 steps, and the standard error of this mean if actions are independent of
-    coins.
+    """Return the mean return over runs of 100 steps, and its standard error if actions are independent of coins.
 
     Plant and planner have equal seeds. A reward is the product of action and coin. If they are independent, the
     variance of the return is therefore the sum of the squared actions.
