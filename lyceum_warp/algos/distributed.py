@@ -94,7 +94,7 @@ class Team:
         return tensor
 
     def largest(self, *numbers: int) -> tuple[int, ...]:
-        """Compute the elementwise maximum over the processes. If there are several, the host waits for the device."""
+        """Compute the elementwise maximum over the processes; if there are several, the host waits for the device."""
         if self.size == 1:
             return numbers
         whole = torch.tensor(numbers, device=self.device)

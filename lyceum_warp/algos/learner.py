@@ -154,7 +154,7 @@ class Learner(abc.ABC):
 
     @property
     def best_by(self) -> str:
-        """Which return selects the best policy and is compared with a target return: a field of ``Iteration``.
+        """Name of the field of ``Iteration`` by which the best policy is selected and a target return is checked.
 
         "mean_return" is the return of the policy after the iteration, "return_mean" the return of the policy before it.
         The default is "mean_return", or "return_mean" if the configuration has ``mean_every=0``.

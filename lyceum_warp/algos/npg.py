@@ -237,7 +237,7 @@ class NPG(OnPolicyLearner):
         advantage, target = self._estimate(reward, value, next_value)
         prediction = prediction_sums(target, value)
         self.value.rescale(target, first=self._value_is_new and self.iteration == 0, team=team)
-        # dividing changes neither the step, which does not depend on the advantages' scale, nor the rounding
+        # the step does not depend on the scale of the advantages, and dividing by a power of two rounds nothing
         unit = torch.exp2(torch.floor(torch.log2(self.value.scale)))
         advantage, scale = advantage / unit.float(), (self.value.scale / unit).float()
         bound = BOUND * scale

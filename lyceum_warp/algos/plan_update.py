@@ -28,7 +28,8 @@ class PlanSamples:
     returns: torch.Tensor
     """The samples' returns, (plants, samples); minus infinity for failed samples."""
     weights: torch.Tensor
-    """The samples' weights, (plants, samples). ``weigh`` writes them; they sum to 1 for each plant."""
+    """The samples' weights, (plants, samples). The method ``weigh`` writes the weights; the weights for each plant sum
+    to 1."""
     actions: torch.Tensor
     """The samples, (rows, plants, samples, nact)."""
     nominal: torch.Tensor
@@ -47,7 +48,7 @@ class PlanSamples:
 
 @document_attributes
 class PlanUpdate(abc.ABC):
-    """Base class of plan updates, to turn samples into the next plan: ``lw.Planner(task, update=MyUpdate(...))``.
+    """Base class of updates that turn samples into the next plan, as in ``lw.Planner(task, update=MyUpdate(...))``.
 
     A subclass implements ``weigh``; the new plan is the weighted mean of the samples. A subclass may also implement
     ``fit``, for example to adapt the noise. Each planner makes a shallow copy of the given object, so ``prepare`` may

@@ -98,7 +98,7 @@ class PPO(OnPolicyLearner):
     config: PPOConfig
     """Hyperparameters."""
     rate: torch.Tensor
-    """The learning rate, on the device."""
+    """The learning rate, as a tensor on the device."""
 
     def __init__(
         self,

@@ -91,7 +91,7 @@ class SACConfig:
     value_group: str | None = None
     """Group of observations for the critics; by default "critic" if the task has such a group, else "policy"."""
     layer_norm: bool = True
-    """Whether to normalise the critics' hidden layers."""
+    """Whether to apply layer normalisation to the critics' hidden layers."""
     symmetry: Literal["none", "exact", "loss", "augment"] = "none"
     """How to use the mirror symmetry that a task declares (``lw.Mirror``): "exact" averages the policy with its mirror
     image; "loss" adds symmetry_coef times the squared difference between the policy and its mirror image; "augment"

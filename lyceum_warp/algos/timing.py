@@ -59,8 +59,9 @@ def one_thread() -> Iterator[None]:
 def beside(function: Callable[[], Result], *, allowed: bool) -> Iterator[Callable[[], Result]]:
     """Run a function and the with block in parallel if torch has exactly two threads.
 
-    Each then uses one thread. This is faster than to run both in turn on two threads, because mini-batches do not
-    benefit from a second thread, and large products speed up by less than a factor of two.
+    The function and the with block then use one thread each. This is faster than running them one after the other on
+    two threads, because mini-batches do not benefit from a second thread, and large products speed up by less than a
+    factor of two.
 
     With any other number of threads, or if ``allowed`` is False, the function runs when the with block asks for its
     result.

@@ -63,7 +63,7 @@ class Comparison:
     first: str
     """Name of the first simulation: "C engine", or "exact physics" (on the C engine)."""
     second: str
-    """Name of the second simulation, such as "Warp engine on cuda:0", or the name of other physics on the C engine."""
+    """Name of the second simulation, such as "Warp engine on cuda:0", or "coarse physics" (on the C engine)."""
     faults: tuple[int, int]
     """Number of faults in each simulation."""
     differences: tuple[Difference, ...]
@@ -100,7 +100,7 @@ class Transfer:
         return "; ".join(found)
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert to JSON values, with the verdicts."""
+        """Convert the result, including the verdicts, to values that JSON supports."""
         made = dataclasses.asdict(self) | {"line": self.line}
         for comparison, entry in zip(self.comparisons, made["comparisons"], strict=True):
             entry["verdict"] = comparison.verdict
@@ -141,8 +141,8 @@ def transfer(
         device: Device of the Warp engine; by default the environment's GPU, or else another GPU, or else the CPU, on
             which Warp's kernels may take minutes to compile.
         warp: Whether to play episodes on the Warp engine, too.
-        physics: Whether to play episodes with each set of physics options of the task. If False, the only sets are the
-            environment's and the exact physics.
+        physics: Whether to play episodes with each set of physics options of the task. If False, play only with the
+            environment's physics options and with the exact physics.
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:

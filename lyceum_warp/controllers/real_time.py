@@ -52,10 +52,10 @@ def control_async(
     The plant steps in the calling thread. Step k of the plant is due at ``k * period``; a late step does not delay
     later steps. The controller plans in a second thread, from the newest state; it makes at most one plan per state.
 
-    Each step applies an action of the newest finished plan. The number of steps since the plan's initial state
-    determines which action of the plan; after the end of the plan, its last action is held. This compensates for
-    planning delays up to the length of the plan. The plant waits for the first plan, so the first action has age 0.
-    Later actions are at least one step old, and exactly one step old if every plan takes less than a period.
+    Each step applies that action of the newest finished plan that was planned for this time; after the end of the plan,
+    its last action is held. This choice by time compensates for planning delays up to the length of the plan. The plant
+    waits for the first plan, so the first action has age 0. Later actions are at least one step old, and exactly one
+    step old if every plan takes less than a period.
 
     Before the clock starts, a warm-up calls the controller three times with the first state, steps the plant three
     times, and restores the plant's state. The warm-up loads kernels and captures graphs, because Warp cannot capture a
@@ -209,7 +209,7 @@ class PlannerThread:
     ) -> None:  # fmt: skip
         self._controller, self._clock, self._seed, self._first, self._reset = controller, clock, seed, first, reset
         self._plans: list[TimedPlan] = []
-        self._qualities: list[tuple[float, float]] = []  # one entry per plan, appended after the plan
+        self._qualities: list[tuple[float, float]] = []  # quality of each plan, appended after the plan itself
         self._error: BaseException | None = None
         self._begun = threading.Event()  # set after the first plan or after an error
         # use SimpleQueue, which is implemented in C, so that no thread loses the GIL while it holds the queue's lock

@@ -213,7 +213,7 @@ sys.exit(main())
 
 @pytest.mark.long
 def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
-    """After a signal during training, all processes end with the iteration; after an earlier one, without any files."""
+    """A signal during training ends all processes after the iteration; a signal before training leaves no files."""
     program, run = tmp_path / "interrupted.py", tmp_path / "learning"
     program.write_text(INTERRUPTED)
     arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations", "100000", "--out"]

@@ -519,8 +519,8 @@ def test_hopper_hops_without_falling() -> None:
 def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
     """Return the mean return over runs of 100 steps, and its standard error if actions are independent of coins.
 
-    Plant and planner have equal seeds. A reward is the product of action and coin. If they are independent, the
-    variance of the return is therefore the sum of the squared actions.
+    Plant and planner have equal seeds. A reward is the product of action and coin. If action and coin are independent,
+    the variance of the return is therefore the sum of the squared actions.
     """
     plan = MPPI(task, engine="mujoco", horizon=4, noise=2.0, smoothing=(1, 0, 0))
     plant = lw.make(task, autoreset=False)

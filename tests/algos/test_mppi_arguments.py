@@ -226,7 +226,7 @@ def test_cem_and_predictive_sampling_equal_mppi_with_another_update(planner: typ
         ("reach", dict(samples=1, engine="warp"), ("warp", "cuda:0")),
         ("reach", dict(samples=4096, device="cpu"), ("auto", "cpu")),
         ("reach", dict(samples=100, solver={"noslip_iterations": 3}), ("mujoco", "cpu")),
-        # the hand's noslip solver is slow on a GPU, unless it is turned off
+        # on a GPU, the hand is slow unless its noslip solver is turned off
         ("adroit_pen", dict(samples=160), ("mujoco", "cpu")),
         ("adroit_pen", dict(samples=480), ("warp", "cuda:0")),
         ("adroit_pen", dict(samples=160, solver={"noslip_iterations": 0}), ("warp", "cuda:0")),

@@ -1,4 +1,4 @@
-"""Test that SAC's updates equal plain torch, and that runs learn and resume exactly."""
+"""Test that SAC's updates equal those of plain torch code, and that runs learn and resume exactly."""
 
 import copy
 import dataclasses

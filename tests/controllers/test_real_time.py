@@ -28,8 +28,8 @@ def test_actions_of_a_fast_planner_are_one_step_old(env: lw.Env) -> None:
     assert episode.times.tolist() == pytest.approx([0, 1, 2, 3, 4, 5])
     assert episode.age_steps.tolist() == [0, 1, 1, 1, 1, 1]
     assert episode.ages.tolist() == pytest.approx([0, 1, 1, 1, 1, 1])
-    assert hundredths(episode.actions[:, 0]) == [0, 0, 1, 2, 3, 4]  # state of the plan's start
-    assert hundredths(episode.actions[:, 1]) == [0, 1, 1, 1, 1, 1]  # index of the action in its plan
+    assert hundredths(episode.actions[:, 0]) == [0, 0, 1, 2, 3, 4]  # the step from which the plan started.
+    assert hundredths(episode.actions[:, 1]) == [0, 1, 1, 1, 1, 1]  # Index of the applied action in its plan
     assert episode.wall_seconds == pytest.approx(6)
     report = control_report(episode)
     assert (report.misses, report.late_ticks, report.age_steps_max, report.deadline_ms) == (0, 0, 1, 1000)
