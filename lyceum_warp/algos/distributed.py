@@ -102,7 +102,7 @@ class Team:
         return tuple(whole.tolist())
 
     def gather(self, part: torch.Tensor) -> torch.Tensor:
-        """Concatenate the tensors (n, ...) of all processes to a tensor (size * n, ...) (all-gather)."""
+        """Concatenate the tensors (n, ...) of all processes into a tensor (size * n, ...), by an all-gather."""
         if self.size == 1:
             return part
         whole = part.new_empty(self.size * part.shape[0], *part.shape[1:])

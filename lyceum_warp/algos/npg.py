@@ -97,7 +97,7 @@ class NPG(OnPolicyLearner):
         scale = 1.0 / max(1.0 - config.gamma, 1e-3)
         self._make_networks(policy, value, scale=scale, time_orders=config.time_orders)
 
-        # only with one process on the CPU can code branch on a tensor without synchronising
+        # only with one process on the CPU, branching on a tensor needs no synchronisation
         self._reads_numbers = device.type == "cpu" and team.size == 1
 
         # samples

@@ -115,7 +115,7 @@ def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> ValueSums
 
 
 def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence[str] = ()) -> dict[str, Any]:
-    """Combine the numbers of all processes to statistics with the names of the fields of ``NPGIteration``.
+    """Combine the numbers of all processes into statistics with the names of the fields of ``NPGIteration``.
 
     Args:
         processes: The ``ProcessNumbers`` of each process, as floats.

@@ -155,7 +155,7 @@ class PPO(OnPolicyLearner):
     def _make_mirror(self) -> None:
         """Make the functions that mirror observations and actions, if ``config.symmetry`` is not "none"."""
         config, env = self.config, self.env
-        if self.policy.mirror is not None:  # a policy from another run may already be mirrored
+        if self.policy.mirror is not None:  # a policy from another run may already be symmetric
             config = self.config = dataclasses.replace(config, symmetry="exact")
         self._mirror: PolicyMirror | None = None
         if config.symmetry == "none":
@@ -180,8 +180,8 @@ class PPO(OnPolicyLearner):
             samples = self.evaluated_samples()
             timer.mark()
 
-            # 3. Run epochs of mini-batches, each a gradient step on the clipped surrogate, the value loss and the
-            # entropy.
+            # 3. Run epochs of gradient steps on the clipped surrogate, the value loss and the entropy, one per
+            # mini-batch.
             self.update(samples)
             kl = self.divergence()
 

@@ -29,8 +29,8 @@ class PPOConfig:
     epochs: int = 5
     """Number of passes over an iteration's samples."""
     minibatches: int = 4
-    """Number of equal mini-batches per epoch. If the number of samples is not a multiple of it, the remaining samples
-    are not used."""
+    """Number of equal mini-batches per epoch. If the number of samples is not a multiple of this number, the remaining
+    samples are not used."""
     gamma: float = 0.99
     """Discount factor."""
     lam: float = 0.95

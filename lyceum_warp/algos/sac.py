@@ -385,7 +385,7 @@ class SAC(Learner):
         return (weight * loss).sum(), -(weight * log_prob.detach()).sum()
 
     def _bound(self, values: torch.Tensor) -> torch.Tensor:
-        """Combine the two critics' predictions, (2, rows), to values of the actions, (rows,)."""
+        """Combine the two critics' predictions, (2, rows), into values of the actions, (rows,)."""
         return values.amin(0) if self.config.critic_bound == "min" else values.mean(0)
 
     def state_dict(self) -> dict[str, Any]:

@@ -68,7 +68,7 @@ class ControlReport:
     known_plans: int
     """Number of plans, including first plans, for which the controller reports the number of failed samples."""
     failed_share: float | None
-    """Fraction of samples that failed, over the ``known_plans``."""
+    """Fraction of samples that failed, in the plans that ``known_plans`` counts."""
     effective_samples_mean: float | None
     """Mean effective sample size of a plan: 1 if a single sample has all the weight, 0 if all samples failed."""
     tick_jitter_ms: float | None

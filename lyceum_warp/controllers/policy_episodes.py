@@ -71,7 +71,7 @@ class _Batch:
         self._states, self._obs = [env.get_state().cpu()], [env.obs.cpu().clone()]
         self._actions: list[torch.Tensor] = []
         self._outcomes: list[torch.Tensor] = []
-        # times of the action and of the step's end, and in between the duration of the policy's call
+        # for each step: time of the action, duration of the policy's call, and time of the step's end
         self._times: list[tuple[float, float, float]] = []
         self._lengths = torch.zeros(env.nworld, dtype=torch.long)
         self._reasons = torch.zeros(env.nworld, dtype=torch.long)

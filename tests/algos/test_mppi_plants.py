@@ -49,7 +49,7 @@ def test_one_planner_for_several_plants_equals_one_planner_per_plant(case: str, 
     states = states_of(settings["task"], 3)
     together = lw.MPPI(**settings, seed=5, plants=3)
     alone = [lw.MPPI(**settings, seed=5 + i) for i in range(3)]
-    for plan in alone:  # a planner of several plants has only one set of models
+    for plan in alone:  # a planner for several plants uses one set of models for all of them
         for name, rows in plan.model_fields.items():
             rows.copy_(together.model_fields[name])
     for shift in (1, 2):
