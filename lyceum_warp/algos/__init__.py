@@ -1,1 +1,1 @@
-"""Learn and plan: NPG, PPO and sampling-based planners, one file each, and the parts that they share."""
+"""Learn by NPG, PPO or SAC, and plan by sampling: one file for each algorithm, and their common modules."""

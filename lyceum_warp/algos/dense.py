@@ -1,7 +1,8 @@
 """Evaluate and differentiate small fully connected networks on the CPU without autograd.
 
-With a hundred units per layer, the overhead of modules and autograd exceeds the arithmetic. This module computes one
-matrix product per layer, into preallocated buffers. Other networks and devices use torch's modules and autograd.
+With a hundred units per layer, torch's modules and autograd take longer than the arithmetic itself. This module
+therefore computes only one matrix product per layer, into preallocated buffers. Other networks, and networks on a GPU,
+use torch's modules and autograd.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -32,22 +33,22 @@ _ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[[tor
     nn.ReLU: (lambda x: np.maximum(x, 0.0, out=x), lambda d, y: _relu_slope(d, y, 0.0, grad_input=d)),
     nn.ELU: (_elu_, lambda d, y: _elu_slope(d, 1.0, 1.0, 1.0, True, y, grad_input=d)),
 }
-"""Map each supported activation to two in-place functions: one applies it, the other multiplies by its slope. The slope
-is computed from the activation's output."""
+"""Map each supported activation to two in-place functions: f(x) applies the activation, and g(d, y) multiplies the
+derivative d by the activation's slope, computed from the activation's output y."""
 
 _FEW = 2**18
-"""Largest matrix product (rows times weights of the largest layer) that NumPy computes; torch computes larger products.
-Calls of NumPy have less overhead than calls of torch, in particular with cold caches after a step of the worlds. Large
-products run faster in torch."""
+"""Use NumPy if batch size times number of weights in the largest layer is at most this number, and torch otherwise. A
+NumPy call has less overhead than a torch call, in particular with cold caches after a simulation step. Large products
+run faster in torch."""
 
 
 class DensePasses:
     """Computes forward passes y = f(x), and products with the Jacobian J = dy / dparameters.
 
-    Results are buffers that the next call overwrites.
+    The next call overwrites the returned tensors.
 
     Args:
-        parameters: Weight and bias of each layer, in the order of the layers.
+        parameters: Weight and bias of the first layer, then of the second layer, and so on.
         activation: The activation after each layer except the last; a key of ``_ACTIVATIONS``.
     """
 
@@ -63,7 +64,7 @@ class DensePasses:
 
     @staticmethod
     def of(network: nn.Module) -> "DensePasses | None":
-        """Wrap a CPU network made by ``mlp``; None for any other network."""
+        """Wrap a CPU network made by ``mlp``; return None for any other network."""
         if type(network) is not nn.Sequential or len(network) % 2 == 0:
             return None
         layers: list[Any] = list(network)[::2]
@@ -83,12 +84,12 @@ class DensePasses:
         return DensePasses(parameters, kind)
 
     def _allocate(self, rows: int) -> None:
-        """Allocate the results and derivatives of each layer, for inputs of the given number of rows."""
+        """Allocate buffers for each layer's output and derivative, for batches of ``rows`` inputs."""
         widths = [len(bias) for bias in self.biases]
         self._buffers = [[torch.empty(rows, n) for n in widths] for _ in range(2)]
 
     def _resize(self, rows: int) -> None:
-        """Use the first rows of the buffers; allocate larger buffers if necessary."""
+        """Use the first ``rows`` rows of the buffers; allocate larger buffers if they are too small."""
         if rows > len(self._buffers[0][0]):
             self._allocate(rows)
         self._rows, self._few = rows, rows * max(weight.numel() for weight in self.weights) <= _FEW
@@ -96,7 +97,7 @@ class DensePasses:
         self._arrays = [result.numpy() for result in self.results]
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
-        """Compute outputs (rows, outputs) from inputs (rows, inputs). Keep the inputs for ``push`` and ``pull``."""
+        """Compute outputs (rows, outputs) from inputs (rows, inputs); store the inputs for ``push`` and ``pull``."""
         if len(x) != self._rows:
             self._resize(len(x))
         self._inputs = [x, *self.results[:-1]]
@@ -114,7 +115,7 @@ class DensePasses:
         return self.results[-1]
 
     def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Compute J v (rows, outputs) at the last inputs, from v in tensors of the parameters' shapes."""
+        """Compute J v (rows, outputs) at the last inputs; v has one tensor in the shape of each parameter."""
         last = len(self.weights) - 1
         for i, derivative in enumerate(self.derivatives):
             torch.addmm(parts[2 * i + 1], self._inputs[i], parts[2 * i].t(), out=derivative)
@@ -125,10 +126,10 @@ class DensePasses:
         return self.derivatives[-1]
 
     def pull(self, u: torch.Tensor, out: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
-        """Compute J^T u at the last inputs, from u (rows, outputs) into tensors of the parameters' shapes."""
+        """Compute J^T u at the last inputs, for u (rows, outputs), into tensors ``out`` shaped like the parameters."""
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
-            # the transposed product is faster, because its result has longer rows
+            # with more outputs than inputs, x^T u is faster than u^T x, because its rows are longer
             if x.shape[1] < u.shape[1]:
                 out[2 * i].copy_((x.t() @ u).t())
             else:
@@ -141,7 +142,7 @@ class DensePasses:
 
 
 class DensePolicy:
-    """Evaluates a ``GaussianPolicy`` with ``DensePasses``, which shares the policy's parameters."""
+    """Evaluates a ``GaussianPolicy`` without autograd, by ``DensePasses`` on the policy's parameters."""
 
     def __init__(self, policy: GaussianPolicy, passes: DensePasses) -> None:
         self.policy, self.passes = policy, passes
@@ -150,7 +151,7 @@ class DensePolicy:
 
     @staticmethod
     def of(policy: GaussianPolicy) -> "DensePolicy | None":
-        """Wrap a policy; None for a subclass, a mirrored policy, or an unsupported or partly frozen network."""
+        """Wrap a policy; return None for a subclass, a symmetric policy, or an unsupported or partly frozen network."""
         plain = (
             type(policy) is GaussianPolicy
             and policy.mirror is None
@@ -178,7 +179,7 @@ class DensePolicy:
         return self.passes(x)
 
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
-        """Draw actions; see ``GaussianPolicy.sample``."""
+        """Sample actions; see ``GaussianPolicy.sample``."""
         action = out.numpy()
         np.multiply(noise.numpy(), np.exp(self.policy.log_std.detach().numpy()), out=action)
         np.add(action, self(obs).numpy(), out=action)
@@ -195,14 +196,14 @@ class DensePolicy:
 
 
 class DenseValue:
-    """Evaluates a ``ValueFunction`` with ``DensePasses``, which shares the value function's parameters."""
+    """Evaluates a ``ValueFunction`` without autograd, by ``DensePasses`` on the value function's parameters."""
 
     def __init__(self, value: ValueFunction, passes: DensePasses) -> None:
         self.value, self.passes = value, passes
 
     @staticmethod
     def of(value: ValueFunction) -> "DenseValue | None":
-        """Wrap a value function; None for a subclass or an unsupported network."""
+        """Wrap a value function; return None for a subclass or an unsupported network."""
         if type(value) is not ValueFunction or _hooked(value):
             return None
         passes = DensePasses.of(value.network)

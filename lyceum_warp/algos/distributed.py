@@ -1,8 +1,8 @@
 """Distribute learning over processes, each of which steps its own worlds and applies the same update.
 
-Sums over worlds are computed in each process and then reduced over the processes. Every process draws the random
-numbers of all worlds from the same stream and uses its own part. The number of processes therefore affects only the
-rounding of sums.
+Sums over worlds are computed in each process and then reduced over the processes. Every process generates the same
+random numbers, for all worlds, and uses the numbers of its own worlds. The number of processes therefore affects only
+the rounding of sums.
 """
 
 import contextlib
@@ -45,7 +45,7 @@ class Team:
     def capture(self, function: Callable[[], object]) -> torch.cuda.CUDAGraph:
         """Capture torch operations and communication in a CUDA graph, and register the graph for ``release``."""
         graph = torch.cuda.CUDAGraph()
-        # other threads, such as NCCL's, call CUDA during the capture
+        # allow other threads, such as NCCL's, to call CUDA during the capture
         with capturing(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
             function()
         self.keep(graph)
@@ -94,7 +94,7 @@ class Team:
         return tensor
 
     def largest(self, *numbers: int) -> tuple[int, ...]:
-        """Compute the elementwise maximum over the processes. With several processes, the host waits for the device."""
+        """Compute the elementwise maximum over the processes; if there are several, the host waits for the device."""
         if self.size == 1:
             return numbers
         whole = torch.tensor(numbers, device=self.device)
@@ -102,7 +102,7 @@ class Team:
         return tuple(whole.tolist())
 
     def gather(self, part: torch.Tensor) -> torch.Tensor:
-        """All-gather: concatenate the parts of all processes, (size * n, ...) from (n, ...)."""
+        """Concatenate the tensors (n, ...) of all processes into a tensor (size * n, ...), by an all-gather."""
         if self.size == 1:
             return part
         whole = part.new_empty(self.size * part.shape[0], *part.shape[1:])
@@ -125,9 +125,9 @@ class Team:
 
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
-        """End all processes if the with block fails in one; only the failing process reports the error.
+        """End all processes if the with block raises an error in one of them; only that process reports the error.
 
-        The with block must not communicate, because a failed process would not take part.
+        The with block must not communicate, because the other processes would wait for the failed process.
 
         Raises:
             SystemExit: The with block failed in another process.
@@ -195,10 +195,11 @@ def side_stream() -> Iterator[None]:
 
 @contextlib.contextmanager
 def join(device: str = "cpu") -> Iterator[Team]:
-    """Join the processes that ``torchrun`` started, or yield a team of one process without torchrun.
+    """Join the processes that ``torchrun`` started; without ``torchrun``, yield a team of this process only.
 
     Args:
-        device: "cpu", or a CUDA device. Each of several processes uses the GPU of its local rank.
+        device: "cpu", or a CUDA device. If there are several processes, each uses the GPU whose index is its local
+            rank.
 
     Raises:
         ValueError: There are fewer GPUs than processes on this machine.
@@ -208,7 +209,7 @@ def join(device: str = "cpu") -> Iterator[Team]:
         yield Team(device=device)
         return
     # The first optimizer imports torch's compiler. If a process group exists during this import, the compiler keeps the
-    # group and its threads alive until Python exits. A thread that is still alive then sometimes aborts the process.
+    # group and its threads alive until Python exits, and these threads sometimes abort the process at its exit.
     torch.optim.SGD([torch.zeros(1)])
     place, neighbours = int(os.environ.get("LOCAL_RANK", "0")), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     if device.startswith("cuda"):
@@ -229,7 +230,7 @@ def join(device: str = "cpu") -> Iterator[Team]:
         clean = True
     finally:
         team.release()
-        # After an error, do not destroy NCCL's group, because NCCL might wait for processes that have exited. Gloo does
-        # not wait. Gloo's threads must end before Python exits.
+        # After an error, do not destroy an NCCL group, because NCCL might wait for processes that have exited. Always
+        # destroy a Gloo group: Gloo does not wait, and its threads must end before Python exits.
         if clean or distributed.get_backend() == "gloo":
             distributed.destroy_process_group()

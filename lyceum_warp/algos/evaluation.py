@@ -40,9 +40,9 @@ class Episodes:
     success: torch.Tensor
     """1.0 for each episode that ended with the goal met, otherwise 0.0."""
     terminated: torch.Tensor
-    """1.0 for each episode that the task ended, 0.0 for each episode that the time limit or a fault ended."""
+    """1.0 for each episode that ended by termination, 0.0 for each episode that ended by the time limit or a fault."""
     metrics: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
-    """Sum of each task metric over each episode, by the metric's name."""
+    """The task's metrics by name, each summed over the steps of an episode."""
 
     def first(self, count: int) -> "Episodes":
         """Select the first ``count`` episodes."""
@@ -62,7 +62,8 @@ def evaluate(
 ) -> Episodes:
     """Run a policy without noise for whole episodes from random initial states.
 
-    Every world contributes the same number of episodes. Counting all finished episodes would favour short episodes.
+    Every world contributes the same number of episodes. If all finished episodes counted, worlds with short episodes
+    would contribute more episodes and bias the results.
 
     Args:
         env: The environment; its worlds are reset.
@@ -70,7 +71,7 @@ def evaluate(
             nact).
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
         seed: Seed of the initial states; an environment made with the same seed draws different initial states. Without
-            a seed, the worlds continue their random streams.
+            a seed, initial states depend on the random numbers that the worlds have used before.
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:
@@ -135,7 +136,7 @@ ENDLESS_STEPS = 1000
 
 
 def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
-    """Make a few worlds of the same task, with a horizon of 1,000 steps if the task has none.
+    """Make a small environment of the same task; if the task has no horizon, the horizon is 1,000 steps.
 
     Args:
         env: The environment.
@@ -163,7 +164,7 @@ class MeanPolicyEvaluation:
         self._few: Env | None = None
 
     def __call__(self, policy: torch.nn.Module) -> dict[str, float]:
-        """Evaluate the policy, and return means over the episodes by their names in ``Iteration``."""
+        """Evaluate the policy, and return the means over the episodes, by the names of the fields of ``Iteration``."""
         means = torch.zeros(len(MEAN_STATISTICS), dtype=torch.float64, device=self.env.obs.device)
         if self.team.leads:
             if self._few is None:
@@ -176,11 +177,11 @@ class MeanPolicyEvaluation:
         return dict(zip(MEAN_STATISTICS, means.tolist(), strict=True))
 
     def added(self, statistics: Mapping[str, Any], policy: torch.nn.Module, *, due: bool) -> dict[str, Any]:
-        """Add an evaluation's results to the samples' statistics, or None for each result if no evaluation is due."""
+        """Evaluate the policy if due, and add the results to the statistics; add None for each result if not due."""
         mean: dict[str, Any] = self(policy) if due else dict.fromkeys(MEAN_STATISTICS)
         success = self.env.task.functions["success"] is not None
         return {**statistics, **mean} | ({} if success else {"success": math.nan, "mean_success": None})
 
 
 MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")
-"""Attributes of ``Iteration`` that an evaluation of the mean policy sets."""
+"""Fields of ``Iteration`` for the results of an evaluation of the mean policy."""

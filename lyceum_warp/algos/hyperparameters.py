@@ -20,7 +20,7 @@ def check_fields(config: Any, bounds: Mapping[str, float | tuple[float, float]])
     a group of observations (``str | None``). None is valid if the annotation includes it.
 
     Args:
-        config: The dataclass, which calls this function in ``__post_init__``.
+        config: The dataclass; its ``__post_init__`` calls this function.
         bounds: Lower bound, or lower and upper bound, of each number.
 
     Raises:

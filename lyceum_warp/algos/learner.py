@@ -15,7 +15,7 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
 
 METRIC_COLUMN, STEP_METRIC_COLUMN = "metrics/", "step_metrics/"
-"""Column prefixes of task metrics, for sums over an episode and for means per step."""
+"""Prefixes of a task metric's two columns: the sum over an episode, and the mean over steps."""
 
 NESTED = ("metrics", "step_metrics", "numbers")
 """Fields of ``Iteration`` that are dicts."""
@@ -81,11 +81,11 @@ class Iteration:
 
 @document_attributes
 class Learner(abc.ABC):
-    """Base class of learning algorithms, which are infinite iterators of ``Iteration``.
+    """Base class of learning algorithms; a learner is an infinite iterator of ``Iteration``.
 
-    A subclass sets ``algorithm``, ``policy`` and ``config``, and implements ``__next__``, which increases ``iteration``
-    and ``samples``. If the algorithm has more state, the subclass extends ``state_dict`` and ``load_state_dict``.
-    docs/learners.md has an example.
+    A subclass sets ``algorithm``, ``policy`` and ``config``. It implements ``__next__``, which must also increase
+    ``iteration`` and ``samples``. If the algorithm has more state, the subclass extends ``state_dict`` and
+    ``load_state_dict``. docs/learners.md has an example.
 
     Args:
         env: The environment, which must not be stepped between iterations.
@@ -102,8 +102,8 @@ class Learner(abc.ABC):
     env: Env
     """The environment that provides the samples."""
     policy: torch.nn.Module
-    """The policy after the last iteration. The method ``act`` maps observations (..., nobs) to actions without noise
-    (..., nact) and normalises observations itself. The policy has the attributes ``nobs`` and ``nact``."""
+    """The policy after the last iteration. Its method ``act`` normalises the observations (..., nobs) itself, and maps
+    them to actions without noise (..., nact). The policy has the attributes ``nobs`` and ``nact``."""
     value: torch.nn.Module | None = None
     """The value function after the last iteration; None for algorithms without one."""
     config: Any
@@ -154,10 +154,10 @@ class Learner(abc.ABC):
 
     @property
     def best_by(self) -> str:
-        """Name of the return that selects the best policy, and that is compared with a target return.
+        """Name of the field of ``Iteration`` by which the best policy is selected and a target return is checked.
 
-        "mean_return" describes the policy after the iteration, "return_mean" the policy before the iteration. The
-        default is "mean_return", or "return_mean" if the configuration has ``mean_every=0``.
+        "mean_return" is the return of the policy after the iteration, "return_mean" the return of the policy before it.
+        The default is "mean_return", or "return_mean" if the configuration has ``mean_every=0``.
         """
         return "return_mean" if getattr(self.config, "mean_every", None) == 0 else "mean_return"
 
@@ -192,7 +192,7 @@ class Learner(abc.ABC):
         return copy.deepcopy(state)  # copy, because a module's state_dict shares memory with the parameters
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from a state of ``state_dict``; later iterations equal an uninterrupted run bit for bit.
+        """Resume from a state of ``state_dict``; later iterations equal those of an uninterrupted run bit for bit.
 
         Raises:
             ValueError: The state has a different number of worlds, or a counter is not a whole number.

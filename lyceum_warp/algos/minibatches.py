@@ -12,11 +12,11 @@ Samples = Mapping[str, torch.Tensor]
 """Map names to tensors with one row per sample."""
 
 _SURE = 6.0
-"""Room for samples beyond the mean number of samples per process, in standard deviations."""
+"""Number of standard deviations between the mean number of a process's samples and the size of its buffer."""
 
 
 def room(batch: int, team: Team) -> int:
-    """Compute the number of rows per process for a mini-batch of ``batch`` samples of all processes."""
+    """Compute the size of a process's buffer for a mini-batch of ``batch`` samples over all processes."""
     share = batch / team.size
     return min(batch, math.ceil(share + _SURE * math.sqrt(share)))
 
@@ -24,15 +24,15 @@ def room(batch: int, team: Team) -> int:
 class Minibatches:
     """Shuffles a rollout's samples once, and learns from the same mini-batches in every epoch.
 
-    The mini-batches do not depend on the number of processes. Each process uses the samples of its own worlds, in a
-    tensor of fixed size that is padded with rows of weight 0. The tensor has room for the mean number of samples plus
-    six standard deviations; further samples are dropped.
+    The mini-batches do not depend on the number of processes. The number of samples that come from a process's own
+    worlds varies between mini-batches. Each process therefore uses a buffer of fixed size, padded with samples of
+    weight 0. The buffer's size is the mean of this number plus six standard deviations; further samples are dropped.
 
     On a GPU, an epoch runs as a CUDA graph, so ``learn`` must update tensors in place.
 
     Args:
-        learn: Function that learns from a mini-batch, called with this process's samples and their weights, (samples,).
-            The weights sum to 1 over all processes.
+        learn: Function that learns from a mini-batch. Its arguments are this process's samples and their weights,
+            (samples,). The weights of all processes sum to 1.
         steps: Steps per world in a rollout.
         nworld: Number of this process's worlds.
         count: Number of mini-batches.
@@ -59,7 +59,7 @@ class Minibatches:
 
         Args:
             samples: Samples of this process's worlds, each (steps, nworld, ...).
-            generator: Draws the permutation of the samples of all processes.
+            generator: Random generator for the permutation of the samples of all processes.
 
         Returns:
             The mini-batches, each (mini-batches, samples, ...).
@@ -90,7 +90,7 @@ class Minibatches:
 
 @contextlib.contextmanager
 def precision(*, tf32: bool) -> Iterator[None]:
-    """Make a context in which matrix products on a GPU may use TensorFloat-32."""
+    """Make a context in which matrix products on a GPU use TensorFloat-32 if ``tf32`` is set."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if tf32 else before)
     try:

@@ -1,4 +1,4 @@
-"""Compute the vanilla policy gradient, products with the Fisher information matrix, and conjugate gradient."""
+"""Compute the vanilla policy gradient and the natural gradient, by conjugate gradient on the Fisher information."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -17,7 +17,7 @@ def score_gradient(
     *,
     dense: DensePolicy | None = None,
 ) -> torch.Tensor:
-    """Compute the gradient of sum(weight * log pi(action | obs)) for all trainable parameters, (parameters,).
+    """Compute the gradient (parameters,) of sum(weight * log pi(action | obs)) for all trainable parameters.
 
     Args:
         policy: The policy.
@@ -40,14 +40,14 @@ def score_gradient(
 class FisherProduct:
     """Compute products with the Fisher information of a Gaussian policy, averaged over observations.
 
-    The Fisher information of N(mean(s; theta), diag(sigma^2)) is E[J^T diag(1 / sigma^2) J] for theta, with J = d mean
-    / d theta, and 2 for each log sigma.
+    The Fisher information of N(mean(s; theta), diag(sigma^2)) has two blocks: E[J^T diag(1 / sigma^2) J] for theta,
+    with J = d mean / d theta; and a diagonal block with the entry 2 for each log sigma.
 
     Args:
         policy: The policy.
         obs: Observations, (samples, nobs).
         damping: Damping that is added to the diagonal.
-        count: Number of observations of all processes; ``len(obs)`` by default.
+        count: Total number of observations over all processes; ``len(obs)`` by default.
         weight: Weights of the observations, (samples,): 0 for observations of other processes, otherwise 1.
         team: The processes.
         dense: The policy's evaluation without autograd, if available.
@@ -75,7 +75,7 @@ class FisherProduct:
         self.jacobian = dense or AutogradJacobian(self.mean, network)
 
     def __call__(self, vector: torch.Tensor) -> torch.Tensor:
-        """Compute (F + damping) vector (parameters,) from a vector (parameters,)."""
+        """Compute the product (F + damping I) v, (parameters,), for a vector v, (parameters,)."""
         parts = [
             part.view_as(p)
             for part, p in zip(vector.split([p.numel() for p in self.parameters]), self.parameters, strict=True)
@@ -84,16 +84,16 @@ class FisherProduct:
         pulled = self.jacobian.pull(self.jacobian.push(parts) * self.precision)
         if (
             self.log_std_at is not None
-        ):  # log_std's part is not a sum over samples, so each process adds an equal fraction
+        ):  # log_std's term is not a sum over samples: divide it by the number of processes
             pulled.insert(self.log_std_at, 2.0 / self.team.size * log_std_part)
         return self.team.sum(flatten(pulled)) + self.damping * vector
 
 
 class AutogradJacobian:
-    """Compute products with the Jacobian J = d mean / d parameters of any network by autograd.
+    """Compute products with any network's Jacobian J = d mean / d parameters by autograd.
 
-    J v is the derivative of u^T J v with respect to u, so both products are backward passes through graphs that are
-    built once.
+    u^T J is a backward pass through the network. J v is the derivative of u^T J v with respect to u, hence a backward
+    pass through the graph of the first pass. Both graphs are built only once.
 
     Args:
         mean: The network's outputs, (samples, nact).
@@ -106,21 +106,21 @@ class AutogradJacobian:
         self.pulled = torch.autograd.grad(mean, parameters, self.probe, create_graph=True)
 
     def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Compute J v (samples, nact) from v in tensors of the parameters' shapes."""
+        """Compute J v (samples, nact); v has one tensor in the shape of each parameter."""
         return torch.autograd.grad(self.pulled, self.probe, parts, retain_graph=True)[0]
 
     def pull(self, u: torch.Tensor) -> list[torch.Tensor]:
-        """Compute J^T u in tensors of the parameters' shapes from u, (samples, nact)."""
+        """Compute J^T u for u (samples, nact); the result has one tensor in the shape of each parameter."""
         return list(torch.autograd.grad(self.mean, self.parameters, u, retain_graph=True))
 
 
 def conjugate_gradient(
     product: Callable[[torch.Tensor], torch.Tensor], target: torch.Tensor, iterations: int
 ) -> torch.Tensor:
-    """Solve product(x) = target for a symmetric positive definite product, from x = 0.
+    """Solve A x = target for a symmetric positive definite matrix A, starting from x = 0; ``product`` computes A x.
 
-    The number of iterations is fixed and no branch depends on values, so the host never waits for the device. Steps are
-    zero after the residual has vanished.
+    The number of iterations is fixed and no branch depends on values, so the host never waits for the device. After the
+    residual has become zero, all steps are zero.
     """
     x = torch.zeros_like(target)
     residual = target.clone()

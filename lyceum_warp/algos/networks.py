@@ -32,7 +32,7 @@ def check_memory(sizes: Sequence[int], **arguments: Any) -> None:
 
     Args:
         sizes: Widths of all layers, including input and output.
-        arguments: The arguments that determine the sizes; an error message names these arguments.
+        arguments: The user's arguments that determine the sizes, by name, for the error message.
 
     Raises:
         ValueError: The weights do not fit into memory.
@@ -79,7 +79,7 @@ def mlp(
 
 @torch.no_grad()
 def initialize_as_torch(network: nn.Module, generator: torch.Generator | None) -> None:
-    """Draw the weights of all linear layers as ``nn.Linear`` does by default, uniformly in +-1 / sqrt(inputs)."""
+    """Initialise all linear layers like ``nn.Linear``: draw weights uniformly in +-1 / sqrt(inputs)."""
     for layer in network.modules():
         if isinstance(layer, nn.Linear):
             bound = 1.0 / math.sqrt(layer.in_features)
@@ -94,7 +94,7 @@ _Applied: TypeAlias = tuple[torch.Tensor, torch.Tensor]
 
 
 class Normalizer(nn.Module):
-    """Normalises observations by their running mean and variance; does nothing before the first update.
+    """Normalises observations by their running mean and variance; before the first update, it changes nothing.
 
     Args:
         size: Length of an observation.
@@ -118,7 +118,7 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def update(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
-        """Update mean and variance with a batch of observations (Chan et al. 1983, parallel mean and variance).
+        """Update mean and variance with a batch of observations, by the parallel formula of Chan et al. (1983).
 
         Args:
             obs: Observations, (..., size).
@@ -139,7 +139,7 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def interpolate(self, before: _Applied, after: _Applied, part: torch.Tensor) -> None:
-        """Apply a fraction of an update to ``shift`` and ``scale``, but keep the whole update in mean and variance.
+        """Apply only a fraction of an update to ``shift`` and ``scale``; mean and variance are not changed.
 
         Args:
             before: ``shift`` and ``scale`` before the update.
@@ -180,7 +180,7 @@ class Normalized(nn.Module):
 
 
 def moved(module: Module, env: Env) -> Module:
-    """Copy a module to the device of an environment's observations, unless it is already there."""
+    """Return a module on the device of an environment's observations: the module itself or a copy."""
     device = env.obs.device
     if all(parameter.device == device for parameter in module.parameters()):
         return module
@@ -188,7 +188,7 @@ def moved(module: Module, env: Env) -> Module:
 
 
 def trainable(module: Module) -> Module:
-    """Unfreeze a module if all its parameters are frozen (``lw.load`` freezes them), and return the module."""
+    """Return a module; first unfreeze its parameters if all are frozen, as in a module from ``lw.load``."""
     if isinstance(module, nn.Module) and not any(parameter.requires_grad for parameter in module.parameters()):
         module.requires_grad_(True)
     return module

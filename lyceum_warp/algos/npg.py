@@ -1,8 +1,8 @@
 """Learn policies by natural policy gradient (NPG).
 
-NPG was proposed by Kakade (2002), and follows Rajeswaran et al., 2017 ("Towards Generalization and Simplicity in
-Continuous Control"): generalised advantages, the vanilla policy gradient, conjugate gradient on the Fisher information,
-and a step of fixed length in the Fisher metric.
+NPG was proposed by Kakade (2002). This implementation follows Rajeswaran et al., 2017 ("Towards Generalization and
+Simplicity in Continuous Control"): generalised advantages, the vanilla policy gradient, conjugate gradient on the
+Fisher information, and a step of fixed length in the Fisher metric.
 """
 
 import copy
@@ -40,13 +40,13 @@ _SHORTER = 4
 """Maximum number of times that NPG shortens a step or a change of the normaliser."""
 
 _LARGEST = 1e30
-"""Bound on rewards, so that float32 can represent the sum of an episode's rewards."""
+"""Rewards are clipped to this absolute value, so that an episode's sum does not overflow float32."""
 
 _PATIENCE = 10
 """Learning ends after this number of consecutive iterations with a non-finite update."""
 
 _DRIFT = 0.2
-"""Maximum KL divergence due to an update of the normaliser, as a fraction of the desired KL divergence."""
+"""Maximum KL divergence that an update of the normaliser may cause, as a fraction of the desired KL divergence."""
 
 
 @document_attributes
@@ -97,7 +97,7 @@ class NPG(OnPolicyLearner):
         scale = 1.0 / max(1.0 - config.gamma, 1e-3)
         self._make_networks(policy, value, scale=scale, time_orders=config.time_orders)
 
-        # with one process on the CPU, branching on a tensor needs no synchronisation
+        # only with one process on the CPU, branching on a tensor needs no synchronisation
         self._reads_numbers = device.type == "cpu" and team.size == 1
 
         # samples
@@ -143,7 +143,7 @@ class NPG(OnPolicyLearner):
         obs, value_obs = rollout.obs.flatten(0, 1), rollout.obs_groups[self.value.group].flatten(0, 1)
         old_mean = self.observe(obs)
 
-        # 3. Compute advantages with the value function before its fit to the new samples.
+        # 3. Compute advantages with the old value function, before its fit to the new samples.
         advantage, target, prediction, outliers = self.advantages()
 
         # 4. Compute the vanilla gradient of E[log pi(a|s) A(s, a)].
@@ -156,7 +156,7 @@ class NPG(OnPolicyLearner):
         fisher = self.fisher(obs)
 
         # 6. Fit the value function to the samples' returns; with two CPU threads, the fit runs in parallel with step 5.
-        # Update the value function's normaliser first, so that the fit corrects the change of the predictions.
+        # First update the value function's normaliser: this changes the predictions, and the fit corrects the change.
         self.value.observe(value_obs, team)
         fit = functools.partial(self.fit, value_obs, rollout.step.flatten(), target.flatten(), self.generator)
         with beside(fit, allowed=self._reads_numbers) as fit_result:
@@ -228,7 +228,7 @@ class NPG(OnPolicyLearner):
 
         Returns:
             Advantages, (steps, nworld), divided by a power of two close to the value function's scale; returns, (steps,
-            nworld); error statistics of the predicted returns; and the number of clipped advantages.
+            nworld); statistics of the value function's errors; and the number of clipped advantages.
         """
         rollout, config, team = self.rollout, self.config, self.team
         value = self.predict(rollout.obs_groups[self.value.group], rollout.step)
@@ -237,7 +237,7 @@ class NPG(OnPolicyLearner):
         advantage, target = self._estimate(reward, value, next_value)
         prediction = prediction_sums(target, value)
         self.value.rescale(target, first=self._value_is_new and self.iteration == 0, team=team)
-        # the step does not depend on the scale of the advantages, and division by a power of two is exact
+        # the step does not depend on the scale of the advantages, and dividing by a power of two rounds nothing
         unit = torch.exp2(torch.floor(torch.log2(self.value.scale)))
         advantage, scale = advantage / unit.float(), (self.value.scale / unit).float()
         bound = BOUND * scale
@@ -250,7 +250,7 @@ class NPG(OnPolicyLearner):
         return advantage, target, prediction, outliers
 
     def predict(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Predict returns, (...,), and replace non-finite predictions by the mean of the last returns.
+        """Predict returns, (...,), and replace non-finite predictions by the mean return of the last fit.
 
         Args:
             obs: Observations, (..., nobs).
@@ -263,8 +263,9 @@ class NPG(OnPolicyLearner):
     def observe(self, obs: torch.Tensor) -> torch.Tensor:
         """Update the normaliser of the policy's observations, and limit the resulting change of the policy.
 
-        If an update would change the policy by more than a fifth of the desired KL divergence, only a fraction is
-        applied; later iterations apply the rest. The iteration's KL divergence includes the normaliser's change.
+        If an update would change the policy by more than a fifth of the desired KL divergence, only a fraction of the
+        update is applied; later iterations apply the rest. The reported KL divergence includes the change of the
+        normaliser.
 
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
@@ -291,7 +292,7 @@ class NPG(OnPolicyLearner):
         return old_mean
 
     def fisher(self, obs: torch.Tensor) -> FisherProduct:
-        """Make the products with the Fisher information, averaged over a random subset of the samples.
+        """Make a function that multiplies by the Fisher information, estimated on a random subset of the samples.
 
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
@@ -301,7 +302,7 @@ class NPG(OnPolicyLearner):
             subset = torch.randperm(self.count, generator=self.generator, device=obs.device)[: self._fisher_count]
             if self.team.size == 1:
                 obs = obs[subset]
-            else:  # weights of 0 exclude other processes' samples, because selecting would synchronise with the device
+            else:  # exclude other processes' samples by the weight 0, because a selection would synchronise
                 places, own = self.team.locate(subset, self.env.nworld)
                 obs, weight = obs[places], own.float()
         return FisherProduct(
@@ -315,10 +316,11 @@ class NPG(OnPolicyLearner):
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Add a step to the policy's parameters; shorten the step if the KL divergence exceeds its limit.
 
-        The Fisher information approximates the KL divergence only to second order and on a subset of the samples. If
-        the measured divergence exceeds its limit, the step is shortened, up to four times. The new length comes from a
-        second-order estimate, but is at most half of the old length. If the divergence still exceeds the limit, or if
-        the step is not finite, the policy does not change. The host does not wait for the device.
+        The step's length was computed from the Fisher information, which approximates the KL divergence only to second
+        order and on a subset of the samples. If the measured divergence exceeds its limit, the step is shortened, up to
+        four times. Each time, the new length follows from a second-order estimate, but is at most half of the old
+        length. If the divergence still exceeds the limit, or if the step is not finite, the policy does not change. The
+        host does not wait for the device.
 
         Args:
             step: The step, (parameters,).

@@ -15,9 +15,9 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 _LONG_EPISODE = 20
-"""By default, NPG restarts worlds if an episode lasts longer than this number of iterations. On hopper with some seeds,
-NPG's return stayed low for a long time with 63 and 31 iterations per episode, but not with 16 (bench/README.md, "NPG's
-learning curves")."""
+"""If an episode lasts longer than this number of iterations, NPG restarts worlds by default (``min_restarts``). On
+hopper with some seeds, NPG's return stayed low for a long time with 63 and 31 iterations per episode, but not with 16
+(bench/README.md, "NPG's learning curves")."""
 
 
 @document_attributes
@@ -30,19 +30,20 @@ class NPGConfig:
     """
 
     samples: int | None = None
-    """Samples per iteration, rounded up to whole steps of all worlds. The default is the paper's 10,000, or 16 steps of
-    every world if that is more."""
+    """Samples per iteration, rounded up to a multiple of the number of worlds. The default is the paper's 10,000, or 16
+    steps of every world if that is more."""
     rollout: Literal["auto", "episodes", "segments"] = "auto"
     """"episodes" starts new episodes in every iteration, as in the paper; "segments" continues the last iteration's
-    episodes, and suits many worlds with few steps each; "auto" selects "episodes" if samples / worlds >= horizon."""
+    episodes, which suits many worlds with few steps each; "auto" selects "episodes" if samples / worlds >= horizon, and
+    otherwise "segments"."""
     min_restarts: float | None = None
     """Minimum number of worlds that start an episode in each iteration, as a multiple of samples / horizon. If fewer
-    worlds started an episode in the last iteration, random worlds are restarted. Restarts apply only to segments with a
-    time limit. Without restarts, worlds that started together also reach the time limit together. Between two time
-    limits, few samples then come from the start of an episode. The statistics do not count interrupted episodes, so
-    values well above 1 bias ``return_mean`` towards short episodes. 0 turns restarts off. The default is 0.5 if an
-    episode lasts longer than 20 iterations, and 0 otherwise. For example, episodes of 1,000 steps last longer than 20
-    iterations with 205 or more worlds and the default number of samples."""
+    worlds started an episode in the last iteration, random worlds are restarted. Worlds are restarted only if the
+    rollout is "segments" and episodes have a time limit. Without restarts, worlds that started together also reach the
+    time limit together, and few samples in between come from the start of an episode. The statistics exclude
+    interrupted episodes, so values well above 1 bias ``return_mean`` towards short episodes. 0 turns restarts off. The
+    default is 0.5 if an episode lasts longer than 20 iterations, and 0 otherwise. For example, episodes of 1,000 steps
+    last longer than 20 iterations with 205 or more worlds and the default number of samples."""
     gamma: float = 0.995
     """Discount factor."""
     lam: float = 0.97
@@ -59,8 +60,8 @@ class NPGConfig:
     fisher_fraction: float = 1.0
     """Fraction of the samples used for the Fisher information, drawn at random in each iteration."""
     kl_limit: float = 1.5
-    """Maximum KL divergence of a step, as a multiple of its second-order value delta / 2. NPG shortens steps with a
-    larger KL divergence."""
+    """Maximum KL divergence of a step, as a multiple of delta / 2 (the KL divergence to second order). NPG shortens
+    steps that exceed this limit."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the policy's hidden layers."""
     activation: Activation = "tanh"
@@ -102,12 +103,12 @@ class NPGConfig:
 
 
 def enough_samples(config: NPGConfig, nworld: int) -> int:
-    """Compute the samples per iteration; ``nworld`` counts the worlds of all processes."""
+    """Compute the number of samples per iteration; ``nworld`` is the number of worlds of all processes."""
     return max(10_000, 16 * nworld) if config.samples is None else config.samples
 
 
 def least_restarts(config: NPGConfig, nworld: int, steps: int, horizon: int) -> int:
-    """Compute the minimum number of worlds of all processes that start an episode in an iteration.
+    """Compute the minimum number of worlds, over all processes, that start an episode in an iteration.
 
     Args:
         config: The hyperparameters.

@@ -35,7 +35,7 @@ class NPGIteration(OnPolicyIteration):
     gradient_norm: float
     """Euclidean norm of the vanilla policy gradient."""
     value_error: float
-    """Squared error of the value function before the fit, relative to the squared error of predicting 0."""
+    """Squared error of the value function before the fit, divided by the squared error of predicting always 0."""
     explained_variance: float
     """Fraction of the returns' variance that the value function explained before the fit."""
     outliers: int
@@ -47,12 +47,12 @@ class NPGIteration(OnPolicyIteration):
     time_solve: float
     """Seconds for conjugate gradient and the step."""
     time_value: float
-    """Seconds for the value function's fit. With two CPU threads, seconds that also count in ``time_solve`` are
-    omitted."""
+    """Seconds for the value function's fit. If the fit runs in parallel with the step (two CPU threads), the time of
+    the overlap counts only in ``time_solve``."""
 
 
 class UpdateNumbers(NamedTuple):
-    """Statistics of one update of the policy, by their names in ``NPGIteration``."""
+    """Statistics of one update of the policy, with the names of the fields of ``NPGIteration``."""
 
     # statistics that are equal in all processes
     finite: Scalar  # whether the step is finite
@@ -61,7 +61,7 @@ class UpdateNumbers(NamedTuple):
     step_fraction: Scalar
     gradient_norm: Scalar
     std_mean: Scalar
-    # statistics of the process's own samples
+    # statistics of this process's samples only
     reward: Scalar
     faults: Scalar
     outliers: Scalar
@@ -70,7 +70,7 @@ class UpdateNumbers(NamedTuple):
 
 
 class ValueSums(NamedTuple):
-    """Moments of a process's discounted returns and of a value function's errors (return minus prediction)."""
+    """Moments of the discounted returns and of the value function's errors (return minus prediction) in one process."""
 
     return_mean: Scalar
     return_square: Scalar  # sum of the squared deviations from the mean
@@ -79,7 +79,7 @@ class ValueSums(NamedTuple):
 
 
 class ProcessNumbers(NamedTuple):
-    """Contribution of one process to the statistics of an iteration."""
+    """What one process contributes to the statistics of an iteration."""
 
     update: UpdateNumbers
     values: ValueSums
@@ -115,7 +115,7 @@ def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> ValueSums
 
 
 def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence[str] = ()) -> dict[str, Any]:
-    """Summarise the numbers of all processes, by their names in ``NPGIteration``.
+    """Combine the numbers of all processes into statistics with the names of the fields of ``NPGIteration``.
 
     Args:
         processes: The ``ProcessNumbers`` of each process, as floats.
@@ -142,7 +142,7 @@ def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence
 
 
 def value_statistics(sums: Sequence[ValueSums], samples: int) -> dict[str, float]:
-    """Compute ``value_error`` and ``explained_variance`` from the sums of all processes (``samples`` samples each)."""
+    """Compute ``value_error`` and ``explained_variance`` from each process's sums over its ``samples`` samples."""
     n, mean, square = pooled([Moments(samples, part.return_mean, part.return_square) for part in sums])
     _, error_mean, error_square = pooled([Moments(samples, part.error_mean, part.error_square) for part in sums])
     error, size = error_square + n * error_mean**2, square + n * mean**2

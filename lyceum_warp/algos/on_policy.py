@@ -22,7 +22,7 @@ from lyceum_warp.support.validate import check_kind
 
 @document_attributes
 class OnPolicyLearner(Learner):
-    """Base class of NPG and PPO, which learn a Gaussian policy and a value function from a rollout buffer.
+    """Base class of NPG and PPO: learn a Gaussian policy and a value function from a rollout buffer.
 
     Raises:
         ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy
@@ -116,7 +116,7 @@ class OnPolicyLearner(Learner):
         return self._advantage, self._return
 
     def _with_mean_policy(self, statistics: dict[str, Any]) -> dict[str, Any]:
-        """Add statistics of the mean policy, which is evaluated every ``mean_every`` iterations."""
+        """Evaluate the mean policy every ``mean_every`` iterations, and add the results to the statistics."""
         every = self.config.mean_every
         return self._evaluate_mean.added(statistics, self.policy, due=every > 0 and self.iteration % every == 0)
 

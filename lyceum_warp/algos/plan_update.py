@@ -1,4 +1,4 @@
-"""Define the interface of plan updates, which weight the samples and may fit parameters to them.
+"""Define the interface of plan updates: they weight the samples, and may fit the noise or the plan to them.
 
 The planner (``planner.py``) rolls out the samples and computes their weighted mean. The modules ``mppi.py``, ``cem.py``
 and ``predictive_sampling.py`` implement three updates.
@@ -18,17 +18,18 @@ from lyceum_warp.support.docstrings import document_attributes
 @document_attributes
 @dataclasses.dataclass(frozen=True)
 class PlanSamples:
-    """The samples of one improvement of the plans, for an update to read and write.
+    """The samples of one planning iteration: the tensors that a plan update reads and writes.
 
-    Plans and samples have one row per step of the horizon or, with knots, per knot. All tensors are float32 on the
-    device of the planner's worlds. The tensors' addresses are fixed, so write into the tensors instead of replacing
-    them.
+    Plans and samples have one row per step of the horizon, or one row per knot if the planner uses knots. All tensors
+    are float32 on the device of the planner's worlds. The tensors' addresses are fixed, so write into the tensors
+    instead of replacing them.
     """
 
     returns: torch.Tensor
     """The samples' returns, (plants, samples); minus infinity for failed samples."""
     weights: torch.Tensor
-    """The samples' weights, (plants, samples). ``weigh`` writes them; they sum to 1 for each plant."""
+    """The samples' weights, (plants, samples). The method ``weigh`` writes the weights; the weights for each plant sum
+    to 1."""
     actions: torch.Tensor
     """The samples, (rows, plants, samples, nact)."""
     nominal: torch.Tensor
@@ -36,30 +37,31 @@ class PlanSamples:
     plan: torch.Tensor
     """The new plans, (rows, plants, nact): before ``fit``, the weighted means of the samples."""
     nominal_deviation: torch.Tensor | None
-    """Standard deviations of the samples' noise before smoothing, (rows, plants, nact); None without
-    ``adapts_noise``."""
+    """Standard deviations of the samples' noise before smoothing, (rows, plants, nact); None if ``adapts_noise`` is
+    False."""
     deviation: torch.Tensor | None
-    """Standard deviations for the next improvement, written by ``fit``."""
+    """Standard deviations of the noise for the next planning iteration, written by ``fit``."""
     summary: torch.Tensor
-    """Best return, mean return, effective number of samples and number of failed samples, (plants, 4). A capturable
-    update writes this tensor in ``weigh``. If the best return is minus infinity, the plan does not change."""
+    """Best return, mean return, effective sample size and number of failed samples, (plants, 4). If ``capturable`` is
+    set, ``weigh`` must write this tensor. If the best return is minus infinity, the plan does not change."""
 
 
 @document_attributes
 class PlanUpdate(abc.ABC):
-    """Base class of plan updates, which turn samples into the next plan: ``lw.Planner(task, update=MyUpdate(...))``.
+    """Base class of updates that turn samples into the next plan, as in ``lw.Planner(task, update=MyUpdate(...))``.
 
     A subclass implements ``weigh``; the new plan is the weighted mean of the samples. A subclass may also implement
-    ``fit``, for example to adapt the noise. Each planner uses a shallow copy of the given object, so ``prepare`` may
-    store buffers as attributes.
+    ``fit``, for example to adapt the noise. Each planner makes a shallow copy of the given object, so ``prepare`` may
+    store buffers in its attributes.
     """
 
     capturable: ClassVar[bool] = False
-    """Whether ``weigh`` and ``fit`` consist of Warp launches on arrays at fixed addresses, so that the planner's graph
-    can include both. If False, ``weigh`` and ``fit`` may use torch, and run between two graphs."""
+    """Whether a CUDA graph can capture ``weigh`` and ``fit``, because they consist of Warp launches on arrays at fixed
+    addresses. If False, ``weigh`` and ``fit`` may use torch, and the planner calls them between two graphs."""
     adapts_noise: ClassVar[bool] = False
     """Whether the noise has a separate standard deviation for each element of a plan. ``fit`` adapts these standard
-    deviations, and the planner shifts them in time. If False, the planner's setting ``noise`` applies."""
+    deviations, and the planner shifts them in time. If False, the standard deviations are those of the planner's
+    setting ``noise``."""
 
     def prepare(self, samples: PlanSamples) -> None:
         """Check sizes and allocate buffers; called once, when the planner is made."""
@@ -80,7 +82,7 @@ class PlanUpdate(abc.ABC):
 
 
 def by_sample(tensor: torch.Tensor) -> Any:
-    """Convert a tensor of ``PlanSamples`` to a Warp array, merging the axes of plants and samples."""
+    """Convert a tensor of ``PlanSamples`` to a Warp array with one merged axis for plants and samples."""
     plants = 0 if tensor.ndim == 2 else 1
     return wp.from_torch(tensor.flatten(plants, plants + 1))
 

@@ -18,7 +18,7 @@ _LARGEST = torch.finfo(torch.float32).max
 
 @document_attributes
 class GaussianPolicy(Normalized):
-    """Draws actions from N(mean(obs), exp(log_std)^2), where log_std does not depend on the observation.
+    """Samples actions from N(mean(obs), exp(log_std)^2), where log_std does not depend on the observation.
 
     Example:
         >>> policy = GaussianPolicy(nobs, nact, network=MyNetwork())  # any nn.Module, (..., nobs) -> (..., nact)
@@ -28,8 +28,9 @@ class GaussianPolicy(Normalized):
         nobs: Length of an observation.
         nact: Length of an action.
         hidden: Widths of the hidden layers.
-        network: A module that replaces the default network. The network maps (normalised) observations (..., nobs) to
-            mean actions (..., nact) independently for each row, in float32. NPG also requires second derivatives.
+        network: A module that replaces the default network. The network maps observations (..., nobs), normalised if
+            ``normalize`` is set, to mean actions (..., nact), in float32 and independently for each observation. For
+            NPG, the network must be twice differentiable.
         activation: Activation of the hidden layers.
         log_std: Initial logarithm of the standard deviations.
         normalize: Whether to normalise observations by their running mean and variance.
@@ -82,7 +83,7 @@ class GaussianPolicy(Normalized):
         self.mirror: PolicyMirror | None = None
 
     def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:
-        """Make the policy symmetric: average its mean actions with its mirrored mean actions for mirrored observations.
+        """Make the policy symmetric: average its actions with the mirrored actions for mirrored observations.
 
         Args:
             reflections: The reflections of ``obs`` and ``action`` (``algos.symmetry.reflections``).
@@ -122,7 +123,7 @@ class GaussianPolicy(Normalized):
 
     @torch.no_grad()
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
-        """Draw actions, without gradients.
+        """Sample actions, without gradients.
 
         Args:
             obs: Observations, (..., nobs).

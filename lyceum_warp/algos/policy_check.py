@@ -17,8 +17,8 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
     """Check that an algorithm can train a policy in an environment.
 
     The policy must be a ``GaussianPolicy``. The policy must map observations (..., nobs) to mean actions (..., nact)
-    deterministically, and independently for each row. The policy must be differentiable with respect to its trainable
-    parameters.
+    deterministically, and independently for each observation. The policy must be differentiable with respect to its
+    trainable parameters.
 
     Args:
         policy: The policy.

@@ -28,7 +28,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
     """Export a policy's ``act`` to a file that runs without this package.
 
     The exported file includes the normaliser, and maps observations, (n, nobs) float32 for any n, to actions without
-    noise. Environments also clip controls to the actuators' ranges; the exported file does not.
+    noise. The exported file does not clip controls to the actuators' ranges, as environments do.
 
     ===========  ======================================================================================
     ``.onnx``    input ``obs``, output ``action``; for ONNX Runtime, TensorRT, OpenVINO, ...
@@ -83,7 +83,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
 
 
 def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
-    """Describe a policy's inputs, outputs and timing, for running the policy on a robot or in another simulator.
+    """Describe a policy's inputs, outputs and timing, as needed on a robot or in another simulator.
 
     ================  ===================================================================================
     ``task``          name of the task

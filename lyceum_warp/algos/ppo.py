@@ -1,8 +1,8 @@
 """Learn policies by proximal policy optimisation (PPO).
 
-PPO was proposed by Schulman et al., 2017 ("Proximal Policy Optimization Algorithms"), and is implemented as in rsl_rl
-(Rudin et al. 2022, "Learning to Walk in Minutes Using Massively Parallel Deep Reinforcement Learning"): with a clipped
-value loss, a learning rate adapted to the KL divergence, and the same mini-batches in every epoch.
+PPO was proposed by Schulman et al., 2017 ("Proximal Policy Optimization Algorithms"). This implementation follows
+rsl_rl (Rudin et al. 2022, "Learning to Walk in Minutes Using Massively Parallel Deep Reinforcement Learning"): a
+clipped value loss, a learning rate adapted to the KL divergence, and the same mini-batches in every epoch.
 """
 
 import collections
@@ -43,7 +43,7 @@ _EPS = 1e-2
 _SMALLEST_STD = 1e-6
 
 _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
-"""Lower limit, upper limit and factor of change of the adaptive learning rate."""
+"""Lower limit and upper limit of the adaptive learning rate, and the factor of one change."""
 
 
 @document_attributes
@@ -51,8 +51,8 @@ _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
 class PPOIteration(OnPolicyIteration):
     """Statistics of one iteration of PPO.
 
-    Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended. With
-    ``stagger``, the statistics exclude the worlds' first episodes, which start at a random step.
+    Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended. If ``stagger``
+    is set, the statistics exclude each world's first episode, because it starts at a random step.
     """
 
     return_recent: float
@@ -98,7 +98,7 @@ class PPO(OnPolicyLearner):
     config: PPOConfig
     """Hyperparameters."""
     rate: torch.Tensor
-    """The learning rate, on the device."""
+    """The learning rate, as a tensor on the device."""
 
     def __init__(
         self,
@@ -118,7 +118,7 @@ class PPO(OnPolicyLearner):
                 "make "
                 "minibatches smaller"
             )
-        # an initial last layer near zero, as in NPG, would start the adaptive learning rate much too high
+        # NPG's initial last layer near zero would make the adaptive learning rate much too high at first
         limit = math.inf if config.normalize else LIMIT
         self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)
         self._make_mirror()
@@ -153,9 +153,9 @@ class PPO(OnPolicyLearner):
             self.rollout.stagger(self.generator, team)
 
     def _make_mirror(self) -> None:
-        """Make the mirror images of observations and actions, if the configuration asks for symmetry."""
+        """Make the functions that mirror observations and actions, if ``config.symmetry`` is not "none"."""
         config, env = self.config, self.env
-        if self.policy.mirror is not None:  # a policy from another run may already be mirrored
+        if self.policy.mirror is not None:  # a policy from another run may already be symmetric
             config = self.config = dataclasses.replace(config, symmetry="exact")
         self._mirror: PolicyMirror | None = None
         if config.symmetry == "none":
@@ -180,8 +180,8 @@ class PPO(OnPolicyLearner):
             samples = self.evaluated_samples()
             timer.mark()
 
-            # 3. Run epochs of mini-batches, each a gradient step on the clipped surrogate, the value loss and the
-            # entropy.
+            # 3. Run epochs of gradient steps on the clipped surrogate, the value loss and the entropy, one per
+            # mini-batch.
             self.update(samples)
             kl = self.divergence()
 
@@ -237,8 +237,8 @@ class PPO(OnPolicyLearner):
     def sample(self) -> None:
         """Fill the rollout buffer with the current policy and new noise.
 
-        Each step of the worlds updates the normalisers with the step's observations. ``evaluated_samples`` computes
-        values and densities for all steps at once.
+        After each step, the normalisers are updated with the step's observations. Values and densities are computed
+        later, by ``evaluated_samples`` for all steps at once.
         """
         env, rollout, std = self.env, self.rollout, self.policy.log_std.exp()
         with one_thread():
@@ -258,10 +258,10 @@ class PPO(OnPolicyLearner):
     def evaluated_samples(self) -> dict[str, torch.Tensor]:
         """Compute the inputs of the update, each (steps, nworld, ...), from the samples and the old networks.
 
-        Every transition bootstraps from the observation after its step. The task's events, such as a push or a new
-        command, follow later. An event changes the value of the state, but no action caused this change, so advantages
-        and targets exclude the change. Time limits, faults and the end of the rollout also bootstrap from this
-        observation. The value function's targets are its predictions plus the advantages.
+        Advantages bootstrap from the observation after each step but before the task's events, such as a push or a new
+        command. An event changes the value of the state, but no action caused this change, so advantages and targets
+        exclude it. The same observation is used at time limits, at faults and at the end of the rollout. The value
+        function's targets are its predictions plus the advantages.
         """
         rollout, config, team = self.rollout, self.config, self.team
         obs, final_obs = rollout.obs_groups[self.value.group], rollout.final_obs_groups[self.value.group]
@@ -280,7 +280,7 @@ class PPO(OnPolicyLearner):
         }  # fmt: skip
 
     def update(self, samples: Samples) -> None:
-        """Learn from the results of ``evaluated_samples`` in epochs of mini-batches."""
+        """Run the epochs of mini-batches on the results of ``evaluated_samples``."""
         config, team = self.config, self.team
         parts = self.minibatches.shuffle(samples, self.generator)
         if config.whiten_minibatches:
@@ -299,8 +299,8 @@ class PPO(OnPolicyLearner):
         """Make one step of Adam on a mini-batch.
 
         Args:
-            samples: The part of the mini-batch that belongs to this process; arrays of shape (samples, ...).
-            weight: Weights of the samples (samples,), which sum to 1 over all processes.
+            samples: This process's samples of the mini-batch, each (samples, ...).
+            weight: Weights of the samples, (samples,). The weights of all processes sum to 1.
         """
         config, clip = self.config, self.config.clip
         if config.symmetry == "augment":
@@ -321,7 +321,7 @@ class PPO(OnPolicyLearner):
             assert self._mirror is not None
             image = self._mirror.action(self.policy(self._mirror.obs(samples["obs"])))
             loss = loss + config.symmetry_coef * (weight * (mean - image).square().mean(-1)).sum()
-        # do not use backward(), which accumulates gradients on the stream of its first call
+        # do not use backward(): it accumulates gradients on the CUDA stream of its first call
         gradients = torch.autograd.grad(loss, self._parameters)
 
         with torch.no_grad():
@@ -338,7 +338,7 @@ class PPO(OnPolicyLearner):
     def _with_images(self, samples: Samples) -> dict[str, torch.Tensor]:
         """Append the mirror images of samples.
 
-        Mirrored samples keep their density, because the mirrored policy draws a mirrored sample with the same density.
+        A mirrored sample has the same density as the original sample, because the mirrored policy has drawn it.
         """
         assert self._mirror is not None
         images = dict(samples)
@@ -375,7 +375,7 @@ class PPO(OnPolicyLearner):
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
-        """Get the returns of the counted episodes that ended in the iteration in any process, ordered by step."""
+        """Get the returns of all processes' counted episodes that ended in the iteration, ordered by step."""
         ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
         ended = self.team.gather(ended.T).T
         found: list[float] = ended[~ended.isnan()].tolist()
@@ -401,4 +401,4 @@ class PPO(OnPolicyLearner):
             self.std.copy_(state["std"])
         self._recent.clear()
         self._recent.extend(state["recent"])
-        self.minibatches.epoch.forget()  # discard the graph, which uses the addresses of Adam's old moments
+        self.minibatches.epoch.forget()  # discard the graph: it contains the addresses of Adam's old moments

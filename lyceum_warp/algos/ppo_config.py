@@ -29,16 +29,17 @@ class PPOConfig:
     epochs: int = 5
     """Number of passes over an iteration's samples."""
     minibatches: int = 4
-    """Number of equal mini-batches per epoch. Samples that do not divide evenly are not used."""
+    """Number of equal mini-batches per epoch. If the number of samples is not a multiple of this number, the remaining
+    samples are not used."""
     gamma: float = 0.99
     """Discount factor."""
     lam: float = 0.95
     """Lambda of the generalised advantage estimate."""
     clip: float = 0.2
-    """Clipping range of the probability ratio around 1. With clip_value_loss, values are clipped to the same range
-    around the old values."""
+    """Clipping range of the probability ratio around 1. If clip_value_loss is set, values are clipped to the same
+    distance from the old values."""
     clip_value_loss: bool = True
-    """Whether the value loss is the larger of the prediction's error and the clipped prediction's error."""
+    """Whether to use a clipped value loss: the larger of the errors of the prediction and of the clipped prediction."""
     value_coef: float = 1.0
     """Coefficient of the value loss."""
     entropy_coef: float = 0.01
@@ -76,16 +77,16 @@ class PPOConfig:
     value_group: str | None = None
     """Group of observations for the value function; by default "critic" if the task has such a group, else "policy"."""
     symmetry: Literal["none", "exact", "loss", "augment"] = "none"
-    """Use of the mirror image that a task declares (``lw.Mirror``): "exact" averages the policy with its mirror image;
-    "loss" adds symmetry_coef times the squared difference between both; "augment" also learns from the mirror images of
-    all samples."""
+    """How to use the mirror symmetry that a task declares (``lw.Mirror``): "exact" averages the policy with its mirror
+    image; "loss" adds symmetry_coef times the squared difference between the policy and its mirror image; "augment"
+    also learns from the mirror images of all samples; "none" ignores the symmetry."""
     symmetry_coef: float = 1.0
     """Coefficient of the symmetry loss, if symmetry is "loss"."""
     normalize: bool = True
     """Whether to normalise observations by their running mean and variance, updated in every step."""
     stagger: bool = True
     """Whether the first episodes start at random steps, so that time limits are spread over time. On the Warp engine,
-    worlds always start together if the task lets initial states settle."""
+    all worlds start together nevertheless if the task sets ``lw.Task.settle``."""
     tf32: bool = True
     """Whether matrix products on a GPU use TensorFloat-32."""
     mean_every: int = 20

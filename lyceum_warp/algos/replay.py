@@ -11,10 +11,10 @@ from lyceum_warp.support.machine import free_memory
 from lyceum_warp.support.validate import check_kind, finite_number, whole_number
 
 Rows: TypeAlias = dict[str, torch.Tensor]
-"""Contents of consecutive steps by name, such as rewards; each tensor is (steps, nworld, ...)."""
+"""The buffer's contents for consecutive steps, such as rewards, by name; each tensor is (steps, nworld, ...)."""
 
 _TRANSITIONS, _STEPS = 1_000_000, 1_024
-"""Default capacity in transitions, and in steps of every world; the larger capacity applies."""
+"""The default capacity is the larger of a number of transitions and a number of steps of every world."""
 
 _SHARE = 0.3
 """Largest fraction of the device's free memory that the default capacity takes."""
@@ -31,7 +31,7 @@ class Transitions(NamedTuple):
     reward: torch.Tensor
     """Discounted sums of the rewards of up to ``n_step`` steps, (batch,)."""
     discount: torch.Tensor
-    """Factors of the value of ``next_obs``: gamma^k after k steps, and 0 if the task ended the episode, (batch,)."""
+    """Factors of the value of ``next_obs``, (batch,): gamma^k after k steps, or 0 if the episode was terminated."""
     next_obs: dict[str, torch.Tensor]
     """Observations of each group after the last step and before any reset."""
 
@@ -41,9 +41,9 @@ class Replay:
     """Ring buffer of the transitions of every world, on the device of the environment's observations.
 
     ``step`` steps the environment and stores its transitions; ``sample`` draws some of the stored transitions. Sampling
-    keeps no memory that it allocates, and the host does not wait for the device. A fault truncates an episode: the
-    transition has the reward 0 and the last valid observations as ``next_obs``. Non-finite actions are stored as 0, so
-    all contents are finite.
+    retains no memory, and the host does not wait for the device. A fault truncates an episode: the transition has the
+    reward 0 and the last valid observations as ``next_obs``. Non-finite actions are stored as 0, so all contents are
+    finite.
 
     Example:
         >>> replay = Replay(env)
@@ -156,14 +156,14 @@ class Replay:
 
     @torch.no_grad()
     def at(self, index: torch.Tensor, *, n_step: int, gamma: float) -> Transitions:
-        """Get transitions by their numbers; a CUDA graph can capture this method.
+        """Get transitions by index; a CUDA graph can capture this method.
 
-        A return has fewer than ``n_step`` rewards if the episode or the stored steps end earlier. A shorter return
-        bootstraps from the last observation, also after a time limit or a fault, but not after a termination.
+        A return has fewer than ``n_step`` rewards if the episode ends earlier or no further steps are stored. Such a
+        return also bootstraps from its last observation, except after a termination.
 
         Args:
-            index: Numbers of the transitions, (batch,) int64; the transition of world w in the k-th oldest step has
-                number k * nworld + w.
+            index: Indices of the transitions, (batch,) int64; the transition of world w in the k-th oldest step has
+                index k * nworld + w.
             n_step: Maximum number of rewards in a return.
             gamma: Discount factor.
         """
@@ -185,33 +185,33 @@ class Replay:
         )  # fmt: skip
 
     def _groups(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Split the first columns into views of each group's observations."""
+        """Get a view of each observation group, stored in the first columns."""
         parts = rows[..., : sum(self._sizes)].split(self._sizes, dim=-1)
         return dict(zip(self.env.obs_groups, parts, strict=True))
 
     # the state
 
     def rows(self, first: int, end: int) -> Rows:
-        """Copy the contents of steps ``first`` to ``end - 1``; the first step ever stored is step 0."""
+        """Copy the contents of steps ``first`` to ``end - 1``, counted from the first step ever stored (step 0)."""
         place = torch.arange(first, end, device=self.reward.device) % self.steps
         return {name: array[place] for name, array in self._arrays().items()}
 
     def set_rows(self, first: int, rows: Rows) -> None:
-        """Write the contents of consecutive steps, beginning with step ``first``; then call ``restore``."""
+        """Write the contents of consecutive steps, beginning with step ``first``; afterwards, call ``restore``."""
         place = torch.arange(first, first + len(rows["reward"]), device=self.reward.device) % self.steps
         for name, array in self._arrays().items():
             array[place] = rows[name].to(array.device)
 
     def restore(self, stored: int) -> None:
-        """Set the number of stored steps, after calls of ``set_rows``."""
+        """Set the number of steps stored so far, after calls of ``set_rows``."""
         self._set_stored(whole_number("stored", stored, low=0, high=2**62))
 
     def state_dict(self) -> dict[str, Any]:
-        """Copy the contents, and the number of stored steps."""
+        """Copy the contents, and the number of steps stored so far."""
         return {"stored": self.stored, "rows": self.rows(self.stored - self.count, self.stored)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of ``state_dict``. Equal random numbers then draw equal transitions.
+        """Restore a state of ``state_dict``. Sampling with equal random numbers then gives equal transitions.
 
         Raises:
             ValueError: The state belongs to a buffer of a different size.
@@ -242,13 +242,13 @@ def default_capacity(env: Env, processes: int = 1) -> int:
 
     Args:
         env: The environment.
-        processes: Number of processes, which share the capacity and have one environment each.
+        processes: Number of processes that share the default number of transitions; each has its own environment.
     """
     wanted, free = max(-(-_TRANSITIONS // processes), _STEPS * env.nworld), free_memory(env.device)
     return wanted if free is None else max(min(wanted, int(_SHARE * free) // _transition_bytes(env)), env.nworld)
 
 
 def _transition_bytes(env: Env) -> int:
-    """Compute the bytes of one transition."""
+    """Compute the size of one transition in bytes."""
     nobs = sum(space.size for space in env.obs_spaces.values())
     return 4 * (2 * nobs + env.action_space.size + 1) + 2

@@ -17,11 +17,11 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_group, check_kind, whole_number
 
 _LARGE = 1e18
-"""Bound on observations, so that float32 can represent their squares."""
+"""Maximum absolute observation whose square still fits into float32, with a margin."""
 
 
 class Sampler(Protocol):
-    """A policy with the method ``GaussianPolicy.sample``."""
+    """A policy with a method ``sample`` like that of ``GaussianPolicy``."""
 
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> Any:
         """Write actions (nworld, nact) into ``out``."""
@@ -36,8 +36,8 @@ class Rollout:
         env: The environment.
         steps: Number of steps.
         groups: Groups of observations to store in addition to "policy", such as ``("critic",)``.
-        first_only: Whether to count only each world's first episode since ``restart``. If all worlds start together, a
-            count of all finished episodes would favour short episodes.
+        first_only: Whether to count only each world's first episode since ``restart``. If all worlds start together and
+            all finished episodes count, the statistics are biased towards short episodes.
 
     Raises:
         ValueError: The task has no group of observations of this name.
@@ -52,9 +52,9 @@ class Rollout:
     final_obs: torch.Tensor
     """Observations after each step, before any reset, (steps, nworld, nobs)."""
     obs_groups: dict[str, torch.Tensor]
-    """Observations before each step by group; the group ``policy`` is ``obs``."""
+    """Observations before each step by group; the entry "policy" is the tensor ``obs``."""
     final_obs_groups: dict[str, torch.Tensor]
-    """Observations after each step by group; the group ``policy`` is ``final_obs``."""
+    """Observations after each step by group; the entry "policy" is the tensor ``final_obs``."""
     reward: torch.Tensor
     """Rewards, (steps, nworld)."""
     eval: torch.Tensor
@@ -127,7 +127,7 @@ class Rollout:
         self._after_step = graphs.sequence([Phase("store outputs", self._launch_outputs)])
 
     def _stored(self, source: torch.Tensor, into: list["_Rows"]) -> torch.Tensor:
-        """Allocate storage (steps, nworld, size) to fill before or after each step."""
+        """Allocate a tensor (steps, nworld, size) in which to store ``source`` at each step."""
         into.append(_Rows(source, self.steps, self.env.device))
         return into[-1].stored
 
@@ -148,7 +148,7 @@ class Rollout:
             self.store_outputs()
 
     def begin(self) -> None:
-        """Start to fill the buffer from the first step, for callers that step the environment themselves."""
+        """Start to fill the buffer; for callers that step the environment themselves instead of by ``collect``."""
         self._index.zero_()
         self._fault.zero_()
 
@@ -171,11 +171,11 @@ class Rollout:
         """Set the worlds' step counters to random values, so that time limits are spread over time.
 
         Worlds that start together and never terminate would otherwise all reach their time limits in the same rollout.
-        The returns of the shortened episodes are not counted. With ``lw.Task.settle`` on the Warp engine, worlds keep
-        starting together, because all worlds wait while one of them settles.
+        The returns of the shortened episodes are not counted. If ``lw.Task.settle`` is set and the engine is Warp, this
+        method does nothing: while one world settles, all others wait, so all should reset at the same time.
 
         Args:
-            generator: Draws the values, which are equal in every process.
+            generator: Random generator for the values, in the same state in every process.
             team: The processes.
         """
         env, team = self.env, team or Team()
@@ -196,7 +196,7 @@ class Rollout:
 
         Args:
             least: Minimum number of worlds in all processes.
-            generator: Draws the worlds, which are equal in every process.
+            generator: Random generator for the choice of worlds, in the same state in every process.
             team: The processes.
         """
         env, team = self.env, team or Team()
@@ -209,10 +209,10 @@ class Rollout:
         self.running_return.masked_fill_(mask, 0.0)
 
     def explain_not_finite(self) -> str:
-        """Describe in one sentence the first number that is infinite, NaN or too large for float32, and the fix.
+        """Describe the first number that is infinite, NaN or too large for float32, and its fix, in one sentence.
 
-        The host waits for the device. A task's rewards and observations are always finite, because non-finite values
-        are faults.
+        The host waits for the device. A task's rewards and observations can be too large, but never infinite or NaN,
+        because the environment treats such values as faults.
         """
         kinds: list[tuple[str, torch.Tensor, float, Mapping[str, slice]]] = [("reward", self.reward, torch.inf, {})]
         for groups in (self.obs_groups, self.final_obs_groups):
@@ -256,7 +256,7 @@ class Rollout:
 
 
 class _Rows:
-    """Storage for one buffer of an environment: (steps, nworld, size) for a buffer (nworld, size)."""
+    """Stores one tensor of an environment, (nworld, size), at each step, in a tensor (steps, nworld, size)."""
 
     def __init__(self, source: torch.Tensor, steps: int, device: wp.Device) -> None:
         self._source = wp.from_torch(source)
@@ -264,6 +264,6 @@ class _Rows:
         self.stored = torch_view(self._rows)
 
     def store(self, index: wp.array) -> None:
-        """Launch a copy of the buffer into the row with the given index."""
+        """Launch a copy of the environment's tensor into the row with the given index."""
         args = [index, self._source, self._rows]
         wp.launch(collect.store_rows, self._source.shape, args, device=self._rows.device)

@@ -12,7 +12,7 @@ from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.support.docstrings import document_attributes
 
 Scalar: TypeAlias = Any
-"""A scalar tensor on the device or, after the transfer to the host, a float."""
+"""A scalar tensor on the device, or a float after the transfer to the host."""
 
 
 @document_attributes
@@ -107,8 +107,8 @@ def finished(rollout: Rollout) -> EpisodeSums:
 def metric_sums(rollout: Rollout) -> tuple[torch.Tensor, ...]:
     """Sum the task's metrics over a rollout, as scalar tensors on the rollout's device.
 
-    The result has the sums over ended episodes first, and then the means over all samples. Non-finite metrics count as
-    zero.
+    The result has first each metric's sum over ended episodes, and then each metric's mean over all samples. Non-finite
+    metrics count as zero.
     """
     ended = _ended(rollout)
     sums = [sums.double().masked_fill(~ended, 0.0).sum() for sums in rollout.episode_metrics.values()]
@@ -116,12 +116,12 @@ def metric_sums(rollout: Rollout) -> tuple[torch.Tensor, ...]:
 
 
 def _ended(rollout: Rollout) -> torch.Tensor:
-    """Compute a mask of the last steps of counted episodes, (steps, nworld) bool."""
+    """Compute a mask, (steps, nworld) bool: whether a counted episode ended in the step."""
     return rollout.done & ~rollout.episode_return.isnan()
 
 
 def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Any]:
-    """Compute ``step_metrics``, and ``metrics`` as means over the episodes that ended (NaN if no episode ended).
+    """Compute ``Iteration.metrics`` (NaN if no episode ended) and ``Iteration.step_metrics``.
 
     Args:
         episodes: Number of ended episodes in all processes.
@@ -137,7 +137,7 @@ def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequen
 
 
 def episode_statistics(sums: Sequence[EpisodeSums]) -> dict[str, float]:
-    """Compute statistics of finished episodes from the sums of all processes; NaN if no episode ended."""
+    """Compute statistics of the finished episodes from each process's sums; NaN if no episode ended."""
     episodes, mean, square = pooled([Moments(part.episodes, part.return_mean, part.return_square) for part in sums])
     if not episodes:
         return dict.fromkeys(_EPISODE_STATISTICS, math.nan)
@@ -160,7 +160,7 @@ _EPISODE_STATISTICS = (
 
 
 def pooled(parts: Sequence[Moments]) -> Moments:
-    """Pool the moments of several sets of numbers."""
+    """Compute the moments of the union of several sets from each set's moments."""
     n = sum(part.n for part in parts)
     mean = sum(part.n * part.mean for part in parts) / n if n else 0.0
     return Moments(n, mean, sum(part.square + part.n * (part.mean - mean) ** 2 for part in parts))

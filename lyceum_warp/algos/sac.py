@@ -1,8 +1,8 @@
 """Learn policies by soft actor-critic (SAC).
 
-SAC was proposed by Haarnoja et al., 2018 ("Soft Actor-Critic Algorithms and Applications"): twin critics, slowly moving
-target critics, and a temperature that adapts to a target entropy. With many worlds and large batches, SAC is close to
-FastSAC (Seo et al. 2025, "Learning Sim-to-Real Humanoid Locomotion in 15 Minutes").
+SAC was proposed by Haarnoja et al., 2018 ("Soft Actor-Critic Algorithms and Applications"). It has twin critics, slowly
+moving target critics, and a temperature that is adapted to reach a target entropy. With many worlds and large batches,
+this implementation is close to FastSAC (Seo et al. 2025, "Learning Sim-to-Real Humanoid Locomotion in 15 Minutes").
 """
 
 import copy
@@ -51,7 +51,7 @@ class SACIteration(SampledIteration):
     Losses, values and entropy are means over the iteration's updates, or NaN without an update.
 
     Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended. The statistics
-    exclude the worlds' first episodes, which start at a random step.
+    exclude each world's first episode, because it starts at a random step.
     """
 
     critic_loss: float
@@ -72,8 +72,8 @@ class SACIteration(SampledIteration):
 class SAC(Learner):
     """Learns a policy by SAC, as an infinite iterator of ``SACIteration``.
 
-    An iteration makes ``num_steps`` steps of every world, each followed by ``updates`` updates. On a GPU, all updates
-    after a step run as one CUDA graph, which also draws the updates' batches.
+    In an iteration, every world makes ``num_steps`` steps, each followed by ``updates`` updates. On a GPU, all updates
+    after a step run as one CUDA graph, including the sampling of their batches.
 
     Example:
         >>> for it in SAC(env):
@@ -85,8 +85,8 @@ class SAC(Learner):
         value: The critics; by default new critics.
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
-        team: The processes that learn together, each with some of the worlds and of the replay buffer. All processes
-            must make the same calls with the same arguments, and get the same statistics.
+        team: The processes that learn together. Each has some of the worlds, and a replay buffer for them. All
+            processes must make the same calls with the same arguments, and get the same statistics.
 
     Raises:
         ValueError: The environment does not reset automatically, or an argument does not fit the environment.
@@ -102,13 +102,13 @@ class SAC(Learner):
     target: TwinCritic
     """The target critics, which share the critics' normaliser."""
     config: Any
-    """Hyperparameters: an ``SACConfig`` in which defaults have replaced None."""
+    """Hyperparameters: an ``SACConfig`` with defaults in place of None."""
     replay: Replay
     """Replay buffer with the samples of this process's worlds."""
     generator: torch.Generator
     """Random generator for actions and updates."""
     rollout: Rollout
-    """Samples of the last iteration, for the iteration's statistics."""
+    """The samples of the last iteration, used only for its statistics."""
     log_temperature: torch.Tensor
     """Logarithm of the temperature."""
 
@@ -185,7 +185,7 @@ class SAC(Learner):
         self.rollout.stagger(self.generator, team)
 
     def _make_mirror(self, config: SACConfig) -> None:
-        """Make the mirror images of observations and actions, if the configuration asks for symmetry."""
+        """Make the functions that mirror observations and actions, if ``config.symmetry`` is not "none"."""
         self._mirror: PolicyMirror | None = None
         if config.symmetry == "none" or self.policy.mirror is not None:  # of another run
             return
@@ -289,7 +289,7 @@ class SAC(Learner):
 
     @torch.no_grad()
     def draw(self) -> None:
-        """Draw samples and noise for the updates after a step, and keep this process's part."""
+        """Draw the indices of samples and the noise for the updates after a step, and select this process's samples."""
         team, nworld, batch = self.team, self.env.nworld, self.config.batch
         shape = len(self._index), batch
         random: dict[str, Any] = dict(generator=self.generator, device=self._index.device)
@@ -305,7 +305,7 @@ class SAC(Learner):
         self._noise.copy_(noise)
 
     def learn(self) -> None:
-        """Make the updates after a step, with the samples that ``draw`` drew."""
+        """Make the updates after a step, with the indices and noise from ``draw``."""
         config, nact = self.config, self.policy.nact
         critic_loss, actor_loss = self._losses
         for i in range(config.updates):
@@ -322,7 +322,7 @@ class SAC(Learner):
                     loss, *numbers = actor_loss(batch, weight, noise)
                 actor_loss_mean, entropy = self.actor_step(loss, *numbers)
                 self._sums[2:] += config.actor_every * torch.stack([actor_loss_mean, entropy])
-                # the temperature rises while the entropy is below its target
+                # the step raises the temperature if the entropy is below its target
                 share = (entropy - config.target_entropy * nact) / self.team.size
                 self.temperature_step(self.log_temperature * share)
             self._follow(list(self.target.parameters()), list(self.value.parameters()), None)
@@ -351,7 +351,7 @@ class SAC(Learner):
 
         Args:
             batch: Transitions.
-            weight: Weights of the transitions (batch,), which sum to 1 over all processes.
+            weight: Weights of the transitions, (batch,). The weights of all processes sum to 1.
             noise: Standard normal numbers for the actions of the next observations, (batch, nact).
         """
         group = self.value.group
@@ -366,7 +366,7 @@ class SAC(Learner):
     def actor_loss(
         self, batch: Transitions, weight: torch.Tensor, noise: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Compute the actor's loss, and the actor's entropy.
+        """Compute the actor's loss and entropy.
 
         Args:
             batch: Transitions; the loss uses only their observations.
@@ -385,7 +385,7 @@ class SAC(Learner):
         return (weight * loss).sum(), -(weight * log_prob.detach()).sum()
 
     def _bound(self, values: torch.Tensor) -> torch.Tensor:
-        """Combine the two critics' predictions (2, rows) into the value of an action (rows,)."""
+        """Combine the two critics' predictions, (2, rows), into values of the actions, (rows,)."""
         return values.amin(0) if self.config.critic_bound == "min" else values.mean(0)
 
     def state_dict(self) -> dict[str, Any]:
@@ -407,7 +407,7 @@ class SAC(Learner):
         self.rollout.running_return.copy_(state["returns"][self.own_worlds])
         for step, saved in zip(self._steps, state["optimizers"], strict=True):
             step.optimizer.load_state_dict(saved)
-        self._learn.forget()  # discard the graph, which uses the addresses of Adam's old moments
+        self._learn.forget()  # discard the graph: it contains the addresses of Adam's old moments
 
     @property
     def _steps(self) -> "tuple[GradientStep, ...]":
@@ -415,7 +415,7 @@ class SAC(Learner):
 
 
 class GradientStep:
-    """Makes steps of Adam on some parameters, with gradients summed over all processes.
+    """Makes Adam steps on given parameters, with gradients summed over all processes.
 
     Args:
         parameters: The parameters; frozen parameters do not change.
@@ -429,8 +429,8 @@ class GradientStep:
         self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=cuda)
 
     def __call__(self, loss: torch.Tensor, *numbers: torch.Tensor) -> torch.Tensor:
-        """Make a gradient step, and return the loss and the numbers summed over all processes, (1 + len(numbers),)."""
-        # do not use backward(), which accumulates gradients on the stream of its first call
+        """Make a gradient step; return the sums of the loss and the numbers over all processes, (1 + len(numbers),)."""
+        # do not use backward(): it accumulates gradients on the CUDA stream of its first call
         gradients = torch.autograd.grad(loss, self.parameters)
         parts = [*gradients, *(number.detach() for number in (loss, *numbers))]
         sums = self.team.sum(torch.cat([part.reshape(-1).float() for part in parts]))
@@ -442,7 +442,7 @@ class GradientStep:
 
 
 def action_bounds(env: Env, limit: float) -> tuple[list[float], list[float]]:
-    """Get lower and upper bounds of actions, each (nact,); actions without bounds get -limit and limit."""
+    """Get lower and upper bounds of actions, each (nact,); for unbounded actions, use -limit and limit."""
     space = env.action_space
     assert space.low is not None and space.high is not None
     return tuple(  # type: ignore[return-value]

@@ -14,7 +14,7 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 MANY_WORLDS = 256
-"""Minimum number of worlds for which the defaults for many worlds apply."""
+"""With this number of worlds or more, the defaults for many worlds apply."""
 
 _FEW: dict[str, Any] = {
     "batch": 256, "actor_every": 1, "gamma": 0.99, "tau": 0.005, "temperature": 1.0, "target_entropy": -1.0,
@@ -34,9 +34,9 @@ _MANY: dict[str, Any] = {
 class SACConfig:
     """Hyperparameters of SAC.
 
-    ``resolved`` replaces None by a default that depends on the number of worlds. Defaults for fewer than 256 worlds
-    follow Haarnoja et al., 2018 ("Soft Actor-Critic Algorithms and Applications"). Defaults for 256 worlds or more are
-    close to Seo et al., 2025 ("Learning Sim-to-Real Humanoid Locomotion in 15 Minutes").
+    If a hyperparameter is None, the method ``resolved`` sets a default that depends on the number of worlds. Defaults
+    for fewer than 256 worlds follow Haarnoja et al., 2018 ("Soft Actor-Critic Algorithms and Applications"). Defaults
+    for 256 worlds or more are close to Seo et al., 2025 ("Learning Sim-to-Real Humanoid Locomotion in 15 Minutes").
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.
@@ -51,15 +51,15 @@ class SACConfig:
     """Number of samples with random actions before the first update. The default is 5,000 samples, or 10 steps of every
     world if that is more."""
     updates: int | None = None
-    """Number of updates of the critics after each step of all worlds. The default is one update for every world, but at
-    most 8."""
+    """Number of updates of the critics after each step of all worlds. The default is the number of worlds, but at most
+    8."""
     actor_every: int | None = None
     """Number of updates of the critics for each update of the actor. This number must divide ``updates``. The default
     is 1, or 4 with 256 or more worlds."""
     batch: int | None = None
     """Number of samples in an update. The default is 8,192 samples with 256 or more worlds, and otherwise 256."""
     n_step: int = 1
-    """Maximum number of rewards in a target."""
+    """Maximum number of rewards in a target of the critics (n-step returns)."""
     gamma: float | None = None
     """Discount factor. The default is 0.97 with 256 or more worlds, and otherwise 0.99."""
     tau: float | None = None
@@ -77,7 +77,7 @@ class SACConfig:
     """Target entropy of the policy, per element of the action scaled to [-1, 1]. SAC adapts the temperature to the
     target entropy. The default is 0 with 256 or more worlds, and otherwise -1."""
     action_limit: float = 1.0
-    """Limit of actions that the task leaves unbounded."""
+    """Absolute limit of actions for which the task gives no bounds."""
     hidden: tuple[int, ...] | None = None
     """Widths of the policy's hidden layers. The default widths are 512 256 128 with 256 or more worlds, and otherwise
     256 256."""
@@ -91,11 +91,11 @@ class SACConfig:
     value_group: str | None = None
     """Group of observations for the critics; by default "critic" if the task has such a group, else "policy"."""
     layer_norm: bool = True
-    """Whether to normalise the critics' hidden layers."""
+    """Whether to apply layer normalisation to the critics' hidden layers."""
     symmetry: Literal["none", "exact", "loss", "augment"] = "none"
-    """Use of the mirror image that a task declares (``lw.Mirror``): "exact" averages the policy with its mirror image;
-    "loss" adds symmetry_coef times the squared difference between both; "augment" also learns from the mirror images of
-    all samples."""
+    """How to use the mirror symmetry that a task declares (``lw.Mirror``): "exact" averages the policy with its mirror
+    image; "loss" adds symmetry_coef times the squared difference between the policy and its mirror image; "augment"
+    also learns from the mirror images of all samples; "none" ignores the symmetry."""
     symmetry_coef: float = 1.0
     """Coefficient of the symmetry loss, if symmetry is "loss"."""
     normalize: bool = True
@@ -116,7 +116,7 @@ class SACConfig:
         check_fields(self, _BOUNDS)
 
     def resolved(self, nworld: int) -> "SACConfig":
-        """Replace values of None by defaults, except ``replay`` and ``value_group``.
+        """Replace None by defaults in all fields except ``replay`` and ``value_group``.
 
         Args:
             nworld: Number of worlds of all processes.

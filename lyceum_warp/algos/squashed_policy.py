@@ -1,4 +1,4 @@
-"""Define SAC's policies, which draw bounded actions as the hyperbolic tangent of a Gaussian sample."""
+"""Define SAC's policies: a bounded action is the hyperbolic tangent of a Gaussian sample, scaled to the bounds."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -18,10 +18,10 @@ _LOWEST, _HIGHEST = -5.0, 2.0
 
 @document_attributes
 class SquashedPolicy(Normalized):
-    """Draws actions between bounds: low + (high - low) (1 + tanh(u)) / 2 with u from N(mean(obs), std(obs)^2).
+    """Samples bounded actions: low + (high - low) (1 + tanh(u)) / 2 with u from N(mean(obs), std(obs)^2).
 
-    A network computes the means and the logarithms of the standard deviations (Haarnoja et al. 2018, "Soft Actor-Critic
-    Algorithms and Applications", appendix C). The *unit action* is tanh(u), between -1 and 1.
+    One network computes both the means and the logarithms of the standard deviations (Haarnoja et al. 2018, "Soft
+    Actor-Critic Algorithms and Applications", appendix C). The *unit action* is tanh(u), between -1 and 1.
 
     Args:
         nobs: Length of an observation.
@@ -32,7 +32,7 @@ class SquashedPolicy(Normalized):
         activation: Activation of the hidden layers.
         normalize: Whether to normalise observations by their running mean and variance.
         limit: Normalised observations are clipped to [-limit, limit]; inf means no limit.
-        mirror: Reflections for ``use_mirror``.
+        mirror: The argument of ``use_mirror``, to make the policy symmetric.
         generator: Draws the initial weights.
 
     Raises:
@@ -78,7 +78,7 @@ class SquashedPolicy(Normalized):
             self.use_mirror(mirror)
 
     def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:
-        """Make the policy symmetric: average its Gaussian with the Gaussian's mirror image.
+        """Make the policy symmetric: average mean and standard deviation with those of its mirror image.
 
         Args:
             reflections: The reflections of ``obs`` and ``action`` (``algos.symmetry.reflections``).
@@ -115,7 +115,7 @@ class SquashedPolicy(Normalized):
         return self.scaled(torch.tanh(self(obs)[0]))
 
     def sample(self, obs: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw unit actions (..., nact) and compute their log-densities (...,).
+        """Sample unit actions, (..., nact), and compute their log-densities, (...,).
 
         Args:
             obs: Observations, (..., nobs).

@@ -28,7 +28,7 @@ class Reflected(nn.Module):
         return self.swapped(rows) * self.signs
 
     def swapped(self, rows: torch.Tensor) -> torch.Tensor:
-        """Compute the mirror image of unsigned values, such as standard deviations."""
+        """Compute the mirror image of numbers that keep their sign, such as standard deviations."""
         return rows.index_select(-1, self.order)
 
 
@@ -45,15 +45,15 @@ class PolicyMirror(nn.Module):
         self.obs, self.action = Reflected(reflections["obs"]), Reflected(reflections["action"])
 
     def average(self, function: Callable[[torch.Tensor], torch.Tensor], obs: torch.Tensor) -> torch.Tensor:
-        """Make a function from observations to actions symmetric, by averaging actions with their mirror images.
+        """Compute symmetric actions: average a function's actions with their mirrored counterparts.
 
-        Mirrored observations then give exactly the mirrored actions, bit for bit.
+        For mirrored observations, the result is exactly the mirror image, bit for bit.
         """
         return 0.5 * (function(obs) + self.action(function(self.obs(obs))))
 
 
 def reflections(env: Env, *, group: str = "policy") -> dict[str, Reflection]:
-    """Get the reflections of an observation group (``obs``) and of the actions (``action``) of a task.
+    """Get the reflections of a task's actions ("action") and of one of its observation groups ("obs").
 
     Raises:
         ValueError: The task declares no mirror, or a part of the observation or action has no mirror image.

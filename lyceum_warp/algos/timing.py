@@ -1,4 +1,4 @@
-"""Measure the phases of an iteration, and control torch's threads on the CPU."""
+"""Measure the duration of an iteration's phases, and control torch's threads on the CPU."""
 
 import contextlib
 import time
@@ -14,7 +14,7 @@ Result = TypeVar("Result")
 class PhaseTimer:
     """Measures the seconds between calls of ``mark``, starting at construction.
 
-    On a GPU, a mark is an event in the current stream, so that only ``seconds`` waits for the device.
+    On a GPU, ``mark`` records a CUDA event, so that only ``seconds`` waits for the device.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -57,11 +57,14 @@ def one_thread() -> Iterator[None]:
 
 @contextlib.contextmanager
 def beside(function: Callable[[], Result], *, allowed: bool) -> Iterator[Callable[[], Result]]:
-    """If torch has exactly two threads, run a function and the with block in parallel, on one thread each.
+    """Run a function and the with block in parallel if torch has exactly two threads.
 
-    Mini-batches do not benefit from a second thread, and large products speed up by less than a factor of two.
-    With any other number of threads, or without ``allowed``, the function runs when the with block asks for the
-    function's result.
+    The function and the with block then use one thread each. This is faster than running them one after the other on
+    two threads, because mini-batches do not benefit from a second thread, and large products speed up by less than a
+    factor of two.
+
+    With any other number of threads, or if ``allowed`` is False, the function runs when the with block asks for its
+    result.
 
     Args:
         function: The function, which must not share state with the with block.

@@ -1,4 +1,4 @@
-"""Compare a policy between engines and physics options, in pairs of episodes with equal initial states."""
+"""Compare a policy's results between engines and physics options, on pairs of episodes with equal initial states."""
 
 import dataclasses
 import functools
@@ -20,17 +20,17 @@ from lyceum_warp.support.intervals import mean_interval, share_interval
 from lyceum_warp.support.validate import check_kind, finite_number, whole_number
 
 EXACT = "exact"
-"""Name of the exact physics of a task."""
+"""Name of a task's exact physics (its model with default physics options)."""
 
 
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Difference:
-    """Mean over episodes in two simulations, and the difference of the two means with a 95 % confidence interval."""
+    """A quantity's means in two simulations, and the difference of the means with a 95 % confidence interval."""
 
     quantity: str
-    """Name of the quantity: return, length (steps) or terminated (fraction of episodes that the task ended, for example
-    by a fall)."""
+    """Name of the quantity: "return", "length" (in steps) or "terminated" (the fraction of episodes that ended by
+    termination, for example by a fall)."""
     first: float
     """The quantity's mean in the first simulation."""
     second: float
@@ -40,7 +40,7 @@ class Difference:
     high: float
     """Upper end of the confidence interval of the difference (second mean minus first mean)."""
     margin: float
-    """The largest difference that does not matter."""
+    """The largest difference that counts as equal."""
 
     @property
     def verdict(self) -> str:
@@ -61,17 +61,17 @@ class Comparison:
     """Differences between two simulations of the same episodes."""
 
     first: str
-    """The first simulation: "C engine", or "exact physics" on the C engine."""
+    """Name of the first simulation: "C engine", or "exact physics" (on the C engine)."""
     second: str
-    """The second simulation: "Warp engine on cuda:0", or other physics on the C engine."""
+    """Name of the second simulation, such as "Warp engine on cuda:0", or "coarse physics" (on the C engine)."""
     faults: tuple[int, int]
     """Number of faults in each simulation."""
     differences: tuple[Difference, ...]
-    """Differences of returns, lengths and, if the task ends episodes, fractions of terminated episodes."""
+    """Differences of returns, lengths and, if the task can terminate episodes, fractions of terminated episodes."""
 
     @property
     def verdict(self) -> str:
-        """Combine all differences: "different" if one is "different", "same" if all are "same", else "not shown"."""
+        """Combine the verdicts: "different" if any is "different", "same" if all are "same", else "not shown"."""
         verdicts = {difference.verdict for difference in self.differences}
         return "different" if "different" in verdicts else "same" if verdicts == {"same"} else "not shown"
 
@@ -79,7 +79,7 @@ class Comparison:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Transfer:
-    """Verdict on whether a policy's returns, lengths and terminations depend on the engine or on physics options."""
+    """The result of ``transfer``: whether a policy's results depend on the engine or on physics options."""
 
     task: str
     """Name of the task."""
@@ -100,7 +100,7 @@ class Transfer:
         return "; ".join(found)
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert to JSON values, with the verdicts."""
+        """Convert the result, including the verdicts, to values that JSON supports."""
         made = dataclasses.asdict(self) | {"line": self.line}
         for comparison, entry in zip(self.comparisons, made["comparisons"], strict=True):
             entry["verdict"] = comparison.verdict
@@ -124,10 +124,11 @@ def transfer(
 ) -> Transfer:
     """Play and compare pairs of episodes, on both engines and with each of the task's physics options.
 
-    The Warp engine is compared with the C engine under the environment's physics options. On the C engine, each of the
-    task's physics options and the environment's options are compared with the task's exact physics. Both episodes of a
-    pair draw equal initial states, model fields, pushes and commands. The intervals of returns and lengths use
-    Student's t over the pairs; the interval of the terminated fraction uses Agresti and Min's method.
+    There are two kinds of comparisons. The Warp engine is compared with the C engine, both with the environment's
+    physics options. On the C engine, each set of physics options of the task, and the environment's set, is compared
+    with the task's exact physics. Both episodes of a pair have equal initial states, randomized model fields, pushes
+    and commands. The intervals of returns and lengths use Student's t over the pairs; the interval of the terminated
+    fraction uses Agresti and Min's method.
 
     Args:
         env: An environment of the task; its worlds do not change.
@@ -139,9 +140,9 @@ def transfer(
             fractions.
         device: Device of the Warp engine; by default the environment's GPU, or else another GPU, or else the CPU, on
             which Warp's kernels may take minutes to compile.
-        warp: Whether to play on the Warp engine.
-        physics: Whether to play with each of the task's physics options, instead of only with the environment's options
-            and the exact physics.
+        warp: Whether to play episodes on the Warp engine, too.
+        physics: Whether to play episodes with each set of physics options of the task. If False, play only with the
+            environment's physics options and with the exact physics.
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:
@@ -181,9 +182,9 @@ def _show(progress: Callable[[int, int], object] | None, play: int, plays: int, 
 
 
 def task_physics(env: Env) -> tuple[dict[str, PhysicsOptions], str]:
-    """Get a task's physics options by name, including the environment's own options, and the name of the latter.
+    """Get a task's sets of physics options by name, including the environment's set, and the name of this set.
 
-    Options that only the Warp engine has are omitted.
+    Options that only the Warp engine has are ignored.
     """
     named = {EXACT: PhysicsOptions(), **env.task.task.physics}
     given = dataclasses.replace(env.options.physics, nconmax=None, njmax=None, deterministic=False)

@@ -15,7 +15,7 @@ from lyceum_warp.support.validate import layer_sizes, whole_number
 
 @document_attributes
 class TwinCritic(Normalized):
-    """Two independent networks of the same shape, computed together layer by layer.
+    """Two independent networks of the same shape, evaluated together, one layer after the other.
 
     Args:
         nobs: Length of an observation.

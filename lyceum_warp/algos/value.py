@@ -21,9 +21,10 @@ class ValueFunction(Normalized):
         nobs: Length of an observation.
         hidden: Widths of the hidden layers.
         activation: Activation of the hidden layers.
-        scale: Factor on the network's output until ``rescale`` fits the factor to returns.
+        scale: Initial factor on the network's output; ``rescale`` later fits the factor to returns.
         time_orders: Highest power of the time features t, t^2, ... with t = step / 1000 (as in mjrl); 0 means no time
-            features. Time features help if the time limit is not observable, because returns then depend on the step.
+            features. Time features help if the observations do not contain the time that is left in the episode,
+            because returns depend on it.
         normalize: Whether to normalise observations by their running mean and variance.
         limit: Normalised observations are clipped to [-limit, limit]; inf means no limit.
         discount: Discount factor of the predicted returns, if known.
@@ -35,18 +36,18 @@ class ValueFunction(Normalized):
     """
 
     LATER = ("shift", "scale")
-    """Buffers that keep their initial values if a checkpoint of an earlier release lacks them."""
+    """Names of buffers that a checkpoint of an earlier release may lack; they then keep their initial values."""
 
     group: str
     """The group of observations that the value function uses."""
     shift: torch.Tensor
-    """Offset of the scaled output: the mean of the returns."""
+    """Number that is added to the scaled output: the mean of the returns."""
     scale: torch.Tensor
     """Factor on the network's output: the standard deviation of the returns."""
     discount: float | None
     """Discount factor of the predicted returns, if known."""
     orders: torch.Tensor
-    """The powers of the time feature, (time_orders,)."""
+    """The exponents of the time features, (time_orders,)."""
 
     def __init__(
         self,
@@ -109,13 +110,14 @@ class ValueFunction(Normalized):
         """Set shift and scale to the mean and standard deviation of returns, without changing the predictions.
 
         The last layer compensates for the change (Pop-Art; van Hasselt et al. 2016, "Learning values across many orders
-        of magnitude"). Returns are clipped to ``BOUND`` scales around the shift, and the scale changes at most by the
-        factor ``BOUND``. If more than a quarter of the returns are outliers, as after a change of the task, the bounds
-        are computed from the quartiles instead. If all returns are equal, the scale does not change.
+        of magnitude"). Returns are clipped to the old shift plus or minus ``BOUND`` times the old scale, and the scale
+        changes at most by the factor ``BOUND``. If more than a quarter of the returns are outliers, for example after a
+        change of the task, returns are instead clipped to bounds from the quartiles, and the scale may change by any
+        factor. If all returns are equal, the scale does not change.
 
         Args:
             returns: Returns, of any shape.
-            first: Whether the value function was never fitted, so that the scale is arbitrary.
+            first: Whether the value function has never been fitted, so that the old scale is arbitrary.
             team: The processes; each contributes the same number of returns.
         """
         team = team or Team()
@@ -150,7 +152,7 @@ class ValueFunction(Normalized):
 
 
 BOUND = 10.0
-"""Number of standard deviations from the mean beyond which returns and advantages are outliers."""
+"""Returns and advantages are outliers if they differ from their mean by more than this many standard deviations."""
 
 
 def value_group(env: Env, given: str | None) -> str:

@@ -15,8 +15,8 @@ class ValueFit:
     """Fits a value function with Adam on squared errors in random mini-batches.
 
     The mini-batches do not depend on the number of processes. Each process uses the samples of its own worlds, and
-    gradients are summed over the processes. On a GPU, a mini-batch step is one graph in place of about 40 launches. On
-    the CPU, a network made by ``mlp`` is fitted without autograd.
+    gradients are summed over the processes. On a GPU, a mini-batch step is one CUDA graph instead of about 40 launches.
+    On the CPU, a network made by ``mlp`` is fitted without autograd.
 
     Args:
         value: The value function.
@@ -49,14 +49,14 @@ class ValueFit:
     def __call__(
         self, obs: torch.Tensor, step: torch.Tensor, target: torch.Tensor, generator: torch.Generator
     ) -> torch.Tensor:
-        """Fit to returns, and restore all parameters and moments of Adam if one becomes non-finite.
+        """Fit to returns; if a parameter or a moment of Adam becomes non-finite, restore all of them.
 
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
             step: Steps since the reset, (samples,).
             target: Returns, (samples,). Returns are clipped to the value function's shift plus or minus ``BOUND`` times
                 its scale.
-            generator: Draws the order of the samples of all processes.
+            generator: Random generator for the order of all processes' samples.
 
         Returns:
             Whether the fit is finite, as a bool tensor.
@@ -110,11 +110,11 @@ class ValueFit:
             tensor.copy_(part.view_as(tensor))
 
     def _own(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | float]:
-        """Select this process's samples of a mini-batch, and compute their weights in the mini-batch's mean."""
+        """Select this process's samples of a mini-batch, and compute their weights in the mean over the mini-batch."""
         if self.team.size == 1:
             return index, 1.0 / len(index)
         places, own = self.team.locate(index, self.nworld)
-        # weights of 0 exclude other processes' samples, because selecting would synchronise with the device
+        # on a GPU, exclude other processes' samples by the weight 0, because a selection would synchronise
         if self.cuda:
             return places, own.unsqueeze(-1) / len(index)
         return places[own], 1.0 / len(index)
@@ -136,13 +136,14 @@ class ValueFit:
         self.optimizer.load_state_dict(state)
         for group in self.optimizer.param_groups:
             group["capturable"] = self.cuda
-        self.captured = None  # discard the graph, which uses the addresses of Adam's old moments
+        self.captured = None  # discard the graph: it contains the addresses of Adam's old moments
 
 
 class DenseSteps:
     """Makes the mini-batch steps of a ``ValueFit`` on the CPU, without autograd or torch's Adam.
 
-    Parameters and moments are flat copies, which ``store`` writes back into the value function and the optimizer.
+    The steps change flat copies of the parameters and moments. ``store`` writes them back into the value function and
+    the optimizer.
     """
 
     def __init__(self, fit: ValueFit, passes: DensePasses) -> None:
@@ -191,7 +192,7 @@ class DenseSteps:
         self.count += 1
         self.first.lerp_(self.gradient, 1.0 - decay)
         self.second.mul_(slow).addcmul_(self.gradient, self.gradient, value=1.0 - slow)
-        # the factor on the step includes the bias corrections of both moments
+        # include the bias corrections of both moments in the step's factor
         unbias = math.sqrt(1.0 - slow**self.count)
         torch.sqrt(self.second, out=self.root).add_(group["eps"] * unbias)
         factor = group["lr"] * unbias / (1.0 - decay**self.count)
@@ -209,9 +210,10 @@ class DenseSteps:
 
 
 class CapturedStep:
-    """Makes the mini-batch steps of a ``ValueFit`` as a CUDA graph. A counter on the device selects the mini-batch.
+    """Makes the mini-batch steps of a ``ValueFit`` as a CUDA graph.
 
-    The constructor uses only the shapes and the device of ``features`` and ``target``.
+    A counter on the device is the index of the next mini-batch. The constructor uses only the shapes and the device of
+    ``features`` and ``target``, not their values.
     """
 
     def __init__(self, fit: ValueFit, features: torch.Tensor, target: torch.Tensor) -> None:
@@ -229,7 +231,7 @@ class CapturedStep:
         self.graph: Any = None
 
     def __call__(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
-        """Run an epoch, with the arguments of ``DenseSteps``."""
+        """Run an epoch; the arguments are those of ``DenseSteps``."""
         self.load(features, target, order)
         done = 0
         if self.graph is None:
@@ -240,7 +242,7 @@ class CapturedStep:
             self.graph.replay()
 
     def load(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
-        """Start an epoch by copying the samples, and the indices and weights of its mini-batches."""
+        """Start an epoch: copy the samples, and the indices and weights of the mini-batches."""
         self.features.copy_(features)
         self.target.copy_(target)
         filled = torch.nn.functional.pad(order, (0, self.places.numel() - len(order))).view_as(self.places)

@@ -1,4 +1,4 @@
-"""Control a world synchronously or in real time, store the trajectory, and make reports.
+"""Control one world, either synchronously or in real time; store its trajectory, and make reports.
 
 The *plant* is the world under control. A planner simulates its plans in separate worlds.
 """

@@ -21,9 +21,9 @@ class CheckedController:
         env: The plant.
 
     Raises:
-        ValueError: The controller cannot be called with a state and an observation, plans in the plant itself, or plans
-            for several plants; or neither the controller's time step nor the plant's time step is a multiple of the
-            other.
+        ValueError: The controller cannot be called with a state and an observation, simulates its plans in the plant
+            itself, or plans for several plants; or the larger of the controller's and the plant's time steps is not a
+            multiple of the smaller.
     """
 
     def __init__(self, controller: Controller, env: Env) -> None:
@@ -53,7 +53,7 @@ class CheckedController:
         Args:
             state: State of the plant, (state_size,) float64.
             obs: The plant's observation, (nobs,).
-            shift: Number of controller steps since the state of the last plan.
+            shift: Number of controller steps between the initial state of the last plan and this state.
             step: Step of the plant, for error messages.
 
         Returns:
@@ -64,7 +64,7 @@ class CheckedController:
         """
         action = self._controller(state, obs, **({"shift": shift} if self._takes_shift else {}))
         plan = getattr(self._controller, "actions", None)
-        # use the action in the plan, because copying plan and action from a GPU would synchronise twice
+        # do not copy the returned action: it is also in the plan, and two copies would synchronise twice
         return self._checked(action, 1, step)[None] if plan is None else self._checked(plan, 2, step)
 
     def reset(self, seed: int | None) -> None:
@@ -73,7 +73,7 @@ class CheckedController:
             reset(seed)
 
     def quality(self) -> tuple[float, float]:
-        """Get the last plan's number of failed samples and effective sample size; NaN if unknown."""
+        """Get the number of failed samples and the effective sample size of the last plan; NaN if unknown."""
         summary = getattr(self._controller, "summary", None)
         if not isinstance(summary, Mapping):
             return math.nan, math.nan
@@ -82,19 +82,19 @@ class CheckedController:
         return failed, 0.0 if failed == getattr(self._controller, "samples", None) else effective
 
     def steps(self, plant_steps: int) -> int:
-        """Convert steps of the plant to complete steps of the controller."""
+        """Convert a number of plant steps to the number of complete controller steps."""
         return plant_steps * self._plan_steps // self._plant_steps
 
     def passed(self, before: int, now: int) -> int:
-        """Count the controller steps between two steps of the plant's episode."""
+        """Count the controller steps that are completed between two plant steps of an episode."""
         return self.steps(now) - self.steps(before)
 
     def action(self, plan: torch.Tensor, plant_steps: int) -> torch.Tensor:
-        """Select the action that applies after ``plant_steps`` steps of the plant since the plan's initial state.
+        """Select the action to apply ``plant_steps`` steps of the plant after the plan's initial state.
 
-        If a plan's step covers several steps of the plant, all plant steps apply the same action; with
-        ``between="linear"``, they interpolate to the next action. After the end of the plan, the plan's last action
-        applies.
+        If a step of the plan covers several steps of the plant, the action is held for all of them; if the controller
+        has ``between="linear"``, the action is interpolated towards the next action. After the end of the plan, the
+        plan's last action is held.
 
         Args:
             plan: The plan, (horizon, nact).
@@ -133,7 +133,7 @@ class CheckedController:
             found |= settings
         if isinstance(env := getattr(controller, "env", None), Env):
             found |= {"engine": env.engine.name, "device": env.device.alias}
-        # convert to JSON and back, so that the result equals the content of a saved file; other types become strings
+        # convert to JSON and back, so that the result equals that from a saved file; other types become strings
         return dict(json.loads(json.dumps(found, default=str)))
 
     def _checked(self, value: Any, ndim: int, step: int) -> torch.Tensor:
@@ -153,7 +153,7 @@ def _steps(plant: float, plan: float) -> tuple[int, int]:
     """Compute how many plan steps and how many plant steps fit into the longer time step.
 
     Raises:
-        ValueError: Neither time step is a multiple of the other.
+        ValueError: The larger time step is not a multiple of the smaller.
     """
     many = round(max(plant, plan) / min(plant, plan))
     if not math.isclose(many * min(plant, plan), max(plant, plan), rel_tol=1e-6):
@@ -165,7 +165,7 @@ def _steps(plant: float, plan: float) -> tuple[int, int]:
 
 
 def _check_call(controller: Any) -> None:
-    """Reject an object that is not a function of a state and an observation."""
+    """Raise an error if a controller cannot be called with a state and an observation."""
     if not callable(controller):
         raise ValueError(
             f"a controller must be callable with (state, obs), not {described(controller)}: pass a function, or "
@@ -181,7 +181,7 @@ def _check_call(controller: Any) -> None:
 
 
 def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
-    """Get a function's signature; None if it is unknown (for some C functions)."""
+    """Get a function's signature; None if Python does not know it, as for some C functions."""
     try:
         return inspect.signature(function)
     except (TypeError, ValueError):
@@ -189,7 +189,7 @@ def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
 
 
 def _fits(signature: inspect.Signature, count: int) -> bool:
-    """Check whether ``count`` positional arguments fit a signature."""
+    """Check whether a function with this signature accepts ``count`` positional arguments."""
     try:
         signature.bind(*[None] * count)
     except TypeError:

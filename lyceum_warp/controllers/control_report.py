@@ -22,8 +22,8 @@ class ControlReport:
     """Statistics of a controller's episodes, computed by ``control_report``.
 
     A value is None if there are too few plans, if the value does not apply, or if the controller does not report the
-    value. Each trajectory's first plan loads kernels and captures graphs, so only ``first_plan_ms`` includes the first
-    planning time.
+    value. The first plan of each trajectory takes longer, because it loads kernels and captures graphs. Statistics of
+    planning times therefore exclude it; ``first_plan_ms`` is its planning time.
     """
 
     task: str
@@ -39,17 +39,17 @@ class ControlReport:
     plans: int
     """Number of plans, excluding the first plan of each trajectory."""
     first_plan_ms: float | None
-    """Longest planning time of a trajectory's first plan, in milliseconds."""
+    """Longest planning time among the trajectories' first plans, in milliseconds."""
     plan_mean_ms: float | None
     """Mean planning time, in milliseconds."""
     plan_p50_ms: float | None
-    """Median planning time, in milliseconds; needs 2 plans. All quantiles are interpolated."""
+    """Median planning time, in milliseconds; None with fewer than 2 plans. All quantiles are interpolated."""
     plan_p90_ms: float | None
-    """90 % quantile of the planning time, in milliseconds; needs 10 plans."""
+    """90 % quantile of the planning time, in milliseconds; None with fewer than 10 plans."""
     plan_p99_ms: float | None
-    """99 % quantile of the planning time, in milliseconds; needs 100 plans."""
+    """99 % quantile of the planning time, in milliseconds; None with fewer than 100 plans."""
     plan_p99_9_ms: float | None
-    """99.9 % quantile of the planning time, in milliseconds; needs 1000 plans."""
+    """99.9 % quantile of the planning time, in milliseconds; None with fewer than 1000 plans."""
     plan_max_ms: float | None
     """Longest planning time, in milliseconds."""
     plan_jitter_ms: float | None
@@ -57,22 +57,22 @@ class ControlReport:
     plans_per_second: float | None
     """Number of finished plans per second of wall time."""
     deadline_ms: float
-    """Deadline of a plan, in milliseconds: 1 / ``rate``, or the plant's period."""
+    """Longest planning time that meets the deadline, in milliseconds: 1 / ``rate``, or the plant's period."""
     misses: int
     """Number of plans with a planning time above the deadline."""
     miss_share: float | None
     """Fraction of plans with a planning time above the deadline."""
     blind_plans: int | None
-    """Number of plans without a valid sample. First plans are included. A plan without a valid sample is the previous
-    plan shifted in time."""
+    """Number of plans whose samples all failed, including first plans. The planner then only shifts the previous plan
+    in time."""
     known_plans: int
-    """Number of plans with a known number of failed samples. First plans are included."""
+    """Number of plans, including first plans, for which the controller reports the number of failed samples."""
     failed_share: float | None
-    """Fraction of failed samples in the plans with a known number of failed samples."""
+    """Fraction of samples that failed, in the plans that ``known_plans`` counts."""
     effective_samples_mean: float | None
     """Mean effective sample size of a plan: 1 if a single sample has all the weight, 0 if all samples failed."""
     tick_jitter_ms: float | None
-    """Standard deviation of the delay of the plant's steps, in milliseconds; None in a synchronous run."""
+    """Standard deviation of the delays of the plant's steps, in milliseconds; None in a synchronous run."""
     tick_delay_max_ms: float | None
     """Longest delay of a step, in milliseconds."""
     late_ticks: int | None
@@ -106,7 +106,7 @@ class ControlReport:
     controller: Mapping[str, Any]
     """Name and settings of the controller; see ``Trajectory.controller``."""
     versions: Mapping[str, Any]
-    """Versions of packages and of Python, and the machine, as stored in the first trajectory."""
+    """The first trajectory's versions of Python and packages, and its machine."""
 
     def to_json(self) -> str:
         """Convert the report to JSON; missing and non-finite numbers become null."""
@@ -161,7 +161,8 @@ def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: flo
 
     Args:
         trajectories: Episodes of the same task, engine, mode and controller.
-        rate: Required plans per second, which determine the deadline; by default one plan per period of the plant.
+        rate: Required number of plans per second; the deadline of a plan is 1 / ``rate``. By default, one plan is
+            required per period of the plant.
 
     Raises:
         ValueError: There is no trajectory, the trajectories differ in task, engine, mode or controller, or the rate is
@@ -203,7 +204,7 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-# each quantile, and the number of plans that it needs
+# quantiles, and the minimum number of plans for each
 _QUANTILES = {"p50": (0.5, 2), "p90": (0.9, 10), "p99": (0.99, 100), "p99_9": (0.999, 1000)}
 
 
@@ -222,7 +223,7 @@ def _joined(parts: Iterable[torch.Tensor]) -> np.ndarray:
 
 
 def _std(values: np.ndarray) -> float | None:
-    """Compute the sample standard deviation (n - 1); None with fewer than two values or with a non-finite value."""
+    """Compute the sample standard deviation (n - 1); None if there are fewer than two values or one is not finite."""
     return float(values.std(ddof=1)) if len(values) > 1 and np.isfinite(values).all() else None
 
 
@@ -254,7 +255,7 @@ def _plan_statistics(episodes: Sequence[Trajectory], deadline: float) -> dict[st
 
 
 def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:
-    """Compute the plans per second, excluding the first plan of each episode and its planning time."""
+    """Compute the number of plans per second, without the first plan of each episode and without its planning time."""
     plans, seconds = 0, 0.0
     for episode in episodes:
         ends = episode.plan_starts + episode.plan_times
@@ -264,7 +265,7 @@ def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:
 
 
 def _sample_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
-    """Summarise failed samples and effective sample sizes over the plans for which the controller reports them."""
+    """Summarise failed samples and effective sample sizes, as far as the controller reports them."""
     failed, effective = (_joined(getattr(e, name) for e in episodes) for name in ("plan_failed", "plan_effective"))
     failed, effective = failed[np.isfinite(failed)], effective[np.isfinite(effective)]
     samples = episodes[0].controller.get("samples")
@@ -278,7 +279,7 @@ def _sample_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
 
 
 def _tick_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
-    """Summarise the delays of the steps in an asynchronous run."""
+    """Summarise the delays of the plant's steps in asynchronous runs."""
     if episodes[0].mode == "sync":
         return {"tick_jitter_ms": None, "tick_delay_max_ms": None, "late_ticks": None}
     delays = 1000 * _joined(episode.times - episode.period * torch.arange(episode.steps) for episode in episodes)

@@ -12,7 +12,7 @@ class Controller(Protocol):
     """A function that returns an action for the state and the observation of one world, the plant.
 
     Plain functions and ``lw.MPPI`` are controllers. To control with a policy, pass ``lambda state, obs: policy(obs)``.
-    ``PlanningController`` lists further members, which are optional.
+    Further attributes and methods are optional; ``PlanningController`` lists them.
     """
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, /) -> torch.Tensor:
@@ -32,7 +32,8 @@ class Controller(Protocol):
 class PlanningController(Controller, Protocol):
     """A controller that plans a sequence of actions and returns the first action, such as ``lw.MPPI``.
 
-    A controller implements only the members that it needs, and need not derive from ``PlanningController``.
+    A controller implements only those attributes and methods that it needs. It need not derive from
+    ``PlanningController``.
     """
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, /, *, shift: int = 1) -> torch.Tensor:
@@ -41,14 +42,14 @@ class PlanningController(Controller, Protocol):
         Args:
             state: See ``Controller``.
             obs: See ``Controller``.
-            shift: Number of steps of length ``timestep`` since the state of the last plan; 0 for the first plan after a
-                reset. With ``reset=False``, the loops assume that the last plan was made in the previous step or, with
-                ``replan_every``, in the last step for which a plan was due. The loops pass ``shift`` only to
-                controllers with an argument ``shift``.
+            shift: Number of steps of length ``timestep`` since the initial state of the last plan; 0 for the first plan
+                after a reset. With ``reset=False``, the loops assume that the last plan was made in the previous step
+                or, with ``replan_every``, in the last step for which a plan was due. The loops pass ``shift`` only if
+                the controller has an argument of this name.
 
         Returns:
-            The first action of the plan, (nu,). If the controller has ``actions``, the loops read the plan from
-            ``actions`` instead.
+            The first action of the plan, (nu,). If the controller has an attribute ``actions``, the loops instead read
+            the whole plan from it.
         """
         ...
 
@@ -58,14 +59,14 @@ class PlanningController(Controller, Protocol):
 
     @property
     def actions(self) -> torch.Tensor:
-        """The last plan, (horizon, nact): finite numbers. The plan's first row is the action for the given state."""
+        """The last plan, (horizon, nact): finite numbers. The first action is for the given state."""
         ...
 
     @property
     def timestep(self) -> float:
         """Simulated seconds between two actions of the plan; by default the plant's time step.
 
-        The controller's time step must be a multiple or a whole fraction of the plant's time step.
+        This time step must be a whole multiple or a whole fraction of the plant's time step.
         """
         ...
 
@@ -76,12 +77,12 @@ class PlanningController(Controller, Protocol):
 
     @property
     def plants(self) -> int:
-        """Number of plants to plan for, by default 1. The control loops support only 1 plant."""
+        """Number of plants for which the controller plans, by default 1. The control loops require 1."""
         ...
 
     @property
     def samples(self) -> int:
-        """Number of samples of a plan."""
+        """Number of samples per plan."""
         ...
 
     @property
@@ -91,10 +92,10 @@ class PlanningController(Controller, Protocol):
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """Settings for ``Trajectory.controller``. Values without a JSON type are converted to strings."""
+        """Settings to store in ``Trajectory.controller``. Values without a JSON type are converted to strings."""
         ...
 
     @property
     def env(self) -> Env:
-        """Environment that simulates the plans. The plant itself is not allowed, because planning changes the state."""
+        """Environment that simulates the plans. It must not be the plant itself, because planning changes the state."""
         ...

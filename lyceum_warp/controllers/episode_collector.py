@@ -1,4 +1,4 @@
-"""Start the episode of a control loop, collect the episode's steps and plans, and report progress."""
+"""Start an episode of a control loop, collect its steps and plans, and report progress."""
 
 import dataclasses
 import time
@@ -29,11 +29,11 @@ class ControlProgress:
     success: bool
     """Whether the state after the step is a success."""
     plan_time: float
-    """Planning time of the plan that contains the action, in seconds."""
+    """Planning time of the plan to which the step's action belongs, in seconds."""
     age: float
-    """Age of the action when it was applied, in seconds; see ``Trajectory.ages``."""
+    """Age of the step's action when it was applied, in seconds; see ``Trajectory.ages``."""
     plans: int
-    """Number of plans so far, up to the plan that contains the action."""
+    """Number of plans so far, up to the plan to which the step's action belongs."""
 
 
 OnStep = Callable[[ControlProgress], object]
@@ -52,7 +52,7 @@ class TimedPlan:
 
 
 def check_arguments(env: Env, *, reset: bool, on_step: OnStep | None, on_abort: OnAbort | None) -> None:
-    """Check the arguments that both control loops share."""
+    """Check the arguments that both control loops have in common."""
     check_kind("env", env, Env, "as lw.make(..., autoreset=False) makes it")
     check_flag("reset", reset)
     check_kind("on_step", on_step, Callable | None, "a function")
@@ -65,7 +65,7 @@ def begin_episode(
     """Reset the plant and the controller, unless ``reset`` is False.
 
     Returns:
-        The maximum number of steps, and the step of the episode at which the run starts.
+        The maximum number of steps, and the number of steps since the reset (not 0 in a continued run).
 
     Raises:
         ValueError: The environment has several worlds or automatic resets, its episodes may never end, the current
@@ -121,7 +121,7 @@ class EpisodeCollector:
         self.start = now()
 
     def restart_clock(self) -> None:
-        """Measure wall time from now on, instead of from the collector's construction."""
+        """Restart the clock, which first starts when the collector is constructed."""
         self.start = self._now()
 
     def elapsed(self) -> float:
@@ -156,13 +156,13 @@ class EpisodeCollector:
             on_step(ControlProgress(step, self.elapsed(), *outcome, plan.seconds, age, plan.index + 1))
 
     def abort(self, on_abort: OnAbort | None, wall_seconds: float) -> None:
-        """Call ``on_abort`` with the trajectory of the steps so far, if there are any."""
+        """If there are complete steps, call ``on_abort`` with their trajectory."""
         if on_abort is not None and self._outcomes and self._plans:
             on_abort(self.trajectory(wall_seconds, done_reason=0))
 
     def trajectory(self, wall_seconds: float, done_reason: int) -> Trajectory:
         """Make the trajectory of all complete steps."""
-        steps = len(self._outcomes)  # an interrupted step has no outcome, because outcomes are recorded last
+        steps = len(self._outcomes)  # omit an interrupted step: it has no outcome, because outcomes are recorded last
         rewards, evals, success = zip(*self._outcomes, strict=True)
         actions, applied, ages, late = zip(*self._applied[:steps], strict=True)
         plan_steps, *plans = zip(*self._plans, strict=True)

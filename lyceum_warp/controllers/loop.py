@@ -31,18 +31,18 @@ def control(
     on_step: OnStep | None = None,
     on_abort: OnAbort | None = None,
 ) -> Trajectory:
-    """Control one world, the plant, until its episode ends. The plant waits for each plan.
+    """Control one world, the plant, until its episode ends; the plant waits while the controller plans.
 
     Args:
         env: The plant, an environment of one world made with ``autoreset=False``.
-        controller: Controller that is called for each plan; see ``lw.Controller``. The controller must not step
+        controller: The controller; see ``lw.Controller``. Each call makes a plan. The controller must not step
             ``env``.
-        steps: Maximum number of steps, if the episode does not end earlier.
-        replan_every: Number of steps from one plan to the next plan. Steps without a new plan apply later actions of
-            the last plan, so values above 1 need a controller with ``actions``.
+        steps: Maximum number of steps; the episode may end earlier.
+        replan_every: Number of steps from one plan to the next plan. Steps in between apply further actions of the last
+            plan, so values above 1 require a controller with an attribute ``actions``.
         seed: Seed of the initial state and of the controller.
         reset: Whether to reset the plant and the controller first. If False, the run continues from the plant's state
-            and the controller's last plan; ``replan_every`` must not change between the runs.
+            and the controller's last plan, and ``replan_every`` must be the same as in the previous run.
         on_step: Called with a ``ControlProgress`` after each step. Planning times do not include ``on_step``.
         on_abort: Called with the trajectory of the complete steps if an exception, such as Ctrl-C, ends the run after
             the first step. The trajectory's ``done_reason`` is 0. The loop raises the exception after calling
@@ -58,7 +58,7 @@ def control(
     check_arguments(env, reset=reset, on_step=on_step, on_abort=on_abort)
     every = whole_number("replan_every", replan_every, low=1)
     checked = CheckedController(controller, env)
-    # count steps from the reset, so that a continued run shifts plans like an uninterrupted run
+    # count steps from the reset, so that plans shift as in an uninterrupted run
     limit, first = begin_episode(env, checked, steps, seed, reset=reset)
     episode = EpisodeCollector(env, checked, mode="sync", period=env.timestep, seed=seed)
     planned = max(first - 1, 0) // every * every

@@ -23,19 +23,20 @@ def policy_episodes(
 ) -> Iterator[Trajectory]:
     """Run a policy for whole episodes from random initial states, and yield them as trajectories.
 
-    The episodes equal the episodes of ``lw.evaluate`` with the same seed and number of worlds. The policy acts in all
-    worlds at once, so the times in a trajectory refer to the whole batch.
+    The episodes equal the episodes of ``lw.evaluate`` with the same seed and number of worlds. The policy computes the
+    actions of all worlds at once, so the times in a trajectory are those of the whole batch.
 
     Args:
         env: An environment made with ``autoreset=False``; its worlds are reset.
         policy: Function from observations (nworld, nobs) to actions (nworld, nact).
         episodes: Number of episodes.
-        seed: Seed of the initial states; by default the worlds continue their random streams.
+        seed: Seed of the initial states. Without a seed, they depend on the random numbers that the worlds have used
+            before.
         controller: Description of the policy; see ``Trajectory.controller``.
         progress: Called every ten steps with the number of steps so far and the maximum number.
 
     Yields:
-        The first episodes of all worlds, then the second episodes of all worlds, and so on.
+        The first episode of each world, then the second episode of each world, and so on.
 
     Raises:
         ValueError: The environment has automatic resets, or its episodes may never end.
@@ -70,7 +71,7 @@ class _Batch:
         self._states, self._obs = [env.get_state().cpu()], [env.obs.cpu().clone()]
         self._actions: list[torch.Tensor] = []
         self._outcomes: list[torch.Tensor] = []
-        # time of the action, duration of the policy's call, and time of the step's end
+        # for each step: time of the action, duration of the policy's call, and time of the step's end
         self._times: list[tuple[float, float, float]] = []
         self._lengths = torch.zeros(env.nworld, dtype=torch.long)
         self._reasons = torch.zeros(env.nworld, dtype=torch.long)
@@ -102,7 +103,7 @@ class _Batch:
         self._reasons[over] = env.done_reason.cpu()[over].long()
 
     def trajectory(self, world: int, **origin: Any) -> Trajectory:
-        """Make the trajectory of a world; ``origin`` has the attributes that describe the trajectory's origin."""
+        """Make the trajectory of a world; ``origin`` has the attributes that ``provenance`` returns, and others."""
         env, steps = self.env, int(self._lengths[world])
         states, obs = (torch.stack([row[world] for row in rows[: steps + 1]]) for rows in (self._states, self._obs))
         rewards, evals, success = torch.stack([row[:, world] for row in self._outcomes[:steps]], 1)

@@ -1,4 +1,4 @@
-"""Implement the real-time loop, ``lw.control_async``: the plant steps at a fixed rate while a thread plans."""
+"""Implement the real-time loop, ``lw.control_async``: the plant steps at a fixed rate while a second thread plans."""
 
 import atexit
 import contextlib
@@ -28,7 +28,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.validate import check_kind, positive_number
 
 # all in seconds
-_SPIN = 0.0005  # length of the last part of a wait, which polls the clock instead of sleeping
+_SPIN = 0.0005  # at the end of a wait, poll the clock for this time instead of sleeping
 _PATIENCE = 0.2  # timeout for an unfinished plan after an exception
 _EXIT_PATIENCE = 5.0  # timeout for an unfinished plan when the program exits
 _SWITCH_INTERVAL = 0.0005  # shorter than Python's default of 5 ms, which is most of a fast plant's period
@@ -47,36 +47,37 @@ def control_async(
     on_abort: OnAbort | None = None,
     clock: "Clock | None" = None,
 ) -> Trajectory:
-    """Control one world, the plant, in real time; the plant steps by the wall clock and does not wait for plans.
+    """Control one world, the plant, in real time: it steps at a fixed rate and does not wait for plans.
 
     The plant steps in the calling thread. Step k of the plant is due at ``k * period``; a late step does not delay
-    later steps. The controller plans in a second thread, always from the newest state, and only once from each state.
+    later steps. The controller plans in a second thread, from the newest state; it makes at most one plan per state.
 
-    Each step applies an action of the newest finished plan. The time since the plan's initial state selects the action;
-    after the end of the plan, its last action applies. Selecting actions by time compensates for planning delays up to
-    the length of the plan. The plant waits for the first plan, so the first action has age 0. Later actions are at
-    least one step old, and exactly one step old if every plan takes less than a period.
+    Each step applies that action of the newest finished plan that was planned for this time; after the end of the plan,
+    its last action is held. This choice by time compensates for planning delays up to the length of the plan. The plant
+    waits for the first plan, so the first action has age 0. Later actions are at least one step old, and exactly one
+    step old if every plan takes less than a period.
 
     Before the clock starts, a warm-up calls the controller three times with the first state, steps the plant three
     times, and restores the plant's state. The warm-up loads kernels and captures graphs, because Warp cannot capture a
-    graph while another thread launches kernels. Functions that evaluate given states, such as ``env.get_reward(before,
-    action, after)``, also capture graphs, so ``on_step`` must not call them.
+    graph while another thread launches kernels. For the same reason, ``on_step`` must not call functions that evaluate
+    given states, such as ``env.get_reward(before, action, after)``, because these also capture graphs.
 
     During the run, Python switches between threads more often than usual (``sys.setswitchinterval``). To keep the plant
-    on time, leave a CPU core free by setting ``nthread`` of the planner's environment, and put the plant on the CPU. A
-    plant on the planner's GPU would share a stream with the planner, and each step would wait for the previous plan.
+    on time, put the plant on the CPU, and leave one CPU core free by a smaller ``nthread`` of the planner's
+    environment. A plant on the planner's GPU would share a CUDA stream with the planner, so each step would wait for
+    the planner's launched kernels.
 
-    At the end of the episode, the loop waits for the unfinished plan and counts this plan, too. If an exception, such
-    as Ctrl-C, ends the run, the loop waits at most 0.2 seconds for the unfinished plan. Do not use the controller again
-    until the thread, named "lyceum_warp planner", has ended.
+    At the end of the episode, the loop waits for the unfinished plan, and the trajectory includes this plan. If an
+    exception, such as Ctrl-C, ends the run, the loop waits at most 0.2 seconds for the unfinished plan. Do not use the
+    controller again until the thread, named "lyceum_warp planner", has ended.
 
     Args:
         env: The plant, an environment of one world made with ``autoreset=False``.
-        controller: Controller that is called in the second thread; see ``lw.Controller``. The controller must plan in a
+        controller: The controller, called in the second thread; see ``lw.Controller``. It must simulate its plans in a
             separate environment.
         period: Wall time between steps, in seconds; by default the plant's time step, so that the plant runs in real
             time.
-        steps: Maximum number of steps, if the episode does not end earlier.
+        steps: Maximum number of steps; the episode may end earlier.
         seed: Seed of the initial state and of the controller.
         reset: Whether to reset the plant and the controller first. If False, the run continues from the plant's state
             and the controller's last plan.
@@ -84,7 +85,7 @@ def control_async(
         on_abort: Called with the trajectory of the complete steps if an exception, such as Ctrl-C, ends the run after
             the first step. The trajectory's ``done_reason`` is 0. The loop raises the exception after calling
             ``on_abort``.
-        clock: Clock that replaces the wall clock, such as a clock that does other work while the plant waits.
+        clock: Replacement for the wall clock, for example to do other work while the plant waits.
 
     Returns:
         The episode.
@@ -151,7 +152,7 @@ def run_plant(
     limit: int,
     on_step: OnStep | None,
 ) -> float:
-    """Step the plant by the clock until its episode ends. Return the end of the last period, in seconds."""
+    """Step the plant at its fixed rate until the episode ends; return the time of the last period's end, in seconds."""
     start, period = episode.start, episode.period
     for k in range(limit):
         due = start + k * period
@@ -199,7 +200,7 @@ class PlannerThread:
         controller: The controller.
         clock: The clock of the control loop.
         seed: Seed of the run.
-        first: Step of the episode at which the run starts.
+        first: Number of steps between the reset and the start of the run.
         reset: Whether the run started with a reset.
     """
 
@@ -208,7 +209,7 @@ class PlannerThread:
     ) -> None:  # fmt: skip
         self._controller, self._clock, self._seed, self._first, self._reset = controller, clock, seed, first, reset
         self._plans: list[TimedPlan] = []
-        self._qualities: list[tuple[float, float]] = []  # one entry per plan, appended after the plan
+        self._qualities: list[tuple[float, float]] = []  # quality of each plan, appended after the plan itself
         self._error: BaseException | None = None
         self._begun = threading.Event()  # set after the first plan or after an error
         # use SimpleQueue, which is implemented in C, so that no thread loses the GIL while it holds the queue's lock
@@ -217,7 +218,7 @@ class PlannerThread:
         self._thread.start()
 
     def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor) -> None:
-        """Pass a state to the thread. The thread plans next from the newest state.
+        """Pass a state to the thread. Its next plan starts from the newest state.
 
         The caller must not change the tensors.
         """
@@ -242,8 +243,8 @@ class PlannerThread:
         """End the thread after its current plan.
 
         Args:
-            patience: Timeout in seconds; None for no limit. After a timeout, the thread ends after its current plan, or
-                when the program exits.
+            patience: Maximum time to wait for the thread, in seconds; None for no limit. A thread that takes longer
+                ends later: after its current plan, or when the program exits.
         """
         self._states.put(None)
         self._thread.join(patience)
@@ -254,7 +255,7 @@ class PlannerThread:
             _unfinished.add(self._thread)
 
     def add_plans(self, episode: EpisodeCollector) -> None:
-        """Add the finished plans to an episode."""
+        """Add the thread's finished plans to an episode."""
         qualities = list(self._qualities)
         plans = self._plans[: len(qualities) + 1]  # the thread appends a plan before the plan's quality
         qualities += [(math.nan, math.nan)] * (len(plans) - len(qualities))
@@ -293,7 +294,7 @@ class PlannerThread:
         shift = controller.passed(self._first + last, self._first + step)
         actions = controller(state, obs, shift, step)
         self._plans.append(TimedPlan(len(self._plans), step, begun, self._clock.now() - begun, actions))
-        # append the quality last, because the plant may be waiting for the plan
+        # append the quality only after the plan, because the plant may be waiting for the plan
         self._qualities.append(controller.quality())
 
 
@@ -301,9 +302,10 @@ _unfinished: "weakref.WeakSet[threading.Thread]" = weakref.WeakSet()
 
 
 def _interrupt_unfinished() -> None:
-    """End planner threads when the program exits, because Python would otherwise free memory that the engine uses.
+    """End planner threads when the program exits, because Python would otherwise free memory that they still use.
 
-    Python raises SystemExit in the thread after the engine's current call, at most one iteration of the plan later.
+    Python raises SystemExit in each thread when the running call of the engine returns, at the latest after one
+    planning iteration.
     """
     for thread in list(_unfinished):
         if thread.is_alive() and thread.ident is not None:

@@ -12,22 +12,22 @@ from lyceum_warp.controllers.real_time import control_async
 from lyceum_warp.env import Env
 
 SHARE = 0.8
-"""Largest 99 % quantile of the planning time, as a fraction of the deadline."""
+"""A setting meets the deadline if the 99 % quantile of its planning time is at most this fraction of the deadline."""
 
-_SECONDS = 0.4  # duration and minimum number of steps of a measurement
+_SECONDS = 0.4  # duration of a measurement; _STEPS is its minimum number of steps
 _STEPS = 12
 
 
 @dataclasses.dataclass(frozen=True)
 class RealTimeSetting:
-    """Settings of a planner that determine its planning time."""
+    """The settings of a planner on which its planning time depends."""
 
     samples: int
     """Number of samples."""
     horizon: int
     """Number of steps in a plan."""
     physics: str | None = None
-    """Name of the physics options of the planner's worlds; None for options without a name."""
+    """Name of the physics options of the planner's worlds; None if the options have no name."""
 
     def __str__(self) -> str:
         physics = "" if self.physics is None else f", physics {self.physics}"
@@ -36,7 +36,7 @@ class RealTimeSetting:
 
 @dataclasses.dataclass(frozen=True)
 class RealTimeChoice:
-    """A chosen setting of a planner, and the measurements for the choice.
+    """A chosen setting of a planner, and the measured planning times behind the choice.
 
     Planning times are 99 % quantiles in seconds.
     """
@@ -48,11 +48,12 @@ class RealTimeChoice:
     deadline: float
     """Longest permitted planning time, in seconds."""
     larger: tuple[int, float] | None
-    """The smallest measured number of samples that misses the deadline, and its planning time."""
+    """The smallest measured number of samples that misses the deadline, and its planning time; None if there is
+    none."""
 
     @property
     def replan_every(self) -> int:
-        """Number of steps from one plan to the next, if a step takes one deadline; 1 if plans meet the deadline."""
+        """Number of plant steps per plan if a step lasts as long as the deadline; 1 if plans meet the deadline."""
         return max(1, math.ceil(self.planning_time / (SHARE * self.deadline)))
 
     def __str__(self) -> str:
@@ -71,15 +72,15 @@ def choose_setting(
     *,
     deadline: float,
 ) -> RealTimeChoice:
-    """Choose the largest number of samples with which plans meet a deadline.
+    """Choose the largest number of samples for which planning meets a deadline.
 
     If the smallest number of samples misses the deadline, the function tries shorter horizons, and then other physics
     options.
 
     Args:
         samples: Numbers of samples, in ascending order.
-        horizons: Horizons in the order of preference.
-        physics: Names of physics options in the order of preference.
+        horizons: Horizons, the preferred one first.
+        physics: Names of physics options, the preferred one first.
         measure: Function from a setting to the 99 % quantile of its planning times, in seconds.
         deadline: Longest permitted planning time, in seconds.
 

@@ -20,7 +20,7 @@ def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajec
             ``.npz`` files of a folder are loaded in alphabetical order.
 
     Returns:
-        Map from files to episodes, in the order of ``paths``.
+        The episodes by file, in the order of ``paths``.
 
     Raises:
         FileNotFoundError: A file does not exist, or a folder holds no episode.
@@ -45,14 +45,14 @@ def episode_env(
     The environment has the parameters, the model and the physics options of the first episode. ``env.set_state``
     accepts the states of all given episodes.
 
-    The file of an episode names a task file, which is run as Python code. The episode may come from another person.
-    Without ``task``, this function runs a task file only if the file and its folder belong to this user or to root, and
-    no other user can write to the file or folder.
+    The file of an episode names the file of its task, and making the environment runs this task file as Python code. An
+    episode from another person could thus run foreign code. Without ``task``, this function therefore runs a task file
+    only if the file and its folder belong to this user or to root, and no other user can write to the file or folder.
 
     Args:
         episodes: The episodes, as ``load_episodes`` returns them.
-        task: The task. The task is required if it was defined in a notebook, if the task's file has moved, or if other
-            users can write to the file. The given task must have the same name as the episodes' task.
+        task: The task. This argument is required if the task was defined in a notebook, if the task's file has moved,
+            or if other users can write to the file. It must have the same name as the episodes' task.
         changes: Additional options and parameters of ``lw.make``.
 
     Raises:
@@ -178,7 +178,7 @@ def _foreign(file: Path) -> str:
 
 
 def _is_private(group: int) -> bool:
-    """Check whether a group is root's, or has only this user as a member, as many systems make for each user."""
+    """Check whether a group is root's, or has only this user as a member (many systems make such a group per user)."""
     import grp
     import pwd
 

@@ -19,7 +19,7 @@ from lyceum_warp.support.versions import versions
 FORMAT = 1
 """Version of the file format. The version increases when older releases cannot read new files."""
 
-# each array has a dtype and axes; axes with the same name have the same length
+# dtype and axes of each array; axes with the same name must have the same length
 _ARRAYS = {
     "states": (torch.float64, ("steps + 1", "state_size")), "obs": (torch.float32, ("steps + 1", "nobs")),
     "actions": (torch.float32, ("steps", "nu")), "rewards": (torch.float32, ("steps",)),
@@ -39,7 +39,7 @@ _SCALARS: dict[str, Callable[[Any], Any]] = {
 @document_attributes
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trajectory:
-    """One episode of a controlled world, which is called the plant. All tensors are on the CPU.
+    """One episode of a controlled world, the plant. All tensors are on the CPU.
 
     In step k, the plant moves from state k to state k + 1 under action k. To replay the episode bit for bit on the same
     engine, set the first state with ``set_state`` and step with each action.
@@ -49,9 +49,11 @@ class Trajectory:
     """
 
     states: torch.Tensor
-    """States, (steps + 1, state_size) float64. After a fault, the last state is the first state of the next episode."""
+    """States, (steps + 1, state_size) float64. If a fault ended the episode, the last state is instead the first state
+    of the next episode."""
     obs: torch.Tensor
-    """Observations of the states, (steps + 1, nobs) float32. After a fault, the last valid observation is repeated."""
+    """Observations of the states, (steps + 1, nobs) float32. If a fault ended the episode, the last valid observation
+    is repeated."""
     actions: torch.Tensor
     """Applied actions, (steps, nact) float32."""
     rewards: torch.Tensor
@@ -63,8 +65,9 @@ class Trajectory:
     times: torch.Tensor
     """Time at which each action was applied, (steps,) float64, in seconds."""
     ages: torch.Tensor
-    """Age of each action when it was applied, (steps,) float64, in seconds. The age is the time since the plant was in
-    the plan's initial state. In a synchronous run, the age of a plan's first action is the planning time."""
+    """Age of each action when it was applied, (steps,) float64, in seconds. The age is the wall time since the plant
+    was in the plan's initial state. In a synchronous run, the age of a plan's first action is thus the planning
+    time."""
     late: torch.Tensor
     """Whether each step started late because the previous step was not finished in time, (steps,) bool. In a
     synchronous run, no step is late."""
@@ -104,15 +107,15 @@ class Trajectory:
     controller: Mapping[str, Any]
     """The controller's ``name``, and settings, ``engine`` and ``device`` if the controller has them."""
     state_parts: Mapping[str, Sequence[int]]
-    """Columns of the named parts of a state, as [start, stop]."""
+    """Columns [start, stop] of each part of a state, by the part's name."""
     obs_parts: Mapping[str, Sequence[int]]
-    """Columns of the named parts of an observation."""
+    """Columns [start, stop] of each part of an observation, by the part's name."""
     action_names: Sequence[str]
     """Names of the action columns."""
     source: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Arguments of ``lw.make``, with which ``episode_env`` rebuilds the plant: ``task`` is a name or "file:class" (None
-    for a task from a notebook or script); ``params`` lists the names of the given parameters; and ``options`` holds the
-    options. Files of earlier releases lack these arguments."""
+    """The arguments of ``lw.make`` from which ``episode_env`` makes the plant again: ``task`` is a name or "file:class"
+    (None for a task from a notebook or script); ``params`` lists the names of those task parameters that were given;
+    and ``options`` holds the options. Files of earlier releases lack these arguments."""
 
     @property
     def steps(self) -> int:
@@ -126,7 +129,7 @@ class Trajectory:
 
     @property
     def terminated(self) -> bool:
-        """Whether the task's ``terminated`` ended the episode."""
+        """Whether the episode ended by termination (the task's ``terminated``)."""
         return bool(self.done_reason & Done.TERMINATED)
 
     @property
@@ -159,9 +162,9 @@ class Trajectory:
         """Write the trajectory to a file atomically, and return the file's path.
 
         The file is a compressed ``.npz`` that numpy reads without pickle. Each tensor attribute is stored as an array
-        of the same name. ``info``, a zero-dimensional string array, holds the other attributes and ``format`` (1) as
-        JSON. For example, with ``start, stop = info["state_parts"]["qpos"]``, the positions are ``states[:,
-        start:stop]``.
+        of the same name. The zero-dimensional string array ``info`` is a JSON object with the other attributes and
+        ``format``, which is 1. For example, with ``start, stop = info["state_parts"]["qpos"]``, the positions are
+        ``states[:, start:stop]``.
         """
         path = Path(path)
         info = {"format": FORMAT, **{name: getattr(self, name) for name in _SCALARS}}
@@ -201,7 +204,7 @@ class Trajectory:
 
 
 def _check(arrays: Mapping[str, torch.Tensor]) -> None:
-    """Reject arrays with wrong types or inconsistent shapes."""
+    """Raise an error if an array has a wrong type, or if the arrays' shapes are inconsistent."""
     steps = len(arrays["actions"])
     lengths = {"steps": steps, "steps + 1": steps + 1, "plans": len(arrays["plan_times"])}
     for name, (dtype, axes) in _ARRAYS.items():
@@ -214,7 +217,7 @@ def _check(arrays: Mapping[str, torch.Tensor]) -> None:
 
 
 def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor]) -> None:
-    """Reject parts outside the columns of an array, and a source with wrong types."""
+    """Raise an error if a part lies outside an array's columns, or if ``source`` has wrong types."""
     for name, array in (("state_parts", "states"), ("obs_parts", "obs")):
         for part, place in scalars[name].items():
             whole = isinstance(place, list) and len(place) == 2 and all(type(column) is int for column in place)
@@ -229,7 +232,7 @@ def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor
 
 
 def provenance(env: Env) -> dict[str, Any]:
-    """Collect the attributes that describe a trajectory's origin: task, engine, versions, column names."""
+    """Collect the trajectory's attributes that depend only on the environment: task, engine, versions, column names."""
     params = {name: np.asarray(value).tolist() for name, value in env.task.params.items()}
     return {
         "task": env.task.name, "engine": env.engine.name, "params": params, "versions": versions(env.device.alias),
@@ -240,11 +243,11 @@ def provenance(env: Env) -> dict[str, Any]:
 
 
 _PLACEMENT = ("engine", "device", "nthread", "nworld", "seed", "first_world", "autoreset", "graphs", "fields")
-"""Options that change neither the physics nor the states."""
+"""Options that affect neither the physics nor the states; they are not stored."""
 
 
 def source(env: Env) -> dict[str, Any]:
-    """Collect the arguments that rebuild an environment; see ``Trajectory.source``."""
+    """Collect the arguments from which an environment can be made again; see ``Trajectory.source``."""
     task = env.task.task
     options = {name: value for name, value in env.options.given().items() if name not in _PLACEMENT}
     model = options.pop("model", None)

@@ -1,5 +1,4 @@
-"""Define tasks for tests of the planner: the reward is the action times a coin, which is -1 or 1 with equal
-probability."""
+"""Define tasks for tests of the planner: the reward is the action times a fair coin (-1 or 1)."""
 
 import warp as wp
 from rail_task import rail
@@ -67,12 +66,12 @@ class TossedAfter(lw.Task):
 
 
 class TossedAfterWithControl(TossedAfter):
-    """``TossedAfter`` with a ``control`` function, which makes the engine run rollouts step by step."""
+    """``TossedAfter`` with a ``control`` function, so that the engine must run rollouts step by step."""
 
     control = copied
 
 
 class TossedBefore(TossedAfter):
-    """The reward's coin is tossed in the previous step, and stored in memory."""
+    """The reward's coin is tossed in the previous step and stored in the world's memory, so the planner can see it."""
 
     reward = paid_by_coin_before_action

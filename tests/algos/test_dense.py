@@ -10,7 +10,7 @@ from lyceum_warp.algos.natural_gradient import FisherProduct, score_gradient
 
 
 def perturbed(module: nn.Module) -> nn.Module:
-    """Perturb a module's weights, so that no part of a derivative vanishes."""
+    """Perturb a module's weights, so that no element of a derivative is zero."""
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():
         for parameter in module.parameters():

@@ -104,7 +104,8 @@ def test_two_machines_make_the_same_update_as_one_process(tmp_path: Path) -> Non
 
 PPO = ["--algorithm", "ppo", "--nworld", "12", "--num-steps", "20", "--minibatches", "7", "--hidden", "8",
        "--value-hidden", "8", "--mean-every", "1", "--mean-episodes", "2"]  # fmt: skip
-"""Settings with unfinished episodes, a normaliser, an adaptive learning rate, leftover samples and an evaluation."""
+"""Settings of PPO that cover unfinished episodes, normalisation, an adaptive learning rate, and an evaluation; the
+number of samples is not a multiple of the number of mini-batches."""
 
 
 @pytest.mark.quick("npg")
@@ -114,7 +115,9 @@ PPO = ["--algorithm", "ppo", "--nworld", "12", "--num-steps", "20", "--minibatch
     [(OPTIONS, 2e-4), (PPO, 2e-3), ([*PPO, "--whiten-minibatches", "--std-type", "log"], 2e-3)],
     ids=["npg", "ppo", "whitened ppo"],
 )
-def test_two_processes_make_the_same_update_as_one(settings: list[str], tolerance: float, tmp_path: Path) -> None:
+def test_two_processes_make_the_same_update_as_one_process(
+    settings: list[str], tolerance: float, tmp_path: Path
+) -> None:
     two, one = tmp_path / "two", tmp_path / "one"
     arguments = ["train", "hopper", *settings, *QUIET, "--iterations", "1", "--out"]
     launch = ["--standalone", "--nproc-per-node=2", "--monitor-interval=0.1", "--local-addr=127.0.0.1"]
@@ -129,11 +132,11 @@ def test_two_processes_make_the_same_update_as_one(settings: list[str], toleranc
 SAC = ["--algorithm", "sac", "--nworld", "12", "--num-steps", "20", "--updates", "4", "--actor-every", "2", "--n-step",
        "2", "--batch", "64", "--warmup", "60", "--replay", "120", "--hidden", "8", "--value-hidden", "8",
        "--mean-every", "1", "--mean-episodes", "2"]  # fmt: skip
-"""Settings of SAC with a replay buffer that is full after 10 steps, a normaliser, a warm-up and an evaluation."""
+"""Settings of SAC that cover a full replay buffer (after 10 steps), normalisation, a warm-up and an evaluation."""
 
 
 @pytest.mark.long
-def test_two_processes_make_the_same_updates_of_sac_as_one(tmp_path: Path) -> None:
+def test_two_processes_make_the_same_sac_updates_as_one_process(tmp_path: Path) -> None:
     two, one = tmp_path / "two", tmp_path / "one"
     arguments = ["train", "hopper", *SAC, *QUIET, "--iterations", "1", "--out"]
     launch = ["--standalone", "--nproc-per-node=2", "--monitor-interval=0.1", "--local-addr=127.0.0.1"]
@@ -210,7 +213,7 @@ sys.exit(main())
 
 @pytest.mark.long
 def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
-    """A signal during training ends all processes after the iteration; an earlier signal leaves no files."""
+    """A signal during training ends all processes after the iteration; a signal before training leaves no files."""
     program, run = tmp_path / "interrupted.py", tmp_path / "learning"
     program.write_text(INTERRUPTED)
     arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations", "100000", "--out"]
@@ -228,8 +231,8 @@ def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_error_in_one_process_ends_all_and_two_processes_resume_the_run_of_one(tmp_path: Path) -> None:
-    """The run's folder exists already, and only rank 0 can see this error."""
+def test_error_ends_all_processes_and_two_processes_resume_a_run_of_one_process(tmp_path: Path) -> None:
+    """The error is that the run's folder exists already, and only rank 0 checks this."""
     launch = ["--standalone", "--nproc-per-node=2"]
     run, other = tmp_path / "run", tmp_path / "other"
     arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations"]
@@ -241,7 +244,7 @@ def test_error_in_one_process_ends_all_and_two_processes_resume_the_run_of_one(t
     code, out, error = refused
     assert code != 0 and out == "", refused
     assert error.count(f"lyceum-warp: {run} contains a run") == 1
-    assert "lyceum_warp/algos" not in error  # no traceback of the other rank
+    assert "lyceum_warp/algos" not in error  # the other rank prints no traceback
     code, out, error = resumed
     assert code == 0 and out.count("iteration    2/2") == 1, resumed
     assert_equal_runs(run, other, tolerance=2e-3)

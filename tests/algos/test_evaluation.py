@@ -67,8 +67,8 @@ def test_mean_policy_is_evaluated_with_the_current_parameters_of_each_world() ->
     assert it.mean_success == it.success == 1.0
 
 
-def test_each_episode_draws_its_own_dynamics() -> None:
-    """Values drawn at resets differ between all episodes; values drawn at the start differ between worlds."""
+def test_each_episode_has_different_random_dynamics() -> None:
+    """The mass is drawn at every reset, and the height only once per world."""
     env = lw.make(Varied, nworld=3)
     policy = lw.GaussianPolicy(1, 1)
     got = lw.evaluate(env, policy, 6, seed=3)

@@ -106,11 +106,11 @@ LIKE_OTHERS = ("negative", "mppi_without_plan", "without_plan", "cem_of_one", "z
 
 @pytest.mark.quick(*(f"{case}-mujoco" for case in CASES if case not in LIKE_OTHERS), "cubic_cem-warp")
 @pytest.mark.parametrize("case, engine", [*((case, "mujoco") for case in CASES), *((case, "warp") for case in ON_WARP)])
-def test_plans_equal_the_plain_implementation(case: str, engine: str) -> None:
+def test_plans_equal_those_of_a_plain_implementation(case: str, engine: str) -> None:
     check_against(Plain, engine, **CASES[case])
 
 
-def test_plans_for_reach_equal_plans_with_only_mujoco_and_numpy() -> None:
+def test_plans_for_the_task_reach_equal_plans_computed_with_mujoco_and_numpy_alone() -> None:
     check_against(PlainReach, "mujoco", **REACH)
 
 
@@ -159,7 +159,7 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
     assert len(starts) == 5
 
 
-def test_samples_that_terminated_get_no_terminal_value() -> None:
+def test_terminal_value_of_a_terminated_sample_is_zero() -> None:
     state = falling_hopper(lw.make("hopper"))
     stop = MPPI(seed=1, **HOPPER)
     value = MPPI(seed=1, **HOPPER | dict(value=lambda obs: torch.full((len(obs),), 100.0)))
@@ -189,7 +189,7 @@ def test_equal_seeds_give_equal_plans_before_and_after_a_reset(update: str) -> N
     assert same(first, numbers(twin, state))
     different = numbers(other, state)
     for a, b in zip(first, different, strict=True):
-        assert not torch.equal(a, b) or not a.any() or update != "mppi"  # the first plan starts from zeros
+        assert not torch.equal(a, b) or not a.any() or update != "mppi"  # the first plan starts from zero actions
     spread = None if plan.adapted_noise is None else plan.adapted_noise.clone()
     assert not same(first, numbers(plan, state)), "without a reset, plans and noise go on"
     plan.reset()
@@ -205,7 +205,7 @@ def test_equal_seeds_give_equal_plans_before_and_after_a_reset(update: str) -> N
 @pytest.mark.quick("mean-mujoco", "worst-mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("risk", ["mean", "worst"])
-def test_plans_in_several_models_equal_the_plain_implementation(risk: Any, engine: str) -> None:
+def test_plans_in_several_models_equal_those_of_a_plain_implementation(risk: Any, engine: str) -> None:
     settings = dict(horizon=6, samples=8, noise=1.0, smoothing=(1, 0, 0), temperature=0.5, update="mppi", risk=risk)
     plan = MPPI(Weighed, engine=engine, models=3, seed=2, **settings)
     fields = {name: rows.numpy() for name, rows in plan.model_fields.items()}
@@ -223,7 +223,7 @@ def test_plans_in_several_models_equal_the_plain_implementation(risk: Any, engin
         plain.knots = plan.actions.double().numpy()
 
 
-def test_drawn_models_depend_on_the_seed_and_differ_from_the_plant_model() -> None:
+def test_random_models_depend_on_the_seed_and_differ_from_the_plant_model() -> None:
     plan, twin, other = (MPPI(Varied, horizon=2, samples=3, models=4, seed=seed) for seed in (1, 1, 2))
     masses = plan.model_fields["body_mass"].clone()
     assert torch.equal(masses, twin.model_fields["body_mass"])
@@ -236,7 +236,7 @@ def test_drawn_models_depend_on_the_seed_and_differ_from_the_plant_model() -> No
     assert not torch.isin(masses[:, 1], drawn[:, 1]).any()
 
 
-def test_planning_in_drawn_models_ignores_the_model_fields_of_the_state() -> None:
+def test_planning_in_random_models_ignores_the_model_fields_of_the_state() -> None:
     light, heavy = (MPPI(Varied, horizon=3, samples=4, models=2, seed=1) for _ in range(2))
     state = light.state_of()
     changed = light.state_of(body_mass=3 * state[light.env.state_space.parts["body_mass"]])
@@ -365,8 +365,7 @@ def test_plans_shift_by_the_elapsed_steps(fill: Any) -> None:
 @pytest.mark.parametrize("spline", ["zero", "linear", "cubic"])
 @pytest.mark.parametrize("knots", [1, 3, 5, 8, 12])
 def test_shifted_plan_with_knots_keeps_its_actions(knots: int, spline: Any) -> None:
-    """The actions of the remaining steps do not change, even if the shift is smaller than the distance between two
-    knots."""
+    """Remaining actions do not change, even if the shift is smaller than the distance between two knots."""
     plan = MPPI("point_mass", horizon=12, samples=4, knots=knots, spline=spline, fill="repeat", noise=0.3, seed=1)
     plan(plan.state_of())
     for shift in (0, 1, 1, 1, 2, 7, 1):
@@ -378,7 +377,7 @@ def test_shifted_plan_with_knots_keeps_its_actions(knots: int, spline: Any) -> N
     assert (plan.nominal == plan.nominal[0]).all(), "the last knot fills the plan"
 
 
-def test_a_shift_beyond_the_horizon_fills_the_whole_plan() -> None:
+def test_shift_beyond_the_horizon_replaces_all_actions_by_the_fill_action() -> None:
     for knots in (None, 4):
         plan = MPPI("point_mass", horizon=8, samples=4, knots=knots, fill=0.25)
         plan(plan.state_of())
@@ -511,18 +510,17 @@ def test_half_cheetah_runs() -> None:
 
 @pytest.mark.long
 def test_hopper_hops_without_falling() -> None:
-    """With the settings of other tasks, the robot falls after about 100 steps."""
+    """With planner settings from other tasks, the robot falls after about 100 steps."""
     plant, rewards, evals = drive("hopper", 130, 1)
     assert len(evals) == 130 and not plant.terminated.item()
     assert evals[-1] > 0.1 and rewards.sum() > 140, (evals[-1], rewards.sum())
 
 
 def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
-    """Return the mean return over runs of 100 steps, and the standard deviation that this mean has if no action depends
-    on its coin.
+    """Return the mean return over runs of 100 steps, and its standard error if actions are independent of coins.
 
-    Plant and planner have equal seeds. A reward is the product of action and coin, so the variance of the return is the
-    sum of the squared actions if no action depends on its coin.
+    Plant and planner have equal seeds. A reward is the product of action and coin. If action and coin are independent,
+    the variance of the return is therefore the sum of the squared actions.
     """
     plan = MPPI(task, engine="mujoco", horizon=4, noise=2.0, smoothing=(1, 0, 0))
     plant = lw.make(task, autoreset=False)
@@ -554,7 +552,7 @@ def test_planner_exploits_noise_drawn_before_the_action() -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [TossedAfter, TossedAfterWithControl])
-def test_each_sample_of_each_iteration_draws_its_own_noise(task: type[lw.Task], engine: str) -> None:
+def test_random_events_differ_between_samples_and_iterations(task: type[lw.Task], engine: str) -> None:
     coins: list[torch.Tensor] = []
 
     def value(obs: torch.Tensor) -> torch.Tensor:

@@ -46,7 +46,7 @@ def arguments(task: Any, config: MPPIConfig | None = None, value: Any = None, pa
     return planner_arguments(find_task(task), config, words, params, value)
 
 
-def test_arguments_override_the_suggestions_in_task_planning() -> None:
+def test_arguments_override_the_planning_attribute_of_the_task() -> None:
     plan = MPPI("hopper", horizon=2, samples=2)
     assert plan.config == MPPIConfig(horizon=2, samples=2, noise=0.1).completed()
     assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
@@ -75,13 +75,13 @@ def test_arguments_override_the_suggestions_in_task_planning() -> None:
         (Planning(options={"nworld": 3}), "planning.options of the task 'planned': a planner takes no option nworld"),
     ],
 )  # fmt: skip
-def test_invalid_planning_raises_an_error_that_names_task_and_part(planning: Any, message: str) -> None:
+def test_error_of_invalid_planning_names_the_task_and_the_entry(planning: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message) as raised:
         MPPI(type("Planned", (Picky,), {"planning": planning}))
     assert "\n" not in str(raised.value)
 
 
-def test_task_planning_entry_that_is_not_a_dict_raises_an_error() -> None:
+def test_planning_settings_that_are_not_a_dict_raise_an_error() -> None:
     with pytest.raises(ValueError, match=r"settings of lw.Planning must be a dict, not \['horizon'\]"):
         Planning(settings=["horizon"])  # type: ignore[arg-type]
 
@@ -100,7 +100,7 @@ REACH = task_config(find_task("reach"))
         ("reach", MPPIConfig(horizon=3, samples=8), {"samples": 7}, MPPIConfig(horizon=3, samples=7)),
     ],
 )
-def test_keyword_settings_override_config_and_config_overrides_planning(
+def test_keywords_override_config_and_config_overrides_the_planning_attribute(
     task: str, config: MPPIConfig | None, words: dict[str, Any], expected: MPPIConfig
 ) -> None:
     assert arguments(task, config, **words)[0] == expected.completed()
@@ -159,8 +159,8 @@ def test_invalid_planner_arguments_raise_a_one_line_error(words: dict[str, Any],
     assert "\n" not in str(raised.value)
 
 
-def test_planning_parameters_are_ignored_with_a_value_function() -> None:
-    """The value function was fitted to the task's own rewards."""
+def test_planning_params_are_ignored_if_there_is_a_value_function() -> None:
+    """``planning.params`` changes the rewards, but the value function was fitted to the task's rewards without them."""
     plan = MPPI("hopper", horizon=2, samples=2, value=lambda obs: obs[:, 0])
     assert plan.env.task.params["healthy_reward"] == 1.0 and plan.env.task.params["forward_reward_weight"] == 1.0
     assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER and plan.settings["noise"] == 0.1
@@ -226,7 +226,7 @@ def test_cem_and_predictive_sampling_equal_mppi_with_another_update(planner: typ
         ("reach", dict(samples=1, engine="warp"), ("warp", "cuda:0")),
         ("reach", dict(samples=4096, device="cpu"), ("auto", "cpu")),
         ("reach", dict(samples=100, solver={"noslip_iterations": 3}), ("mujoco", "cpu")),
-        # the hand's noslip solver is slow on a GPU, unless it is turned off
+        # on a GPU, the hand is slow unless its noslip solver is turned off
         ("adroit_pen", dict(samples=160), ("mujoco", "cpu")),
         ("adroit_pen", dict(samples=480), ("warp", "cuda:0")),
         ("adroit_pen", dict(samples=160, solver={"noslip_iterations": 0}), ("warp", "cuda:0")),

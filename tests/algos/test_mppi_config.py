@@ -48,7 +48,7 @@ def test_error_of_a_setting_out_of_range_names_the_setting(name: str, wrong: lis
             pytest.fail(f"{name}={value!r} was accepted")
 
 
-def test_drawn_models_exclude_the_nominal_model() -> None:
+def test_random_models_and_nominal_model_together_raise_an_error() -> None:
     with pytest.raises(ValueError, match="models=4 draws model fields, but nominal_model=True does not: omit one"):
         MPPIConfig(models=4, nominal_model=True)
 
@@ -86,7 +86,7 @@ def test_settings_for_a_different_action_size_raise_an_error(name: str, value: A
         MPPI("point_mass", horizon=3, samples=4, **{name: value})
 
 
-def test_fill_actions_are_clipped_to_the_bounds() -> None:
+def test_fill_action_is_clipped_to_the_action_bounds() -> None:
     low, high = np.array([-1.0, 0.2]), np.array([1.0, 0.4])
     space = dataclasses.replace(MPPI("point_mass", samples=1).env.action_space, low=low, high=high)
     assert isinstance(space, Space)

@@ -44,12 +44,12 @@ def states_of(task: Any, count: int) -> torch.Tensor:
 
 @pytest.mark.quick(*(f"{case}-mujoco" for case in CASES))
 @pytest.mark.parametrize("case, engine", [*((c, "mujoco") for c in CASES), *((c, "warp") for c in ON_WARP)])
-def test_plans_for_several_plants_equal_single_planners(case: str, engine: str) -> None:
+def test_one_planner_for_several_plants_equals_one_planner_per_plant(case: str, engine: str) -> None:
     settings = dict(horizon=6, samples=8, temperature=0.5, engine=engine) | CASES[case]
     states = states_of(settings["task"], 3)
     together = lw.MPPI(**settings, seed=5, plants=3)
     alone = [lw.MPPI(**settings, seed=5 + i) for i in range(3)]
-    for plan in alone:  # a planner of several plants has only one set of models
+    for plan in alone:  # a planner for several plants uses one set of models for all of them
         for name, rows in plan.model_fields.items():
             rows.copy_(together.model_fields[name])
     for shift in (1, 2):

@@ -24,7 +24,7 @@ def env() -> lw.Env:
     return lw.make("point_mass", nworld=16, horizon=12, nthread=1)
 
 
-def test_policy_step_has_the_kl_divergence_that_the_setting_delta_gives(env: lw.Env) -> None:
+def test_policy_step_has_a_kl_divergence_of_half_delta(env: lw.Env) -> None:
     env.rand_reset(0)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=3200, delta=1e-3, normalize=False), seed=0)
     before = torch.cat([p.detach().flatten() for p in npg.policy.parameters()])
@@ -190,8 +190,7 @@ def test_rollout_segments_continue_the_previous_episodes(env: lw.Env) -> None:
 
 @pytest.mark.parametrize(("min_restarts", "begun"), [(None, 1), (2.0, 3), (0.0, 0)])
 def test_worlds_restart_if_too_few_begin_an_episode(min_restarts: float | None, begun: int) -> None:
-    """If time limits were evenly spread, 40 * 5 / 128 = 1.6 worlds would begin an episode in an iteration of 5
-    steps."""
+    """With evenly spread time limits, 40 * 5 / 128 = 1.6 worlds would begin an episode in an iteration of 5 steps."""
     env = lw.make("point_mass", nworld=40, horizon=128)
     config = lw.NPGConfig(samples=40 * 5, hidden=(8,), value_hidden=(8,), mean_every=0, min_restarts=min_restarts)
     npg = lw.NPG(env, config=config)
@@ -383,8 +382,7 @@ def test_gpu_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.gpu
 def test_gpu_learner_continues_after_loading_a_state() -> None:
-    """A captured value fit contains the addresses of the optimizer's moments, so loading a state must capture it
-    again."""
+    """The graph of the value fit contains the addresses of Adam's moments, so it is captured again after loading."""
     npg = on_gpu()
     saved = npg.state_dict()
     first = next(npg)

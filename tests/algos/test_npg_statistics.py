@@ -50,7 +50,7 @@ def part_of(rollout: lw.Rollout, worlds: slice) -> Any:
 
 
 def test_episode_statistics_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
-    """The statistics of a rollout equal the pooled statistics of two parts of its worlds."""
+    """The statistics of a rollout equal the pooled statistics of two subsets of its worlds."""
     ended = rollout.done & ~rollout.episode_return.isnan()
     assert 6 < ended.sum() < rollout.done.sum()
     returns = rollout.episode_return[ended].double()
@@ -80,8 +80,7 @@ def test_value_statistics_of_two_processes_equal_those_of_all_samples() -> None:
 
 
 def test_metric_means_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
-    """The mean metrics of a rollout equal the pooled means of two parts of its worlds, and are NaN if no episode
-    ended."""
+    """The mean metrics of a rollout equal the pooled means of two subsets of its worlds, or NaN without episodes."""
     ended = rollout.done & ~rollout.episode_return.isnan()
     expected = {name: sums[ended].mean().item() for name, sums in rollout.episode_metrics.items()}
     assert list(expected) == ["forward", "effort"] and expected["effort"] > 0.1

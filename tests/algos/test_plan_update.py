@@ -1,4 +1,4 @@
-"""Compare user-written plan updates, in torch and in Warp, with the package's own."""
+"""Compare plan updates that a user writes, in torch or in Warp, with the updates of the package."""
 
 from typing import Any
 
@@ -80,7 +80,7 @@ def compare(one: lw.Planner, other: lw.Planner, calls: int = 4) -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("more", [{}, {"knots": 3}, {"plants": 2, "iterations": 2}, {"graphs": False}])
-def test_user_written_cem_in_torch_gives_the_same_plans(more: dict[str, Any], engine: str) -> None:
+def test_cem_written_in_torch_gives_the_same_plans_as_the_class_cem(more: dict[str, Any], engine: str) -> None:
     smoothing = lw.MPPIConfig(knots=more.get("knots")).noise_smoothing
     own = lw.Planner(engine=engine, update=TorchCEM(3, 0.05, smoothing), **POINT, **more)
     compare(own, cem := lw.CEM(engine=engine, elites=3, min_noise=0.05, **POINT, **more))
@@ -122,7 +122,7 @@ def test_planners_with_one_update_object_do_not_share_buffers() -> None:
     assert vars(update).keys() == {"elites", "min_noise", "smoothing"}
 
 
-def test_settings_show_the_attributes_of_an_update_that_the_user_wrote() -> None:
+def test_planner_settings_contain_the_attributes_of_a_user_written_update() -> None:
     plan = lw.Planner(update=EliteMean(3), **POINT)
     assert plan.settings["update"] == "EliteMean(elites=3)"
     assert plan.config.update is not None and type(plan).__name__ == "Planner"

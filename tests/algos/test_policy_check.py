@@ -1,4 +1,4 @@
-"""Test that NPG rejects unsuitable policy networks of users, and trains others like its default network."""
+"""Test that NPG rejects unsuitable networks, and trains suitable ones like its default network."""
 
 from collections.abc import Callable
 from pathlib import Path

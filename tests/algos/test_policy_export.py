@@ -29,7 +29,7 @@ RUNS = pytest.mark.parametrize(("name", "run"), [("policy.onnx", run_onnx), ("po
 
 
 def trained(**options: object) -> lw.GaussianPolicy:
-    """Make a policy with non-trivial weights and statistics."""
+    """Make a policy with random weights and non-trivial observation statistics."""
     torch.manual_seed(0)
     policy = lw.GaussianPolicy(5, 2, (16, 8), **options)
     with torch.no_grad():
@@ -40,8 +40,7 @@ def trained(**options: object) -> lw.GaussianPolicy:
 
 
 def compare(policy: lw.GaussianPolicy, path: Path, run: Run) -> None:
-    """Compare actions for batches of other sizes than in the export, for single observations, and for clipped
-    observations."""
+    """Compare actions for several batch sizes, for single observations, and for clipped observations."""
     for n in (1, 7):
         obs = (40.0 * np.random.default_rng(n).standard_normal((n, 5))).astype(np.float32)
         with torch.no_grad():

@@ -73,7 +73,7 @@ def test_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], en
 
 
 def test_reported_statistics_equal_the_statistics_of_the_samples(shared_env: SharedEnv) -> None:
-    """Every episode has 10 steps; an episode with a random start does not count."""
+    """Every episode has 10 steps; an episode that starts at a random step does not count."""
     ppo = made(shared_env(Metered, nworld=4, horizon=10, far=1e3))
     found: list[float] = []
     for _ in range(3):
@@ -93,8 +93,7 @@ def test_reported_statistics_equal_the_statistics_of_the_samples(shared_env: Sha
 
 
 def test_truncated_episode_bootstraps_from_its_final_observation(env: lw.Env) -> None:
-    """In the first step, world 0 continues, world 1 reaches its time limit, world 2 has a fault, and world 3
-    terminates."""
+    """In step 1, world 0 continues, world 1 reaches its time limit, world 2 has a fault, and world 3 terminates."""
     ppo = made(env, num_steps=3, normalize=False, minibatches=1)
     state = env.get_state()
     for part, column in {"qpos": [0, 0, 0, 5], "qvel": [1, 2, 3, 4], "step": [0, 9, 0, 0]}.items():

@@ -37,7 +37,7 @@ def test_rollout_buffer_stores_inputs_and_results_of_each_step(graphs: bool) -> 
     torch.testing.assert_close(rollout.episode_metrics["effort"][5], rollout.action.square().sum(-1)[4:].sum(0))
 
 
-def test_rollout_buffer_counts_only_the_first_episode_of_each_world_on_request() -> None:
+def test_rollout_buffer_with_first_only_counts_only_the_first_episode_of_each_world() -> None:
     env = lw.make("hopper", nworld=8)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
     noise = torch.randn(200, 8, 3, generator=torch.Generator().manual_seed(0))
@@ -60,7 +60,7 @@ def test_faults_within_a_rollout_are_counted() -> None:
     noise[1:3, 2] = math.nan
     rollout.collect(policy, noise)
     assert rollout.faults.tolist() == [0, 0, 2]
-    # a fault truncates the episode; it is not a termination, whose return would be 0
+    # a fault counts as truncation, not as termination, because learners bootstrap after it
     assert rollout.done[1, 2] and not rollout.terminated.any()
     assert env.fault_counts["action"] == 2
     noise.zero_()
@@ -75,7 +75,7 @@ class Settling(Metered):
 @pytest.mark.parametrize(("task", "engine", "spread"), [
     (Metered, "warp", True), (Settling, "mujoco", True), (Settling, "warp", False),
 ])  # fmt: skip
-def test_worlds_start_at_different_steps_unless_settling_one_world_delays_all_others(
+def test_episodes_are_staggered_unless_the_warp_engine_settles_initial_states(
     task: type[lw.Task], engine: str, spread: bool
 ) -> None:
     rollout = lw.Rollout(lw.make(task, nworld=4, horizon=50, engine=engine), 1)

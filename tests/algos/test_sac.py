@@ -1,4 +1,4 @@
-"""Test that SAC's updates equal plain torch, and that runs learn and resume exactly."""
+"""Test that SAC's updates equal those of plain torch code, and that runs learn and resume exactly."""
 
 import copy
 import dataclasses
@@ -37,8 +37,10 @@ def numbers(it: SACIteration) -> dict[str, Any]:
 
 
 def test_sac_learns_for_a_fixed_seed(shared_env: SharedEnv) -> None:
-    """With random actions, the pole falls after about 5 steps. After these updates, the pole falls after 45 to 75 steps
-    (measured for other seeds)."""
+    """With random actions, the pole falls after about 5 steps.
+
+    After these updates, the pole falls after 45 to 75 steps (measured for other seeds).
+    """
     config = lw.SACConfig(
         hidden=(32, 32), value_hidden=(32, 32), num_steps=50, warmup=300, updates=4, batch=128, n_step=3,
         learning_rate=1e-3, temperature=0.1, tau=0.02, gamma=0.97, mean_every=4, mean_episodes=4,

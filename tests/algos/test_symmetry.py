@@ -27,7 +27,7 @@ def learner(env: lw.Env, symmetry: str, **changes: Any) -> lw.PPO:
 
 
 def asymmetry(policy: Callable[[torch.Tensor], torch.Tensor], env: lw.Env) -> float:
-    """Return the mean difference between actions and mirrored actions of mirrored observations."""
+    """Return the mean absolute difference between actions for mirrored observations and mirrored actions."""
     mirror = PolicyMirror(reflections(env))
     obs = torch.randn(500, env.obs_space.size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
@@ -47,7 +47,7 @@ def test_symmetric_policy_is_equivariant_bit_for_bit_before_and_after_loading(en
     obs = torch.randn(9, 6)
     (action,) = runtime.InferenceSession(str(file)).run(["action"], {"obs": obs.numpy()})
     np.testing.assert_allclose(action, policy(obs), rtol=1e-5, atol=1e-6)
-    # the policy stays symmetric under NPG and in a run that continues
+    # the policy stays symmetric if NPG or another run of PPO continues to train it
     npg = lw.NPG(env, lw.load(run), config=lw.NPGConfig(samples=512, value_hidden=(8,), mean_every=0))
     next(npg)
     assert asymmetry(npg.policy, env) == 0.0
@@ -95,8 +95,8 @@ def test_a_symmetric_run_resumes_bit_for_bit(symmetry: str, tmp_path: Path) -> N
         lw.train(lw.PPO(lw.make("point_mass", nworld=8), config=CONFIG), halves.folder, iterations=9, resume=True)
 
 
-def test_mirrored_samples_add_the_gradient_of_the_mirrored_task(env: lw.Env) -> None:
-    """If policy and value function are symmetric, mirrored samples add the mirror image of the gradient."""
+def test_mirrored_samples_add_the_mirrored_gradient(env: lw.Env) -> None:
+    """Policy and value function are zero, hence symmetric, so mirrored samples add the mirror image of the gradient."""
     ppo = learner(env, "augment", hidden=(), value_hidden=(), normalize=False)
     with torch.no_grad():
         for network in (ppo.policy.network, ppo.value.network):
@@ -108,7 +108,7 @@ def test_mirrored_samples_add_the_gradient_of_the_mirrored_task(env: lw.Env) -> 
     weight = ppo.policy.network[0].weight.grad
     signs = torch.tensor([1.0, -1.0])
     rows, columns = signs, signs.repeat(3)
-    assert weight.abs().min() < 1e-6 * weight.abs().max()  # reflection changes the sign of entries that mix x and y
+    assert weight.abs().min() < 1e-6 * weight.abs().max()  # entries that mix x and y cancel
     torch.testing.assert_close(weight, weight * rows[:, None] * columns, rtol=0.0, atol=1e-6)
 
 

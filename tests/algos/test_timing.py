@@ -1,4 +1,4 @@
-"""Run two calls concurrently, each with one of torch's threads."""
+"""Run two functions in parallel, each on one of torch's two threads."""
 
 import threading
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Fit value functions, with and without a captured step."""
+"""Fit value functions, with and without CUDA graphs."""
 
 from typing import Any
 

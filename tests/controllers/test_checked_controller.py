@@ -64,7 +64,7 @@ def test_invalid_action_or_plan_raises_an_error(run: Run, env: lw.Env) -> None:
             run(env, controller)
 
 
-def test_plan_with_long_steps_is_held_or_interpolated_and_plan_with_short_steps_skips_actions(env: lw.Env) -> None:
+def test_long_plan_steps_hold_or_interpolate_actions_and_short_plan_steps_skip_actions(env: lw.Env) -> None:
     plan = torch.tensor([[0.0, 1.0], [1.0, 3.0], [2.0, 9.0]])
 
     def applied(timestep: float, steps: int, **words: str) -> list[float]:

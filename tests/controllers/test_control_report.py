@@ -27,7 +27,7 @@ def episode(env: lw.Env) -> Trajectory:
 
 
 def with_plan_times(episode: Trajectory, times: np.ndarray) -> Trajectory:
-    """Replace the planning times of an episode; the first time becomes one second."""
+    """Replace the planning times of an episode, so that the first plan takes one second."""
     plans = len(times) + 1
     return dataclasses.replace(
         episode, plan_times=torch.tensor([1.0, *times], dtype=torch.float64), plan_of=torch.zeros_like(episode.plan_of),
