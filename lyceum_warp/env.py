@@ -128,7 +128,8 @@ class Env:
     device: wp.Device
     """The Warp device; ``obs.device`` is the same device in torch."""
     options: EnvOptions
-    """The options of the environment. If physics options were given by name, the options replace the name."""
+    """The options of the environment. If physics options were given by name, ``options.physics`` contains the options
+    themselves."""
     task: BoundTask
     """The task with the model, the parameters (``task.params``) and the kernels."""
     engine: Engine
@@ -423,7 +424,7 @@ class Env:
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
         """Get a live view of a field of MjData or MjModel, by MuJoCo's name.
 
-        An environment keeps ``time``, ``ctrl`` and the fields that its task reads. Request other fields when making the
+        Available are ``time``, ``ctrl`` and the fields that the task reads. Request other fields when making the
         environment, as in ``make("hopper", fields=["site_xpos", "body_mass"])``. Do not write into the view: use
         ``set_state`` or ``set_dynamics``.
 
@@ -463,8 +464,8 @@ class Env:
                 all worlds.
 
         Raises:
-            ValueError: A field is unknown or the same in all worlds, or a value has the wrong size, is not finite, or
-                is negative although the field must be positive.
+            ValueError: A field is unknown, or all worlds share its value; or a value has the wrong size, is not finite,
+                or is negative although the field must be positive.
         """
         state = self.get_state()
         put_rows(self.task.model, fields, self._columns_of_dynamics(state))
@@ -528,7 +529,7 @@ class Env:
 
     @property
     def given_params(self) -> dict[str, Any]:
-        """The given task parameters by name; all other parameters have their defaults."""
+        """The task parameters that were set explicitly, by name; all others have their defaults."""
         return dict(self._given_params)
 
     def set_params(self, **params: Any) -> None:
@@ -556,8 +557,8 @@ class Env:
     def replicate(self, *, nworld: int | None = None, **changes: Any) -> "Env":
         """Make another environment of the same task, with the same options and parameters except for the given changes.
 
-        By default, ``seed`` and ``first_world`` become 0. Parameters with one value per world are repeated if the
-        number of worlds differs.
+        By default, ``seed`` and ``first_world`` become 0. If the number of worlds differs, parameters with one value
+        per world are repeated or cut.
         """
         nworld = self.nworld if nworld is None else nworld
         # pass the parsed model, because the model's file may have changed
@@ -569,7 +570,7 @@ class Env:
         return made
 
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
-        """Replicate the environment with a few worlds, such as for evaluation; engine="auto" selects the C engine.
+        """Replicate the environment with only a few worlds; engine="auto" selects the C engine.
 
         On a GPU, a step of a few worlds takes nearly as long as a step of thousands of worlds.
         """
@@ -578,7 +579,7 @@ class Env:
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
         """Get the values of the named parameters, for ``nworld`` worlds."""
         known, worlds = self.task.parameters, np.arange(nworld) % self.nworld
-        # keep other values as given, for example an element's name instead of its index
+        # return values other than tables as they were given, for example an element's name instead of its index
         given = {name: value for name, value in self._given_params.items() if name not in known.tables}
         values = {name: (known.values | given)[name] for name in names}
         return values | {name: known.values[name][worlds] for name in names if name in known.per_world}
