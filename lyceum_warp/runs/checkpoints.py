@@ -24,7 +24,7 @@ PolicyContent = dict[str, Any]
 """Content of a saved policy: ``iteration``, ``policy``, and ``value`` if there is a value function."""
 
 _CLASSES: dict[str, type[nn.Module]] = {"policy": GaussianPolicy, "value": ValueFunction}
-"""Classes of networks for files that name no class."""
+"""Network classes to use if a file does not name the class."""
 
 
 def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> PolicyContent:
@@ -209,6 +209,6 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
 
 
 def _first_sentence(error: BaseException) -> str:
-    """Get the first sentence of an error message, because torch's messages can fill a page."""
+    """Get the first sentence of an error message; torch's whole messages can fill a page."""
     text = str(error).strip() or type(error).__name__
     return text.splitlines()[0].split(". ")[0][:200]
