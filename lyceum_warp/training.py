@@ -105,8 +105,8 @@ def train(
             into the folder. By default, only comparisons that take seconds are made: with the C engine, after training
             on a GPU; and with the task's exact physics, after training with different physics options.
             ``transfer=True`` adds comparisons with each set of physics options that the task defines and, after
-        training on CPU cores, with the Warp engine. resume: Whether to continue the run in the folder. To resume, make
-        the learner with the same arguments as
+            training on CPU cores, with the Warp engine.
+        resume: Whether to continue the run in the folder. To resume, make the learner with the same arguments as
             before.
         take_over: Whether to continue a run that another process has locked, on the same or another host. The locking
             process then ends at its next write.

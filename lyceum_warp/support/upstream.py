@@ -142,7 +142,7 @@ def replaced_in_this_thread(functions: Mapping[str, Callable[..., Any]]) -> Iter
 
 
 _REMADE = ("reset_data", "get_state", "set_state")
-"""The functions of MuJoCo Warp that define their kernels anew in every call. Each kernel is a closure over one
+"""The functions of MuJoCo Warp that define their kernels again in every call. Each kernel is a closure over one
 variable, the mask, and depends only on whether it is None."""
 
 
