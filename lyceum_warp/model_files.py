@@ -28,7 +28,7 @@ _SCENES_IN_ASSETS = "mujoco/playground/assets/mujoco_playground/_src"
 class ModelFile:
     """Model file in an installed package or in a local folder. The ``model`` of a task may be a ``ModelFile``.
 
-    ``lw.make`` searches for the file, so tasks can be listed on a machine without the file. The functions
+    Only ``lw.make`` searches for the file, so tasks can also be listed on a machine without the file. The functions
     ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model``, ``menagerie_model`` and ``playground_model``
     make a ``ModelFile``.
     """

@@ -73,7 +73,7 @@ def _checked_limits(solver: Any) -> dict[str, int]:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhysicsOptions:
-    """Options of the simulation. An option of None keeps the setting of the task or the model.
+    """Options of the simulation. If an option is None, the setting of the task or the model applies.
 
     Raises:
         ValueError: A value is unknown or out of range.
@@ -94,7 +94,7 @@ class PhysicsOptions:
     """Constraint Jacobian: dense, sparse or auto. The choice of Jacobian affects speed and memory, and affects results
     only by rounding."""
     impratio: float | None = None
-    """Ratio of a contact's stiffness against slip to its stiffness against penetration, for elliptic cones."""
+    """Ratio of a contact's frictional impedance to its normal impedance, for elliptic cones."""
     solver: Mapping[str, int] | None = None
     """Limits of the constraint solver: iterations, ls_iterations (of the line search) and noslip_iterations (0 turns
     the noslip solver off)."""

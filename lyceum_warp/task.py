@@ -440,7 +440,7 @@ class Task:
     - ``startup``: model fields and lasting memory. Resets do not change these values.
     - ``substep``: memory and lasting memory. ``advance``: memory and lasting memory of ``s1``.
 
-    ``reject`` gets the initial state before the state settles. While an initial state settles, no ``substep`` runs.
+    ``reject`` is called before the substeps of ``settle``. In these substeps, ``substep`` is not called.
 
     An event runs after the reward and the termination of a step and before the next observation, but not in worlds that
     restart. Open-loop rollouts and planners run no events.
@@ -484,15 +484,15 @@ class Task:
     """Fields that keep the values left by ``mj_step``. These values lag one substep behind the state, as in some
     Gymnasium tasks."""
     cleared: ClassVar[tuple[str, ...]] = ()
-    """Fields of the last substep, such as contact forces, which a reset must clear before ``initialize`` runs. If
-    ``cleared`` does not list such fields, a forward pass computes them in the worlds that restart."""
+    """Fields of the last substep, such as contact forces, which a reset must clear before ``initialize`` runs. For all
+    other fields of the last substep, a forward pass computes the values in the worlds that restart."""
     actions: ClassVar[Mapping[str, int | str] | None] = None
     """Parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls; ``control``
     then converts actions to inputs. A size may be the name of a table in Params; the part then has one number per row
     of the table. If ``actions`` is None, an action has one number for each control."""
     action_range: ClassVar[tuple[float, float] | None] = None
     """The range of actions. The default ``control`` scales this range to the model's control ranges. If
-    ``action_range`` is None, actions are controls, or are unbounded if the task has ``actions``."""
+    ``action_range`` is None, actions are not scaled; they are unbounded if the task declares ``actions``."""
     keyframe: ClassVar[str | None] = None
     """Name of the model's keyframe to which ``reset`` sets the state before ``initialize``; None means ``qpos0``."""
     draws: ClassVar[int] = 10
@@ -501,7 +501,7 @@ class Task:
     settle: ClassVar[int] = 0
     """Number of substeps that are simulated from an initial state before the first observation of the episode, so that
     the objects come to rest. They use the initial state's controls, and do not call ``substep``. The episode's time
-    starts at 0 after settling."""
+    starts at 0 after these substeps."""
     gymnasium: ClassVar[str | None] = None
     """Id of the Gymnasium environment that the task reimplements, such as "Hopper-v5"; None without such an
     environment. Model, observation, reward, termination, reset and parameters are the same. Subclasses do not inherit

@@ -419,8 +419,8 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
 
     Args:
         spec: The model.
-        feet: For each new site, by its name, an element and a position: the name of the site's body (or of one of the
-            body's joints or geoms), and the site's position in this body, in m.
+        feet: For each new site, by the site's name, a pair: the name of a body (or of one of its joints or geoms), and
+            the site's position in this body, in m.
 
     Raises:
         ValueError: The model has no element of this name.

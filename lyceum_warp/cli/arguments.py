@@ -29,7 +29,7 @@ ParamWords = Annotated[
 Trust = Annotated[
     bool,
     tyro.conf.arg(
-        help="Trust a run from elsewhere, now and later: allow it to run its task and to read the files that it names.",
+        help="Trust a run that you did not make on this machine: commands may then execute its task and read its files.",
     ),
 ]
 """Declare the flag --trust; see ``lyceum_warp.runs.trust``."""
@@ -59,7 +59,7 @@ _UNIONS = (UnionType, type(typing.Union[int, str]))  # noqa: UP007 (the type of 
 
 @typing.dataclass_transform(kw_only_default=True, frozen_default=True)
 class OptionFlags:
-    """Base class that adds the fields of dataclasses to its subclass as flags, with their docstrings as help text.
+    """Base class of groups of flags: a field of a given dataclass becomes a flag, and its docstring the help text.
 
     A field must be declared in the subclass itself if its type is a union, or if its type or help text differs on the
     command line. Values are validated when the options are made; if the parser validated them, it would print errors in

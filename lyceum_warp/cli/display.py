@@ -136,7 +136,7 @@ def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omi
         console: The output.
         columns: The cells of each column, by its heading. The first column may contain text; all other columns contain
             numbers.
-        omit: Headings of the columns that may be omitted, the first one first.
+        omit: Headings of the columns that may be omitted, in the order in which they are omitted.
     """
     table = Table()
     for count in range(len(omit) + 1):
@@ -208,8 +208,8 @@ def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
 class PlanDisplay:
     """Shows the progress of a planner's episode: a live line on a terminal, and a line at the end of the episode.
 
-    With ``real_time``, the live line shows the rate of plans and the age of the action. Otherwise it shows the rate of
-    the plant. Rates are averaged over the episode so far.
+    If ``real_time`` is True, the live line shows the number of plans per second and the age of the action. Otherwise,
+    it shows the number of steps per second. Both numbers are means over the episode so far.
     """
 
     def __init__(

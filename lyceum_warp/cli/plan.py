@@ -198,7 +198,7 @@ def _check_value_task(run: Path, task: str) -> None:
     try:
         config = Run.open(run.parent if run.is_file() else run).config
     except FileNotFoundError:
-        return  # load_value reports missing files; a policy file may have no run folder
+        return  # a policy file need not be in a run folder; load_value reports missing files
     found = str(config.get("task"))
     names = {_stem(found), snake_case(found.partition(":")[2]), str(config.get("kept", {}).get("name"))}
     if not names & {_stem(task), task_name(find_task(task))}:
@@ -354,7 +354,7 @@ def _save(run: Run, done: list[Trajectory], options: Plan) -> None:
 
 
 def _summary(done: list[Trajectory], options: Plan) -> ControlReport:
-    """Make the report of the given episodes. The deadline of a plan is the time until the next plan."""
+    """Make the report of the given episodes. The deadline of a plan is the time from one plan to the next."""
     return control_report(done, rate=1 / (options.replan_every * done[0].period))
 
 

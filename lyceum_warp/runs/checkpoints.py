@@ -174,7 +174,7 @@ def read_checkpoint(
     try:
         data = io.BytesIO(path.read_bytes())
         with zipfile.ZipFile(data) as archive:
-            # test the checksums that torch does not test, and find records marked as folders, which torch ignores
+            # torch neither checks all checksums nor refuses entries marked as folders, which it ignores
             folders = (record.filename for record in archive.infolist() if record.external_attr & 0x10)
             if (name := archive.testzip() or next(folders, None)) is not None:
                 raise ValueError(f"the record {name} is corrupt")

@@ -99,7 +99,7 @@ def _npy(array: np.ndarray) -> bytes:
 
 
 def _sources(file: Path, loaded: Mapping[Path, bytes]) -> dict[Path, bytes]:
-    """Get a task's file and the modules that it imports from its folder; too many or too large modules are omitted."""
+    """Get a task's file and the modules that it imports from its folder; omit the modules if they exceed a limit."""
     size = sum(map(len, loaded.values())) - len(loaded[file])
     if len(loaded) - 1 <= _MOST_MODULES and size <= _LARGEST_MODULES:
         return dict(loaded)
