@@ -29,7 +29,8 @@ ParamWords = Annotated[
 Trust = Annotated[
     bool,
     tyro.conf.arg(
-        help="Trust a run that you did not make on this machine: commands may then execute its task and read its files.",
+        help="Trust a run that you did not make on this machine. From now on, commands may execute the run's task and "
+        "read the files that the run names.",
     ),
 ]
 """Declare the flag --trust; see ``lyceum_warp.runs.trust``."""
