@@ -155,7 +155,7 @@ _MODULES = {name: module for module, names in _NAMES.items() for name in names.s
 
 def __getattr__(name: str) -> Any:
     """Load a public name."""
-    if name in ("terms", "walkers"):  # lw.terms.NAME and lw.walkers.NAME: these functions have no name lw.NAME
+    if name in ("terms", "walkers"):  # functions of these modules are used as lw.terms.NAME, not as lw.NAME
         return importlib.import_module(f"{__name__}.{name}")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

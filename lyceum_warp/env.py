@@ -91,7 +91,7 @@ class Env:
     obs_groups: dict[str, torch.Tensor]
     """Observations by group, each (nworld, size of the group); the group ``policy`` is ``obs``."""
     final_obs_groups: dict[str, torch.Tensor]
-    """``final_obs`` of each group of observations, by the group's name."""
+    """``final_obs`` for each group of observations, by the group's name."""
     reward: torch.Tensor
     """Rewards of the last step, (nworld,), float32."""
     eval: torch.Tensor
@@ -131,7 +131,7 @@ class Env:
     """The options of the environment. If physics options were given by name, ``options.physics`` contains the options
     themselves."""
     task: BoundTask
-    """The task with the model, the parameters (``task.params``) and the kernels."""
+    """The task, with its model, its parameters (``task.params``) and its kernels."""
     engine: Engine
     """The physics engine; ``engine.name`` is "mujoco" or "warp"."""
     worlds: Worlds
@@ -452,7 +452,7 @@ class Env:
         return view[:, where.start] if one_object else view[:, where]
 
     def set_dynamics(self, mask: torch.Tensor | None = None, **fields: Any) -> None:
-        """Set model fields of worlds, and update derived constants.
+        """Set the values of model fields in some or all worlds, and update constants derived from the fields.
 
         The task must randomize the fields, or the option ``dynamics`` must list them. Each reset first restores the
         nominal values of fields that the task's ``initialize``, ``randomize`` or ``event`` writes. Other fields keep
@@ -502,7 +502,8 @@ class Env:
         """Copy the memory that all worlds share, and the sums for the memory's next update.
 
         Returns:
-            The memory followed by the sums, float64; empty if the task has no shared memory.
+            The shared memory, followed by the sums for the next update, float64; empty if the task has no shared
+            memory.
         """
         parts = (torch_view(self.worlds.shared)[0], torch_view(self.worlds.sums) / steps.UNIT)
         return torch.cat([part.double() for part in parts])

@@ -174,7 +174,7 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
         columns: Views of the states, (nworld, size), by the names of the model fields that differ between worlds.
 
     Raises:
-        ValueError: A field is unknown, all worlds share the field's value, or a value has the wrong size.
+        ValueError: A field is unknown or not in ``columns``, or a value has the wrong size.
     """
     for name, value in values.items():
         field = describe_model_field(model, name)  # raises an error for a misspelt name

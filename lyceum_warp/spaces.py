@@ -75,7 +75,7 @@ def action_space(
 ) -> Space:
     """Make the space of actions: by default controls, bounded by ``action_range`` or by the controls' ranges.
 
-    An actuator may have several controls or none. An actuator without a name gets a name from its index. If the task
+    An actuator may have several controls or none. An actuator without a name is named after its index. If the task
     declares ``actions``, these parts replace the controls, and have bounds only if ``action_range`` is given.
     """
     if actions is not None:

@@ -409,7 +409,7 @@ class Task:
     ``World`` lists fields of MjData, such as ``qpos`` and ``site_xpos``, and fields of MjModel, such as ``body_mass``
     and ``geom_friction``, under MuJoCo's names. A model field differs between worlds, and belongs to the state, if
     ``startup``, ``initialize``, ``randomize`` or ``event`` writes it; all worlds share the other model fields.
-    ``World`` also names the task's memory: ``air_time: Row[float] = lw.memory(4)``, or ``lw.lasting_memory(4)``.
+    ``World`` also declares the task's memory: ``air_time: Row[float] = lw.memory(4)``, or ``lw.lasting_memory(4)``.
 
     A default in ``Params`` may name an element of the model, such as ``tip: int = lw.site("tip")``; the functions then
     get the element's index. ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``,
@@ -471,7 +471,7 @@ class Task:
     terminations: ClassVar[tuple[str, ...]] = ()
     """Names of functions that end the episode if any of them returns True, in place of ``terminated``. The functions
     may take the arguments ``s`` and ``p``, and arguments that are found by name, as in terms. Each function is also a
-    metric: 1 if it returns True after the step, otherwise 0."""
+    metric, which is 1 if the function returns True after the step, and otherwise 0."""
     metrics: ClassVar[tuple[str, ...]] = ()
     """Names of the metrics that ``measure`` writes. If the task has no ``measure``, each name is a function with the
     arguments of a term that returns a float or a bool."""

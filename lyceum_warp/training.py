@@ -34,7 +34,7 @@ from lyceum_warp.viz.video import check_video
 log = logging.getLogger(__name__)
 
 Callback = Callable[[Any], Any]
-"""Function that is called with an iteration's statistics, an ``Iteration`` of the algorithm."""
+"""Function that is called with an iteration's statistics, an object of the algorithm's ``Iteration`` class."""
 
 
 class Display:

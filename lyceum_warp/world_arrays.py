@@ -212,7 +212,7 @@ class WorldArrays:
             launch_rows(state.narrow, self.mask, columns, array)
 
     def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
-        """Yield the array of each of ``own_parts``, and a view of the part's columns in the states."""
+        """Yield a pair for each of ``own_parts``: the part's array, and its columns in the states."""
         columns = memory_columns(self.task, self.state_space)
         columns |= {name: self.state_space.parts[name] for name in own_parts(self.task) if name in OWN_PARTS}
         arrays = {"metrics": self.metric_sums, "success_steps": self.success_counts}

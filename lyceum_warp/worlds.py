@@ -105,7 +105,7 @@ class Worlds(WorldArrays):
         ]
 
     def _phases_of_a_graph(self) -> list[Phase]:
-        """List the phases of a step for a single graph, whose replay skips phases without any world to change."""
+        """List the phases of a step for a single graph, whose replay skips a phase if no world needs it."""
         if not self.engine.capturable:
             return self.step_phases()
         restart = self._restart_phases(self.restarting, randomly=True)
@@ -213,7 +213,7 @@ class Worlds(WorldArrays):
         ]
 
     def rehearsal(self) -> None:
-        """Run every phase once that only launches kernels, so that ``compile_ahead`` can list the kernels."""
+        """Run once every phase that only launches kernels, so that ``compile_ahead`` can list the kernels."""
         self.seed_streams(0)
         # two substeps suffice, because all substeps after the first are equal; with the Warp engine, each additional
         # substep would take milliseconds

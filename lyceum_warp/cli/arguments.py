@@ -158,7 +158,7 @@ def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str]
         instead: The flags of options whose flags have a different name in this command.
 
     Raises:
-        ValueError: A string is not of the form NAME=VALUE, or sets an option.
+        ValueError: A string is not of the form NAME=VALUE, or NAME is an option instead of a parameter.
     """
     found: dict[str, Any] = {}
     for text in texts:

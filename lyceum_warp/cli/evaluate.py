@@ -175,7 +175,7 @@ def run_worlds(
             the CPU.
         params: Parameters that override the run's parameters.
         nworld: Number of worlds.
-        task: A different task, with its own options and parameters.
+        task: A different task to use, with this task's options and parameters.
         trust: Whether to execute the run's task even if the run was not made by this user on this machine.
     """
     saved = Configuration.of(run)

@@ -214,7 +214,7 @@ def _stem(task: str) -> str:
 def _worlds(
     options: Plan, params: dict[str, Any], planner_params: dict[str, Any]
 ) -> tuple[Env, Callable[[RealTimeSetting | None], MPPI]]:
-    """Make the controlled world, and a function that makes a planner from the setting of ``_choice`` or from flags."""
+    """Make the controlled world, and a function that makes a planner with settings from ``_choice`` or from flags."""
     steps: dict[str, Any] = {} if options.steps is None else {"horizon": whole_number("steps", options.steps, low=1)}
     plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
     if plant.horizon == 0:

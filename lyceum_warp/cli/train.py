@@ -211,7 +211,8 @@ class Train:
             return self._report(run, learner)
 
     def _suggestion(self) -> Training:
-        """Return the task's suggestion, or only the algorithm if a flag chooses a different one."""
+        """Return the suggested algorithm and settings; if a flag chooses another algorithm, return this one without
+        settings."""
         assert self.task is not None
         suggestion = find_task(self.task).training
         if self.algorithm in (None, suggestion.algorithm):

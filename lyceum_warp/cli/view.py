@@ -41,7 +41,7 @@ _NICE = 10  # the niceness (low priority) of the subprocess of `lw.RunViewer`
 class Place(
     OptionFlags, options=[EnvOptions], omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)"
 ):
-    """Engine and device of the displayed worlds; with --mppi, of the planner's worlds."""
+    """Engine and device of the displayed worlds or, if --mppi is given, of the planner's worlds."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto."""
@@ -81,7 +81,7 @@ class View:
     which: str = "last"
     """The policy of a run to show: last, best, or the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """The task's name or file; needed only if the task of the run or the episodes cannot be found."""
+    """The task's name or file, if the task of the run or of the episodes cannot be found."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of worlds: by default 16 for a run, and 1 for anything else."""
     seed: int = 0

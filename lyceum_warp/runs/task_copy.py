@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 Note = Callable[[str], None]
 
 Files = dict[Path, Path | bytes]
-"""The files of a copy: each path with the content, or with the path of the file to copy."""
+"""The files of a copy, by path: each is the content, or the path of the file to copy."""
 
 _MODEL, TABLES = "model", "tables"
 _APART = 2

@@ -18,7 +18,7 @@ class Interrupted(BaseException):
 
 
 def _ignore(number: int, frame: Any) -> None:
-    """Ignore a signal. This handler is distinct from SIG_IGN because ``obeyed`` replaces only this handler."""
+    """Ignore a signal. Unlike SIG_IGN, this handler is replaced by ``obeyed``."""
 
 
 def _interrupt(number: int, frame: Any) -> None:

@@ -53,7 +53,7 @@ def share_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]
         second: The second outcome of each pair, (pairs,) bool.
 
     Returns:
-        The difference, second minus first, at the centre of the interval, and the half-width of the interval.
+        The centre of the interval, which estimates second minus first, and the half-width of the interval.
     """
     gained, lost = (np.count_nonzero(~first & second) + 0.5, np.count_nonzero(first & ~second) + 0.5)
     pairs = len(first) + 2.0
