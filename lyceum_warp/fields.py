@@ -104,7 +104,7 @@ _KINDS = {
     "subtree_angmom".split(),
     _Kind.mjOBJ_BODY,
 ) | dict.fromkeys(("xanchor", "xaxis"), _Kind.mjOBJ_JOINT)  # fmt: skip
-"""For fields with one row per object: map the field's name or prefix to the kind of object."""
+"""The kinds of objects of fields that have one row per object, by the field's name or prefix."""
 
 _QPOS = (_Kind.mjOBJ_JOINT, "jnt_qposadr", "nq")
 _DOFS = (_Kind.mjOBJ_JOINT, "jnt_dofadr", "nv")

@@ -47,7 +47,7 @@ class WorldArrays:
 
     Args:
         task: The task with its model and parameters.
-        engine: The physics engine, with the task's fields.
+        engine: The physics engine, which has arrays of the fields that the task reads.
     """
 
     def __init__(self, task: BoundTask, engine: Engine) -> None:

@@ -46,7 +46,7 @@ class Worlds(WorldArrays):
 
     Args:
         task: The task with its model and parameters.
-        engine: The physics engine, with the task's fields.
+        engine: The physics engine, which has arrays of the fields that the task reads.
         options: Options of the environment.
     """
 

@@ -102,7 +102,7 @@ class Train:
     """The policy to start from with --from: last, best, or the number of a saved iteration."""
     target_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """End the run once the return of the mean policy reaches this number. With --mean-every 0, the mean return of the
-    sampled episodes counts."""
+    sampled episodes is compared instead."""
     minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Time limit in minutes: training ends after the iteration that exceeds it. --resume continues the run."""
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
@@ -211,8 +211,7 @@ class Train:
             return self._report(run, learner)
 
     def _suggestion(self) -> Training:
-        """Return the suggested algorithm and settings; if a flag chooses another algorithm, return this one without
-        settings."""
+        """Return the suggested algorithm and settings, or only the algorithm that a flag chooses instead."""
         assert self.task is not None
         suggestion = find_task(self.task).training
         if self.algorithm in (None, suggestion.algorithm):

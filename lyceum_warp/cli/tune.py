@@ -40,7 +40,7 @@ class Tune:
     """The policy of --run to use: last, best, or the number of a saved iteration."""
     tolerance: Annotated[str, tyro.conf.arg(metavar="strict|loose|any")] = "strict"
     """How much the mean return may change: the 95 % interval of the change must lie within 2 % (strict) or 5 % (loose)
-    of the mean absolute return. With any, every setting without additional faults is accepted."""
+    of the mean absolute return. The value any accepts every setting that causes no additional faults."""
     short: bool = False
     """Compare the first 100 steps of episodes, for a few seconds for each setting, instead of whole episodes."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None

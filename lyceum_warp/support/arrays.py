@@ -37,7 +37,7 @@ def shared_rows(row: np.ndarray, dtype: type, count: int, device: wp.Device) -> 
 
 
 def with_memory(array: wp.array) -> wp.array:
-    """Return the array, or for an empty array, an equally empty array with allocated memory.
+    """Return the array; if it is empty, return an array of the same shape that has allocated memory.
 
     A task that reads an element of an empty array by mistake would otherwise crash the process.
     """
