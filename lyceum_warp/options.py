@@ -80,8 +80,8 @@ class PhysicsOptions:
     """
 
     base: str | None = None
-    """Name of a set of options in the task's ``physics``, to which the other options are changes. "exact" means the
-    options of the task's model."""
+    """Name of a set of options in the task's ``physics``; other options that are given override the set. "exact" means
+    the options of the task's model."""
     frame_skip: int | None = None
     """Substeps in a step."""
     timestep: float | None = None
@@ -273,7 +273,7 @@ def suggestion(word: str, others: Iterable[str] = ()) -> str:
 
 
 def signature_of_options(function: Callable[..., Any]) -> inspect.Signature:
-    """Make a signature for a function in which keyword arguments for all options replace ``**words``."""
+    """Make a function's signature with a keyword argument for each option instead of ``**words``."""
     keyword = inspect.Parameter.KEYWORD_ONLY
     options = [
         inspect.Parameter(field.name, keyword, default=field.default, annotation=field.type)

@@ -190,7 +190,7 @@ class Worlds(WorldArrays):
         return phases
 
     def _observe_phases(self) -> list[Phase]:
-        """List the phases that observe worlds again: those that have changed since the transition was evaluated."""
+        """List the phases that again observe the worlds that have changed since the transition was evaluated."""
         changed = self.restarting if self.task.kernels.run_events is None else self._outdated
         return [Phase("observe", partial(self._observe, changed), by_world=True)]
 
@@ -307,7 +307,7 @@ class Worlds(WorldArrays):
             launch_rows(state.fill_rows, mask, flat(self.engine.nominal[name])[0], flat(self.engine.arrays[name]))
 
     def _redraw(self, kernel: wp.Kernel, mask: wp.array) -> None:
-        """Redraw the masked worlds' initial states while the task rejects the states."""
+        """Draw new initial states for the masked worlds whose initial state the task rejects."""
         wp.copy(self._rejected, mask)
         for _ in range(self.task.task.draws - 1):
             # on a GPU, reading the mask would wait for the device, so all launches run, even if the mask is empty
@@ -354,7 +354,7 @@ class Worlds(WorldArrays):
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         """Compute observations, evaluations and terminations of the masked worlds' states, which need no transition."""
-        # states that were set without a check may be invalid: find faults, so that such a world keeps its last
+        # states that were set without a check may be invalid: find faults, so that such a world keeps its last valid
         # observation
         self.engine.find_faults(self.mask)
         keep_reason = keep_reason and not self.autoreset

@@ -155,7 +155,7 @@ def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str]
         texts: The strings, each NAME=VALUE.
         command: The command's arguments. If a name in the strings is an option instead of a parameter, the error names
             the option's flag.
-        instead: The flags of options whose flags have a different name in this command.
+        instead: For options whose flag has a different name in this command: the flag, by the option's name.
 
     Raises:
         ValueError: A string is not of the form NAME=VALUE, or NAME is an option instead of a parameter.

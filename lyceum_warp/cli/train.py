@@ -88,7 +88,8 @@ class Train:
     """npg, the natural policy gradient; ppo; or sac, soft actor-critic with a replay buffer. By default, the algorithm
     that the task suggests, with its hyperparameters: ppo for walking robots, npg for others."""
     iterations: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Total number of iterations, including those before --resume; by default as many as the task suggests, or 100."""
+    """Total number of iterations, including those before the run was resumed; by default as many as the task suggests,
+    or 100."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Seed of the networks, the noise and the worlds' initial states."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -106,11 +107,11 @@ class Train:
     minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Time limit in minutes: training ends after the iteration that exceeds it. --resume continues the run."""
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Save the policy in a numbered file every this many iterations; 0 saves none. The last and the best policy are
-    always saved."""
+    """Save the policy in a numbered file every INT iterations; 0 saves none. The last and the best policy are always
+    saved."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Save the policy and the complete state, from which a killed run resumes, every this many iterations. 0 saves
-    every 30 s, or more often if that takes at most 1 % of the time."""
+    """Save the policy and the complete state, from which a killed run resumes, every INT iterations. 0 saves every 30
+    s, or more often if that takes at most 1 % of the time."""
     tensorboard: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to also write metrics for TensorBoard into the run's folder."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None

@@ -17,8 +17,7 @@ _STEP = 0.02
 """Seconds in a step."""
 
 _NEAR = 0.1
-"""The end of a leg is a foot if it is not much higher than the lowest foot: at most this fraction of the base's
-height."""
+"""The end of a leg is a foot if it is at most this fraction of the base's height above the lowest foot."""
 
 _FLAT = 0.01
 """A sphere of the foot belongs to the sole if it is at most this many metres above the foot's lowest sphere."""

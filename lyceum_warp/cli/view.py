@@ -204,7 +204,7 @@ def _planner(options: View, env: Env) -> MPPI:
 
 
 def _words(options: View) -> dict[str, Any]:
-    """Return the options of the displayed worlds; with --mppi, of the planner's worlds."""
+    """Return the options of the displayed worlds or, if --mppi is given, of the planner's worlds."""
     return given(options.place) | given(options.physics)
 
 

@@ -76,7 +76,7 @@ def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
 
 
 def _parts(replay: Replay, first: int, stored: int) -> Iterator[tuple[int, int]]:
-    """Yield the first step and the end of each part that contains any of the steps from ``first`` to ``stored``."""
+    """Yield the range of steps, (start, end), of each part with any of the steps from ``first`` to ``stored``."""
     each = -(-replay.steps // _PARTS)
     for start in range(first // each * each, stored, each):
         yield start, min(start + each, stored)
