@@ -145,7 +145,7 @@ _NAMES = {
     "viewer.follow": "RunViewer",
     "viewer.show": "view",
 }
-"""Map modules to their public names. Type checkers do not read this table, but the imports above."""
+"""Map modules to their public names. Type checkers read the imports above instead."""
 # isort: on
 # fmt: on
 
@@ -155,7 +155,7 @@ _MODULES = {name: module for module, names in _NAMES.items() for name in names.s
 
 def __getattr__(name: str) -> Any:
     """Load a public name."""
-    if name in ("terms", "walkers"):  # return the module itself, because its functions are not public names here
+    if name in ("terms", "walkers"):  # functions of these modules are used as lw.terms.NAME, not as lw.NAME
         return importlib.import_module(f"{__name__}.{name}")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -37,4 +37,4 @@ class Done(enum.IntFlag):
 
 
 FAULTS = ~(Done.TERMINATED | Done.TRUNCATED)
-"""Bits that mark faults; all other bits mark ordinary ends of an episode."""
+"""Bits of faults; the other two bits mark ordinary ends of an episode."""

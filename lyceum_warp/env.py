@@ -91,7 +91,7 @@ class Env:
     obs_groups: dict[str, torch.Tensor]
     """Observations by group, each (nworld, size of the group); the group ``policy`` is ``obs``."""
     final_obs_groups: dict[str, torch.Tensor]
-    """``final_obs`` of each group of observations, by the group's name."""
+    """``final_obs`` for each group of observations, by the group's name."""
     reward: torch.Tensor
     """Rewards of the last step, (nworld,), float32."""
     eval: torch.Tensor
@@ -128,9 +128,10 @@ class Env:
     device: wp.Device
     """The Warp device; ``obs.device`` is the same device in torch."""
     options: EnvOptions
-    """The options of the environment. If physics options were given by name, the options replace the name."""
+    """The options of the environment. If physics options were given by name, ``options.physics`` contains the options
+    themselves."""
     task: BoundTask
-    """The task with the model, the parameters (``task.params``) and the kernels."""
+    """The task, with its model, its parameters (``task.params``) and its kernels."""
     engine: Engine
     """The physics engine; ``engine.name`` is "mujoco" or "warp"."""
     worlds: Worlds
@@ -423,7 +424,7 @@ class Env:
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
         """Get a live view of a field of MjData or MjModel, by MuJoCo's name.
 
-        An environment keeps ``time``, ``ctrl`` and the fields that its task reads. Request other fields when making the
+        Available are ``time``, ``ctrl`` and the fields that the task reads. Request other fields when making the
         environment, as in ``make("hopper", fields=["site_xpos", "body_mass"])``. Do not write into the view: use
         ``set_state`` or ``set_dynamics``.
 
@@ -451,7 +452,7 @@ class Env:
         return view[:, where.start] if one_object else view[:, where]
 
     def set_dynamics(self, mask: torch.Tensor | None = None, **fields: Any) -> None:
-        """Set model fields of worlds, and update derived constants.
+        """Set the values of model fields in some or all worlds, and update constants derived from the fields.
 
         The task must randomize the fields, or the option ``dynamics`` must list them. Each reset first restores the
         nominal values of fields that the task's ``initialize``, ``randomize`` or ``event`` writes. Other fields keep
@@ -463,8 +464,8 @@ class Env:
                 all worlds.
 
         Raises:
-            ValueError: A field is unknown or the same in all worlds, or a value has the wrong size, is not finite, or
-                is negative although the field must be positive.
+            ValueError: A field is unknown, or all worlds share its value; or a value has the wrong size, is not finite,
+                or is negative although the field must be positive.
         """
         state = self.get_state()
         put_rows(self.task.model, fields, self._columns_of_dynamics(state))
@@ -501,7 +502,8 @@ class Env:
         """Copy the memory that all worlds share, and the sums for the memory's next update.
 
         Returns:
-            The memory followed by the sums, float64; empty if the task has no shared memory.
+            The shared memory, followed by the sums for the next update, float64; empty if the task has no shared
+            memory.
         """
         parts = (torch_view(self.worlds.shared)[0], torch_view(self.worlds.sums) / steps.UNIT)
         return torch.cat([part.double() for part in parts])
@@ -528,7 +530,7 @@ class Env:
 
     @property
     def given_params(self) -> dict[str, Any]:
-        """The given task parameters by name; all other parameters have their defaults."""
+        """The task parameters that were set explicitly, by name; all others have their defaults."""
         return dict(self._given_params)
 
     def set_params(self, **params: Any) -> None:
@@ -556,8 +558,8 @@ class Env:
     def replicate(self, *, nworld: int | None = None, **changes: Any) -> "Env":
         """Make another environment of the same task, with the same options and parameters except for the given changes.
 
-        By default, ``seed`` and ``first_world`` become 0. Parameters with one value per world are repeated if the
-        number of worlds differs.
+        By default, ``seed`` and ``first_world`` become 0. If the number of worlds differs, parameters with one value
+        per world are repeated or cut.
         """
         nworld = self.nworld if nworld is None else nworld
         # pass the parsed model, because the model's file may have changed
@@ -569,7 +571,7 @@ class Env:
         return made
 
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
-        """Replicate the environment with a few worlds, such as for evaluation; engine="auto" selects the C engine.
+        """Replicate the environment with only a few worlds; engine="auto" selects the C engine.
 
         On a GPU, a step of a few worlds takes nearly as long as a step of thousands of worlds.
         """
@@ -578,7 +580,7 @@ class Env:
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
         """Get the values of the named parameters, for ``nworld`` worlds."""
         known, worlds = self.task.parameters, np.arange(nworld) % self.nworld
-        # keep other values as given, for example an element's name instead of its index
+        # return values other than tables as they were given, for example an element's name instead of its index
         given = {name: value for name, value in self._given_params.items() if name not in known.tables}
         values = {name: (known.values | given)[name] for name in names}
         return values | {name: known.values[name][worlds] for name in names if name in known.per_world}

@@ -76,7 +76,7 @@ ON_DEMAND = {
     "subtree_linvel": mujoco.mjtSensor.mjSENS_SUBTREELINVEL,
     "subtree_angmom": mujoco.mjtSensor.mjSENS_SUBTREEANGMOM,
 }
-"""Fields that MuJoCo leaves at zero unless a sensor needs the field, each with a type of such sensors."""
+"""Fields that MuJoCo computes only if a sensor needs them, each with the type of such a sensor."""
 
 SENSED = {"sensordata", *ON_DEMAND}
 """Fields that are computed only if the model's sensors are enabled."""
@@ -104,7 +104,7 @@ _KINDS = {
     "subtree_angmom".split(),
     _Kind.mjOBJ_BODY,
 ) | dict.fromkeys(("xanchor", "xaxis"), _Kind.mjOBJ_JOINT)  # fmt: skip
-"""For fields with one row per object: map the field's name or prefix to the kind of object."""
+"""The kinds of objects of fields that have one row per object, by the field's name or prefix."""
 
 _QPOS = (_Kind.mjOBJ_JOINT, "jnt_qposadr", "nq")
 _DOFS = (_Kind.mjOBJ_JOINT, "jnt_dofadr", "nv")
@@ -128,9 +128,9 @@ _RANGES = (
     | {"sensordata": _SENSORS, "flexvert_xpos": _VERTICES}
     | dict.fromkeys(("flexedge_length", "flexedge_velocity"), _EDGES)
 )  # fmt: skip
-"""Describe the fields in which an object may have several rows, by the field's name or prefix. An entry holds the kind
-of object, the MjModel array with the index of each object's first row, and the array of row counts or the total number
-of rows."""
+"""Fields in which an object may have several rows, by the field's name or prefix. The values are the kind of object,
+the MjModel array with the index of each object's first row, and the name of the array of row counts or of the total
+number of rows."""
 
 _COUNTS = {
     _Kind.mjOBJ_ACTUATOR: "nactuator",
@@ -155,13 +155,13 @@ class Field:
 
     name: str
     shape: tuple[int, ...]
-    """Shape of the field in one world. An axis that belongs to ``dtype`` is omitted."""
+    """Shape of the field in one world. The axis of the elements of a vector or quaternion is omitted."""
     dtype: type
     """Warp type of an element: float, wp.vec3, quat (w, x, y, z), ..."""
     refresh: Stage
-    """The stage to compute after a step so that the field matches the new state."""
+    """The stage of the forward pass that updates the field after a step, so that it matches the new state."""
     reset: Stage
-    """The stage to compute after a reset; ``Stage.NONE`` for a field that a reset sets to zero."""
+    """The stage that updates the field after a reset; ``Stage.NONE`` for a field that a reset sets to zero."""
     lagged: bool
     """Whether the field keeps the value left by ``mj_step``. This value lags one substep behind the state."""
     snapshot: bool
@@ -197,7 +197,7 @@ def describe(
     Fields of the position and velocity stages match the current state after every step, restart and event. Fields of
     the acceleration stage, such as ``qacc``, ``cfrc_ext`` or actuator forces, come from the last substep, which
     computes them from the state before the substep. At the start of an episode, these fields are computed from the
-    first state. In ``sensordata``, each sensor's columns follow the sensor's stage.
+    first state. In ``sensordata``, each sensor's columns belong to the stage that computes the sensor.
 
     Args:
         model: The compiled model.
@@ -208,8 +208,9 @@ def describe(
         written: Whether the task writes the field before a step. Controls are always written.
 
     Raises:
-        ValueError: There is no field of this name, no enabled sensor makes MuJoCo compute the field, ``written`` is set
-            for a field not in ``INPUTS``, or ``cleared`` is set for a field of the current state.
+        ValueError: There is no field of this name; MuJoCo computes the field only for a sensor, and no enabled sensor
+            needs it; ``written`` is True, but the field is not in ``INPUTS``; or ``cleared`` is True, but the field
+            describes the current state.
     """
     if written and name not in INPUTS:
         raise ValueError(f"the field {name!r} cannot be written before a step: the inputs are {', '.join(INPUTS)}")
@@ -313,7 +314,7 @@ def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
 
 
 def has_several_rows(name: str) -> bool:
-    """Check whether an object may have several rows in a field, such as a joint in ``cdof``."""
+    """Check whether an object may have several rows in a field, as a ball joint has three in ``cdof``."""
     return name in _RANGES or name.partition("_")[0] in _RANGES
 
 

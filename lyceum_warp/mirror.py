@@ -18,8 +18,8 @@ class Mirror:
     of the signs of the part's columns: ``"command": (1, -1, -1)`` keeps the forward velocity, and inverts the lateral
     velocity and the yaw rate. A reflection may also consist of an order of the columns and their signs: ``"foot_force":
     ([1, 0], [1, 1])`` exchanges the left and the right foot. In the base's axes, a vector has the signs (1, -1, 1), and
-    an angular velocity has the signs (-1, 1, -1). The reflection "action" applies to the whole action, if its parts are
-    actuators.
+    an angular velocity has the signs (-1, 1, -1). If the parts of an action are actuators, one reflection named
+    "action" applies to the whole action.
 
     Args:
         parts: Reflections by the names of parts.
@@ -44,12 +44,12 @@ class Mirror:
         object.__setattr__(self, "parts", parts)
 
     def columns(self, parts: Mapping[str, slice], *, task: str, whole: str | None = None) -> Reflection:
-        """Combine the reflections of all parts of a row into the reflection of the row.
+        """Combine the reflections of all parts of an observation, an action or a state into one reflection.
 
         Args:
             parts: The columns of each part, in the format of ``Space.parts``.
             task: Name of the task for error messages.
-            whole: Name of a reflection of the whole row, if there is one.
+            whole: Name of a reflection that replaces the reflections of the parts, if it is declared.
 
         Raises:
             ValueError: A part has no reflection, or its reflection has a different size.

@@ -6,7 +6,7 @@ from lyceum_warp.support.validate import positive_number
 
 
 def follow_velocity(actuator: mujoco.MjsActuator, speed: float) -> None:
-    """Turn a position servo into an actuator with the velocity of the servo's target as control.
+    """Turn a position servo into an actuator whose control is the velocity at which the servo's target moves.
 
     The actuator's gains do not change. The target becomes an activation of the model (``act``), limited to the
     actuator's old control range.

@@ -25,7 +25,8 @@ class Constants(enum.IntFlag):
     INERTIAL = 4
     """Inverse weights and unit accelerations at ``qpos0``."""
     PRIVATE = 8
-    """Constants that only the C engine uses: coinciding frames, bounding volumes of bodies, indices and flags."""
+    """Constants that only the C engine uses: bounding volumes of bodies, indices, and flags for frames that
+    coincide."""
 
 
 _ALL = Constants.FIXED | Constants.KINEMATIC | Constants.INERTIAL | Constants.PRIVATE
@@ -110,7 +111,7 @@ class ModelField:
 
     name: str
     shape: tuple[int, ...]
-    """Shape of the field in one world. An axis that belongs to ``dtype`` is omitted."""
+    """Shape of the field in one world. The axis of the elements of a vector or quaternion is omitted."""
     dtype: type
     """Warp type of an element: float, wp.vec3, wp.vec4 for quaternions (w, x, y, z), ..."""
     constants: Constants
@@ -165,15 +166,15 @@ class ModelField:
 
 
 def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[str, torch.Tensor]) -> None:
-    """Write values of model fields into the fields' columns of a batch of states.
+    """Write the given values of model fields into a batch of states.
 
     Args:
         model: The compiled model.
         values: Values by field name, each with one row per world or one row for all worlds.
-        columns: The columns of each model field that differs between worlds (nworld, size) by the field's name.
+        columns: Views of the states, (nworld, size), by the names of the model fields that differ between worlds.
 
     Raises:
-        ValueError: A field is unknown or the same in every world, or a value has the wrong size.
+        ValueError: A field is unknown or not in ``columns``, or a value has the wrong size.
     """
     for name, value in values.items():
         field = describe_model_field(model, name)  # raises an error for a misspelt name
@@ -212,8 +213,8 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
         varies: Whether to accept only fields that can differ between worlds.
 
     Raises:
-        ValueError: There is no field of this name, the field has no real numbers, or the field cannot differ between
-            worlds.
+        ValueError: There is no field of this name, its values are not floating-point numbers, or it cannot differ
+            between worlds.
     """
     if not varies and name not in _FIELDS:
         value: Any = getattr(model, name, None)
@@ -232,7 +233,7 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
     constants = _FIELDS[name]
     if name in _WRAPPED and np.isin(model.wrap_type, _WRAPS).any():
         constants |= _POSES
-    # a scalar becomes a row of one element, so that a task can write the scalar
+    # a scalar becomes an array of one element, so that a task can write it
     shape: tuple[int, ...] = np.shape(getattr(model.opt if name in _OPTIONS else model, name)) or (1,)
     return _described(name, shape, constants)
 
@@ -244,7 +245,7 @@ def _described(name: str, shape: tuple[int, ...], constants: Constants) -> Model
 
 
 MOVED_INERTIA = {"body_ipos", "body_iquat"}
-"""Fields that must be equal in all worlds for "simple" bodies, for which the inertial frame equals the body frame."""
+"""Fields that cannot differ between worlds if a body is "simple", that is, if its inertial frame is its body frame."""
 
 
 def check_simple(model: mujoco.MjModel, name: str) -> None:

@@ -26,9 +26,9 @@ _SCENES_IN_ASSETS = "mujoco/playground/assets/mujoco_playground/_src"
 
 @dataclasses.dataclass(frozen=True)
 class ModelFile:
-    """Model file in an installed package or in a local folder. A task may name it as its ``model``.
+    """Model file in an installed package or in a local folder. The ``model`` of a task may be a ``ModelFile``.
 
-    ``lw.make`` searches for the file, so tasks can be listed on a machine without the file. The functions
+    Only ``lw.make`` searches for the file, so tasks can also be listed on a machine without the file. The functions
     ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model``, ``menagerie_model`` and ``playground_model``
     make a ``ModelFile``.
     """
@@ -84,7 +84,7 @@ class PackageFile(ModelFile):
     install: str
     """The requirement for pip, such as "lyceum-warp[hand]"."""
     before_python: str | None = None
-    """The first Python version without a release of the package, such as "3.13"; None if every version has one."""
+    """The first Python version that the package does not support, such as "3.13"; None if it supports all versions."""
 
     def place(self) -> tuple[Path, str]:
         """Get the folder of models in the package, and the file's path in the folder."""
@@ -199,7 +199,7 @@ def package_model(
         package: The import name of the package.
         file: The path of the file within the package's folder.
         install: The requirement for pip, with an extra or a version; by default the package's name.
-        before_python: The first Python version without a release of the package, such as "3.13".
+        before_python: The first Python version that the package does not support, such as "3.13".
     """
     name = package.replace("_", "-")
     return PackageFile(file, name, package, "", install or name, before_python)

@@ -31,20 +31,20 @@ class OpenLoop:
     """Rolls out an environment's worlds from one or several states under given actions, and stores rewards.
 
     Write ``state`` and ``actions``, call ``run``, and read the other tensors, which are updated in place. Episodes
-    continue to the horizon even after a termination; the caller decides how to treat terminations. The C engine runs
-    the whole horizon in one native call if this is exact and the task has neither ``control`` nor ``substep``, and
-    otherwise step by step. On the Warp engine, the rollout is one graph.
+    continue to the horizon even after a termination; the caller decides how to treat terminations. The C engine
+    simulates the whole horizon in one native call if this gives exactly the same results and if the task has neither
+    ``control`` nor ``substep``; otherwise it simulates step by step. On the Warp engine, the rollout is one graph.
 
     Args:
         env: Environment of the worlds to roll out; do not use it for anything else.
         horizon: Number of steps.
         keys: Keys of the worlds' random streams, (nworld,) uint32 on the environment's device, read at every run. By
             default, each world uses the key in ``state`` and draws the same numbers as with ``env.step``.
-        nominal_model: Whether model fields that differ between worlds take nominal values instead of the values in
-            ``state``.
-        models: Values of model fields that differ between worlds, by name, each (n, size) float64 on the environment's
-            device. Every run reads the values: world w uses row w % n instead of the values in ``state``.
-        states: Number of initial states. Each initial state has nworld / states consecutive worlds.
+        nominal_model: Whether to simulate with the nominal values of model fields that differ between worlds, instead
+            of the values in ``state``.
+        models: Values for model fields that differ between worlds, by name, each (n, size) float64 on the environment's
+            device. World w uses row w % n instead of the values in ``state``. Every run reads the values again.
+        states: Number of initial states. nworld / states consecutive worlds start from each of them.
 
     Raises:
         ValueError: The environment resets its worlds automatically, ``keys`` has the wrong shape, type or device, the
@@ -52,8 +52,8 @@ class OpenLoop:
     """
 
     state: torch.Tensor
-    """The initial state of every world, (state_space.size,) float64; with several initial states, equal to
-    ``states``."""
+    """The initial state of every world, (state_space.size,) float64; the same tensor as ``states`` if there are several
+    initial states."""
     states: torch.Tensor
     """The initial states, (states, state_space.size) float64."""
     actions: torch.Tensor
@@ -108,7 +108,7 @@ class OpenLoop:
             for group, space in env.obs_spaces.items():
                 setattr(self._obs, group, wp.zeros((n, space.size), dtype=float))
             self._no_memory = wp.zeros((rows + n, 0), dtype=float)
-            # one buffer per field holds the states before each step, after each step and at the end
+            # one buffer per field: views of it are the states before each step, after each step and at the end
             self._fields: dict[str, wp.array] = {}
             self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
             if task.shared:
@@ -169,7 +169,7 @@ class OpenLoop:
         )
 
     def _step_by_step(self) -> tuple[Phase, ...]:
-        """List the phases for tasks with ``control`` or ``substep``. Both functions read the state at every call."""
+        """List the phases for tasks with ``control`` or ``substep``, which need the current state at every call."""
         engine, worlds = self.env.engine, self.worlds
         phases = [
             Phase("start", self._start),
@@ -219,7 +219,7 @@ class OpenLoop:
             wp.launch(planning.overwrite, (states.shape[0], row.shape[1]), args, device=self.env.device)
 
     def _transitions(self) -> list[Any]:
-        """Get the batches, parameters and actions of all transitions of the horizon."""
+        """Get the states before and after all transitions of the horizon, the parameters, and the actions."""
         actions = self._actions.reshape((-1, self._actions.shape[2]))
         return [self._before, self._after, self.worlds.params, actions]
 
@@ -234,7 +234,7 @@ class OpenLoop:
             ]
             args = [*self._transitions(), self.worlds.counters, *memories]
             launch_worlds(kernels.advance_rows, n, args, self.env.device)
-        else:  # the task's memory stays constant
+        else:  # the task does not change its memory
             for buffer in self._memories.values():
                 for t in range(self.horizon):
                     wp.copy(buffer[t + 1], buffer[0])

@@ -73,15 +73,15 @@ def _checked_limits(solver: Any) -> dict[str, int]:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhysicsOptions:
-    """Options of the simulation. An option of None keeps the setting of the task or the model.
+    """Options of the simulation. If an option is None, the setting of the task or the model applies.
 
     Raises:
         ValueError: A value is unknown or out of range.
     """
 
     base: str | None = None
-    """Name of a set of options in the task's ``physics``; the other options change this set. "exact" means the options
-    of the task's model."""
+    """Name of a set of options in the task's ``physics``; other options that are given override the set. "exact" means
+    the options of the task's model."""
     frame_skip: int | None = None
     """Substeps in a step."""
     timestep: float | None = None
@@ -94,7 +94,7 @@ class PhysicsOptions:
     """Constraint Jacobian: dense, sparse or auto. The choice of Jacobian affects speed and memory, and affects results
     only by rounding."""
     impratio: float | None = None
-    """Ratio of a contact's stiffness against slip to its stiffness against penetration, for elliptic cones."""
+    """Ratio of a contact's frictional impedance to its normal impedance, for elliptic cones."""
     solver: Mapping[str, int] | None = None
     """Limits of the constraint solver: iterations, ls_iterations (of the line search) and noslip_iterations (0 turns
     the noslip solver off)."""
@@ -166,15 +166,16 @@ class EnvOptions:
     seed: int = 0
     """Seed of the worlds' random streams."""
     first_world: int = 0
-    """Index of the first world, if several processes share a batch. A world's random stream depends on the world's
-    index in the whole batch."""
+    """Index of this environment's first world, if several processes simulate one batch of worlds. A world's random
+    stream depends on the world's index in the whole batch."""
     autoreset: bool = True
     """Whether a world starts its next episode within the step that ends an episode. If False, finished worlds keep
     stepping with ``done`` set until a reset; only worlds with a fault restart at once."""
     horizon: int | None = None
     """Steps after which an episode is truncated, or 0 for no limit; by default the task's horizon."""
     graphs: bool = True
-    """Whether launches are captured as graphs and replayed. Disable graphs for debugging; results are the same."""
+    """Whether kernel launches are captured as graphs and replayed. Results without graphs are the same; turn graphs off
+    to debug."""
     model: ModelSource | None = None
     """File or MjSpec that replaces the task's model."""
     fields: Collection[str] = ()
@@ -183,8 +184,8 @@ class EnvOptions:
     """Model fields that ``env.set_dynamics`` may set in each world, in addition to the fields that the task
     randomizes."""
     physics: PhysicsOptions = PhysicsOptions()
-    """Physics options, or the name of options in the task's ``physics``; "exact" means the options of the task's
-    model."""
+    """Physics options, or the name of a set of options in the task's ``physics``; "exact" means the options of the
+    task's model."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -193,7 +194,7 @@ class EnvOptions:
         check_kind("device", self.device, str | None, "as 'cpu' or 'cuda:0'")
         if not isinstance(self.engine, str) and not callable(self.engine):
             raise ValueError(f"engine must be 'auto', 'mujoco', 'warp' or a callable, not {described(self.engine)}")
-        # an MjModel gets a specific error elsewhere
+        # the binding of the task raises a clearer error for an MjModel
         if self.model is not None and not isinstance(self.model, mujoco.MjModel):
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         object.__setattr__(self, "physics", _physics(self.physics))
@@ -210,7 +211,7 @@ class EnvOptions:
 
         Args:
             words: The keyword arguments.
-            base: The options that keywords change; by default ``EnvOptions()``.
+            base: The options to which the keywords are applied; by default ``EnvOptions()``.
         """
         rest = {name: value for name, value in words.items() if name not in OPTIONS}
         options = {name: value for name, value in words.items() if name in OPTIONS}
@@ -272,7 +273,7 @@ def suggestion(word: str, others: Iterable[str] = ()) -> str:
 
 
 def signature_of_options(function: Callable[..., Any]) -> inspect.Signature:
-    """Make a function's signature that has every option as a keyword in place of ``**words``."""
+    """Make a function's signature with a keyword argument for each option instead of ``**words``."""
     keyword = inspect.Parameter.KEYWORD_ONLY
     options = [
         inspect.Parameter(field.name, keyword, default=field.default, annotation=field.type)

@@ -67,16 +67,16 @@ COUNTERS = ("step", "key", "episode", "done_reason")
 """Counters in a state: steps since the reset, key of the random stream, episode number, bits of ``Done``."""
 
 OWN_PARTS = (*COUNTERS, "metrics", "success_steps")
-"""Parts that an environment adds to MuJoCo's state and the task's memory."""
+"""Parts of a state that come neither from MuJoCo nor from the task's memory."""
 
 
 def action_space(
     model: mujoco.MjModel, action_range: tuple[float, float] | None, actions: Mapping[str, int] | None = None
 ) -> Space:
-    """Make the space of actions from the actuators' controls, with ``action_range`` or the control ranges as bounds.
+    """Make the space of actions: by default controls, bounded by ``action_range`` or by the controls' ranges.
 
-    An actuator may have several controls or none. An actuator without a name gets a name from its index. If the task
-    declares its actions in ``actions``, they are not controls, and have bounds only if ``action_range`` is given.
+    An actuator may have several controls or none. An actuator without a name is named after its index. If the task
+    declares ``actions``, these parts replace the controls, and have bounds only if ``action_range`` is given.
     """
     if actions is not None:
         space = Space.of(actions)
@@ -93,7 +93,7 @@ def _controls(model: mujoco.MjModel) -> dict[str, int]:
     sizes: dict[str, int] = {}
     for i in np.argsort(model.actuator_ctrladr, kind="stable").tolist():
         name = given[i] or f"actuator_{i}"
-        while not given[i] and name in given:  # another actuator already has this name
+        while not given[i] and name in given:  # avoid a name that an actuator has
             name = f"{name}_"
         if model.actuator_ctrlnum[i]:
             sizes[name] = int(model.actuator_ctrlnum[i])

@@ -136,7 +136,7 @@ functions."""
 
 
 RESULTS = ("obs", "ctrl", "metrics", "rng", "sums", "shared")
-"""Arguments that are rows for results; a function may write into these rows."""
+"""Arguments into which a function writes its results; each is one world's row of an array."""
 
 MEMORIES = ("memory", "lasting_memory")
 """Kinds of memory that World declares. Each world has one row of floats per kind."""
@@ -343,8 +343,8 @@ def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
         parameter is recomputed if another parameter changes, unless a value was given explicitly.
 
     Args:
-        function: Function of the MjModel and of an object with parameters as attributes: the parameters with ordinary
-            defaults, and computed parameters that Params declares earlier.
+        function: Function of two arguments: the MjModel, and an object with parameters as attributes. These are the
+            parameters with ordinary defaults, and the computed parameters that Params declares earlier.
     """
     return FromModel(function)
 
@@ -407,10 +407,9 @@ class Task:
     step and a substep. Each function is a ``wp.func``. Structs and functions may also be attributes of the class.
 
     ``World`` lists fields of MjData, such as ``qpos`` and ``site_xpos``, and fields of MjModel, such as ``body_mass``
-    and ``geom_friction``, under MuJoCo's names. Model fields that are written by ``startup``, ``initialize``,
-    ``randomize`` or ``event`` differ between worlds, and belong to the state; all other model fields are the same in
-    all worlds. ``World`` also names the task's memory: ``air_time: Row[float] = lw.memory(4)``, or
-    ``lw.lasting_memory(4)``.
+    and ``geom_friction``, under MuJoCo's names. A model field differs between worlds, and belongs to the state, if
+    ``startup``, ``initialize``, ``randomize`` or ``event`` writes it; all worlds share the other model fields.
+    ``World`` also declares the task's memory: ``air_time: Row[float] = lw.memory(4)``, or ``lw.lasting_memory(4)``.
 
     A default in ``Params`` may name an element of the model, such as ``tip: int = lw.site("tip")``; the functions then
     get the element's index. ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``,
@@ -441,7 +440,7 @@ class Task:
     - ``startup``: model fields and lasting memory. Resets do not change these values.
     - ``substep``: memory and lasting memory. ``advance``: memory and lasting memory of ``s1``.
 
-    ``reject`` gets the initial state before the state settles. While an initial state settles, no ``substep`` runs.
+    ``reject`` is called before the substeps of ``settle``. In these substeps, ``substep`` is not called.
 
     An event runs after the reward and the termination of a step and before the next observation, but not in worlds that
     restart. Open-loop rollouts and planners run no events.
@@ -460,8 +459,8 @@ class Task:
     """Parts of the observation and their sizes, in order, such as ``{"position": 5, "velocity": 6}``; or a static
     method that computes the sizes from the Params. A task may have several groups of observations, such as ``{"policy":
     {"position": 5}, "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy`` (``env.obs``).
-    ``observe_critic`` has the same arguments, and writes the group ``critic``. A task omits ``obs`` if the last
-    argument of ``observe`` is a Warp struct with the defaults ``lw.part(size)``."""
+    ``observe_critic`` has the same arguments, and writes the group ``critic``. Omit ``obs`` if the last argument of
+    ``observe`` is a Warp struct, whose fields have the defaults ``lw.part(size)``."""
     rewards: ClassVar[Mapping[str, float]] = {}
     """Terms of the reward with weights per second, such as ``{"upright": 1.0, "effort": -0.1}``, in place of
     ``reward``. A term is a function of the module that returns a float. The arguments of a term are found by name:
@@ -471,11 +470,11 @@ class Task:
     source."""
     terminations: ClassVar[tuple[str, ...]] = ()
     """Names of functions that end the episode if any of them returns True, in place of ``terminated``. The functions
-    may take ``s``, ``p`` and the named arguments of terms. Each function is also a metric: 1 if it returns True after
-    the step, otherwise 0."""
+    may take the arguments ``s`` and ``p``, and arguments that are found by name, as in terms. Each function is also a
+    metric, which is 1 if the function returns True after the step, and otherwise 0."""
     metrics: ClassVar[tuple[str, ...]] = ()
-    """Names of the metrics that ``measure`` writes. Without ``measure``, each name is a function that takes the
-    arguments of terms and returns a float or a bool."""
+    """Names of the metrics that ``measure`` writes. If the task has no ``measure``, each name is a function with the
+    arguments of a term that returns a float or a bool."""
     horizon: ClassVar[int] = 1000
     """Number of steps after which an episode is truncated; 0 means never."""
     success_steps: ClassVar[int] = 1
@@ -485,30 +484,31 @@ class Task:
     """Fields that keep the values left by ``mj_step``. These values lag one substep behind the state, as in some
     Gymnasium tasks."""
     cleared: ClassVar[tuple[str, ...]] = ()
-    """Fields of the last substep, such as contact forces, which a reset must clear before ``initialize`` runs. If
-    ``cleared`` does not list such fields, a forward pass computes them in the worlds that restart."""
+    """Fields of the last substep, such as contact forces, which a reset must clear before ``initialize`` runs. For all
+    other fields of the last substep, a forward pass computes the values in the worlds that restart."""
     actions: ClassVar[Mapping[str, int | str] | None] = None
     """Parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls; ``control``
-    then converts actions to inputs. A size may be the name of a table in Params with one row per number. If ``actions``
-    is None, an action has one number for each control."""
+    then converts actions to inputs. A size may be the name of a table in Params; the part then has one number per row
+    of the table. If ``actions`` is None, an action has one number for each control."""
     action_range: ClassVar[tuple[float, float] | None] = None
     """The range of actions. The default ``control`` scales this range to the model's control ranges. If
-    ``action_range`` is None, actions are controls, or are unbounded if the task has ``actions``."""
+    ``action_range`` is None, actions are not scaled; they are unbounded if the task declares ``actions``."""
     keyframe: ClassVar[str | None] = None
     """Name of the model's keyframe to which ``reset`` sets the state before ``initialize``; None means ``qpos0``."""
     draws: ClassVar[int] = 10
-    """Maximum number of initial states that a reset draws while ``reject`` returns True; a reset keeps the last
-    draw."""
+    """Maximum number of initial states that a reset draws until ``reject`` accepts one. If none is accepted, the reset
+    uses the last."""
     settle: ClassVar[int] = 0
-    """Number of substeps in which an initial state settles, under its own controls and without ``substep``, before the
-    first observation of the episode. The episode's time starts at 0 after settling."""
+    """Number of substeps that are simulated from an initial state before the first observation of the episode, so that
+    the objects come to rest. They use the initial state's controls, and do not call ``substep``. The episode's time
+    starts at 0 after these substeps."""
     gymnasium: ClassVar[str | None] = None
     """Id of the Gymnasium environment that the task reimplements, such as "Hopper-v5"; None without such an
     environment. Model, observation, reward, termination, reset and parameters are the same. Subclasses do not inherit
     this attribute."""
     trace: ClassVar[str | None] = None
-    """Name of a site or body. For a planner's samples, the viewer draws the path of this site or body. If None, the
-    viewer draws the centre of mass of a robot with a floating base, or the end of an arm."""
+    """Name of a site or body. For a planner's samples, the viewer draws the path of this site or body. If None, it
+    draws the path of the centre of mass if the robot has a floating base, or else of the end of the arm."""
     mirror: ClassVar[Any] = None
     """The task's mirror image, for learning symmetric policies: ``lw.Mirror(...)``, or a static method ``mirror(model,
     p)`` that returns an ``lw.Mirror``. None means that the task has no mirror image."""
@@ -520,7 +520,7 @@ class Task:
     training: ClassVar[Training] = Training()
     """The task's settings for ``lyceum-warp train``, such as ``lw.Training(algorithm="ppo", settings={...})``."""
 
-    # the World, the Params and the Warp functions that the module had when the class was defined
+    # World, Params and the Warp functions of the task's module, as they were when the class was defined
     scope: ClassVar[dict[str, Any]]
 
     @staticmethod

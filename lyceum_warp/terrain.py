@@ -13,8 +13,8 @@ from lyceum_warp.task import from_model
 
 Shape = Callable[[np.ndarray, np.ndarray, float, np.random.Generator], np.ndarray]
 """Function ``shape(x, y, amount, rng)`` that returns the heights of a square patch. ``x`` and ``y`` are the coordinates
-of the points relative to the patch's centre. All three arrays are (n, n), in m. The outline of a patch is set to 0
-afterwards, so that patches meet without a step."""
+of the points relative to the patch's centre. The heights and both coordinates are arrays (n, n), in m. The outline of a
+patch is set to 0 afterwards, so that patches meet without a step."""
 
 _PLATFORM = 1.0
 """Half the side of the flat square at the centre of a patch, in m."""
@@ -24,7 +24,7 @@ _BASE = 1.0
 
 
 def _inwards(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Compute the distance of points from the outline of a patch, in m, clipped to the distance of the platform."""
+    """Compute the distance of points from the outline of a patch, in m, at most the distance of the flat platform."""
     half = float(x.max())
     return np.clip(half - np.maximum(abs(x), abs(y)), 0.0, max(half - _PLATFORM, 0.0))
 
@@ -83,7 +83,7 @@ _KINDS: dict[str, tuple[Shape, float]] = {
     "stairs_up": (_stairs, -0.2), "stairs_down": (_stairs, 0.2),
     "steps": (_steps, 0.2), "rough": (_rough, 0.08), "waves": (_waves, 0.2), "stones": (_stones, 0.4),
 }  # fmt: skip
-"""Shapes of patches, each with the size (``amount``) at difficulty 1."""
+"""Shapes of patches by kind, each with the value of ``amount`` at difficulty 1."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,8 +183,9 @@ class Terrain:
         """Add the ground to a model in place of the world's plane.
 
         The plane becomes the height field and keeps its name, friction and material; without a plane, the model gets a
-        geom ``name``. The plane's position becomes a corner between patches in the middle of the field, so a robot that
-        stood on the plane stands on the field. The model's extent, on which cameras depend, does not change.
+        geom ``name``. The plane's position becomes a corner between patches in the middle of the field. Corners have
+        height 0, so a robot that stood on the plane stands on the field. The model's extent, on which cameras depend,
+        does not change.
 
         Args:
             spec: The model, which is changed in place, for example in a task's ``edit_model``.

@@ -34,7 +34,7 @@ from lyceum_warp.viz.video import check_video
 log = logging.getLogger(__name__)
 
 Callback = Callable[[Any], Any]
-"""Function that is called with an iteration's statistics, an ``Iteration`` of the algorithm."""
+"""Function that is called with an iteration's statistics, an object of the algorithm's ``Iteration`` class."""
 
 
 class Display:
@@ -78,8 +78,8 @@ def train(
     """Train a learner, and write metrics, policies and checkpoints into a run folder, as ``lyceum-warp train`` does.
 
     The call ``lw.load(folder)`` returns the last policy, and ``lw.load(folder, which="best")`` returns the policy with
-    the best return. The return is ``mean_return`` if the learner evaluates the mean policy. Without evaluations, the
-    return is ``return_mean`` over the iteration's episodes, which the policy sampled before the update.
+    the best return. This return is ``mean_return`` if the learner evaluates the mean policy. Otherwise, it is
+    ``return_mean`` of the iteration's episodes, which were sampled by the policy before the update.
 
     The policy and the complete state are saved at the start, at the end, and every 30 s, or more often if saving takes
     at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run resumes from the last save and produces the
@@ -92,7 +92,7 @@ def train(
         iterations: Total number of iterations, including iterations before resuming.
         callback: Function of an iteration, called after the iteration's row was written. Training ends if the callback
             returns True. If the callback raises an error, the run is saved and the error is raised again.
-        target_return: Return at which training ends, compared with the return that selects the best policy.
+        target_return: Training ends when the return that selects the best policy reaches this number.
         minutes: Time limit; training ends after the iteration that exceeds the limit. A limit of None means no limit.
         keep_every: Iterations between two policies that are saved in numbered files; 0 saves none.
         save_every: Iterations between two saves; 0 to save by time.
@@ -102,9 +102,10 @@ def train(
         camera: Camera of the videos: a camera of the model by name or index, a ``viz.cameras.FreeCamera``, or "free"
             for MuJoCo's default free camera.
         transfer: Whether to judge the policy's transfer at the end with ``lw.transfer``, and to write ``transfer.json``
-            into the folder. By default, only comparisons of a few seconds run: the C engine after training on a GPU,
-            and the task's exact physics after training with different physics options. ``transfer=True`` adds
-            comparisons with each of the task's physics options and, after training on CPU cores, with the Warp engine.
+            into the folder. By default, only comparisons that take seconds are made: with the C engine, after training
+            on a GPU; and with the task's exact physics, after training with different physics options.
+            ``transfer=True`` adds comparisons with each set of physics options that the task defines and, after
+            training on CPU cores, with the Warp engine.
         resume: Whether to continue the run in the folder. To resume, make the learner with the same arguments as
             before.
         take_over: Whether to continue a run that another process has locked, on the same or another host. The locking
@@ -122,7 +123,7 @@ def train(
         NoVideoError: ``video_every`` is given, but the extra ``viz`` is not installed.
         OSError: The folder cannot be written; the run can be resumed from the last save later.
         FloatingPointError: An update of the learner is not finite.
-        Interrupted: With several ranks, one rank received a signal.
+        Interrupted: A rank received a signal, and there are several ranks.
     """
     check_kind("learner", learner, Learner, "as lw.NPG(env)")
     check_kind("folder", folder, str | Path, "as 'runs/mine'")
@@ -188,11 +189,12 @@ def train(
 
 
 _PAIRS = 64
-"""Number of pairs of episodes for the transfer verdict at the end of training."""
+"""Number of episodes, each played under both settings, from which the transfer verdict at the end of training is
+computed."""
 
 
 def _judge_transfer(run: Run, learner: Learner, wanted: bool | None, display: Display) -> None:
-    """Write the policy's transfer verdict into the run if requested, or if the comparison takes only seconds."""
+    """Judge the policy's transfer and write ``transfer.json``, if requested or if the comparison takes only seconds."""
     env, exact = learner.env, task_physics(learner.env)[1] == EXACT
     on_gpu = env.device.is_cuda and env.engine.name == "warp"
     if wanted is False or (wanted is None and exact and not on_gpu):
@@ -271,7 +273,7 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
         text = " ".join(str(error).split())
         raise ValueError(f"{run.checkpoint} does not fit the run's configuration: {text}") from error
     if learner.team.leads:
-        cut_rows(run.metrics, done)  # a killed run may have written rows of unsaved iterations
+        cut_rows(run.metrics, done)  # delete rows of iterations that a killed run did not save
         now = versions(run.config["device"])
         then = run.config.get("versions", now)  # runs of earlier releases have no versions in config.json
         if changed := {name: value for name, value in now.items() if then.get(name) != value}:

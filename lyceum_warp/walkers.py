@@ -1,7 +1,7 @@
 """Compute the tables of a walking robot from its compiled model, and prepare models for walking.
 
-Functions with the arguments ``(model, p)`` are for ``lw.from_model``; ``p`` has the parameters ``joints`` and ``feet``,
-which are indices of joints and of sites. The base is the body of the first joint, which must be a free joint.
+Functions with the arguments ``(model, p)`` are for ``lw.from_model``. The parameters ``p.joints`` and ``p.feet`` are
+the indices of the joints and of the feet's sites. The base is the body of the first joint, which must be a free joint.
 """
 
 import functools
@@ -63,7 +63,7 @@ def servos(model: mujoco.MjModel, p: Any) -> list[int]:
 
 
 def controls(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the index of each joint's servo in ``ctrl``, (joints,)."""
+    """Get the index in ``ctrl`` of each joint's servo, (joints,)."""
     return model.actuator_ctrladr[servos(model, p)]
 
 
@@ -108,7 +108,7 @@ def home_height(model: mujoco.MjModel, p: Any) -> float:
 
 
 def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
-    """Collect the names, gains and poses with which a robot runs a velocity policy, for ``lw.Task.deployment``.
+    """Collect the names, gains and poses that a robot needs to run a velocity policy, for ``lw.Task.deployment``.
 
     All lists are in the order of ``joints``.
     """
@@ -137,8 +137,8 @@ def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
 def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
     """Make the mirror image of a velocity task in the plane y = 0 of the base, for ``lw.Task.mirror``.
 
-    With all joints at 0, the position and the axis of a joint must mirror the position and the axis of its partner. The
-    partner is the joint on the other side, or the joint itself. The masses of the robot need not be symmetric.
+    The partner of a joint is the corresponding joint on the other side, or the joint itself. With all joints at 0, the
+    positions and axes of two partners must be mirror images. The masses of the robot need not be symmetric.
 
     Raises:
         ValueError: A joint or a foot has no partner, or the default pose or the scale of actions is not symmetric.
@@ -174,7 +174,7 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
     found: dict[str, Any] = {
         "linear_velocity": flip, "angular_velocity": spin, "gravity": flip, "command": (1.0, -1.0, -1.0),
         **dict.fromkeys(("joint_position", "joint_velocity", "last_action"), joints),
-        "clock": (-1.0, -1.0),  # the feet are half a cycle apart
+        "clock": (-1.0, -1.0),  # left and right are half a cycle apart, so mirroring shifts the clock by half a cycle
         **dict.fromkeys(("foot_height", "foot_air_time", "foot_contact"), feet), "foot_force": vectors,
         # qpos and qvel also contain joints that the task does not use
         "qpos": ([*range(7), *(partner[hinges] + 6)], [*flip, 1.0, *spin, *sign[hinges]]),
@@ -232,7 +232,7 @@ def foot_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Compute spheres for each foot; they touch a plane if and only if the foot touches the plane.
+    """Compute spheres that replace each foot: they touch a plane if and only if the foot does.
 
     The result has the shape (feet, most spheres, 4), and contains centres and radii, in m. Centres are relative to the
     foot's last joint. A capsule becomes spheres at both ends, a box becomes spheres at its corners, and any other geom
@@ -252,7 +252,7 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
         found[:, :3] -= data.xanchor[_last_joint(model, foot)]
         spheres.append(found)
     most = max(map(len, spheres))
-    return np.array([np.resize(found, (most, 4)) for found in spheres])  # if a foot has fewer spheres, repeat them
+    return np.array([np.resize(found, (most, 4)) for found in spheres])  # repeat the spheres of feet that have fewer
 
 
 def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
@@ -371,7 +371,7 @@ def prepare_walker(
     timestep: float | None = None,
     iterations: tuple[int, int] | None = None,
 ) -> None:
-    """Prepare a model for a velocity task: add force sensors to the feet, and let the feet determine the friction.
+    """Prepare a model for a velocity task: add force sensors to the feet, and ignore the friction of the ground.
 
     The model's own sensors are removed, because sensors cost time and the task reads none of the model's sensors. Geoms
     of the feet get priority in contacts, so that the feet's randomized friction applies. Ordinary contacts replace
@@ -419,8 +419,8 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
 
     Args:
         spec: The model.
-        feet: For each new site, by its name, an element and a position: the name of the site's body (or of one of the
-            body's joints or geoms), and the site's position in this body, in m.
+        feet: The new sites: a pair for each site's name. The pair consists of the name of a body (or of one of its
+            joints or geoms) and the site's position in this body, in m.
 
     Raises:
         ValueError: The model has no element of this name.
@@ -437,7 +437,7 @@ def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0
     """Turn joints' motors into position servos in place; existing servos do not change.
 
     The servo's force limit does not change. A servo reaches the limit at a position error of ``reach`` rad, so kp =
-    limit / reach. The servo is critically damped for the joint's inertia M at ``qpos0``, so kp + kd s + M s^2 has a
+    limit / reach. The servo is critically damped for the joint's inertia M at ``qpos0``, so M s^2 + kd s + kp has a
     double root.
 
     Args:

@@ -28,7 +28,7 @@ def own_bytes_per_world(task: BoundTask) -> int:
 
 
 def own_parts(task: BoundTask) -> dict[str, int]:
-    """Compute the sizes of the parts that ``Worlds`` adds to a state, except the counters."""
+    """Compute the sizes of the parts that ``Worlds`` adds to the engine's state, without the counters."""
     form, found = task.task, dict[str, int]()
     for layout in task.memory.values():
         found |= sizes(layout)
@@ -47,7 +47,7 @@ class WorldArrays:
 
     Args:
         task: The task with its model and parameters.
-        engine: The physics engine, with the task's fields.
+        engine: The physics engine, which has arrays of the fields that the task reads.
     """
 
     def __init__(self, task: BoundTask, engine: Engine) -> None:
@@ -62,7 +62,7 @@ class WorldArrays:
         self.state_view = torch_view(self.state)
 
     def _allocate_fields(self) -> None:
-        """Allocate the fields of the states before and after a step, and the task's memory."""
+        """Allocate the fields before and after a step, and the task's memory."""
         n, model, task, kernels = self.nworld, self.task.model, self.task.task, self.task.kernels
         self.memory, self.lasting_memory, self._lasting_before = (
             wp.zeros((n, sum(sizes(self.task.memory[name]).values())), dtype=float)
@@ -106,7 +106,7 @@ class WorldArrays:
         layouts = self.task.shared
         shared, sums = (sum(sizes(layouts.get(name, {})).values()) for name in ("Shared", "Sums"))
         self.shared, self.sums = wp.zeros((1, shared), dtype=float), wp.zeros(sums, dtype=wp.int64)
-        """Shared memory (1, size) and sums in units of 1 / ``kernels.steps.UNIT`` (size of Sums,)."""
+        """Shared memory, (1, size of Shared), and sums in units of 1 / ``kernels.steps.UNIT``, (size of Sums,)."""
         self._shares = wp.zeros((self.nworld, sums), dtype=float)
         if layouts:
             for batch in (self.after, self.before):
@@ -172,13 +172,13 @@ class WorldArrays:
         self._rejected = wp.zeros(n, dtype=bool)
         """Worlds with a rejected initial state, which is drawn again."""
         self._continuing = wp.zeros(n, dtype=bool)
-        """Worlds that ran events instead of restarting."""
+        """Worlds that did not restart after the last step, and therefore ran the task's events."""
         self._physics_changed = wp.zeros(n, dtype=bool)
         """Worlds in which an event of the last step changed the physics."""
         self._changed = wp.zeros(n, dtype=bool)
         """Worlds in which an event of the last step changed the physics or the task's memory."""
         self._outdated = wp.zeros(n, dtype=bool)
-        """Worlds that restarted, or that events changed, since the last observation."""
+        """Worlds that need a new observation, because they restarted or were changed by an event."""
         self.mask_view, self.changed_view = torch_view(self.mask), torch_view(self._changed)
         self.terminated_view = torch_view(self._found.terminated)
 
@@ -196,7 +196,7 @@ class WorldArrays:
             self.mask_view.copy_(mask)
 
     def pack_state(self, ended: wp.array) -> None:
-        """Write every world's state vector into ``state``; its part ``done_reason`` is ``ended``, (nworld,)."""
+        """Write every world's state vector into ``state``; the part ``done_reason`` is copied from ``ended``."""
         size = self.engine.state_size
         self.engine.get_state(self.state[:, :size])
         own = self.counters
@@ -212,7 +212,7 @@ class WorldArrays:
             launch_rows(state.narrow, self.mask, columns, array)
 
     def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
-        """Yield the arrays of ``own_parts``, each with its columns in the state."""
+        """Yield a pair for each of ``own_parts``: the part's array, and its columns in the states."""
         columns = memory_columns(self.task, self.state_space)
         columns |= {name: self.state_space.parts[name] for name in own_parts(self.task) if name in OWN_PARTS}
         arrays = {"metrics": self.metric_sums, "success_steps": self.success_counts}
@@ -220,7 +220,7 @@ class WorldArrays:
             yield arrays[name] if name in arrays else getattr(self, name), self.state[:, place]
 
     def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
-        """Read the masked worlds' counters from the state columns that follow the engine's columns."""
+        """Set the masked worlds' counters from ``columns``, the state columns after those of the engine."""
         own = self.counters
         counters = [mask, columns, own.step, own.key, own.episode, self.outcome.done_reason]
         wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)

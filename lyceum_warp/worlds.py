@@ -28,7 +28,7 @@ from lyceum_warp.world_arrays import WorldArrays
 
 @dataclasses.dataclass(frozen=True)
 class Programs:
-    """Phases of an environment as callables, for one combination of horizon, autoreset and graphs."""
+    """The programs of an environment: its phases as callables, for one combination of horizon, autoreset and graphs."""
 
     graphs: Graphs
     step: Calls
@@ -41,11 +41,12 @@ class Programs:
 class Worlds(WorldArrays):
     """Many worlds of one task on one engine: arrays at fixed addresses, and phases that process the arrays.
 
-    Every phase must launch the same kernels on the same arrays each time, because graphs replay the phase.
+    Every phase must launch the same kernels on the same arrays each time, because a captured graph repeats these
+    launches.
 
     Args:
         task: The task with its model and parameters.
-        engine: The physics engine, with the task's fields.
+        engine: The physics engine, which has arrays of the fields that the task reads.
         options: Options of the environment.
     """
 
@@ -83,7 +84,7 @@ class Worlds(WorldArrays):
         del self.programs, self.step
 
     def _make_workers(self) -> Workers | None:
-        """Make worker threads for launches around the engine's calls; None if only the caller's thread launches."""
+        """Make worker threads for launches before and after engine calls; None if one thread suffices."""
         # Warp's kernels in debug mode are not thread-safe
         if not self.device.is_cpu or self.engine.capturable or wp.config.mode == "debug":
             return None
@@ -104,7 +105,7 @@ class Worlds(WorldArrays):
         ]
 
     def _phases_of_a_graph(self) -> list[Phase]:
-        """List the phases of a step as a single graph, which skips phases without any world to change."""
+        """List the phases of a step for a single graph, whose replay skips a phase if no world needs it."""
         if not self.engine.capturable:
             return self.step_phases()
         restart = self._restart_phases(self.restarting, randomly=True)
@@ -141,7 +142,7 @@ class Worlds(WorldArrays):
         ]
 
     def _tally_phases(self) -> list[Phase]:
-        """Add up the task's sums over all worlds in one thread, as atomic additions on a CPU require."""
+        """List the phase that adds up the task's sums; on a CPU, atomic additions require a single thread."""
         kernel = self.task.kernels.tally_worlds if self.autoreset else None
         return [] if kernel is None else [Phase("tally", partial(self._tally, kernel))]
 
@@ -189,7 +190,7 @@ class Worlds(WorldArrays):
         return phases
 
     def _observe_phases(self) -> list[Phase]:
-        """List the phases that observe the worlds that have changed since the transition was evaluated."""
+        """List the phases that again observe the worlds that have changed since the transition was evaluated."""
         changed = self.restarting if self.task.kernels.run_events is None else self._outdated
         return [Phase("observe", partial(self._observe, changed), by_world=True)]
 
@@ -212,10 +213,10 @@ class Worlds(WorldArrays):
         ]
 
     def rehearsal(self) -> None:
-        """Run every phase that consists of launches once, so that ``compile_ahead`` can list the kernels."""
+        """Run once every phase that only launches kernels, so that ``compile_ahead`` can list the kernels."""
         self.seed_streams(0)
-        # two substeps suffice, because all substeps but the first are equal, and listing one takes the Warp engine
-        # milliseconds
+        # two substeps suffice, because all substeps after the first are equal; with the Warp engine, each additional
+        # substep would take milliseconds
         step = self.step_phases(min(self.task.frame_skip, 2))
         phases = (*self.reset_phases(randomly=True), *step, *self.read_phases(), *self.restore_phases())
         for phase in phases:
@@ -306,10 +307,10 @@ class Worlds(WorldArrays):
             launch_rows(state.fill_rows, mask, flat(self.engine.nominal[name])[0], flat(self.engine.arrays[name]))
 
     def _redraw(self, kernel: wp.Kernel, mask: wp.array) -> None:
-        """Redraw the masked worlds' initial states while the task rejects the states."""
+        """Draw new initial states for the masked worlds whose initial state the task rejects."""
         wp.copy(self._rejected, mask)
         for _ in range(self.task.task.draws - 1):
-            # reading the mask would wait for the GPU, so a GPU runs all launches, even with an empty mask
+            # on a GPU, reading the mask would wait for the device, so all launches run, even if the mask is empty
             if not self.engine.capturable and not self._rejected.numpy().any():
                 return
             self.engine.refresh(self._rejected)
@@ -337,13 +338,13 @@ class Worlds(WorldArrays):
         self.engine.commit(self._physics_changed, state_fields)
 
     def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
-        """Mark the continuing worlds in which a field has changed; ``physics`` is False for the task's memory."""
+        """Mark worlds in which an event changed a field; ``physics`` is False if the field is the task's memory."""
         found = [self._physics_changed, self._changed, self._outdated]
         args = [self._continuing, flat(before), flat(after), physics, *found]
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
 
     def _observe(self, mask: wp.array) -> None:
-        """Observe the masked worlds; the evaluation of the transition has already observed all other worlds."""
+        """Observe the masked worlds; other worlds were already observed when the transition was evaluated."""
         kernels, finite, parts = self.task.kernels, self._finite_obs, self._observing
         args = [mask, self.after, self.params, self.counters, self.final_obs, finite, self.obs, parts]
         launch_parts(kernels.observe_worlds, parts, self.nworld, args, self.device)
@@ -352,22 +353,23 @@ class Worlds(WorldArrays):
             launch_lanes(kernels.replace_observations, self.nworld, args, self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
-        """Compute observations, evaluations and terminations of the masked worlds' states, without a transition."""
-        # a state that was set without a check may be invalid; a world with a fault keeps the last valid observation
+        """Compute observations, evaluations and terminations of the masked worlds' states, which need no transition."""
+        # states that were set without a check may be invalid: find faults, so that such a world keeps its last valid
+        # observation
         self.engine.find_faults(self.mask)
         keep_reason = keep_reason and not self.autoreset
         self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)
 
     def _read_state(self) -> None:
-        # done_reason is part of a state only without automatic resets, and otherwise lasts for one step
+        # with automatic resets, done_reason describes only the last step, so states contain 0 instead
         self.pack_state(self._no_fault if self.autoreset else self.outcome.done_reason)
 
-    # for environments and rollouts
+    # called by Env and OpenLoop
 
     def judge_transition(self, action: torch.Tensor) -> None:
         """Evaluate the transition from ``before`` to the current state under given actions, ignoring engine faults."""
         torch_view(self.safe_action).copy_(action)
-        self._judged.zero_()  # will contain the transition's faults
+        self._judged.zero_()  # the evaluation writes the transition's faults here
         self._judge(self.everyone, self._judged, self._no_fault, transition=True)
 
     def seed_streams(self, seed: int) -> None:
@@ -384,7 +386,7 @@ class Worlds(WorldArrays):
             self.engine.apply_model(self.mask)
 
     def update_shared(self) -> None:
-        """From the sums, update the memory that all worlds share; then clear the sums, and observe the worlds again."""
+        """Update the shared memory from the sums, clear the sums, and observe all worlds again."""
         if (kernel := self.task.kernels.share_memory) is not None:
             launch_worlds(kernel, 1, [self.sums, self._shares, self.params, self.shared], self.device)
             self._observe(self.everyone)

@@ -29,7 +29,8 @@ ParamWords = Annotated[
 Trust = Annotated[
     bool,
     tyro.conf.arg(
-        help="Trust a run from elsewhere, now and later: allow it to run its task and to read the files that it names.",
+        help="Trust a run that you did not make on this machine. From now on, commands may execute the run's task and "
+        "read the files that the run names.",
     ),
 ]
 """Declare the flag --trust; see ``lyceum_warp.runs.trust``."""
@@ -59,24 +60,24 @@ _UNIONS = (UnionType, type(typing.Union[int, str]))  # noqa: UP007 (the type of 
 
 @typing.dataclass_transform(kw_only_default=True, frozen_default=True)
 class OptionFlags:
-    """Base class that adds the fields of dataclasses to its subclass as flags, with their docstrings as help text.
+    """Base class of groups of flags: a field of a given dataclass becomes a flag, and its docstring the help text.
 
-    The subclass itself declares fields that need a different type or help text on the command line, and all fields with
-    union types. Values are validated when the options are made, because the parser would print errors in a multi-line
-    box.
+    A field must be declared in the subclass itself if its type is a union, or if its type or help text differs on the
+    command line. Values are validated when the options are made; if the parser validated them, it would print errors in
+    a multi-line box.
 
     Args:
         options: The dataclasses. If several dataclasses have the same field, the first one determines its type and help
             text.
-        omit: Names of fields that get no flag.
-        default: Text that describes the default in the help, for all flags or by field name. With a text, flags default
-            to None. Without a text, flags have the dataclass's defaults.
+        omit: Names of fields without a flag.
+        default: Text that describes the default in the help, for all flags or by field name. If a text is given, flags
+            default to None; otherwise, flags have the dataclass's defaults.
     """
 
     def __init_subclass__(
         cls, *, options: Sequence[type] = (), omit: Collection[str] = (), default: str | Mapping[str, str] | None = None
     ) -> None:
-        if not options:  # the help shows subclasses with fewer flags
+        if not options:  # a subclass of a subclass, which omits flags from the help
             return
         own = dict(vars(cls).get("__annotations__", {}))
         flags: dict[str, Any] = {}
@@ -90,7 +91,7 @@ class OptionFlags:
                     setattr(cls, name, field.default if default is None else None)
                 value = getattr(cls, name)
                 flag = own.pop(name, None) or hints[name]
-                if value is None and flag is hints[name]:  # flags do not accept None, which the first sentence explains
+                if value is None and flag is hints[name]:  # the word None is not accepted; to get None, omit the flag
                     (kind_of_flag,) = {*(typing.get_args(flag) if isinstance(flag, _UNIONS) else [flag])} - {type(None)}
                     flag = Annotated[kind_of_flag | None, tyro.conf.DisallowNone]
                 text = default[name] if isinstance(default, Mapping) else default or ""
@@ -101,7 +102,7 @@ class OptionFlags:
 
 
 def given(flags: Any) -> dict[str, Any]:
-    """Return the flags that were changed from their defaults, as a dict of values by name.
+    """Return the values, by name, of all flags that differ from their defaults.
 
     Raises:
         ValueError: A limit of the solver is not of the form NAME=VALUE.
@@ -132,16 +133,16 @@ class EnvFlags(OptionFlags, options=[EnvOptions], omit=NO_FLAGS, default=""):
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto (the default): warp on a CUDA device and mujoco on the CPU."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu (the default), or a CUDA device such as cuda:0. Without this flag, a run with the engine auto is evaluated on
-    the CPU, where a few worlds step fastest."""
+    """cpu (the default), or a CUDA device such as cuda:0. By default, the policy is evaluated on the CPU if the run's
+    engine is auto, because a few worlds step fastest there."""
 
 
 class Physics(OptionFlags, options=[PhysicsOptions], omit=["base"], default=""):
     """Physics options of the worlds. The defaults come from the run, the task or its model."""
 
     physics: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """One of the task's physics by name, as listed by lyceum-warp tasks, or exact for the task's own
-    physics. Flags of single physics options override it."""
+    """The name of a set of physics options that the task defines (see lyceum-warp tasks), or exact for the task's
+    default physics. Flags of single options, such as --integrator, override the set."""
     solver: Repeated = ()
     """A limit of the constraint solver, such as iterations=4, ls_iterations=10 or noslip_iterations=0; may be repeated.
     The default limits come from the model."""
@@ -152,11 +153,12 @@ def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str]
 
     Args:
         texts: The strings, each NAME=VALUE.
-        command: The command's arguments; if a parameter's name is an option, the error names the option's flag.
-        instead: Flags of options that have a different name in this command.
+        command: The command's arguments. If a name in the strings is an option instead of a parameter, the error names
+            the option's flag.
+        instead: For options whose flag has a different name in this command: the flag, by the option's name.
 
     Raises:
-        ValueError: A string is not of the form NAME=VALUE, or sets an option.
+        ValueError: A string is not of the form NAME=VALUE, or NAME is an option instead of a parameter.
     """
     found: dict[str, Any] = {}
     for text in texts:

@@ -52,7 +52,7 @@ class Display(training.Display):
 
     @contextlib.contextmanager
     def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
-        """Print the task, its worlds and the run folder, and show the bar within the context."""
+        """Print the task, its worlds and the run folder, and show a progress bar until the context ends."""
         env, size = learner.env, learner.team.size
         processes = f" each in {size} processes" if size > 1 else ""
         self.console.print(
@@ -130,13 +130,13 @@ _COLUMNS = [
 
 
 def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omit: Sequence[str] = ()) -> Table:
-    """Make a table that fits the console's width: wrap words in the first column, then omit columns.
+    """Make a table that fits the console's width: wrap text in the first column and, if necessary, omit columns.
 
     Args:
         console: The output.
-        columns: The cells of each column, by its heading. The first column may hold words; all other columns hold
+        columns: The cells of each column, by its heading. The first column may contain text; all other columns contain
             numbers.
-        omit: Headings of the columns that may be omitted, the first one first.
+        omit: Headings of the columns that may be omitted, in the order in which they are omitted.
     """
     table = Table()
     for count in range(len(omit) + 1):
@@ -157,7 +157,7 @@ def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omi
 
 
 def curve_table(rows: list[dict[str, float | None]], console: Console) -> Table:
-    """Make a table of at most 15 iterations of a run, without empty columns and columns that do not fit the console.
+    """Make a table of at most 15 iterations of a run; omit empty columns and columns that do not fit the console.
 
     Iterations that did not evaluate the mean policy are omitted if at least 4 others remain between the first and last.
     """
@@ -192,7 +192,7 @@ def _known(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
-    """Call a function that writes a file; return the path, or "none" with the reason for a failure.
+    """Call a function that writes a file, and return the path; if the function fails, return "none" and the reason.
 
     Plots and videos are made from saved results, so the command succeeds even if one of them fails.
     """
@@ -208,8 +208,8 @@ def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
 class PlanDisplay:
     """Shows the progress of a planner's episode: a live line on a terminal, and a line at the end of the episode.
 
-    With ``real_time``, the live line shows the rate of plans and the age of the action. Otherwise it shows the rate of
-    the plant. Rates are averaged over the episode so far.
+    If ``real_time`` is True, the live line shows the number of plans per second and the age of the action. Otherwise,
+    it shows the number of steps per second. Both numbers are means over the episode so far.
     """
 
     def __init__(
@@ -253,7 +253,7 @@ class PlanDisplay:
 
 
 def report_table(report: ControlReport, *, success: bool = True) -> Table:
-    """Make the table of a controller's report; a report without ``success`` has no such row."""
+    """Make the table of a controller's report; ``success`` is False to omit the row "success"."""
     table = Table(box=rich.box.SIMPLE, show_header=False)
     for row in report.rows():
         if success or row[0] != "success":

@@ -57,8 +57,9 @@ class Eval:
     which: str = "last"
     """The policy to evaluate: last, best, or the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """A task, by name or file, to use instead of the run's task, with its own physics and defaults. It may be the
-    current version of the run's task. The observations and actions of both tasks must have the same sizes."""
+    """The name or file of a task to use instead of the run's task, such as the current version of the run's task.
+    Physics and parameters then come from this task, not from the run. The observations and actions of both tasks must
+    have the same sizes."""
     param: ParamWords = ()
     episodes: int = 32
     """Number of episodes."""
@@ -70,8 +71,9 @@ class Eval:
     """Whether to write a video of one episode: eval.mp4 in the run's folder, or TASK.mp4 with --pretrained."""
     camera: CameraWords = ()
     transfer: bool = False
-    """Whether to play the episodes on both engines and under each of the task's physics. The command then prints the
-    differences and a verdict. The Warp engine runs on --device, by default on a GPU if there is one."""
+    """Whether to play the episodes on both engines and under each set of physics options that the task defines. The
+    command then prints the differences and a verdict. The Warp engine runs on --device, by default on a GPU if there is
+    one."""
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder for the episodes, one file each, in the format of lyceum-warp plan: episode-000.npz and so
     on."""
@@ -169,11 +171,12 @@ def run_worlds(
 
     Args:
         run: The run.
-        words: Options that override the run's options; with the engine auto and no device, the worlds run on the CPU.
+        words: Options that override the run's options. If the engine is auto and no device is given, the worlds run on
+            the CPU.
         params: Parameters that override the run's parameters.
         nworld: Number of worlds.
-        task: A different task, with its own options and parameters.
-        trust: Whether to execute a run's task although this user did not make the run on this machine.
+        task: A different task to use, with this task's options and parameters.
+        trust: Whether to execute the run's task even if the run was not made by this user on this machine.
     """
     saved = Configuration.of(run)
     known, own = saved.options.changed({"seed": 0}), dict(saved.params)

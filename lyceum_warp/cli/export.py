@@ -48,7 +48,7 @@ class Export:
         return 0
 
     def _env(self, run: Run) -> Env | None:
-        """Make a world of the run's task for the metadata.
+        """Make an environment of the run's task, from which the metadata are computed.
 
         If the task cannot be loaded, print a message and return None.
         """

@@ -110,7 +110,7 @@ def _entry(name: str) -> _Entry:
 
 
 def _cells(entry: _Entry) -> tuple[str, ...]:
-    """Return the cells of a task's row. If the task's model cannot be loaded, the entry's note says why."""
+    """Return the cells of a task's row, and set the entry's note if the task's model cannot be loaded."""
     task = entry.task
     if task is None:
         return (entry.name, *[_UNKNOWN] * 5, entry.source)

@@ -48,9 +48,10 @@ class New:
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
     """The task's name in snake_case, for the file TASK.py in the working directory; or a path, path/to/task.py."""
     model: Annotated[str, tyro.conf.arg(metavar="FILE")]
-    """An MJCF or URDF file; or menagerie:ROBOT/FILE.xml, of MuJoCo Menagerie (the extra "menagerie", the package
-    mujoco-menagerie, or a checkout to which MENAGERIE_ROOT points); or gymnasium:FILE.xml or gymnasium_robotics:PATH,
-    from the package of that name. The task file stores a relative path relative to its own folder."""
+    """An MJCF or URDF file; menagerie:ROBOT/FILE.xml for a model of MuJoCo Menagerie (from the extra "menagerie", the
+    package mujoco-menagerie, or a checkout to which MENAGERIE_ROOT points); or gymnasium:FILE.xml or
+    gymnasium_robotics:PATH for a model in the package of that name. The task file stores a relative path as relative to
+    the task file's folder."""
 
     template: Literal["plain", "velocity"] = "plain"
     """With velocity, the task trains a walking robot to follow velocity commands. The robot needs a floating base, and
@@ -120,7 +121,7 @@ def _class_name(path: Path) -> str:
         or keyword.iskeyword(class_name)
     ):
         raise ValueError(f"a task can't be named {name!r}: use letters, digits and _, as in my_robot")
-    if snake_case(class_name) != name:  # a task is named after its class
+    if snake_case(class_name) != name:  # the class name determines the task's name
         raise ValueError(f"a task can't be named {name!r}: use {snake_case(class_name)!r}, for the class {class_name}")
     if class_name in _TAKEN:
         raise ValueError(f"a task can't be named {name!r}: its file defines {class_name} for another purpose")

@@ -10,7 +10,7 @@ from typing import Any
 
 import tyro
 
-_CONFIG = (tyro.conf.DisallowNone,)  # tyro does not accept the word None for an option with the default None
+_CONFIG = (tyro.conf.DisallowNone,)  # refuse the word None as an option's value
 
 
 def parse(command: type, prog: str, words: Sequence[str]) -> Any:

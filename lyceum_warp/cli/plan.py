@@ -83,13 +83,13 @@ class Plan:
     """Control a task with a planner that replans at every step, and report rewards, success and planning times.
 
     The planner is MPPI; --update selects the cross-entropy method (cem) or predictive sampling. The default settings of
-    the planner come from the task. Physics options (--physics, --integrator, ...) apply only to the planner; --physics
-    exact is the controlled world's physics.
+    the planner come from the task. Physics options (--physics, --integrator, ...) apply only to the planner's worlds;
+    --physics exact gives them the same physics as the controlled world.
 
     With --real-time, the world does not wait for plans. The command then measures planning times for a few seconds, and
     chooses the largest number of samples that meets the deadline on this machine. If no number meets it, the command
-    tries a shorter horizon and then other physics of the task. Values of --samples, --horizon and --physics that you
-    give are never changed.
+    tries a shorter horizon, and then other physics that the task defines. Values of --samples, --horizon and --physics
+    that you give are never changed.
 
     The command writes config.json, report.json, plan.png, a video of the first episode (video.mp4), and
     one file per episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy) into a
@@ -125,8 +125,8 @@ class Plan:
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder; by default runs/plan-TASK-DATE."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """The folder of an NPG or PPO run of the same task. The planner adds the run's value function at each sample's
-    final state."""
+    """The folder of an NPG or PPO run of the same task. The planner adds the value of each sample's final state to the
+    sample's return."""
     param: ParamWords = ()
     planner_param: Repeated = ()
     """A parameter of the task that only the planner's worlds use; the flag may be repeated."""
@@ -198,7 +198,7 @@ def _check_value_task(run: Path, task: str) -> None:
     try:
         config = Run.open(run.parent if run.is_file() else run).config
     except FileNotFoundError:
-        return  # load_value reports missing files; a policy file may have no run folder
+        return  # a policy file need not be in a run folder; load_value reports missing files
     found = str(config.get("task"))
     names = {_stem(found), snake_case(found.partition(":")[2]), str(config.get("kept", {}).get("name"))}
     if not names & {_stem(task), task_name(find_task(task))}:
@@ -214,7 +214,7 @@ def _stem(task: str) -> str:
 def _worlds(
     options: Plan, params: dict[str, Any], planner_params: dict[str, Any]
 ) -> tuple[Env, Callable[[RealTimeSetting | None], MPPI]]:
-    """Make the controlled world, and a function that makes a planner from a measured setting or from flags."""
+    """Make the controlled world, and a function that makes a planner with settings from ``_choice`` or from flags."""
     steps: dict[str, Any] = {} if options.steps is None else {"horizon": whole_number("steps", options.steps, low=1)}
     plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
     if plant.horizon == 0:
@@ -240,11 +240,11 @@ def _worlds(
 
 
 _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
-"""The numbers of samples from which real-time planning chooses, in addition to the task's own number."""
+"""The numbers of samples that real-time planning tries, in addition to the number that the task suggests."""
 
 
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
-    """Measure planning times to choose the settings that no flag gives; return None if flags give all settings.
+    """Measure planning times to choose the settings that no flag gives; return None if flags give all.
 
     A plan must be ready within a step of the plant. If no setting is fast enough, a plan may take as long as a step of
     the planner.
@@ -334,7 +334,7 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
 
 
 def _left(run: Run, whole: int, aborted: list[Trajectory], path: Path | None) -> str:
-    """Describe the files of a run that was interrupted after ``whole`` complete episodes."""
+    """Describe where the episodes are saved if the command is interrupted after ``whole`` complete episodes."""
     steps = f"after {aborted[0].steps} step{'s' * (aborted[0].steps != 1)}" if aborted else "before its first step"
     if not whole:
         where = f"it is in {path}" if path else f"{run.folder} holds no episode"
@@ -354,7 +354,7 @@ def _save(run: Run, done: list[Trajectory], options: Plan) -> None:
 
 
 def _summary(done: list[Trajectory], options: Plan) -> ControlReport:
-    """Make the report of the given episodes. The deadline of a plan is the time until the next plan."""
+    """Make the report of the given episodes. The deadline of a plan is the time from one plan to the next."""
     return control_report(done, rate=1 / (options.replan_every * done[0].period))
 
 

@@ -88,7 +88,8 @@ class Train:
     """npg, the natural policy gradient; ppo; or sac, soft actor-critic with a replay buffer. By default, the algorithm
     that the task suggests, with its hyperparameters: ppo for walking robots, npg for others."""
     iterations: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Total number of iterations, including those before --resume; by default as many as the task suggests, or 100."""
+    """Total number of iterations, including those before the run was resumed; by default as many as the task suggests,
+    or 100."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Seed of the networks, the noise and the worlds' initial states."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -102,15 +103,15 @@ class Train:
     """The policy to start from with --from: last, best, or the number of a saved iteration."""
     target_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """End the run once the return of the mean policy reaches this number. With --mean-every 0, the mean return of the
-    sampled episodes counts."""
+    sampled episodes is compared instead."""
     minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Time limit in minutes: training ends after the iteration that exceeds it. --resume continues the run."""
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """The number of iterations after which another numbered policy is saved; 0 saves none. The last and the best policy
-    are always saved."""
+    """Save the policy in a numbered file every INT iterations; 0 saves none. The last and the best policy are always
+    saved."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Iterations between two saves of the policy and the complete state, from which a killed run resumes. 0 saves every
-    30 s, or more often if that takes at most 1 % of the time."""
+    """Save the policy and the complete state, from which a killed run resumes, every INT iterations. 0 saves every 30
+    s, or more often if that takes at most 1 % of the time."""
     tensorboard: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to also write metrics for TensorBoard into the run's folder."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
@@ -129,9 +130,9 @@ class Train:
     camera: CameraWords = ()
     transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default, only two
-    cheap comparisons run: the C engine after training on a GPU, and the task's own physics if the run has other
-    physics. With --transfer, a policy trained on CPU cores is also tested under each physics of the task, and on the
-    Warp engine, whose kernels may take minutes to compile."""
+    cheap comparisons are made: with the C engine, after training on a GPU; and with the task's default physics, after
+    training with other physics. With --transfer, the policy is also tested under each set of physics options that the
+    task defines and, after training on CPU cores, on the Warp engine, whose kernels may take minutes to compile."""
     trust: Trust = False
     take_over: bool = False
     """Continue a run that another process has locked, on this or another host. The process that held the lock ends at
@@ -211,7 +212,7 @@ class Train:
             return self._report(run, learner)
 
     def _suggestion(self) -> Training:
-        """Return the settings that the task suggests, or none of them if a flag gives another algorithm."""
+        """Return the suggested algorithm and settings, or only the algorithm that a flag chooses instead."""
         assert self.task is not None
         suggestion = find_task(self.task).training
         if self.algorithm in (None, suggestion.algorithm):

@@ -39,16 +39,17 @@ class Tune:
     which: str = "last"
     """The policy of --run to use: last, best, or the number of a saved iteration."""
     tolerance: Annotated[str, tyro.conf.arg(metavar="strict|loose|any")] = "strict"
-    """Largest difference of returns, relative to the mean absolute return: the 95 % interval must lie within 2 %
-    (strict) or 5 % (loose); any accepts all settings without additional faults."""
+    """How much the mean return may change: the 95 % interval of the change must lie within 2 % (strict) or 5 % (loose)
+    of the mean absolute return. The value any accepts every setting that causes no additional faults."""
     short: bool = False
     """Compare the first 100 steps of episodes, for a few seconds for each setting, instead of whole episodes."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of episodes of each setting. By default, as many as the confidence interval needs, for at most a
     minute (5 s with --short)."""
     planning: bool = False
-    """Find physics for the task's planner: compare planning times, and test whether coarser physics rank samples as the
-    task's own physics do. --nworld is then the number of samples, and --episodes the number of states of each kind."""
+    """Find physics options for the task's planner: compare planning times, and test whether coarser physics rank the
+    samples in the same order as the task's default physics. --nworld is then the number of samples, and --episodes the
+    number of states of each kind."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of worlds; by default 256, or 4096 on a GPU. With --planning, the number of the planner's samples, by
     default 64."""

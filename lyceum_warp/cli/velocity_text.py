@@ -17,10 +17,10 @@ _STEP = 0.02
 """Seconds in a step."""
 
 _NEAR = 0.1
-"""The end of a leg is a foot if its height above the lowest leg is at most this fraction of the base's height."""
+"""The end of a leg is a foot if it is at most this fraction of the base's height above the lowest foot."""
 
 _FLAT = 0.01
-"""The maximum height in metres of a sole's spheres above the sole's lowest sphere."""
+"""A sphere of the foot belongs to the sole if it is at most this many metres above the foot's lowest sphere."""
 
 _AT = 0.06
 """The maximum distance in metres between the centre of a sole and a site that marks the foot."""
@@ -31,10 +31,10 @@ _Kind = mujoco.mjtObj
 @dataclasses.dataclass
 class _Foot:
     name: str
-    """The name of the foot's site, which the model has or the task adds."""
+    """The name of the foot's site, in the model or added by the task."""
     body: int
     element: str = ""
-    """The name of a body, joint or geom that finds the foot's body; empty if the model has the site."""
+    """The name of the foot's body, or of a joint or geom of this body; empty if the model already has the site."""
     position: tuple[float, ...] = ()
     """The position of the new site in the body, m."""
     height: float = 0.0
@@ -116,7 +116,7 @@ class Walker:
         raise ValueError(f"the model has no site, geom or body {name!r}: give names after --feet, separated by spaces")
 
     def _foot(self, body: int, name: str) -> _Foot:
-        """Find the site at the centre of a body's sole, or describe a new site there."""
+        """Find a site near the centre of a body's sole; if there is none, describe a new site."""
         spheres = self._spheres(body)
         if not len(spheres):
             raise ValueError(f"the body {self._called(body)} of a foot has no geom that can touch the ground")

@@ -33,15 +33,15 @@ from lyceum_warp.viewer.session.clock import Watcher
 from lyceum_warp.viewer.show import view
 
 _RUN_WORLDS = 16
-_WAIT = 10.0  # the time that --follow waits for a run
+_WAIT = 10.0  # seconds that --follow waits until the run starts
 _LONG = 1e9
-_NICE = 10  # the niceness of the subprocess of `lw.RunViewer`
+_NICE = 10  # the niceness (low priority) of the subprocess of `lw.RunViewer`
 
 
 class Place(
     OptionFlags, options=[EnvOptions], omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)"
 ):
-    """Engine and device of the displayed worlds; with --mppi, of the planner's worlds."""
+    """Engine and device of the displayed worlds or, if --mppi is given, of the planner's worlds."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto."""
@@ -57,8 +57,8 @@ class View:
     real time. For a run, it shows the run's policy; with --follow, it shows the newest policy while the run trains.
     Episode files, or a folder of lyceum-warp plan, are played back.
 
-    The viewer is a web page. The command prints the address of the page, which contains a secret, and over ssh also the
-    command that forwards the port.
+    The viewer is a web page. The command prints the address of the page; the address contains a secret. Over ssh, it
+    also prints the command that forwards the port.
 
     $ lyceum-warp view hopper
     $ lyceum-warp view go1_velocity --pretrained
@@ -81,7 +81,7 @@ class View:
     which: str = "last"
     """The policy of a run to show: last, best, or the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """The task's name or file, for a run or episodes from which the task cannot be found."""
+    """The task's name or file, if the task of the run or of the episodes cannot be found."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of worlds: by default 16 for a run, and 1 for anything else."""
     seed: int = 0
@@ -204,7 +204,7 @@ def _planner(options: View, env: Env) -> MPPI:
 
 
 def _words(options: View) -> dict[str, Any]:
-    """Return the options of the displayed worlds; with --mppi, of the planner's worlds."""
+    """Return the options of the displayed worlds or, if --mppi is given, of the planner's worlds."""
     return given(options.place) | given(options.physics)
 
 

@@ -24,7 +24,7 @@ PolicyContent = dict[str, Any]
 """Content of a saved policy: ``iteration``, ``policy``, and ``value`` if there is a value function."""
 
 _CLASSES: dict[str, type[nn.Module]] = {"policy": GaussianPolicy, "value": ValueFunction}
-"""Classes of networks for files that name no class."""
+"""Network classes to use if a file does not name the class."""
 
 
 def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> PolicyContent:
@@ -174,7 +174,7 @@ def read_checkpoint(
     try:
         data = io.BytesIO(path.read_bytes())
         with zipfile.ZipFile(data) as archive:
-            # test the checksums that torch does not test, and find records marked as folders, which torch ignores
+            # torch neither checks all checksums nor refuses entries marked as folders, which it ignores
             folders = (record.filename for record in archive.infolist() if record.external_attr & 0x10)
             if (name := archive.testzip() or next(folders, None)) is not None:
                 raise ValueError(f"the record {name} is corrupt")
@@ -209,6 +209,6 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
 
 
 def _first_sentence(error: BaseException) -> str:
-    """Get the first sentence of an error message, because torch's messages can fill a page."""
+    """Get the first sentence of an error message; torch's whole messages can fill a page."""
     text = str(error).strip() or type(error).__name__
     return text.splitlines()[0].split(". ")[0][:200]

@@ -9,7 +9,7 @@ from lyceum_warp.support.files import unknown_format
 from lyceum_warp.support.validate import whole_number
 
 _COUNT = 0
-"""Stands for the type of entries that are non-negative whole numbers."""
+"""The type, in ``_ENTRIES``, of entries that are non-negative whole numbers."""
 
 _ENTRIES: dict[str, Any] = {
     "task": str | None, "params": dict, "options": dict, "physics": dict, "engine": str, "device": str,
@@ -22,7 +22,8 @@ _KEPT: dict[str, Any] = {
     "name": str, "file": str, "model": str, "model_given": bool, "source_hash": str, "model_hash": str, "modules": dict,
     "program": bool,
 }  # fmt: skip
-"""Map each entry, and each entry of ``reached`` and of ``kept``, to a type or ``_COUNT``. All entries are optional."""
+"""The type of each entry of config.json, and of each entry in its dicts ``reached`` and ``kept``. All entries are
+optional."""
 
 
 def read_config(path: Path) -> dict[str, Any]:

@@ -83,14 +83,14 @@ class Configuration:
 
     @classmethod
     def of(cls, run: Run) -> "Configuration":
-        """Read a run's configuration, with the run's copies in place of missing tables.
+        """Read a run's configuration; if a table's file is missing, use the run's copy.
 
         Raises:
             ValueError: A value is missing or not valid.
         """
         config = run.config
         try:
-            # earlier releases stored options given as --param in "params", or had no "physics"
+            # earlier releases stored options that were given as --param in "params", or wrote no "physics"
             words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
             words.pop("unroll", None)  # ignore an option of earlier releases that changed no numbers
             base = EnvOptions(
@@ -129,7 +129,7 @@ class Configuration:
             networks: The initial policy and value function; None for new networks.
             note: Function that is called with messages about the task's files.
             task: A task, in its current version, to use instead of the run's task.
-            trust: Whether to execute a run's task although this user did not make the run on this machine.
+            trust: Whether to execute the run's task even if the run was not made by this user on this machine.
 
         Raises:
             ValueError: A value is not valid, or ``run`` is not trusted.
@@ -161,13 +161,13 @@ class Configuration:
 
 
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:
-    """Get the initial policy and value function for a learner, and the iteration that saved them.
+    """Get a learner's initial policy and value function from a run, and the iteration after which they were saved.
 
     Args:
         run: The run that saved the networks.
-        which: Policy of the run, or None to resume the run. The networks are None if the run is resumed and its
-            hyperparameters determine the networks. The hyperparameters do not determine them if the run started from
-            another run's networks, or uses ``limit``.
+        which: Policy of the run, or None to resume the run. To resume, a learner usually makes new networks from the
+            hyperparameters, so the returned networks are None. They are loaded only if the run started from another
+            run's networks, or uses ``limit``.
 
     Raises:
         FileNotFoundError: The run has no policy of this name or number.

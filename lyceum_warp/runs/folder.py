@@ -116,14 +116,15 @@ class Run:
     ) -> "Run":
         """Create a run folder with the copy of the task, the configuration and the versions.
 
-        A failure leaves no files in the folder. A run that has files of the user is recorded as trusted in the user's
-        state directory (``lyceum_warp.runs.trust``), so later calls can execute the run's task without ``trust=True``.
+        A failure leaves no files in the folder. If the task, its model or a parameter is a file of the user, the run is
+        recorded as trusted in the user's state directory (``lyceum_warp.runs.trust``), so later calls can execute the
+        run's task without ``trust=True``.
 
         Args:
             folder: A new or empty folder.
             config: The configuration, which consists of JSON values.
             device: Device of the run; the entry ``versions`` names the device's hardware.
-            files: Contents of the folder ``task`` by path; each is a file to copy, or bytes.
+            files: The files to write into the folder ``task``, by path: each is the path of a file to copy, or bytes.
 
         Raises:
             ValueError: The folder is not empty, or is a file.
@@ -131,7 +132,7 @@ class Run:
         folder = Path(folder)
         cls.check_free(folder)
         run, task = cls(folder, {"format": FORMAT, **config, "versions": versions(device)}), folder / f"{_TASK}.tmp"
-        text = json.dumps(run.config, indent=2)  # conversion may fail, so create the folder afterwards
+        text = json.dumps(run.config, indent=2)  # may fail, so the folder is created afterwards
         try:
             shutil.rmtree(task, ignore_errors=True)
             folder.mkdir(parents=True, exist_ok=True)
@@ -321,7 +322,7 @@ def load_value(run: str | Path | Run, *, which: str | int = "last", device: str 
 
 
 def _content(run: str | Path | Run, which: str | int, device: str | torch.device) -> tuple[PolicyContent, Path]:
-    """Read the content of a saved policy, and return the content and the file."""
+    """Read a saved policy; return the file's content and path."""
     check_kind("run", run, str | Path | Run, "a run's folder")
     check_kind("which", which, str | int, "as 'last', 'best' or 100")
     check_kind("device", device, str | torch.device, "as 'cpu' or 'cuda:0'")

@@ -13,9 +13,9 @@ from pathlib import Path
 def run_lock(folder: Path, *, take_over: bool = False) -> Iterator[Callable[[], None]]:
     """Lock a run within the context. The file ``lock`` stores the process and its host.
 
-    The process holds the file by flock, which the system releases when the process ends, even after ``kill -9``. Some
-    network file systems do not pass flock on to other hosts, so a lock that names another host counts as held. Without
-    flock, every lock counts as held until its file is deleted.
+    The process locks this file by flock; the system releases the lock when the process ends, even after ``kill -9``.
+    On some network file systems, other hosts do not see the lock, so a lock file that names another host counts as
+    locked. On systems without flock, every lock file counts as locked until it is deleted.
 
     Args:
         folder: The run's folder.

@@ -63,7 +63,7 @@ def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
     """
     oldest = max(0, stored - replay.steps)
     for start, end in _parts(replay, oldest, stored):
-        # a later save may have written more steps, but no checkpoint; ignore these steps
+        # ignore additional steps, written by a later save that was interrupted before its checkpoint
         longer = sorted(path for path in folder.glob(f"{start:012d}-*.pt") if path.name >= _name(start, end))
         if not longer:
             raise ValueError(f"{folder} lacks steps {start} to {end} of the replay buffer")
@@ -76,7 +76,7 @@ def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
 
 
 def _parts(replay: Replay, first: int, stored: int) -> Iterator[tuple[int, int]]:
-    """Yield the start and end of each part that has steps from ``first`` to ``stored``."""
+    """Yield the range of steps, (start, end), of each part with any of the steps from ``first`` to ``stored``."""
     each = -(-replay.steps // _PARTS)
     for start in range(first // each * each, stored, each):
         yield start, min(start + each, stored)

@@ -14,13 +14,13 @@ from lyceum_warp.runs.replay_files import clean_replay, write_replay
 log = logging.getLogger(__name__)
 
 SAVE_SECONDS = 30.0
-"""Maximum number of seconds between saves, unless saves take long; see ``LONG``."""
+"""Maximum number of seconds between saves, unless ``LONG`` requires more."""
 
 SHARE = 100
-"""Time between saves, as a multiple of the last save's duration, if this is less than ``SAVE_SECONDS``."""
+"""Usual time between saves, as a multiple of the last save's duration; at most ``SAVE_SECONDS``."""
 
 LONG = 20
-"""Minimum time between saves, as a multiple of the last save's duration."""
+"""Minimum time between saves, as a multiple of the last save's duration, even if this exceeds ``SAVE_SECONDS``."""
 
 
 class Saver:
@@ -70,7 +70,7 @@ class Saver:
         """Write an iteration's metrics. Also write the policy if it is the best so far, or if a numbered file is due.
 
         Returns:
-            The return that selects the best policy; None if the iteration has no return.
+            The iteration's return, which decides whether its policy is the best; None if the iteration has no return.
         """
         assert self.run is not None and self._check is not None
         self._check()
@@ -80,7 +80,7 @@ class Saver:
         score = None if score is None or math.isnan(score) else score
         better = score is not None and score > self._best
         numbered = self.keep_every > 0 and learner.iteration % self.keep_every == 0
-        # the policy before the update sampled the iteration's episodes
+        # the episodes behind return_mean were sampled by the policy before the update
         sampled = name == "return_mean"
         before = self._before
         if better or numbered or sampled:

@@ -26,16 +26,17 @@ log = logging.getLogger(__name__)
 Note = Callable[[str], None]
 
 Files = dict[Path, Path | bytes]
-"""Map files to their contents, or to the paths from which they are copied."""
+"""The files of a copy, by path: each is the content, or the path of the file to copy."""
 
 _MODEL, TABLES = "model", "tables"
 _APART = 2
-"""Maximum depth of a task's file below the common folder of task and model; deeper files get a separate folder."""
+"""The copy preserves the paths of the task's file and the model relative to their common parent folder. If the task's
+file is more than this many levels below this folder, the copy has separate folders instead."""
 _LARGEST = 512 * 2**20
 """Maximum size of a model's files in bytes; larger models are not copied."""
 _MOST_MODULES, _LARGEST_MODULES = 100, 8 * 2**20
-"""Maximum number and maximum total size in bytes of a task's modules; a run folder has no copy of modules beyond these
-limits."""
+"""Maximum number and maximum total size in bytes of a task's modules. If they exceed a limit, none of them is
+copied."""
 
 
 def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
@@ -98,7 +99,7 @@ def _npy(array: np.ndarray) -> bytes:
 
 
 def _sources(file: Path, loaded: Mapping[Path, bytes]) -> dict[Path, bytes]:
-    """Get a task's file and the modules that it imports from its folder; too many or too large modules are omitted."""
+    """Get a task's file and the modules that it imports from its folder; omit the modules if they exceed a limit."""
     size = sum(map(len, loaded.values())) - len(loaded[file])
     if len(loaded) - 1 <= _MOST_MODULES and size <= _LARGEST_MODULES:
         return dict(loaded)
@@ -130,8 +131,8 @@ def run_env(
         params: Parameters of the task.
         note: Function that is called with each message.
         task: A different task, in its current version.
-        trust: Whether to execute the task and read the files of a run that this user did not make on this machine; see
-            ``lyceum_warp.runs.trust``.
+        trust: Whether to execute the task and read the files even if this user did not make the run on this machine;
+            see ``lyceum_warp.runs.trust``.
 
     Raises:
         ValueError: The task does not fit the run, or the run is not trusted.
@@ -188,7 +189,7 @@ def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, b
     Args:
         file: The task's file.
         kept: The entry ``kept`` of config.json.
-        loaded: Contents of files that are already loaded; all other files are read.
+        loaded: Contents of files that were already read, by path.
     """
     changes = []
     for name, hashed in {file.name: kept.get("source_hash"), **kept.get("modules", {})}.items():
@@ -204,7 +205,7 @@ def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, b
 def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = True) -> None:
     """Report how an environment's task and model differ from the run's task and model.
 
-    The environment keeps its own task and model.
+    The environment itself does not change.
 
     Args:
         run: The run.
@@ -214,7 +215,7 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = 
     """
     kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
     file = next(iter(loaded), None)
-    # ignore changes to a training script, which contains more than the task
+    # if the task's file is also the training script, a change may be unrelated to the task
     hashed = None if kept.get("program") else kept.get("source_hash")
     for change in _source_changes(file, {**kept, "source_hash": hashed}, loaded) if file is not None else ():
         note(f"{change}: it is used as it is now" if "changed" in change else change)
@@ -223,7 +224,7 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = 
 
 
 def _model_changed(run: Run, env: Env) -> bool:
-    """Check whether the model has changed since the run started; False with a different version of MuJoCo."""
+    """Check whether the model has changed since the run started; False if the version of MuJoCo has changed."""
     known, version = run.config.get("kept", {}).get("model_hash"), mujoco.__version__
     # runs of earlier releases have no versions in config.json
     same_version = run.config.get("versions", {}).get("mujoco", version) == version
@@ -257,8 +258,8 @@ def _beside(path: Path, file: Path) -> str:
 def _names_in_copy(paths: Collection[Path], file: Path | None, modules: Collection[Path] = ()) -> dict[Path, str]:
     """Choose paths within the folder ``task`` for a task's file, its modules and its model's files.
 
-    Relative paths are preserved, so that the copied task finds the copied model. If the task's file and model are in
-    distant folders, both get separate folders.
+    Relative paths are preserved, so that the copied task finds the copied model. If the folders of the task's file and
+    the model are too far apart, each gets its own folder in the copy.
     """
     if not paths:
         return {}

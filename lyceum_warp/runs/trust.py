@@ -34,8 +34,8 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
     Args:
         folder: The run's folder.
         config: Content of the run's config.json.
-        named: A file to which the run refers, for the error message.
-        runs: Whether the run's task is executed; otherwise, files are only read.
+        named: The file that the error message names.
+        runs: Whether the command executes the run's task, or only reads files.
         trust: Whether to trust and record the run.
 
     Raises:
@@ -53,13 +53,13 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
 
 
 def _record(folder: Path, config: Mapping[str, Any]) -> Path:
-    """Get the file that records a run as trusted. Its name is a hash of everything that the run can execute or read."""
+    """Get the file that records a run as trusted, named by a hash of all that the run can execute or read."""
     kept = config.get("kept", {})
     paths = [{key: value for key, value in config.get(part, {}).items() if isinstance(value, str)}
              for part in ("params", "options")]  # fmt: skip
     found = hashlib.sha256(json.dumps([config.get("task"), kept, paths], sort_keys=True).encode())
     task = folder / "task"
-    # hash the copy if there is one, so that the user may edit the original
+    # hash the run's copy instead of the original, so that the run stays trusted if the user edits the original
     main = task / kept["file"] if "file" in kept else Path(str(config.get("task")).partition(":")[0])
     for name, path in [*((str(path.relative_to(task)), path) for path in sorted(task.rglob("*"))), ("", main)]:
         link, content = os.readlink(path) if path.is_symlink() else None, ""

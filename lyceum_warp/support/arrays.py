@@ -14,7 +14,7 @@ WORLDS_A_BLOCK = 32
 multiprocessors idle."""
 
 _SPARE = 256
-"""The number of elements that are allocated behind an empty array."""
+"""The number of elements that ``with_memory`` allocates for an empty array."""
 
 
 def alias(array: wp.array, dtype: type, shape: tuple[int, ...], strides: tuple[int, ...] | None = None) -> wp.array:
@@ -37,9 +37,9 @@ def shared_rows(row: np.ndarray, dtype: type, count: int, device: wp.Device) -> 
 
 
 def with_memory(array: wp.array) -> wp.array:
-    """Return the array; replace an empty array by an array of the same shape that has allocated memory.
+    """Return the array; if it is empty, return an array of the same shape that has allocated memory.
 
-    Without allocated memory, a task that reads an element by mistake would crash the process.
+    A task that reads an element of an empty array by mistake would otherwise crash the process.
     """
     if array.size:
         return array
@@ -52,8 +52,7 @@ def torch_view(array: wp.array) -> torch.Tensor:
 
 
 _PART: ContextVar[tuple[int, int]] = ContextVar("_PART", default=(0, 1))
-"""The current part of the worlds, for which this module's functions launch kernels: its index, and the number of
-parts."""
+"""The part of the worlds to which launches are currently restricted: its index, and the number of parts."""
 
 
 @contextlib.contextmanager
@@ -74,7 +73,7 @@ def part_of_worlds(part: int, parts: int) -> Iterator[None]:
 def _launch(kernel: wp.Kernel, dim: Sequence[int], axis: int, args: Sequence[Any], device: Any, **options: Any) -> None:
     """Launch a kernel for the current part of the worlds; ``axis`` is the axis of the worlds in ``dim``.
 
-    The kernel's last argument is the first world of the part.
+    The kernel's last argument is the index of the first world of the part.
     """
     part, parts = _PART.get()
     first, end = (dim[axis] * k // parts for k in (part, part + 1))
@@ -98,10 +97,10 @@ def launch_parts(kernel: wp.Kernel, parts: int, nworld: int, args: Sequence[Any]
 
 
 def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device) -> None:
-    """Launch a kernel over (nworld, lanes); its last arguments are the number of lanes and the first world.
+    """Launch a kernel over (nworld, lanes); its last arguments are the number of lanes and the first world's index.
 
-    The lanes are threads that share a world's rows: a single thread on the CPU, and a warp on a GPU, for coalesced
-    access.
+    The lanes of a world are threads that share the work on its rows: one thread on the CPU, and a warp on a GPU, for
+    coalesced memory access.
     """
     lanes = 32 if device.is_cuda else 1
     _launch(kernel, (nworld, lanes), 0, [*args, lanes], device)

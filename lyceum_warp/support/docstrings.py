@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 Class = TypeVar("Class", bound=type)
 
 
-_parse = functools.lru_cache(maxsize=1)(ast.parse)  # the classes of a module are documented one after another
+_parse = functools.lru_cache(maxsize=1)(ast.parse)  # parse each module only once
 
 
 def attribute_docs(cls: type) -> dict[str, str]:
@@ -48,7 +48,7 @@ def listed(docs: dict[str, str]) -> str:
 
 
 def document_attributes(cls: Class) -> Class:
-    """Class decorator: append the docstrings of attributes, also of inherited fields, to the class's docstring."""
+    """Class decorator: append the docstrings of attributes, including inherited fields, to the class's docstring."""
     docs: dict[str, str] = {}
     for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__[1:])):
         docs |= attribute_docs(base)
@@ -68,11 +68,11 @@ def document_overloads(function: Any) -> None:
 
 
 def document_arguments(function: Any, meanings: Mapping[str, str]) -> None:
-    """Append descriptions of a Warp function's arguments, for all overloads, to its docstring.
+    """Append descriptions of the arguments of all overloads to a Warp function's docstring.
 
     Args:
         function: The function.
-        meanings: The descriptions by argument name; additional names are ignored.
+        meanings: The descriptions by argument name; names that are not arguments of the function are ignored.
     """
     overloads = (*function.user_overloads.values(), *function.user_templates.values())
     names = dict.fromkeys(name for overload in overloads for name in overload.input_types)

@@ -13,8 +13,8 @@ from typing import Any
 def replaced(path: Path, *, durable: bool = False, previous: Path | None = None) -> Iterator[Path]:
     """Replace a file atomically, so that a reader finds either the old file or the complete new file.
 
-    The block writes to the yielded path, a temporary file beside the target. If the block raises, the target stays
-    unchanged and the temporary file is deleted.
+    The body of the ``with`` statement writes to the yielded path, a temporary file beside the target. If the body
+    raises an error, the target stays unchanged and the temporary file is deleted.
 
     Args:
         path: The file.

@@ -18,7 +18,7 @@ class Interrupted(BaseException):
 
 
 def _ignore(number: int, frame: Any) -> None:
-    """Ignore a signal after Interrupted was raised. ``obeyed`` replaces this handler, but not SIG_IGN."""
+    """Ignore a signal. Unlike SIG_IGN, this handler is replaced by ``obeyed``."""
 
 
 def _interrupt(number: int, frame: Any) -> None:
@@ -33,12 +33,12 @@ def _interrupt(number: int, frame: Any) -> None:
 def signals(handler: Callable[[int, Any], None] = _interrupt, *, replaces: Any = None) -> Iterator[dict[int, Any]]:
     """Within the context, the first Ctrl-C, SIGTERM or SIGHUP raises Interrupted.
 
-    Later signals do so only within ``obeyed``.
+    Later signals raise Interrupted only within ``obeyed``.
 
     Args:
         handler: The handler of the signals; by default it raises Interrupted.
-        replaces: The handler to replace; by default every handler except those that ignore the signal. Shells make
-            background programs ignore SIGINT, and nohup makes programs ignore SIGHUP.
+        replaces: Replace only this handler; by default, replace every handler that does not ignore the signal. Shells
+            make background programs ignore SIGINT, and nohup makes programs ignore SIGHUP.
 
     Yields:
         The replaced handlers by signal, which the context restores at its end.
@@ -57,7 +57,7 @@ def signals(handler: Callable[[int, Any], None] = _interrupt, *, replaces: Any =
 
 
 def obeyed() -> contextlib.AbstractContextManager[object]:
-    """Within the context, a second Ctrl-C, SIGTERM or SIGHUP (after the first in ``signals``) raises Interrupted, too.
+    """After the first Ctrl-C, SIGTERM or SIGHUP (see ``signals``), let a further one raise Interrupted, too.
 
     The user can then cancel long work at the end of a program.
     """
@@ -79,17 +79,17 @@ def _raise(number: int) -> None:
 
 @contextlib.contextmanager
 def postponed(*, insist: bool = False) -> Iterator[list[int]]:
-    """Return a context that collects Ctrl-C, SIGTERM and SIGHUP in a list, and handles the first one at its end.
+    """Return a context that collects Ctrl-C, SIGTERM and SIGHUP in a list; at its end, the first one is handled.
 
-    If the program does not handle that signal, the context raises SystemExit. After Interrupted is raised, further
+    If the program has no handler for this signal, the context raises SystemExit. After Interrupted is raised, further
     signals are ignored.
 
     Args:
-        insist: Whether a second signal is handled immediately.
+        insist: Whether a second signal is handled immediately instead of being collected.
 
     Raises:
-        Interrupted: A signal came within the context, and ``signals`` is active.
-        SystemExit: A signal with its default handler came within the context.
+        Interrupted: A signal arrived within the context, and ``signals`` handles it.
+        SystemExit: A signal arrived within the context, and the program has no handler for it.
     """
     noted: list[int] = []
 

@@ -9,7 +9,7 @@ import numpy as np
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
-# cached, because a figure has intervals at hundreds of points, mostly with equal degrees of freedom
+# cached, because a figure shows hundreds of intervals, mostly with the same degrees of freedom
 @functools.lru_cache(maxsize=256)
 def student_quantile(probability: float, freedom: float) -> float:
     """Compute a quantile of Student's t distribution, by bisection on the integral of its density.
@@ -49,11 +49,11 @@ def share_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]
     observation is added to each of a pair's four outcomes, so that the interval has a width even if all pairs agree.
 
     Args:
-        first: The outcome of each pair's first member, (pairs,) bool.
-        second: The outcome of each pair's second member, (pairs,) bool.
+        first: The first outcome of each pair, (pairs,) bool.
+        second: The second outcome of each pair, (pairs,) bool.
 
     Returns:
-        The difference, second minus first, at the centre of the interval, and the half-width of the interval.
+        The centre of the interval, which estimates second minus first, and the half-width of the interval.
     """
     gained, lost = (np.count_nonzero(~first & second) + 0.5, np.count_nonzero(first & ~second) + 0.5)
     pairs = len(first) + 2.0

@@ -1,6 +1,6 @@
 """Access and patch internals of Warp and MuJoCo Warp.
 
-Only this module uses such internals, so no other module depends on the versions of these packages.
+Only this module uses such internals, so a new version of these packages cannot break any other module.
 """
 
 import contextlib
@@ -23,8 +23,9 @@ def builtin_functions() -> Mapping[str, Any]:
 def extend_structs() -> None:
     """Let a Python class extend a ``wp.struct`` and inherit its fields, as in ``class World(go1.World)``.
 
-    Warp refuses a class that extends a struct, because a struct is not a type. A class that extends the struct's Python
-    class would lose the inherited fields, because Warp reads only the class's own annotations.
+    Warp refuses a class that extends a struct, because a struct is not a type. If the class extended the struct's
+    Python class instead, Warp would lose the inherited fields, because it reads only the annotations of the class
+    itself.
     """
     codegen: Any = wp._src.codegen
 
@@ -43,9 +44,9 @@ def extend_structs() -> None:
 
 
 def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
-    """Whether a module of kernels for a block size is loaded or in Warp's cache.
+    """Whether a module of kernels, compiled for a block size, is loaded or in Warp's cache.
 
-    The result is also False if Warp's internals have changed; this only costs time.
+    If Warp's internals have changed, the result is always False, which costs time but changes no results.
     """
     if (device.context, block) in module.execs:
         return True
@@ -107,7 +108,7 @@ their tiles in a static variable, so two threads would overwrite each other's ti
 
 
 def separate_tiles() -> None:
-    """Serialise launches of kernels with tiles on the CPU, and set ``tiles.launched`` at each such launch."""
+    """Serialise CPU launches of kernels that use tiles, and set ``tiles.launched`` at each of them."""
     launch_tiled = wp.launch_tiled
 
     def launch(*args: Any, **options: Any) -> Any:
@@ -141,12 +142,12 @@ def replaced_in_this_thread(functions: Mapping[str, Callable[..., Any]]) -> Iter
 
 
 _REMADE = ("reset_data", "get_state", "set_state")
-"""The functions of MuJoCo Warp that make their kernels again in every call. The kernels have a single
-free variable: whether there is a mask."""
+"""The functions of MuJoCo Warp that define their kernels again in every call. Each kernel is a closure over one
+variable, the mask, and depends only on whether it is None."""
 
 
 def quicken_mujoco_warp() -> None:
-    """Cache results in MuJoCo Warp's host code, which takes most of the time of a step or a reset without graphs.
+    """Cache results in MuJoCo Warp's host code, which takes most of a step's or reset's time if graphs are not used.
 
     For each pair of geom types, MuJoCo Warp calls a Warp function from Python, and each call resolves overloads. The
     functions in ``_REMADE`` parse and hash their kernels in every call, and ``put_model`` parses packages' metadata.

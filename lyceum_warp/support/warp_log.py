@@ -1,4 +1,4 @@
-"""Initialise Warp without its banner, and send its messages about the CUDA driver to Python's log."""
+"""Initialise Warp without a banner, and send Warp's messages about the CUDA driver to Python's log."""
 
 import contextlib
 import logging
@@ -17,14 +17,14 @@ _remarks: list[str] | None = None
 
 
 def start_warp() -> list[str]:
-    """Initialise Warp quietly, and log its messages about the CUDA driver.
+    """Initialise Warp without a banner, and log Warp's messages about the CUDA driver.
 
     At its default log level, Warp prints a banner and a line for every loaded module. The level is therefore raised to
     warnings, unless the user has set a level. Without a GPU, Warp's native library prints messages about the driver to
     stderr. Such messages are logged instead, and all other output is printed.
 
     Returns:
-        The messages about the CUDA driver, which callers add to errors about a missing device.
+        The messages about the CUDA driver; callers append them to errors about a missing device.
     """
     global _remarks
     with _lock:
