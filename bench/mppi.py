@@ -52,7 +52,7 @@ ON_WARP = ("mppi_warp", "mppi_warp_together")
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Episodes under MPPI, and the time of its plans."""
+    """Episodes controlled by MPPI, and planning times."""
 
     parts: tuple[str, ...] = ()
     """Parts: plans, episodes; by default both."""

@@ -7,16 +7,17 @@
 Part "faults": worlds step under random actions, and each world gets a fault every thousand steps on average. The
 program writes invalid states, states with excessive velocities, and non-finite actions. For the other faults, it writes
 a variant of the task (``VARIANT``), in which an additional action requests a NaN reward, a NaN observation or a
-negative mass. Every fault must be reported in its world and step, nothing else may be reported, and
-``env.fault_counts`` must agree. A second environment without faults must give bitwise equal numbers for each world
-until its first fault. Every fourth world gets no faults, so its numbers must be equal in both environments throughout.
+negative mass. Every fault must be reported in the world and the step in which it was injected, no other fault may be
+reported, and ``env.fault_counts`` must agree. A second environment without faults must give bitwise equal numbers for
+each world until its first fault. Every fourth world gets no faults, so its numbers must be equal in both environments
+throughout.
 
 A run is divided into chunks. Each chunk is one result, and ends by writing the worlds' states to a file in the folder
 ``--work``. The next chunk continues from this file, even on another machine with a copy of the folder.
 
 Part "random": worlds step under uniformly random actions, without injected faults. The result has the number of faults
 by reason, and the step and world of the first fault. Part "memory": environments are made and deleted. Part "kills":
-training runs are killed and resumed, and must end like an uninterrupted run.
+training runs are killed and resumed, and must give the same results as an uninterrupted run.
 """
 
 import collections
@@ -51,14 +52,14 @@ from lyceum_warp.support.validate import whole_number
 PARTS = ("faults", "random", "memory", "kills")
 KINDS = {"state": Done.NAN, "speed": Done.NAN, "action": Done.ACTION, "reward": Done.REWARD,
          "observation": Done.OBSERVATION, "model": Done.MODEL}  # fmt: skip
-"""Each kind of fault, named after the place of its injection, with the reason that must be reported. Kinds are numbered
-from 1."""
+"""The kinds of faults, named after where they are injected, and the reason that must be reported for each kind. Kinds
+are numbered from 1."""
 NBIT = len(Done)
 EVERY = 16
 """Number of steps between writes of invalid states. If writes are less frequent, each write affects more worlds, so the
 number of faults stays the same."""
 SAMPLES = 5
-"""Memory samples per chunk."""
+"""Number of times that memory is measured per chunk."""
 TASKS = {
     "point_mass": (1024, 10**7, 10, 4.0), "hopper": (512, 10**6, 10, 100.0), "soft_ball": (256, 10**6, 10, 100.0),
     "panda_lift": (256, 10**6, 10, 250.0), "adroit_relocate": (256, 10**6, 10, 250.0),
@@ -135,9 +136,9 @@ class Options(experiment.Options):
     engine: str = "auto"
     """Engine of the parts "faults", "random" and "memory"."""
     nworld: int | None = None
-    """Number of worlds; by default the task's."""
+    """Number of worlds; by default, the number listed for the task."""
     steps: int | None = None
-    """Number of steps per chunk, summed over worlds; by default the task's."""
+    """Number of steps per chunk, summed over worlds; by default, the number listed for the task."""
     kill_every: float = 40.0
     """Mean training time between two kills, in seconds."""
     work: Path = Path("runs/soak")
