@@ -103,10 +103,10 @@ class WorldControl:
         self._reset_due = self._wanted = False
         self._seen: PlanView | None = None
         self.hidden: slice | None = None
-        """The part of the state that the controller gets as zeros: the forces of the user's push."""
+        """The part of the state that is hidden from the controller (set to zero): the forces of the user's push."""
 
     def new_run(self) -> "ControlRun":
-        """Return the controller for a new run of a loop. Calls from earlier runs then fail."""
+        """Return the controller for a new run of a control loop; from now on, calls from earlier runs fail."""
         self._run += 1
         return ControlRun(self, self._run)
 

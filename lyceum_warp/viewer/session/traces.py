@@ -1,8 +1,8 @@
 """Roll out a planner's plan and samples again in a thread, to get their paths.
 
 A planner does not store positions. This module rolls out the actions of some samples from the plan's initial state, in
-worlds with the planner's task, model and time step. The random streams of these worlds differ from the planner's, so
-the paths differ if the task draws random numbers during an episode.
+worlds with the planner's task, model and time step. These worlds have other random numbers than the planner's worlds,
+so if the task is random during an episode, the paths differ from the planner's.
 """
 
 import dataclasses
@@ -145,7 +145,7 @@ class TraceRollouts:
         return Traces(paths, view.best, ended, time.perf_counter())
 
     def _put(self, state: torch.Tensor) -> None:
-        """Copy the parts of the planner's state into every row; rows may also have parts for additional fields."""
+        """Copy the planner's state into every world; additional fields of these worlds stay unchanged."""
         parts = self.env.state_space.parts
         state = state.to(self._states.device)
         for name, part in self._parts.items():
