@@ -8,7 +8,7 @@ OLD and NEW are git revisions or folders with a checkout; NEW is this working tr
 subprocess, with the same Python and packages, and both compute the same units of work side by side. A unit is one part
 of the comparison for one task on one engine.
 
-The numbers depend on the processor, so stored numbers cannot replace OLD. The program uses only public names of the
+OLD must run again each time, because its numbers depend on the processor. The program uses only public names of the
 package (probes/checkout.py). Exit code: 0 without differences, 1 with differences, 2 for bad input.
 """
 

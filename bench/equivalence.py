@@ -45,7 +45,7 @@ class Case:
 
 
 def cases(options: experiment.Options) -> list[Case]:
-    """List the runs; the engines take turns."""
+    """List the runs, alternating between the engines."""
     short = options.short
     engines = choose(options.contestants, ENGINES, what="contestant")
     return [

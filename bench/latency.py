@@ -62,7 +62,7 @@ class Case:
 
     task: str
     physics: str
-    """Name of the planner's physics; "own" if the task suggests unnamed options."""
+    """Name of the planner's physics; "own" if the task suggests options that have no name."""
     samples: int
     horizon: int
     contestant: str

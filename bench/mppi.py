@@ -4,7 +4,7 @@
     lyceum-warp bench mppi --parts episodes --threads 1 --jobs 16
 
 ``episodes``: success and time of episodes of 75 steps, on the paper's planning tasks with the paper's settings.
-``plans``: the time of a plan from given states.
+``plans``: the planning time from given states.
 
 The Python planner (python_mppi.py) sends one message per plan to each process. All planners control the same plant, and
 take turns in blocks of episodes. The contestants named "a set at a time" run last: one planner controls the plants of

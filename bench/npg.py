@@ -43,7 +43,7 @@ CONFIGS = {
 """Settings of NPG: the defaults, except for Swimmer's discount."""
 
 SHORT: dict[str, Any] = {"samples": 500, "value_epochs": 1}
-"""Settings of NPG that differ in the short mode."""
+"""Settings of NPG that --short replaces."""
 
 CONTESTANTS = {
     "npg": "NPG, lyceum_warp",
@@ -279,7 +279,9 @@ def iterate(learner: Any, curve: Curve) -> dict[str, Any]:
     sampling = 0.0
     curve.start(mean_action(learner.policy))
     while not curve.ended(learner.samples):
-        sampling += next(learner).time_sample  # an iteration ends with a copy to the host, so a GPU has finished
+        sampling += next(
+            learner
+        ).time_sample  # an iteration ends with a copy to the host, so the work of a GPU is complete
         if curve.due(learner.samples):
             curve.add(learner.samples, mean_action(learner.policy))
     curve.add(learner.samples, mean_action(learner.policy))

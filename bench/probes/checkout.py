@@ -263,7 +263,7 @@ def plans(numbers: Numbers, *, task: str, engine: str, device: str, variants: Se
 
 
 def learning(numbers: Numbers, *, task: str, engine: str, device: str, learner: str, iterations: int) -> None:
-    """Run iterations of a learner, and add its final networks."""
+    """Run iterations of a learner; the results also contain its final networks."""
     import lyceum_warp as lw
 
     env = make(task, engine, device, nworld=4, seed=5)

@@ -31,7 +31,7 @@ MAX_POINTS, MAX_MESSAGES = 20_000, 200
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """What the window needs once, at the start: the model and the names of modes, controllers, episodes and curves."""
+    """The part of the display that stays the same: title, model, modes, controllers, episodes and curves."""
 
     title: str
     """The title of the window."""

@@ -1,7 +1,7 @@
 """Write an episode as one HTML file: a scene that plays and turns in any browser, without a server or a network.
 
-The file holds triangles of the visible geoms, in the axes of their bodies, and the bodies' poses in each frame. The
-script in ``page.html`` draws the triangles with WebGL. Textures are omitted, except for the floor's squares.
+The file holds the triangles of the visible geoms in body coordinates, and the bodies' poses in each frame. The script
+in ``page.html`` draws the triangles with WebGL. Textures are omitted, except for the floor's squares.
 """
 
 import base64
@@ -143,7 +143,7 @@ def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 
 def _surface(model: mujoco.MjModel, geom: int) -> Surface | None:
-    """Make a geom's vertices, normals and triangles, in its own frame; None for a kind that is not drawn."""
+    """Make a geom's vertices, normals and triangles, in the geom's coordinates; None for a kind that is not drawn."""
     types = mujoco.mjtGeom
     kind, size = types(int(model.geom_type[geom])), model.geom_size[geom]
     if kind == types.mjGEOM_PLANE:

@@ -42,10 +42,10 @@ _TAGS = {
 class TensorBoard:
     """Writes a run's iterations to files for TensorBoard; the horizontal axis counts iterations from 0.
 
-    Every number of an iteration becomes a curve. Curves that rsl_rl or mjlab also write have their names, units and
-    axis, so that runs of these libraries can be overlaid: Train/, Loss/, Policy/, Perf/, Episode_Metrics/ and, with
-    ``env``, Episode_Reward/ and Episode_Termination/. All other curves are in the groups return/, episode/,
-    mean_policy/, policy/, value/, time/ and metrics/.
+    Every number of an iteration becomes a curve. A curve that rsl_rl or mjlab also writes has that library's name, unit
+    and axis, so that runs can be overlaid: Train/, Loss/, Policy/, Perf/, Episode_Metrics/ and, with ``env``,
+    Episode_Reward/ and Episode_Termination/. All other curves are in the groups return/, episode/, mean_policy/,
+    policy/, value/, time/ and metrics/.
 
     If the folder already has curves, they are continued; from the first new iteration on, new values replace old ones.
 

@@ -134,7 +134,7 @@ class WorldControl:
         Raises:
             ControllerError: The controller raised an exception, or a newer run has begun.
         """
-        with self._busy:  # the lock waits for a call of an interrupted run
+        with self._busy:  # wait until a call of an interrupted run has ended
             if run != self._run:
                 raise ControllerError(self.name, RuntimeError("this run has ended"))
             self._reset_now()
@@ -172,7 +172,7 @@ class WorldControl:
 
 
 class ControlRun:
-    """Wraps a controller for one run of a loop, with the controller's attributes and signature."""
+    """Wraps a controller for one run of a control loop; has the controller's attributes and signature."""
 
     def __init__(self, control: WorldControl, number: int) -> None:
         self._control, self._number = control, number

@@ -1,7 +1,7 @@
 """Replace the task's command for a walking robot, and draw arrows for commanded and measured velocities.
 
-A robot can be driven if its task's memory has the names of a velocity task's memory (see ``docs/velocity.md``), where
-the command is stored. The robot's first joint must be the free joint of its base.
+A robot can be driven if its task has the memory in which a velocity task stores the command (see ``docs/velocity.md``).
+The robot's first joint must be the free joint of its base.
 """
 
 import math

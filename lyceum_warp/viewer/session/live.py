@@ -44,12 +44,12 @@ class Past:
         self.pushed: list[int | None] = [None] * self.length
         """The world that the user was pushing in each step, if any."""
         self.now = self.newest = self.oldest = 0
-        """The numbers of the present step, the newest step and the oldest step."""
+        """Step numbers in the history: the present, the newest and the oldest step."""
 
     @property
     def behind(self) -> int:
         """The number of steps that can be taken back."""
-        # the first step back stores the present state too, which replaces the oldest state
+        # the first step back also stores the present state, in place of the oldest state
         return min(self.now - self.oldest, max(self.length - 1, 0))
 
     @property

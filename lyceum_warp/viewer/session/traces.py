@@ -1,8 +1,8 @@
 """Roll out a planner's plan and samples again in a thread, to get their paths.
 
 A planner does not store positions. This module rolls out the actions of some samples from the plan's initial state, in
-worlds with the planner's task, model and time step. These worlds have other random numbers than the planner's worlds,
-so if the task is random during an episode, the paths differ from the planner's.
+worlds with the planner's task, model and time step. If the task is random during an episode, the paths differ from the
+planner's, because these worlds draw other random numbers.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ SHARE = 0.15
 
 @dataclasses.dataclass(frozen=True)
 class TracePoint:
-    """The point of a robot for which paths are drawn."""
+    """The point of a robot whose paths are drawn."""
 
     field: str
     """The field with the point's position: "site_xpos", "xpos", "xipos" or "subtree_com"."""
@@ -35,10 +35,11 @@ class TracePoint:
 
 
 def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
-    """Choose the point of a robot for which paths are drawn.
+    """Choose the point of a robot whose paths are drawn.
 
     For a robot with an unactuated base, such as a hopper or a humanoid, the default is the centre of mass. For an arm,
-    the default is the end of the longest chain of actuated bodies: its first site, or its centre of mass.
+    the default is the last body in the longest chain of actuated bodies: the body's first site, or without sites its
+    centre of mass.
 
     Args:
         model: The model.
