@@ -279,9 +279,7 @@ def iterate(learner: Any, curve: Curve) -> dict[str, Any]:
     sampling = 0.0
     curve.start(mean_action(learner.policy))
     while not curve.ended(learner.samples):
-        sampling += next(
-            learner
-        ).time_sample  # an iteration ends with a copy to the host, so the work of a GPU is complete
+        sampling += next(learner).time_sample  # an iteration ends with a copy to the host, which waits for the GPU
         if curve.due(learner.samples):
             curve.add(learner.samples, mean_action(learner.policy))
     curve.add(learner.samples, mean_action(learner.policy))

@@ -86,7 +86,7 @@ def cases(options: Options) -> list[Case]:
     tasks = choose(options.tasks, RECORDS, ("hopper",) if options.short else (), what="task")
     for task in options.tasks:
         if kind not in RECORDS[task][1]:
-            raise ValueError(f"{task} has no record on {kind}: give --device {next(iter(RECORDS[task][1]))}")
+            raise ValueError(f"{task} has no target on {kind}: give --device {next(iter(RECORDS[task][1]))}")
     seeds = options.seeds or range(1 if options.short else 3)
     return [
         Case(task, 20.0 if options.short else RECORDS[task][0], seed, cache, kind, " ".join(RECORDS[task][1][kind]))
