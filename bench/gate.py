@@ -4,7 +4,7 @@
     lyceum-warp bench gate --policy runs/go1-1 runs/go1-2
 
 The mean policy controls the robot on the C engine under the task's exact physics. A Unitree G1 must pass nanoG1's gate
-(kingjulio8238/nanoG1, eval.py). The gate plays six commands of 20 s, each from four noisy starts. The gate also
+(kingjulio8238/nanoG1, eval.py). The gate plays six commands of 20 s, each from four noisy initial states. The gate also
 measures the gait in 2,000 steps at 0.5 m/s. The gate has no noise, no pushes and no differences between robots. In
 nanoG1, actions are clipped to 1 and multiplied by 0.25 rad. To compare with nanoG1's limit, the action change is
 computed here as the change of a servo's target, divided by 0.25 rad. Other robots play 100 episodes of 20 s. Noise and

@@ -528,7 +528,7 @@ def kill(case: Kills, options: Options) -> dict[str, Any]:
 
 
 def table(folder: Path) -> list[dict[str, str]]:
-    """Return the rows of a run's metrics.csv without measured times."""
+    """Return the rows of a run's metrics.csv, but not the columns with measured times."""
     path = folder / "metrics.csv"
     rows = csv.DictReader(path.read_text().splitlines()) if path.exists() else ()
     measured = ("seconds", "samples_per_second")

@@ -38,8 +38,8 @@ def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
     """Choose the point of a robot whose paths are drawn.
 
     For a robot with an unactuated base, such as a hopper or a humanoid, the default is the centre of mass. For an arm,
-    the default is the last body in the longest chain of actuated bodies: the body's first site, or without sites its
-    centre of mass.
+    the default is the last body in the longest chain of actuated bodies: the body's first site, or the body's centre of
+    mass if it has no site.
 
     Args:
         model: The model.
