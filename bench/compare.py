@@ -8,7 +8,7 @@ OLD and NEW are git revisions or folders with a checkout; NEW is this working tr
 subprocess, with the same Python and packages, and both compute the same units of work side by side. A unit is one part
 of the comparison for one task on one engine.
 
-The numbers depend on the processor, so stored numbers cannot replace OLD. The program uses only public names of the
+OLD must run again each time, because its numbers depend on the processor. The program uses only public names of the
 package (probes/checkout.py). Exit code: 0 without differences, 1 with differences, 2 for bad input.
 """
 
@@ -48,7 +48,7 @@ ENGINES = ("mujoco", "warp")
 
 EVERY_VARIANT = ("MPPI", "CEM", "PredictiveSampling", "knots", "plants", "control")
 MANY_PLANNERS = ("point_mass", "reach", "hopper")
-"""Tasks on which all planners are compared; other tasks compare only MPPI."""
+"""Tasks on which all planners are compared; on other tasks, only MPPI is compared."""
 LEARNING = {"mujoco": ("point_mass", "hopper", "go1_velocity"), "warp": ("hopper",)}
 """Tasks on which learners are compared, by engine."""
 COMMANDS = {"mujoco": ("hopper",), "warp": ("point_mass",)}
@@ -114,7 +114,7 @@ class Difference:
     text: str
     """A description in one line."""
     first: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """Index of the first different element, as a dict from axis names."""
+    """Index of the first different element: a dict from the name of each axis to the index along it."""
     old: str = ""
     """The old value at the index ``first``."""
     new: str = ""
@@ -340,14 +340,14 @@ class Report:
     units: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     found: list[Difference] = dataclasses.field(default_factory=list)
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Names of skipped units, with the extra that each one lacks."""
+    """The message about the missing model, by the name of the skipped unit."""
     arrays: int = 0
     """Number of compared arrays."""
     ignored: int = 0
     """Number of arrays that --ignore excluded."""
 
     def kept(self, name: str) -> bool:
-        """Return whether --ignore leaves a name in the comparison; count the names that it excludes."""
+        """Return whether a name is compared; count the names that --ignore excludes."""
         if any(fnmatch.fnmatchcase(name, pattern) for pattern in self.ignore):
             self.ignored += 1
             return False
@@ -356,7 +356,7 @@ class Report:
     def add(
         self, name: str, found: Sequence[Difference], seconds: float = 0.0, digests: Mapping[str, Any] | None = None
     ) -> None:
-        """Add and print the differences of a unit; ``digests`` holds the old and the new digest of each array."""
+        """Add and print the differences of a unit; ``digests`` holds two digests of each array, old and new."""
         digests = digests or {}
         self.found += found
         self.arrays += len(digests)
@@ -373,7 +373,7 @@ class Report:
 
 
 def failures(name: str, answers: Mapping[str, Mapping[str, Any]]) -> list[Difference]:
-    """Return a unit's failures; each text names the checkout. If both checkouts fail, the failure is listed, because
+    """Return a unit's failures; each text names the checkout. A failure of both checkouts is also listed, because
     nothing was compared."""
     failed = {side: answer["failure"] for side, answer in answers.items() if "failure" in answer}
     for failure in failed.values():
@@ -494,7 +494,7 @@ def run(options: Options) -> int:
 
 
 def main(options: Options) -> int:
-    """Run the program; return 0, 1 with differences, 2 for bad input, 130 or 143 after a signal."""
+    """Run the program; the exit code is 1 if there are differences, 2 for bad input, and 130 or 143 after a signal."""
     for number in (signal.SIGTERM, signal.SIGHUP):  # SIGTERM raises SystemExit, so temporary folders are removed
         signal.signal(number, lambda number, frame: sys.exit(128 + number))
     try:

@@ -14,8 +14,8 @@ def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
     The test permutes whole curves, and compares each point's Welch statistic with the largest statistic over all points
     (Westfall and Young 1993, single step). The probability of a false positive at any point is therefore at most the
-    level, for any dependence between points. With few curves, the p-values cannot be small: five against five have 252
-    splits.
+    level, however the points depend on one another. With few curves, the p-values cannot be small: five against five
+    curves can be split in only 252 ways.
 
     Args:
         a: Curves, (curves, points).
@@ -38,7 +38,7 @@ def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     statistics = np.stack([_welch(both[first], both[~first]) for first in chosen])
     observed = _welch(a, b)
     largest = statistics.max(axis=1)
-    # the factor is a tolerance for rounding: the observed split must count as equal to itself
+    # rounding must not make the observed split smaller than itself, hence the tolerance
     return (largest[:, None] >= observed * (1.0 - 1e-9)).mean(axis=0)
 
 

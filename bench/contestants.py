@@ -109,7 +109,7 @@ class LyceumWarp:
 
 
 def actions(env: lw.Env, seed: int) -> list[torch.Tensor]:
-    """Return actions for several steps as a list of (nworld, nact) arrays; indexing a tensor would cost time."""
+    """Return a list with the actions of several steps, (nworld, nact) each; indexing a tensor would take time."""
     low, high = (np.nan_to_num(x, posinf=1.0, neginf=-1.0) for x in (env.action_space.low, env.action_space.high))
     drawn = sampling.draw(np.asarray(low), np.asarray(high), env.nworld, seed)
     return list(torch.as_tensor(drawn, dtype=torch.float32, device=env.obs.device))

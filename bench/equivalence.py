@@ -1,11 +1,12 @@
-"""Test whether NPG learns equally on both engines.
+"""Test whether NPG learns equally well on both engines.
 
     lyceum-warp bench equivalence --device cuda
 
-The area under a learning curve is the mean return of the episodes sampled over a run. Two one-sided t tests (TOST) at
-the level 0.05 decide whether the areas of 20 seeds on each engine are equivalent. The areas are equivalent if the 90 %
-interval of the difference of the means (Welch) lies within the margin. The margin is one standard deviation between
-seeds, pooled over both engines. The margin, the tasks and the seeds were chosen before the first run.
+The area under a learning curve is the run's mean return: the mean over all iterations of the mean return of the
+episodes that ended. Two one-sided t tests (TOST) at the level 0.05 decide whether the areas of 20 seeds on each engine
+are equivalent. The areas are equivalent if the 90 % interval of the difference of the means (Welch) lies within the
+margin. The margin is one standard deviation between seeds, pooled over both engines. The margin, the tasks and the
+seeds were chosen before the first run.
 """
 
 import dataclasses
@@ -24,7 +25,7 @@ from lyceum_warp.engines.placement import find_device
 from lyceum_warp.support.intervals import student_quantile
 
 SAMPLES = {"inverted_double_pendulum": 100_000, "hopper": 200_000, "half_cheetah": 200_000}
-"""Tasks, with the number of samples of a run."""
+"""Number of samples of a run, by task."""
 
 ENGINES = {"mujoco": "C engine", "warp": "Warp engine"}
 SEEDS, NWORLD, PER_ITERATION = 20, 10, 10_000
@@ -44,7 +45,7 @@ class Case:
 
 
 def cases(options: experiment.Options) -> list[Case]:
-    """List the runs; the engines take turns."""
+    """List the runs, alternating between the engines."""
     short = options.short
     engines = choose(options.contestants, ENGINES, what="contestant")
     return [
@@ -87,8 +88,8 @@ def equivalence(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
         b: Areas of the other engine, at least two.
 
     Returns:
-        The difference of the means (b minus a), its 90 % interval, the margin, and the verdict: equivalent, different
-        (the interval lies outside the margin) or not shown.
+        The difference of the means (b minus a), its 90 % interval, the margin, and the verdict: "equivalent",
+        "different" (the interval lies outside the margin) or "not shown" (neither).
     """
     parts = a.var(ddof=1) / len(a), b.var(ddof=1) / len(b)
     spread = sum(parts)

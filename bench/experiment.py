@@ -1,9 +1,9 @@
 """Run experiments: cases, stored results, tables and figures.
 
-An experiment is a module with an ``EXPERIMENT``, which consists of functions: one lists the cases, one measures a case,
-and others make tables and a figure from stored results. ``main`` prints the expected duration, and skips cases with
-stored results from the same hardware and software. Each result is written immediately: an interrupted run loses at most
-one case per job, and the same command continues it.
+An experiment is a module that defines ``EXPERIMENT``, an object made of functions: one lists the cases, one measures a
+case, and others make tables and a figure from stored results. ``main`` prints the expected duration, and skips cases
+with stored results from the same hardware and software. Each result is written immediately: an interrupted run loses at
+most one case per job, and the same command continues it.
 """
 
 import concurrent.futures
@@ -118,9 +118,9 @@ class Experiment:
     cases: Callable[[Any], Sequence[Any]]
     """Return the cases for the options, in the order of measurement."""
     estimate: Callable[[Any], float]
-    """Return the seconds that a case takes on two cores."""
+    """Return the expected seconds of a case on two cores."""
     measure: Callable[[Any, Any], dict[str, Any]]
-    """Measure a case with the options; raise Skipped if this machine cannot."""
+    """Measure a case; raise Skipped if this machine cannot. The arguments are the case and the options."""
     tables: Callable[[Sequence[Row]], Sequence[Table]]
     """Make tables from the stored results of one machine."""
     figure: Callable[[Sequence[Row]], Any] | None = None
@@ -279,7 +279,7 @@ def key(case: Mapping[str, Any]) -> str:
     return json.dumps(case, sort_keys=True)
 
 
-# helpers of several experiments
+# helpers that several experiments use
 
 
 def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[float]]:
@@ -287,8 +287,8 @@ def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[floa
 
     Args:
         rows: Rows whose cases differ only in contestant and ``repeat``.
-        quantity: Entry of the results.
-        unit: The reference contestant.
+        quantity: Name of the quantity in the results.
+        unit: Name of the reference contestant.
     """
     values: dict[str, dict[int, float]] = {}
     for row in rows:
@@ -435,7 +435,7 @@ def outcomes(
 
 
 def _measure_apart(measure: Callable[[Any, Any], Any], case: Any, options: Options) -> Any:
-    """Measure a case in this subprocess, and end on SIGTERM or with the parent process."""
+    """Measure a case in this subprocess; the subprocess ends on SIGTERM, or when the parent process ends."""
     # SIGTERM must raise KeyboardInterrupt, so that the subprocesses of the case also end
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     threading.Thread(target=_interrupt_after_parent, daemon=True).start()
@@ -479,7 +479,7 @@ def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
 
 
 def guarded(program: Callable[[], int], name: str) -> int:
-    """Run a program with one-line messages for bad input and Ctrl-C; return the exit code."""
+    """Run a program, and report bad input and Ctrl-C in one line; return the exit code."""
     try:
         return program()
     except (ValueError, FileNotFoundError) as error:

@@ -1,15 +1,15 @@
-"""Judge whether a robot walks: play fixed commands, with limits for tracking, falls and gait.
+"""Test whether a robot walks: give it fixed commands, and check its tracking, falls and gait against limits.
 
     lyceum-warp bench gate --policy runs/g1
     lyceum-warp bench gate --policy runs/go1-1 runs/go1-2
 
-The mean policy plays on the C engine under the task's exact physics. A Unitree G1 must pass nanoG1's gate
-(kingjulio8238/nanoG1, eval.py). The gate plays six commands of 20 s, each from four noisy starts. The gate also
+The mean policy controls the robot on the C engine under the task's exact physics. A Unitree G1 must pass nanoG1's gate
+(kingjulio8238/nanoG1, eval.py). The gate plays six commands of 20 s, each from four noisy initial states. The gate also
 measures the gait in 2,000 steps at 0.5 m/s. The gate has no noise, no pushes and no differences between robots. In
-nanoG1, actions are clipped to 1 and multiplied by 0.25 rad. Here, the change of a servo's target, divided by 0.25 rad,
-counts as the change of the action. Other robots play 100 episodes of 20 s. Noise and differences between robots are the
-same as in training. These robots get ten commands from ten starts each, once without and once with pushes. After a
-fall, a world returns to its start.
+nanoG1, actions are clipped to 1 and multiplied by 0.25 rad. To compare with nanoG1's limit, the action change is
+computed here as the change of a servo's target, divided by 0.25 rad. Other robots play 100 episodes of 20 s. Noise and
+differences between robots are the same as in training. The 100 episodes combine ten commands with ten initial states,
+and are played once without and once with pushes. After a fall, a world returns to its initial state.
 """
 
 import dataclasses
@@ -78,7 +78,7 @@ class Options(experiment.Options):
     which: str = "last"
     """Policy of each run: last, best, or the number of a saved iteration."""
     task: str | None = None
-    """Velocity task to play instead of the run's task. The task has its own parameters, not the run's."""
+    """Velocity task to play instead of the run's task. The parameters of the run are not applied to this task."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,7 +127,7 @@ class Steps:
 
 @torch.no_grad()
 def play(env: lw.Env, policy: Any, commands: Sequence[Sequence[float]], steps: int, start: torch.Tensor) -> Steps:
-    """Play from states with fixed commands; a world that fell returns to its start.
+    """Play from given states with fixed commands; after a fall, a world returns to its initial state.
 
     Args:
         env: The environment, which must have no horizon.
@@ -159,7 +159,7 @@ def worlds(folder: Path, nworld: int, options: Options, **params: Any) -> lw.Env
 
 
 def calm(env: lw.Env) -> dict[str, Any]:
-    """Return parameters that turn off noise, pushes and differences between robots. The friction is the model's own."""
+    """Return parameters that turn off noise, pushes and differences between robots. The friction is as in the model."""
     slide, spin, roll = env.model.geom_friction[env.task.params["foot_geoms"][0]].tolist()
     return dict.fromkeys(NOISES, 0.0) | {
         "encoder_bias": 0.0, "trunk_offset": [0.0, 0.0, 0.0], "push_seconds": [NEVER, NEVER],

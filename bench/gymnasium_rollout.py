@@ -21,8 +21,8 @@ TASKS = {"swimmer": "Swimmer-v5", "hopper": "Hopper-v5", "walker2d": "Walker2d-v
 class GymnasiumRollout(Rollout):
     """Fill NPG's rollout buffer from a Gymnasium vector environment; ``Rollout`` fills it from an ``Env``.
 
-    When an episode ends, the next one begins within the same step. The first episodes start at the step counts of
-    ``env``.
+    When an episode ends, the next one begins within the same step. The first episode of each world starts at the step
+    count of the same world in ``env``.
     """
 
     def __init__(self, env: lw.Env, steps: int, envs: VectorEnv, seed: int, *, segments: bool) -> None:
@@ -32,7 +32,8 @@ class GymnasiumRollout(Rollout):
         self.elapsed = torch.zeros(env.nworld)
         if segments:
             self.elapsed.copy_(env.episode_step)
-            # the time limit is also the outermost wrapper in AsyncVectorEnv
+            # this attribute belongs to the TimeLimit wrapper, which is the outermost wrapper in both vector
+            # environments
             envs.set_attr("_elapsed_steps", env.episode_step.tolist())
             self.running_return.masked_fill_(self.elapsed > 0, torch.nan)
 

@@ -1,10 +1,11 @@
-"""Compare the step times of an environment and its bare engine on the same states.
+"""Compare the step time of an environment with the step time of its physics engine alone, on the same states.
 
-Environment and bare engine alternate every ten steps. The states before the environment's steps are copied to the bare
-engine, while the clock is stopped. Environment and bare engine therefore step the same states, resets included, under
-the same machine load. The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the
-same model, controls and substeps. ``kept`` is the bare engine's time divided by the environment's, and ``added`` is the
-environment's time minus the bare engine's.
+Environment and bare engine (the engine without a task) alternate every ten steps. The environment's states before each
+step are copied to the bare engine while the clock is stopped. Both therefore step the same states, also after resets,
+under the same machine load. The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with
+the same model, controls and substeps. ``kept`` is the bare engine's step time divided by the environment's step time:
+the fraction of the engine's speed that the environment keeps. ``added`` is the environment's step time minus the bare
+engine's step time.
 """
 
 import statistics

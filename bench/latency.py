@@ -4,12 +4,12 @@
     lyceum-warp bench latency --tasks reach humanoid --samples 256 1024 --horizons 32 --device cuda
     lyceum-warp bench latency --tasks dm/cartpole_swingup --own --seconds 50
 
-Each case is one cell of the table: a task, the physics of the planner's worlds, a number of samples, a horizon, an
-engine and its device. Episodes run in real time (``lw.control_async``) until their steps take ``--seconds``: the plant
-keeps its rate, and the planner plans as often as it can. A plan meets its deadline if it takes no longer than one step
-of the plant. Run this on idle cores, because other processes delay plans. Without --samples and --horizons, cells whose
-plans take long on two cores are omitted. With --own, each task has one cell: the samples and the horizon that the task
-suggests for planners.
+A case combines a task, the physics of the planner's worlds, a number of samples, a horizon, an engine and its device.
+Episodes run in real time (``lw.control_async``) until their steps take ``--seconds``: the plant keeps its rate, and the
+planner plans as often as it can. A plan meets its deadline if it takes no longer than one step of the plant. Run this
+on idle cores, because other processes delay plans. Without --samples and --horizons, cases whose plans would take long
+on two cores are omitted. With --own, each task has one case: the samples and the horizon that the task suggests for
+planners.
 """
 
 import dataclasses
@@ -31,8 +31,8 @@ COST = {
     ("point_mass", "own"): 2.0, ("reach", "own"): 6.0, ("cartpole_swingup", "own"): 2.0, ("half_cheetah", "own"): 15.0,
     ("humanoid", "fast"): 9.0, ("humanoid", "exact"): 120.0, ("adroit_pen", "own"): 95.0,
 }  # fmt: skip
-"""Microseconds per step of a sample on two cores, by task and planning physics. The tasks in the keys are the default
-tasks."""
+"""Microseconds to simulate one step of one sample on two cores, by task and planning physics. The tasks in the keys are
+the default tasks."""
 LONGEST = 0.2
 """Maximum expected duration of a plan, in seconds; longer plans run only if samples or horizons are given."""
 SAMPLES, HORIZONS = (16, 64, 256, 1024), (16, 32, 64)
@@ -41,7 +41,7 @@ CONTESTANTS = {"mujoco": "C engine", "warp": "Warp engine"}
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Planning times in real time, by task, samples, horizon, engine and device."""
+    """Planning times under real-time control, by task, samples, horizon, engine and device."""
 
     samples: tuple[int, ...] = ()
     """Numbers of samples; by default 16, 64, 256 and 1024."""
@@ -51,18 +51,18 @@ class Options(experiment.Options):
     """Whether to use the samples and the horizon that each task suggests."""
     physics: tuple[str, ...] = ()
     """Names of the planner's physics: exact, or a name that the task defines. By default, the physics that the task
-    suggests; if the suggestion has a name, also exact."""
+    suggests; if these physics have a name, the exact physics are also measured."""
     seconds: float = 10.0
     """Seconds of a case; the 99.9 % quantile needs a thousand plans."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One cell of the table."""
+    """The settings of one measurement, which is one cell of the table."""
 
     task: str
     physics: str
-    """Name of the planner's physics; "own" if the task suggests unnamed options."""
+    """Name of the planner's physics; "own" if the task suggests options that have no name."""
     samples: int
     horizon: int
     contestant: str
@@ -75,7 +75,7 @@ class Case:
 
 
 def cases(options: Options) -> list[Case]:
-    """List the cells of each task, small plans first."""
+    """List the cases of each task, small plans first."""
     short, cuda = options.short, options.device.startswith("cuda")
     tasks = options.tasks or (("point_mass",) if short else tuple(dict.fromkeys(task for task, _ in COST)))
     contestants = choose(options.contestants, CONTESTANTS, ("warp",) if cuda else ("mujoco",), what="contestant")
@@ -99,7 +99,7 @@ def cases(options: Options) -> list[Case]:
 
 
 def physics_of(task: str, names: Sequence[str]) -> Sequence[str]:
-    """Return the given names that the task knows, or else its default physics."""
+    """Return those of the given names that the task defines; without given names, return the task's default physics."""
     found = find_task(task)
     if names:
         return [name for name in names if name == "exact" or name in found.physics]

@@ -34,15 +34,15 @@ TARGETS: dict[str, tuple[str, float, int, int | None, int]] = {
     "half_cheetah": ("npg", 5000.0, 4096, 65_536, 5),
     "humanoid": ("npg", 4500.0, 8192, 131_072, 5),
 }
-"""Algorithm, target, worlds, samples per iteration, and iterations between evaluations (0 uses the last 100
-episodes)."""
+"""By task: algorithm, target return, worlds, samples per iteration, and iterations between evaluations (with 0, the
+last 100 training episodes are used instead)."""
 
 SETTINGS: dict[str, dict[str, Any]] = {"default": {}, "desired_kl 0.01": {"desired_kl": 0.01}}
 """Hyperparameters that differ from the algorithm's defaults."""
 
 JUDGED, RECENT, WALKED = 16, 100, (256, 500)
-"""Number of episodes per evaluation, number of episodes in a run's mean return, and (worlds, steps) of the walking
-test."""
+"""Number of episodes per evaluation, number of episodes in a run's mean return, and (worlds, steps) in the test of
+tracking errors and falls."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +104,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     seconds, curve, mean = 0.0, [], -math.inf
     while seconds < case.seconds and mean < case.target:
         began = time.perf_counter()
-        it = next(made)  # the device has finished, because an iteration ends with a copy to the host
+        it = next(made)  # an iteration ends with a copy to the host, which waits for the device
         seconds += time.perf_counter() - began
         if judge is None:
             returns = made.rollout.episode_return[made.rollout.done]

@@ -11,7 +11,7 @@ from typing import Any
 from lyceum_warp.support.versions import versions
 
 HARDWARE = ("cpu", "cores", "gpu", "driver", "power_limit")
-"""Entries that describe the hardware; numbers are compared only if they are equal."""
+"""Entries that describe the hardware; two measurements are compared only if these entries are equal."""
 
 _QUERY = {
     "driver": "driver_version",

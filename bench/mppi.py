@@ -4,7 +4,7 @@
     lyceum-warp bench mppi --parts episodes --threads 1 --jobs 16
 
 ``episodes``: success and time of episodes of 75 steps, on the paper's planning tasks with the paper's settings.
-``plans``: the time of a plan from given states.
+``plans``: the planning time from given states.
 
 The Python planner (python_mppi.py) sends one message per plan to each process. All planners control the same plant, and
 take turns in blocks of episodes. The contestants named "a set at a time" run last: one planner controls the plants of
@@ -52,7 +52,7 @@ ON_WARP = ("mppi_warp", "mppi_warp_together")
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Episodes under MPPI, and the time of its plans."""
+    """Episodes controlled by MPPI, and planning times."""
 
     parts: tuple[str, ...] = ()
     """Parts: plans, episodes; by default both."""

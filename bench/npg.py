@@ -43,7 +43,7 @@ CONFIGS = {
 """Settings of NPG: the defaults, except for Swimmer's discount."""
 
 SHORT: dict[str, Any] = {"samples": 500, "value_epochs": 1}
-"""Settings of NPG that differ in the short mode."""
+"""Settings of NPG that --short replaces."""
 
 CONTESTANTS = {
     "npg": "NPG, lyceum_warp",
@@ -66,7 +66,7 @@ LIMITS = dict.fromkeys(YARDSTICKS, 720.0) | dict.fromkeys(ON_GPU, 30.0)
 """Maximum learning time of a run in seconds."""
 
 EVALUATIONS, EPISODES = 20, 16
-"""Number of evaluations of a run after the first, and number of episodes per evaluation."""
+"""Number of evaluations per run, not counting the first one, and number of episodes per evaluation."""
 
 _TUNED_NETWORK = {"log_std_init": -2.0, "ortho_init": False, "activation_fn": torch.nn.ReLU,
                   "net_arch": {"pi": [256, 256], "vf": [256, 256]}}  # fmt: skip
@@ -179,7 +179,7 @@ class Judge:
 
 
 class Curve:
-    """Collect a run's curve on a clock that stops during evaluations."""
+    """Collect the learning curve of a run; its clock stops during evaluations."""
 
     def __init__(self, case: Case) -> None:
         self.case, self.judge = case, Judge(case.task, 2 if case.short else EPISODES)
@@ -204,12 +204,12 @@ class Curve:
         return self.ended(samples) or self._evaluations(samples) >= self._next
 
     def _evaluations(self, samples: int) -> float:
-        """Return the progress of the run in evaluations."""
+        """Return the run's progress as a fractional number of evaluations."""
         progress = max(samples / (self.case.samples or math.inf), self.seconds() / self.case.limit)
         return (2 if self.case.short else EVALUATIONS) * progress
 
     def add(self, samples: int, act: Act) -> None:
-        """Evaluate a policy, unless the last point has the same number of samples."""
+        """Evaluate a policy and add a point to the curve, unless this number of samples has a point."""
         if self.points and self.points[-1][0] == samples:
             return
         seconds, self._next = self.seconds(), int(self._evaluations(samples)) + 1
@@ -222,7 +222,7 @@ class Curve:
 
 
 def mean_action(policy: torch.nn.Module) -> Act:
-    """Return the mean action of a copy of a policy."""
+    """Copy a policy, and return a function that computes the copy's mean actions."""
     now = copy.deepcopy(policy).cpu()
 
     @torch.no_grad()
@@ -279,7 +279,7 @@ def iterate(learner: Any, curve: Curve) -> dict[str, Any]:
     sampling = 0.0
     curve.start(mean_action(learner.policy))
     while not curve.ended(learner.samples):
-        sampling += next(learner).time_sample  # an iteration ends with a copy to the host, so a GPU has finished
+        sampling += next(learner).time_sample  # an iteration ends with a copy to the host, which waits for the GPU
         if curve.due(learner.samples):
             curve.add(learner.samples, mean_action(learner.policy))
     curve.add(learner.samples, mean_action(learner.policy))

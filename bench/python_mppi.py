@@ -84,7 +84,7 @@ ENVS: dict[str, Callable[[mujoco.MjModel], Any]] = {
 
 
 def smoothed(noise: np.ndarray, smoothing: tuple[float, float, float]) -> np.ndarray:
-    """Smooth noise of shape (samples, horizon, nact) over time, in place. The first two steps stay unchanged."""
+    """Smooth the noise, (samples, horizon, nact), over time and in place. The first two steps stay unchanged."""
     for t in range(2, noise.shape[1]):
         noise[:, t] = smoothing[0] * noise[:, t] + smoothing[1] * noise[:, t - 1] + smoothing[2] * noise[:, t - 2]
     return noise
@@ -115,7 +115,7 @@ class PythonMPPI:
             pipe.recv()
 
     def reset(self, seed: int | None) -> None:
-        """Clear the plan and seed the noise."""
+        """Set the plan to zero, and seed the noise."""
         self.plan[:] = 0.0
         for pipe in self.pipes:
             pipe.send(seed)

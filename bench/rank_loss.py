@@ -1,12 +1,12 @@
-"""Measure how coarser physics affect a planner: the rank correlation of its samples, and the loss of return.
+"""Measure how coarser physics affect a planner: how well it ranks its samples, and how much return is lost.
 
     lyceum-warp bench rank_loss half_cheetah hopper
 
 Each line of results/rank-loss.jsonl belongs to one task and one setting, and holds the rank correlations that
-``lyceum-warp tune --planning`` measures. The line also holds three returns of the same episodes in the task's own
-physics: R_exact with plans in these physics, R_setting with plans in the setting's physics, and R_none without plans.
-The loss is (R_exact - R_setting) / (R_exact - R_none). Episodes do not run in real time, so a busy machine changes no
-number.
+``lyceum-warp tune --planning`` measures. The line also holds three returns of the same episodes, which always run in
+the task's own physics. The planner uses the task's physics for R_exact, and the setting's physics for R_setting; R_none
+is measured without a planner. The loss is (R_exact - R_setting) / (R_exact - R_none). Episodes do not run in real time,
+so the results do not depend on the load of the machine.
 """
 
 import dataclasses
@@ -67,7 +67,7 @@ STUDIES = {
 
 
 def returns(task: str, study: Study, physics: Any, *, planned: bool = True) -> np.ndarray:
-    """Plan episodes with the given physics, and return their returns, (plants,)."""
+    """Run one episode per plant with a planner that uses the given physics; return the episodes' returns, (plants,)."""
     env = lw.make(task, nworld=study.plants, autoreset=False)
     env.rand_reset(1000)
     plan = lw.MPPI(task, plants=study.plants, seed=1000, physics=physics, **study.words)

@@ -31,12 +31,13 @@ from lyceum_warp.binding.registry import file_name, package_task_names
 from lyceum_warp.runs.folder import Run
 
 WALKING = ("--algorithm", "ppo", "--mean-every", "0")
-"""Flags for targets of an iteration's mean return; its episodes have exploration noise."""
+"""Flags for tasks whose target applies to the mean return of the training episodes, which have exploration noise."""
 NPG = ("--algorithm", "npg", "--mean-every", "5")
-"""Flags for targets of the mean policy's return in 16 episodes; the clock includes these evaluations."""
+"""Flags for tasks whose target applies to the mean policy's return in 16 episodes; the clock includes these
+evaluations."""
 LARGE = ("--samples", "65536")
 SUITE = (*WALKING, "--num-steps", "32", "--gamma", "0.995", "--entropy-coef", "0.001", "--no-clip-value-loss")
-"""One setting for all tasks of dm_control's suite."""
+"""Flags that all tasks of dm_control's suite share."""
 
 RECORDS: dict[str, tuple[float, dict[str, tuple[str, ...]]]] = {
     "go1_velocity": (80.0, {"cuda": WALKING}),
@@ -85,7 +86,7 @@ def cases(options: Options) -> list[Case]:
     tasks = choose(options.tasks, RECORDS, ("hopper",) if options.short else (), what="task")
     for task in options.tasks:
         if kind not in RECORDS[task][1]:
-            raise ValueError(f"{task} has no record on {kind}: give --device {next(iter(RECORDS[task][1]))}")
+            raise ValueError(f"{task} has no target on {kind}: give --device {next(iter(RECORDS[task][1]))}")
     seeds = options.seeds or range(1 if options.short else 3)
     return [
         Case(task, 20.0 if options.short else RECORDS[task][0], seed, cache, kind, " ".join(RECORDS[task][1][kind]))
@@ -150,8 +151,7 @@ def run(words: Sequence[str], environment: dict[str, str]) -> "subprocess.Popen[
 def timed(
     words: Sequence[str], folder: Path, environment: dict[str, str], limit: float
 ) -> tuple[dict[str, Any] | None, float]:
-    """Run the command until its run reaches the target, or for ``limit`` seconds; return the run's entry and the
-    seconds.
+    """Run the command up to its target, or for ``limit`` seconds; return the entry in config.json and the seconds.
 
     Raises:
         RuntimeError: The command failed.

@@ -7,16 +7,17 @@
 Part "faults": worlds step under random actions, and each world gets a fault every thousand steps on average. The
 program writes invalid states, states with excessive velocities, and non-finite actions. For the other faults, it writes
 a variant of the task (``VARIANT``), in which an additional action requests a NaN reward, a NaN observation or a
-negative mass. Every fault must be reported in its world and step, nothing else may be reported, and
-``env.fault_counts`` must agree. A second environment without faults must give bitwise equal numbers for each world
-until its first fault. Every fourth world gets no faults, so its numbers must be equal in both environments throughout.
+negative mass. Every fault must be reported in the world and the step in which it was injected, no other fault may be
+reported, and ``env.fault_counts`` must agree. A second environment without faults must give bitwise equal numbers for
+each world until its first fault. Every fourth world gets no faults, so its numbers must be equal in both environments
+throughout.
 
 A run is divided into chunks. Each chunk is one result, and ends by writing the worlds' states to a file in the folder
 ``--work``. The next chunk continues from this file, even on another machine with a copy of the folder.
 
 Part "random": worlds step under uniformly random actions, without injected faults. The result has the number of faults
 by reason, and the step and world of the first fault. Part "memory": environments are made and deleted. Part "kills":
-training runs are killed and resumed, and must end like an uninterrupted run.
+training runs are killed and resumed, and must give the same results as an uninterrupted run.
 """
 
 import collections
@@ -51,14 +52,14 @@ from lyceum_warp.support.validate import whole_number
 PARTS = ("faults", "random", "memory", "kills")
 KINDS = {"state": Done.NAN, "speed": Done.NAN, "action": Done.ACTION, "reward": Done.REWARD,
          "observation": Done.OBSERVATION, "model": Done.MODEL}  # fmt: skip
-"""Each kind of fault, named after the place of its injection, with the reason that must be reported. Kinds are numbered
-from 1."""
+"""The kinds of faults, named after where they are injected, and the reason that must be reported for each kind. Kinds
+are numbered from 1."""
 NBIT = len(Done)
 EVERY = 16
 """Number of steps between writes of invalid states. If writes are less frequent, each write affects more worlds, so the
 number of faults stays the same."""
 SAMPLES = 5
-"""Memory samples per chunk."""
+"""Number of times that memory is measured per chunk."""
 TASKS = {
     "point_mass": (1024, 10**7, 10, 4.0), "hopper": (512, 10**6, 10, 100.0), "soft_ball": (256, 10**6, 10, 100.0),
     "panda_lift": (256, 10**6, 10, 250.0), "adroit_relocate": (256, 10**6, 10, 250.0),
@@ -135,9 +136,9 @@ class Options(experiment.Options):
     engine: str = "auto"
     """Engine of the parts "faults", "random" and "memory"."""
     nworld: int | None = None
-    """Number of worlds; by default the task's."""
+    """Number of worlds; by default, the number listed for the task."""
     steps: int | None = None
-    """Number of steps per chunk, summed over worlds; by default the task's."""
+    """Number of steps per chunk, summed over worlds; by default, the number listed for the task."""
     kill_every: float = 40.0
     """Mean training time between two kills, in seconds."""
     work: Path = Path("runs/soak")
@@ -218,7 +219,7 @@ def cases(options: Options) -> list[Any]:
             steps = whole_number("--steps", options.steps or sizes[1], low=nworld * SAMPLES)
             chunks = [Faults(task, chunk, steps, nworld, options.engine, options.device, compared,
                              1e-2 if short else 1e-3, seed) for chunk in range(sizes[2])]  # fmt: skip
-            # a copy of the folder on another machine continues from the last state
+            # another machine with a copy of the folder continues from the last state
             done = max((i for i in range(1, len(chunks) + 1) if chunks[0].state(options.work, i).exists()), default=1)
             found += chunks[done - 1 :]
         for task, sizes, _ in runs if "random" in parts else ():
@@ -265,7 +266,7 @@ def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
     fields = [f"    {name}: Row[float]\n" for name in ("userdata", "body_mass") if name not in own.world.vars]
     source = source.replace("class World:\n", "".join(["class World:\n", *fields]), 1)
     noisy = functions["observe"] is not None and len(functions["observe"].input_types) > 3
-    # in a module with several tasks, a task's functions and structs may have other names
+    # if a module has several tasks, the names of functions and structs may differ from the usual ones
     names = {name: function.func.__name__ for name, function in functions.items() if function and function.func}
     world, params = (struct.cls.__name__ for struct in list(functions["observe"].func.__annotations__.values())[:2])
     copy = "for i in range(ctrl.shape[0]):\n        ctrl[i] = action[i]"
@@ -527,7 +528,7 @@ def kill(case: Kills, options: Options) -> dict[str, Any]:
 
 
 def table(folder: Path) -> list[dict[str, str]]:
-    """Return the rows of a run's metrics.csv without measured times."""
+    """Return the rows of a run's metrics.csv, but not the columns with measured times."""
     path = folder / "metrics.csv"
     rows = csv.DictReader(path.read_text().splitlines()) if path.exists() else ()
     measured = ("seconds", "samples_per_second")

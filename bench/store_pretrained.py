@@ -20,7 +20,7 @@ from lyceum_warp.runs.folder import Run
 FOLDER = Path(lw.__file__).parent / "pretrained"
 KEPT = ("format", "algorithm", "task", "params", "physics", "options", "nworld", "threads", "seed")
 EPISODES, SEED = 32, 1
-FEW, FIRST = 4, 60  # number of worlds and steps in the test of a stored policy
+FEW, FIRST = 4, 60  # number of worlds and of steps in which a stored policy is tested
 
 
 def store(folder: Path, which: str) -> Path:

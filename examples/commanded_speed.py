@@ -1,4 +1,4 @@
-"""Define a cheetah that runs at a commanded speed, with most features of the task form.
+"""Define a cheetah that runs at a commanded speed, with most features that a task can have.
 
 ``python examples/commanded_speed.py`` checks the task; ``lyceum-warp train examples/commanded_speed.py`` trains a
 policy.

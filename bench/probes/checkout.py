@@ -35,7 +35,7 @@ LEARNERS = ("NPG", "PPO")
 
 
 class MissingModel(Exception):  # noqa: N818
-    """The model of a task needs an extra that is not installed."""
+    """The model of a task needs an optional dependency that is not installed."""
 
 
 class Numbers:
@@ -44,8 +44,8 @@ class Numbers:
     def __init__(self) -> None:
         self.axes: dict[str, list[str]] = {}
         self.equal: list[tuple[str, str]] = []
-        """Pairs of prefixes of names. Arrays of this checkout whose names differ only by such prefixes must be
-        equal."""
+        """Pairs of name prefixes, for example of the runs with and without an interruption. Two arrays whose names
+        differ only in the prefixes of a pair must be equal."""
         self._arrays: dict[str, Any] = {}
 
     def add(self, name: str, value: Any, *axes: str, along: str | None = None) -> None:
@@ -85,7 +85,7 @@ def make(task: str, engine: str, device: str, **options: Any) -> Any:
     """Make an environment on an engine; on a GPU, the environment is deterministic.
 
     Raises:
-        MissingModel: The task needs an extra that is not installed.
+        MissingModel: The task needs an optional dependency that is not installed.
     """
     import lyceum_warp as lw
 
@@ -116,7 +116,7 @@ def split(env: Any, state: torch.Tensor) -> dict[str, torch.Tensor]:
 
 
 def observed(env: Any) -> dict[str, Any]:
-    """Return all outputs of an environment, except for its fields."""
+    """Return the state, the observations, the action and all results of a step, but not the fields of the physics."""
     names = ("reward", "eval", "terminated", "truncated", "done", "done_reason", "success", "episode_step", "time")
     return {
         "state": split(env, env.get_state()),
@@ -144,7 +144,7 @@ def constants(model: Any) -> Iterator[tuple[str, Any]]:
 
 
 def without_clocks(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the numbers of an iteration without measured times; None becomes nan."""
+    """Return an iteration's numbers, but not its measured times; None becomes nan."""
     return {
         name: without_clocks(value) if isinstance(value, Mapping) else np.nan if value is None else value
         for name, value in row.items()
@@ -235,7 +235,7 @@ TRAJECTORY = (
     "states", "obs", "actions", "rewards", "evals", "success", "plan_of", "plan_steps", "plan_failed", "plan_effective",
     "done_reason",
 )  # fmt: skip
-"""Fields of a trajectory without measured times."""
+"""The fields of a trajectory to compare; fields with measured times are left out."""
 
 
 def plans(numbers: Numbers, *, task: str, engine: str, device: str, variants: Sequence[str]) -> None:
@@ -263,7 +263,7 @@ def plans(numbers: Numbers, *, task: str, engine: str, device: str, variants: Se
 
 
 def learning(numbers: Numbers, *, task: str, engine: str, device: str, learner: str, iterations: int) -> None:
-    """Run iterations of a learner, and add its final networks."""
+    """Run iterations of a learner; the results also contain its final networks."""
     import lyceum_warp as lw
 
     env = make(task, engine, device, nworld=4, seed=5)

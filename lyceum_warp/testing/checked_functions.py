@@ -1,6 +1,6 @@
 """Copy a task's functions with a bounds check for every index, and make kernels that run the copies.
 
-In a copy, each index of a row, a vector or a matrix goes through a function that compares it with the size, and each
+In a copy, each index into a row, a vector or a matrix is passed to a function that checks it against the size, and each
 ``while`` loop counts its iterations. A copy is otherwise unchanged, so it computes the same numbers. Native functions
 (``wp.func_native``) are C++ and cannot be checked.
 """
@@ -19,7 +19,7 @@ from lyceum_warp.binding.sources import FunctionSource, is_row, is_struct, name_
 from lyceum_warp.kernels import index_checks
 
 _SHAPES = ("shape", "strides")
-"""Attributes of an array that are tuples."""
+"""Attributes of an array whose values are tuples."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,10 +57,10 @@ class Unchecked(Exception):  # noqa: N818
 class CheckedFunctions:
     """Makes checked copies of functions, and a kernel for each copy.
 
-    A kernel takes the report and, for each argument of the function, the values of all worlds. World becomes a
-    ``Batch``, Params an array (nworld,) or (1,), and a row an array (nworld, size). The report, (places, 3) int32, has
-    a row per indexing expression. A row holds how often the index was out of range, the first such index, and the size
-    of the array.
+    A kernel takes the report and, for each argument of the function, the values of all worlds. The values of a World
+    are a ``Batch``, those of Params an array (nworld,) or (1,), and those of a row an array (nworld, size). The report,
+    (places, 3) int32, has a row per indexing expression. A row holds how often the index was out of range, the first
+    such index, and the size of the array.
 
     Raises:
         Unchecked: A function can't be copied.
@@ -93,12 +93,12 @@ class CheckedFunctions:
         return list(dict.fromkeys(place.problem(*found[i, 1:]) for i, place in enumerate(self.places) if found[i, 0]))
 
     def place(self, source: FunctionSource, node: ast.AST, text: str, verb: str) -> int:
-        """Add an index or a loop to the report, and return the number of its row."""
+        """Add a row for an index or a loop to the report, and return the row's index."""
         self.places.append(Place(source.name, text, source.place(node), verb))
         return len(self.places) - 1
 
     def number(self, function: wp.Function) -> int:
-        """Return the number of a function's copy; the first call makes the copy."""
+        """Return the index of a function's copy, which the first call makes."""
         if function not in self._numbers:
             number = self._numbers[function] = len(self._numbers)
             for overload in overloads(function):
@@ -202,7 +202,7 @@ class _Rewriter(ast.NodeTransformer):
         if kind == "static":
             return node
         if callee is None and self.source.is_static(node.func):
-            raise Unchecked(f"{self.source.name} calls a function that a loop selects ({self.source.place(node)})")
+            raise Unchecked(f"{self.source.name} calls a function chosen by a loop ({self.source.place(node)})")
         if kind == "native" and any(is_row(given) or is_struct(given) for given in callee.input_types.values()):
             raise Unchecked(
                 f"{self.source.name} calls the native function {name_of(callee)} ({self.source.place(node)}), which "
@@ -289,7 +289,7 @@ def _call(name: str, *arguments: ast.expr) -> ast.Call:
 
 
 def _loaded(node: ast.expr) -> ast.expr:
-    """Copy an expression with load context."""
+    """Copy an expression, with the context ``ast.Load``."""
     loaded = copy.deepcopy(node)
     if isinstance(loaded, ast.Attribute | ast.Subscript | ast.Name):
         loaded.ctx = ast.Load()
@@ -302,9 +302,9 @@ _made: dict[Any, CheckedFunctions] = {}
 def checked_functions(
     name: str, functions: Mapping[str, wp.Function], views: Mapping[Any, wp.Function], device: wp.Device
 ) -> CheckedFunctions:
-    """Get the copies of a task's functions, compiled for a device and cached for equal functions.
+    """Get the checked copies of a task's functions, compiled for a device; equal functions share cached copies.
 
-    ``name`` is the name of the copies' Warp module, and ``views`` come from the task's kernels.
+    ``name`` is the name of the copies' Warp module, and ``views`` are those of the task's kernels.
 
     Raises:
         Unchecked: A function can't be checked.

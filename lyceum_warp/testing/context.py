@@ -44,7 +44,7 @@ class Context:
     """The name of the rule that is being checked."""
 
     def fail(self, problem: str, world: int = 0) -> NoReturn:
-        """Raise the AssertionError for a problem, with the seed, the step and the state of a world of ``a``."""
+        """Raise an AssertionError that states a problem, the seed, and the step and state of one world of ``a``."""
         state, parts = self.a.get_state()[world], self.a.state_space.parts
         values = ", ".join(f"{name} {state[part].tolist()}" for name, part in parts.items())
         where = f"with seed {self.seed}, world {world} in step {int(state[parts['step']])} of its episode: {values}"
@@ -76,7 +76,7 @@ class Context:
             env.rand_reset(self.seed if seed is None else seed)
 
     def actions(self, steps: int, salt: int = 0) -> torch.Tensor:
-        """Draw random actions within their bounds, or from -1 to 1 without bounds, (steps, nworld, nact)."""
+        """Draw random actions, (steps, nworld, nact); a missing bound is replaced by -1 or 1."""
         env = self.a
         assert env.action_space.low is not None and env.action_space.high is not None
         low = torch.as_tensor(np.where(np.isfinite(env.action_space.low), env.action_space.low, -1.0))

@@ -37,7 +37,7 @@ def check_noise(ctx: Context) -> None:
     state = env.get_state()
     ctx.equal(env.get_obs(state), env.obs, "the noise of a state")
     parts = env.state_space.parts
-    # these copies of a state differ only in their position in the random stream
+    # these copies of a state differ only in where their sequence of random numbers continues
     same = state[:1].expand_as(state).contiguous()
     changes: dict[str, torch.Tensor] = {"key": state[:, parts["key"]]}
     for name in ("episode", "step"):
@@ -125,9 +125,9 @@ def check_success_steps(ctx: Context) -> None:
 
 
 def check_events(ctx: Context) -> None:
-    """An event runs after a step's reward and end are computed, and changes some worlds' states and next observations.
+    """An event runs after a step's reward and termination are computed, and changes the state and the next observation.
 
-    Events do not run in worlds that restart, and do not change any bit of worlds without an event.
+    An event does not run in worlds that restart, and leaves worlds without an event bitwise unchanged.
     """
     a, b = ctx.a, ctx.b
     if a.task.functions["event"] is None:

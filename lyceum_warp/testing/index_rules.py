@@ -105,14 +105,14 @@ class _Run:
         self._run_step(env.worlds)
 
     def _run_step(self, worlds: Worlds) -> None:
-        """Run the functions of a step on its transition and on its last state."""
+        """Run the functions of a step, on the states before and after it."""
         dirty = True
         for name, function in self.functions.items():
             if name in (*_RESET, "control"):
                 continue
             if dirty:
                 self._copy(worlds.after, self.after)
-            if name == "advance":  # advance gets the memory of the previous step
+            if name == "advance":  # the function advance gets the memory of the previous step
                 for memory in MEMORIES:
                     if memory in self.env.task.types:
                         wp.copy(getattr(self.after, memory), getattr(self.before, memory))
@@ -138,7 +138,7 @@ class _Run:
         env.reset()
 
     def _run(self, name: str, state: Any) -> None:
-        """Run the copy of a function, if the task has such a function; ``state`` is its argument ``s`` or ``s1``."""
+        """Run the copy of a function, if the task defines it; ``state`` is the function's argument ``s`` or ``s1``."""
         if name not in self.functions:
             return
         draws = self.rng.integers(0, 2**32, (self.env.nworld, 1), dtype=np.uint32)

@@ -1,6 +1,7 @@
-"""Check the effects of inputs and of model fields that differ between worlds.
+"""Check that a world's inputs (such as applied forces) and its own model fields affect its physics.
 
-An engine's result must be nearer to the result of ``mj_step`` than to the result without these inputs and fields.
+The reference is ``mj_step``. An engine's result must be nearer to the reference than to ``mj_step`` without these
+inputs and fields.
 """
 
 import copy
@@ -16,7 +17,7 @@ from lyceum_warp.testing.context import SHORT, Context
 from lyceum_warp.world_arrays import memory_columns
 
 _SMALLEST = 1e-4
-"""Coordinates are not compared if inputs and model fields move every coordinate by less than this distance."""
+"""If inputs and model fields move every coordinate by less than this distance, their effect is not checked."""
 
 
 def predicted(
@@ -108,9 +109,9 @@ def check_inputs(ctx: Context) -> None:
 
 
 def check_dynamics(ctx: Context) -> None:
-    """A world's model fields belong to its state and affect its physics, and draws do not accumulate over resets.
+    """A world's model fields belong to its state and affect its physics; randomization does not accumulate over resets.
 
-    ``reset`` restores nominal values, except in fields that are drawn once for each world.
+    ``reset`` restores nominal values, except in fields that are randomized only once per world.
     """
     a, b = ctx.a, ctx.b
     varied = [field.name for field in a.task.dynamics]
@@ -143,7 +144,7 @@ def check_dynamics(ctx: Context) -> None:
         b.rand_reset(ctx.seed + 7)
         b.set_state(after)
         compare(b, after, "after set_state")
-    # many resets and one reset lead to the same next draw
+    # the next random values are the same after many resets as after one reset
     for _ in range(3 * SHORT):
         a.rand_reset()
     late = a.get_state()

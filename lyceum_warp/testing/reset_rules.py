@@ -1,4 +1,4 @@
-"""Check how episodes start: from a keyframe, after rejected draws, after settling."""
+"""Check how episodes start: from a keyframe, after rejected initial states, after the substeps of ``settle``."""
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ from lyceum_warp.testing.context import Context
 from lyceum_warp.testing.physics_rules import closer, predicted
 
 _RESETS = 6
-"""The number of resets in the check of rejected draws."""
+"""The number of resets in ``check_rejection``."""
 
 
 def check_keyframe(ctx: Context) -> None:
@@ -30,7 +30,7 @@ def check_keyframe(ctx: Context) -> None:
 
 
 def check_rejection(ctx: Context) -> None:
-    """An episode starts in a rejected state only after the maximum number of draws. Worlds draw independently."""
+    """Each world draws initial states until one is accepted or the maximum number of draws is reached."""
     a, b = ctx.a, ctx.b
     reject = a.task.kernels.reject_worlds
     if reject is None:

@@ -10,7 +10,7 @@ from lyceum_warp.testing.context import SHORT, Context
 
 
 def check_round_trip(ctx: Context) -> None:
-    """A state that is set and read again is the same.
+    """After ``set_state(state)``, ``get_state()`` returns the same state.
 
     With a mask, ``get_state`` writes only the rows of masked worlds.
     """
@@ -84,7 +84,7 @@ def check_set_state_shows(ctx: Context) -> None:
             if has_evaluate:
                 ctx.equal(b.eval[calm], a.eval[calm], "eval after set_state")
             ctx.that((b.reward == 0).all(), f"the reward after set_state is {b.reward.tolist()}")
-            for name in ("terminated", "done", "done_reason"):  # an ended episode stays ended
+            for name in ("terminated", "done", "done_reason"):  # the end of the episode is part of the state
                 ctx.equal(getattr(b, name)[calm], getattr(a, name)[calm], f"{name} after set_state")
             judged = calm & ~ctx.faulty(a)  # a world with a fault has already restarted
             ended |= a.get_terminated(state) & judged
@@ -199,7 +199,7 @@ def check_masked_reset(ctx: Context) -> None:
 
 
 def check_rand_reset(ctx: Context) -> None:
-    """``rand_reset(seed)`` repeats its draws and clears actions; draws differ between resets, worlds and seeds."""
+    """``rand_reset(seed)`` is reproducible and clears actions; resets, worlds and seeds give different states."""
     a, b = ctx.a, ctx.b
     ctx.run(a, ctx.actions(5))
     ctx.restart()

@@ -51,7 +51,7 @@ class Follower:
         try:
             content = self._read()
             policy_of(content, self.run.policy, self.policy)
-        except (FileNotFoundError, ValueError) as error:  # the file may be changing
+        except (FileNotFoundError, ValueError) as error:  # the training may be writing the file
             self._seen = stamp
             return [f"the policy of {self.run.folder} was not read: {str(error).splitlines()[0]}"]
         self._seen, self.iteration = stamp, content["iteration"]
@@ -115,7 +115,7 @@ class RunViewer:
         )  # fmt: skip
         threading.Thread(target=self._print, daemon=True).start()
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError):  # a process that has already ended has printed the reason
+        with contextlib.suppress(OSError):  # if the process has already ended, it has printed the reason
             self._process.stdin.write(job + "\n")
             self._process.stdin.flush()
 

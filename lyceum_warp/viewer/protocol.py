@@ -31,7 +31,7 @@ MAX_POINTS, MAX_MESSAGES = 20_000, 200
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """The part of the display that never changes."""
+    """The part of the display that stays the same: title, model, modes, controllers, episodes and curves."""
 
     title: str
     """The title of the window."""
@@ -88,13 +88,13 @@ class SetGhosts:
     """Choose the ghosts to draw."""
 
     worlds: int = 0
-    """The number of worlds to draw as ghosts, at most ``MOST_GHOSTS``. The first ghost is the world whose number
-    follows the shown world's."""
+    """The number of worlds to draw as ghosts, at most ``MOST_GHOSTS``. The ghosts are the worlds that follow the shown
+    world in the order of their numbers."""
     grid: bool = False
     """Whether to draw the other worlds beside each other, in the model's colours."""
     episodes: int = 0
-    """The number of episodes to draw as ghosts, all at the same step as the shown episode. The first ghost is the
-    episode that follows the shown episode."""
+    """The number of episodes to draw as ghosts, all at the same step as the shown episode. The ghosts are the episodes
+    that follow the shown episode."""
     burst: int = 0
     """The number of past (red) and future (blue) states to draw along the trajectory, at most ``MOST_BURST``."""
     plan: bool = True
@@ -257,9 +257,9 @@ class Perturb:
     qpos: np.ndarray | None = None
     """Positions, (nq,) float64, which take effect only while paused."""
     mocap_pos: np.ndarray | None = None
-    """(nmocap, 3) float64, in metres."""
+    """Positions of mocap bodies, (nmocap, 3) float64, in metres."""
     mocap_quat: np.ndarray | None = None
-    """(nmocap, 4) float64: w, x, y, z."""
+    """Orientations of mocap bodies, (nmocap, 4) float64: w, x, y, z."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -267,7 +267,8 @@ class Drive:
     """Command a walking robot."""
 
     command: tuple[float, float, float] | None
-    """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s). If None, the task draws commands again."""
+    """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s). None returns the choice of commands to the
+    task."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -27,8 +27,8 @@ def view(
 ) -> "BackgroundView | None":
     """Show worlds, controllers and episodes on a page in a browser, until the user quits.
 
-    ``lw.view(env)`` shows passive worlds; ``lw.view(env, controllers={"policy": policy, "mppi": plan})`` adds
-    controllers to switch between; ``lw.view(env, episodes=[trajectory, "episode-000.npz"])`` adds episodes to play
+    ``lw.view(env)`` shows worlds without a controller; ``lw.view(env, controllers={"policy": policy, "mppi": plan})``
+    adds controllers to switch between; ``lw.view(env, episodes=[trajectory, "episode-000.npz"])`` adds episodes to play
     back. The panel and its keys choose the mode, the world, the speed, ghosts and the camera.
 
     The viewer steps the worlds of ``env``, and leaves them in their last state. A policy acts in all worlds. A
@@ -84,9 +84,9 @@ if (navigator.userAgentData && ["localhost", "127.0.0.1"].includes(location.host
   link.before(frame);
 }}
 </script>"""
-"""Return the HTML of a notebook's output: the page, and a link to the page. Only Chromium-based browsers give an
-embedded page the memory that it needs. Chromium-based browsers send the viewer's cookie only below the notebook's own
-host name."""
+"""The HTML of a notebook's output: the embedded page, and a link to the page. Only Chromium-based browsers let an
+embedded page share memory between threads, which studio needs. These browsers send the viewer's cookie only if the page
+has the same host name as the notebook."""
 
 
 class BackgroundView:

@@ -57,7 +57,7 @@ class DrawingProcess:
     """
 
     product = "the drawing"
-    """The name of the result in error messages."""
+    """What the subprocess makes, as error messages name it."""
 
     def __init__(
         self, model: mujoco.MjModel, *, camera: CameraChoice, size: tuple[int, int], fps: float | None,
@@ -191,7 +191,7 @@ class DrawingProcess:
 
 
 class Drawing(DrawingProcess):
-    """A subprocess that draws poses into a video file, with the arguments and errors of ``write_video``."""
+    """A subprocess that draws poses into a video file; see ``write_video`` for arguments and errors."""
 
     product = "the video"
 

@@ -1,7 +1,7 @@
 """Write an episode as one HTML file: a scene that plays and turns in any browser, without a server or a network.
 
-The file holds triangles of the visible geoms, in the axes of their bodies, and the bodies' poses in each frame. The
-script in ``page.html`` draws the triangles with WebGL. Textures are omitted, except for the floor's squares.
+The file holds the triangles of the visible geoms in body coordinates, and the bodies' poses in each frame. The script
+in ``page.html`` draws the triangles with WebGL. Textures are omitted, except for the floor's squares.
 """
 
 import base64
@@ -81,7 +81,7 @@ def write_poses(
         frames.append(np.concatenate([data.xpos, data.xquat], axis=1))
     vertices, indices, ranges = _triangles(model)
     _, fixed, tracked = (int(value) for value in camera[:3])
-    if fixed >= 0:  # the camera belongs to the model
+    if fixed >= 0:  # a camera of the model has no point to look at, so the page looks at the whole model
         tracked, view = int(model.cam_bodyid[fixed]), model.stat.extent * 1.5
         camera = (0, -1, tracked, *model.stat.center, view, 120.0, -20.0)
     moving = np.flatnonzero(model.body_dofnum)
@@ -143,7 +143,7 @@ def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 
 def _surface(model: mujoco.MjModel, geom: int) -> Surface | None:
-    """Make a geom's vertices, normals and triangles, in its axes; None for a kind that is not drawn."""
+    """Make a geom's vertices, normals and triangles, in the geom's coordinates; None for a kind that is not drawn."""
     types = mujoco.mjtGeom
     kind, size = types(int(model.geom_type[geom])), model.geom_size[geom]
     if kind == types.mjGEOM_PLANE:

@@ -42,12 +42,12 @@ _TAGS = {
 class TensorBoard:
     """Writes a run's iterations to files for TensorBoard; the horizontal axis counts iterations from 0.
 
-    Every number of an iteration becomes a curve. Some curves have rsl_rl's or mjlab's names, units and axis, so that
-    runs can be overlaid: Train/, Loss/, Policy/, Perf/, Episode_Metrics/ and, with ``env``, Episode_Reward/ and
-    Episode_Termination/. All other curves are in the groups return/, episode/, mean_policy/, policy/, value/, time/ and
-    metrics/.
+    Every number of an iteration becomes a curve. A curve that rsl_rl or mjlab also writes has that library's name, unit
+    and axis, so that runs can be overlaid: Train/, Loss/, Policy/, Perf/, Episode_Metrics/ and, with ``env``,
+    Episode_Reward/ and Episode_Termination/. All other curves are in the groups return/, episode/, mean_policy/,
+    policy/, value/, time/ and metrics/.
 
-    Curves that exist in the folder are continued, and their values from the first new iteration on are replaced.
+    If the folder already has curves, they are continued; from the first new iteration on, new values replace old ones.
 
     Example:
         >>> with TensorBoard("runs/mine") as board:
@@ -58,8 +58,8 @@ class TensorBoard:
         folder: The folder, which is created if it does not exist. Pass this folder, or one above it, to ``tensorboard
             --logdir``.
         env: The environment of the run. Episode_Reward/NAME is the sum of a reward term over an episode, divided by the
-            time limit in seconds. Episode_Termination/NAME is the number of episodes that the function NAME ended, per
-            step of all worlds.
+            time limit in seconds. Episode_Termination/NAME is how many episodes the function NAME ended in one step of
+            all worlds, on average.
 
     Raises:
         ImportError: The package tensorboard is not installed.
@@ -131,9 +131,9 @@ def check_tensorboard() -> None:
 
 
 def _terms(env: Env) -> dict[str, tuple[str, float]]:
-    """Return the curves with mjlab's names and units by column, each with the factor of its values."""
+    """Return the curves with mjlab's names and units, by column: the name, and the factor that converts the units."""
     task, seconds = env.task.task, env.horizon * env.timestep
-    rewards = task.rewards if seconds else ()  # mjlab's unit requires a time limit
+    rewards = task.rewards if seconds else ()  # mjlab divides rewards by the time limit
     return {f"metrics/{name}": (f"Episode_Reward/{name}", 1 / seconds) for name in rewards} | {
         f"step_metrics/{name}": (f"Episode_Termination/{name}", float(env.nworld)) for name in task.terminations
     }

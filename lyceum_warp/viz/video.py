@@ -39,7 +39,7 @@ def write_video(
     speed: float = 1.0,
     progress: Progress | None = None,
 ) -> Path:
-    """Render states into an mp4 file; each state has its own model fields.
+    """Render states into an mp4 file; model fields that differ between worlds are taken from the states.
 
     The video has at most 60 frames per second; with a shorter time step, states are skipped. A subprocess draws the
     video, without a display.
@@ -127,7 +127,7 @@ class Recorder:
         self.added = 0
         """The number of frames so far."""
         self.dropped = 0
-        """The number of frames for which the shot was dropped."""
+        """The number of frames whose shot was dropped."""
         self._drawing = Drawing(model, out, camera=camera, size=size, fps=fps, background=True)
         self._most = most_waiting
         self._shots: deque[Shot] = deque()

@@ -34,7 +34,7 @@ GYMNASIUM = {
 """Gymnasium's names of the tasks."""
 
 JUDGE_NEW_STATE = {"humanoid_standup", "reacher", "pusher", "inverted_pendulum", "inverted_double_pendulum"}
-"""Tasks for which Gymnasium's step reads only the state at the end of the step."""
+"""Tasks whose reward and termination depend only on the state at the end of the step."""
 
 
 class CartpoleEnv(MujocoEnv):

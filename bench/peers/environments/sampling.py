@@ -1,8 +1,8 @@
 """Measure environment steps per second of other libraries, as a worker of bench/venvs.py.
 
 The program reads a JSON object (contestant, task, envs, threads, seconds, warm, seed) and prints a JSON object. Actions
-are uniform within their bounds and drawn before the clock starts. If the library supports it, an episode restarts
-within its last step.
+are uniform within their bounds and drawn before the clock starts. If the library supports it, the last step of an
+episode also resets the environment.
 """
 
 import json
@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 KEPT_ACTIONS = 4096
-"""Total number of actions to draw before the clock starts; at least 16 steps are drawn."""
+"""Number of actions to draw before the clock starts, summed over steps and environments; at least 16 steps are
+drawn."""
 
 ENVPOOL = {
     "hopper": "Hopper-v5",

@@ -1,4 +1,4 @@
-"""Run a viewing session: step the worlds by the clock, carry out the window's commands, and send it frames."""
+"""Run a viewing session: step the worlds at the chosen speed, carry out the window's commands, and send it frames."""
 
 import contextlib
 import sys
@@ -33,7 +33,7 @@ from lyceum_warp.viz import NoVideoError
 _FPS = 30.0
 """The maximum number of frames per second."""
 _LAG = 0.25
-"""The maximum lag of the worlds behind the clock in seconds; a greater lag moves the clock."""
+"""The maximum lag of the worlds behind the wall clock, in seconds; any further lag is not caught up."""
 _IDLE = 0.5
 """The seconds between two frames while nothing changes."""
 _CHECK = 0.5
@@ -46,9 +46,9 @@ Watcher = Callable[[], Sequence[str]]
 class Session:
     """Show worlds in a window.
 
-    Policies act in all worlds, which the session steps by the clock. A controller of one world controls the plant, a
-    single world that runs in real time. The session then handles commands and frames only while the plant waits for its
-    next step.
+    A policy acts in all worlds, which the session steps at the chosen speed. A controller of one world controls the
+    plant, a single world that runs in real time; the session then handles commands and frames only while the plant
+    waits for its next step.
 
     Args:
         env: The worlds.
@@ -101,7 +101,7 @@ class Session:
                     self._give_up_control(error)
 
     def _tick(self) -> None:
-        """Make the steps that are due by the clock, show a frame, and wait."""
+        """Make the steps that are due, show a frame, and wait."""
         stage, now = self.stage, time.perf_counter()
         if stage.paused:
             self._next_step = now
@@ -159,12 +159,12 @@ class Session:
     # real time
 
     def _by_the_clock(self) -> bool:
-        """Whether a controller of one world acts in its plant in real time."""
+        """Whether a controller of one world is running its plant in real time."""
         stage = self.stage
         return isinstance(stage.control, WorldControl) and not stage.paused and not stage.live.past.ahead
 
     def _run_plant(self) -> None:
-        """Run the plant until its episode ends, or until a command needs its state."""
+        """Run the plant until the episode ends, or until the user gives a command that needs the plant's state."""
         stage, control = self.stage, self.stage.control
         assert isinstance(control, WorldControl)
         stage.begin_due_episode()
@@ -181,7 +181,7 @@ class Session:
         self.stage.steps += 1
         if (
             time.perf_counter() - self._last_work > 1 / _FPS
-        ):  # a late or fast plant never waits, so it never calls `work`
+        ):  # a plant that is late or runs fast does not wait between steps, so `work` is not called otherwise
             self._work()
 
     def _work(self) -> None:
@@ -193,9 +193,9 @@ class Session:
     # commands
 
     def obey(self, command: Command) -> None:
-        """Carry out a command. The message of an error is shown to the user.
+        """Carry out a command; if it fails, show the error's message to the user.
 
-        While a plant runs in real time, a command that needs its state interrupts the run.
+        A command that needs the plant's state interrupts a run in real time.
         """
         push = isinstance(command, Drive) or (isinstance(command, Perturb) and command.qpos is None)
         if self._in_run and not push and not isinstance(command, SetVideo | TakePicture | SetGhosts):

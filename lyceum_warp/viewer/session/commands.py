@@ -21,7 +21,7 @@ def obey(stage: Stage, command: protocol.Command) -> None:
         case protocol.SetWorld(choice):
             world = stage.main.choose(choice)
             if not 0 <= world < stage.env.nworld:
-                raise ValueError(f"there is no world {world}: there are {stage.env.nworld} worlds, from 0")
+                raise ValueError(f"there is no world {world}: there are {stage.env.nworld} worlds, numbered from 0")
             stage.show_world(world)
         case protocol.SetPaused(paused):
             stage.paused = paused

@@ -103,10 +103,10 @@ class WorldControl:
         self._reset_due = self._wanted = False
         self._seen: PlanView | None = None
         self.hidden: slice | None = None
-        """The part of the state that the controller gets as zeros: the forces of the user's push."""
+        """The part of the state that is hidden from the controller (set to zero): the forces of the user's push."""
 
     def new_run(self) -> "ControlRun":
-        """Return the controller for a new run of a loop. Calls from earlier runs then fail."""
+        """Return the controller for a new run of a control loop; from now on, calls from earlier runs fail."""
         self._run += 1
         return ControlRun(self, self._run)
 
@@ -134,7 +134,7 @@ class WorldControl:
         Raises:
             ControllerError: The controller raised an exception, or a newer run has begun.
         """
-        with self._busy:  # the lock waits for a call of an interrupted run
+        with self._busy:  # wait until a call of an interrupted run has ended
             if run != self._run:
                 raise ControllerError(self.name, RuntimeError("this run has ended"))
             self._reset_now()
@@ -172,7 +172,7 @@ class WorldControl:
 
 
 class ControlRun:
-    """Wraps a controller for one run of a loop, with the controller's attributes and signature."""
+    """Wraps a controller for one run of a control loop; has the controller's attributes and signature."""
 
     def __init__(self, control: WorldControl, number: int) -> None:
         self._control, self._number = control, number

@@ -1,7 +1,7 @@
 """Replace the task's command for a walking robot, and draw arrows for commanded and measured velocities.
 
-The command is found by the names of a velocity task's memory; see ``docs/velocity.md``. A robot's first joint is the
-free joint of its base.
+A robot can be driven if its task has the memory in which a velocity task stores the command (see ``docs/velocity.md``).
+The robot's first joint must be the free joint of its base.
 """
 
 import math
@@ -14,7 +14,7 @@ from lyceum_warp.viewer.protocol import Arrow
 from lyceum_warp.viewer.session.live import Live
 
 _MEMORY = ("drawn_velocity", "heading_target", "heading_controlled", "standing", "command_timer")
-_NEVER = 1e9  # seconds until the task would draw a command
+_NEVER = 1e9  # seconds until the task would choose a new command
 _HEIGHT, _SECONDS = 0.25, 0.4  # height of arrows above the base, m, and duration of the motion that an arrow shows, s
 _COMMANDED, _MEASURED = (0.1, 0.35, 0.95, 1.0), (0.1, 0.85, 0.55, 1.0)
 
@@ -35,7 +35,7 @@ class Driving:
             _, _, forward, turn = np.asarray(self._params["stages"])[0]
             self.limits = float(forward), float(self._params["lateral_velocity"]), float(turn)
         self.wanted: tuple[float, float, float] | None = None
-        """The user's command, or None if the task draws commands."""
+        """The user's command, or None if the task chooses the commands."""
 
     def command(self, state: np.ndarray) -> tuple[float, float, float] | None:
         """Return the command in a state, (state_space.size,): forward velocity, lateral velocity and yaw rate."""
@@ -51,7 +51,7 @@ class Driving:
         return float(velocity[0]), float(velocity[1]), float(turn)
 
     def apply(self, live: Live) -> None:
-        """Write the user's command into the shown world, or let the task draw a command in the next step."""
+        """Write the user's command into the shown world, or let the task choose a command in the next step."""
         if self.wanted is None:
             live.write(command_timer=np.zeros(1))
         else:

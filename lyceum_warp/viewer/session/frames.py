@@ -47,7 +47,7 @@ class FrameMaker:
         self.messages.append(text)
 
     def forget_seen(self, live: Live) -> None:
-        """Report only future ends of episodes and faults."""
+        """Do not report ends of episodes and faults that have happened so far."""
         self._seen_end = self._seen_fault = float(live.made)
 
     def add_point(self, playback: Playback) -> None:
@@ -60,7 +60,7 @@ class FrameMaker:
     def of_worlds(
         self, live: Live, main: Live, traces: Traces | None, status: Callable[..., Status], *, paused: bool
     ) -> Frame:
-        """Make a frame of worlds that are stepped.
+        """Make a frame of the shown world, and of other worlds as ghosts.
 
         Args:
             live: The worlds.
@@ -68,8 +68,8 @@ class FrameMaker:
                 ``main``.
             traces: The paths of a planner's samples.
             status: A function that makes the complete status.
-            paused: Whether the frame must show the present state; otherwise the frame may show the state at the time of
-                the previous frame.
+            paused: Whether the session is paused. The frame then shows the present state; otherwise it may show the
+                state at the time of the previous frame.
         """
         shown = _following(main.world, main.env.nworld, self.ghosts.worlds)
         wanted = shown if live is main else [], self.ghosts.burst
@@ -83,7 +83,7 @@ class FrameMaker:
             rows = live.take()
             assert rows is not None
             points.append(rows.points)
-        if live.asynchronous and not paused:  # request rows for the next frame
+        if live.asynchronous and not paused:  # start to copy the states for the next frame
             live.request(*wanted)
         state, parts = rows.states[0], live.env.state_space.parts
         self._report(rows, main.world if live is not main else None)

@@ -1,7 +1,7 @@
-"""Step the worlds of a session, keep their history, and copy the rows of a frame to the host.
+"""Step the worlds of a session, keep their history, and copy the data of a frame to the host.
 
 The history, the returns and the points of the curves stay on the worlds' device. On a GPU, no step waits for the
-device, and a frame copies its rows to the host asynchronously.
+device, and the data of a frame are copied to the host asynchronously.
 """
 
 import dataclasses
@@ -25,9 +25,9 @@ _CURVE_ROWS = 512  # curve points between two frames; further points overwrite t
 
 
 class Past:
-    """A ring buffer with the states of all worlds before each of the last steps.
+    """A ring buffer of states: the states of all worlds before each of the most recent steps.
 
-    Without memory for two states of all worlds, the buffer stays empty.
+    If the memory is too small for two states of all worlds, the buffer stays empty.
 
     Args:
         env: The worlds.
@@ -44,12 +44,12 @@ class Past:
         self.pushed: list[int | None] = [None] * self.length
         """The world that the user was pushing in each step, if any."""
         self.now = self.newest = self.oldest = 0
-        """The numbers of the present step, the newest step and the oldest step."""
+        """Step numbers in the history: the present, the newest and the oldest step."""
 
     @property
     def behind(self) -> int:
         """The number of steps that can be taken back."""
-        # when a step is taken back, the present state replaces the oldest state
+        # the first step back also stores the present state, in place of the oldest state
         return min(self.now - self.oldest, max(self.length - 1, 0))
 
     @property
@@ -72,7 +72,7 @@ class Past:
 
 @dataclasses.dataclass(frozen=True)
 class Rows:
-    """The rows of a frame on the host."""
+    """The data of a frame, copied to the host."""
 
     worlds: tuple[int, ...]
     """The indices of the worlds; the shown world comes first."""
@@ -107,7 +107,7 @@ class Live:
         """The world that the user is pushing."""
         device, n = env.obs.device, env.nworld
         self.asynchronous = device.type != "cpu"
-        """Whether rows are copied to the host asynchronously."""
+        """Whether the data of a frame are copied to the host asynchronously."""
         self.returns = torch.zeros(n, dtype=torch.float64, device=device)
         """The return of each world's episode so far, (nworld,)."""
         self._clock = 0  # steps since the session began, without steps that were taken back
@@ -154,7 +154,7 @@ class Live:
         self._after_step()
 
     def expect_steps(self) -> None:
-        """Prepare for steps that other code makes; call ``stepped`` after each of these steps."""
+        """Prepare for steps that other code makes directly on ``env``; that code calls ``stepped`` after each step."""
         self.past.drop_ahead()
         self.env.get_state(out=self._state)
         self._before_step()
@@ -310,7 +310,7 @@ class Live:
     # worlds to show
 
     def choose(self, choice: int | str) -> int:
-        """Find the index of a world. The choices "best" and "worst" wait for the device.
+        """Return the index of the chosen world; "best" and "worst" wait for the device.
 
         Args:
             choice: An index; "next" or "previous"; "best" or "worst" by the return of the episode so far.
@@ -324,7 +324,7 @@ class Live:
     # rows of frames
 
     def request(self, worlds: Sequence[int] = (), burst: int = 0) -> None:
-        """Start copying the rows of a frame to the host, unless a copy is already in progress.
+        """Start to copy the data of a frame to the host, unless a copy is already in progress.
 
         Args:
             worlds: The worlds to copy in addition to the shown world.
@@ -347,7 +347,7 @@ class Live:
             self._event.record()
 
     def take(self) -> Rows | None:
-        """Wait for the requested rows, and return them, or None if there was no request."""
+        """Wait for the requested data, and return them; return None if there was no request."""
         if self._reading is None:
             return None
         (worlds, times, parts), self._reading = self._reading, None

@@ -14,12 +14,12 @@ POLL = 0.005
 """The seconds between two polls of the window's commands."""
 
 _RESERVE = 0.0015  # no other work starts in the last seconds before a step
-_PART = 10_000  # maximum steps of a run, because all states are stored
+_PART = 10_000  # maximum steps of a run, because a run stores all its states
 _WARM_UP = 3  # number of first calls during which no other work runs, because they may capture graphs
 
 
 class InterruptedByCommand(BaseException):
-    """Raised to end a run of the plant, because a command needs its state."""
+    """Raised to end a run of the plant, because a command of the user needs the plant's state."""
 
 
 def make_plant(main: Live) -> Live:
@@ -67,7 +67,7 @@ def run_plant(
     except ValueError as error:  # from invalid actions
         raise ControllerError(control.name, error) from error
     finally:
-        control.new_run()  # remaining calls of this run fail
+        control.new_run()  # from now on, calls from this run fail
 
 
 class _WorkingClock(Clock):
@@ -75,7 +75,7 @@ class _WorkingClock(Clock):
 
     Args:
         work: A function that is called while the plant waits for its next step.
-        warm: Whether to call ``work`` even before the first plan.
+        warm: Whether to call ``work`` also before the first plan is ready.
     """
 
     def __init__(self, work: Callable[[], None], *, warm: bool) -> None:

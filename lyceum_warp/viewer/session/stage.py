@@ -127,7 +127,7 @@ class Stage:
             self.live.env.action.zero_()
 
     def _step_plant(self, current: WorldControl) -> None:
-        """Make one step of a plant that waits for its controller."""
+        """Make one step of the plant, not in real time: the step waits for the controller."""
         self.begin_due_episode()
         self.live.expect_steps()
         try:
@@ -262,7 +262,7 @@ class Stage:
         frame = self.frames.of_worlds(self.live, self.main, self._traces(), self._status, paused=self.paused)
         wanted, command, live = self.driving.wanted, frame.status.command, self.live
         if wanted and command and not live.past.ahead and not np.allclose(command, wanted, atol=1e-6):
-            self.driving.apply(live)  # a new episode or another world has a different command
+            self.driving.apply(live)  # after a reset or a change of world, the command differs from the user's
             live.expect_steps()
         return frame
 

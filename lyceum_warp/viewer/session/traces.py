@@ -1,8 +1,8 @@
 """Roll out a planner's plan and samples again in a thread, to get their paths.
 
 A planner does not store positions. This module rolls out the actions of some samples from the plan's initial state, in
-worlds with the planner's task, model and time step. The random streams of these worlds differ from the planner's, so
-the paths differ if the task draws random numbers during an episode.
+worlds with the planner's task, model and time step. If the task is random during an episode, the paths differ from the
+planner's, because these worlds draw other random numbers.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ SHARE = 0.15
 
 @dataclasses.dataclass(frozen=True)
 class TracePoint:
-    """The point of a robot for which paths are drawn."""
+    """The point of a robot whose paths are drawn."""
 
     field: str
     """The field with the point's position: "site_xpos", "xpos", "xipos" or "subtree_com"."""
@@ -35,10 +35,11 @@ class TracePoint:
 
 
 def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
-    """Choose the point of a robot for which paths are drawn.
+    """Choose the point of a robot whose paths are drawn.
 
     For a robot with an unactuated base, such as a hopper or a humanoid, the default is the centre of mass. For an arm,
-    the default is the end of the longest chain of actuated bodies: its first site, or its centre of mass.
+    the default is the last body in the longest chain of actuated bodies: the body's first site, or the body's centre of
+    mass if it has no site.
 
     Args:
         model: The model.
@@ -145,7 +146,7 @@ class TraceRollouts:
         return Traces(paths, view.best, ended, time.perf_counter())
 
     def _put(self, state: torch.Tensor) -> None:
-        """Copy the parts of the planner's state into every row; rows may also have parts for additional fields."""
+        """Copy the planner's state into every world; additional fields of these worlds stay unchanged."""
         parts = self.env.state_space.parts
         state = state.to(self._states.device)
         for name, part in self._parts.items():

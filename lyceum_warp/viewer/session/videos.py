@@ -178,7 +178,7 @@ def _numbers(pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _shot(frame: Frame, count: int) -> Shot:
-    """Return the content of ``count`` frames of a video."""
+    """Convert a frame of the viewer to a shot, which fills ``count`` frames of a video."""
     paths = () if frame.traces is None else frame.traces
     lines = [(path, BEST_COLOUR if i == frame.best else TRACE_COLOUR, _WIDTH) for i, path in enumerate(paths)]
     lines += [(np.stack([arrow.start, arrow.end]), arrow.colour, 2 * _WIDTH) for arrow in frame.arrows]

@@ -72,7 +72,7 @@ class Window:
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
                 stderr=self._log,
-                process_group=0,  # a separate group, because the terminal sends Ctrl-C to its own group
+                process_group=0,  # a separate process group, because a terminal sends Ctrl-C to its whole group
             )
         self.error: str | None = None
         """The error that ended the window, if there was one."""
@@ -127,7 +127,7 @@ class Window:
     def close(self) -> None:
         """End the window process. A second call does nothing."""
         self._end()
-        with contextlib.suppress(OSError):  # closing wakes both threads and the process
+        with contextlib.suppress(OSError):  # shutting down the socket wakes both threads and the process
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
         try:

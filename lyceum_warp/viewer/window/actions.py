@@ -20,7 +20,7 @@ MANY_STEPS = 50
 _DRIVING = tuple(getattr(imgui.Key, name) for name in "WSADQE")  # forward, back, left, right, turn left, turn right
 
 KEY_NAMES = {"Right": "RightArrow", "Left": "LeftArrow", "Up": "UpArrow", "Down": "DownArrow"}
-"""Map the panel's names of keys to studio's names, if the names differ."""
+"""Studio's names of keys, by the panel's names, where the two differ."""
 
 
 class Actions:
@@ -87,7 +87,7 @@ class Actions:
             self.do(protocol.Drive(command))
 
     def toggle_driving(self) -> None:
-        """Let the user drive, beginning with a velocity of 0, or let the task draw commands again."""
+        """Let the user drive, beginning with a velocity of 0, or let the task choose commands again."""
         if self.scene.speeds is not None:
             self.do(protocol.Drive(None if self.status.driven else (0.0, 0.0, 0.0)))
 

@@ -71,5 +71,5 @@ def _perturbation(model: mujoco.MjModel, data: mujoco.MjData, perturb: mujoco.Mj
 
 
 def _rounded(push: Perturb) -> list[Any]:
-    """Round the parts of a command, so that equal commands compare equal."""
+    """Round the numbers of a command, so that rounding errors do not make commands differ."""
     return [None if part is None else (part.round(9) + 0.0).tolist() for part in vars(push).values()]

@@ -92,7 +92,7 @@ class ExtraGeoms:
             for geom in scene.geoms[begin : scene.ngeom]:
                 if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and same[geom.objid] and not beside:
                     continue  # two surfaces in the same place would flicker
-                geom.size *= SHRUNK  # a geom that is only turned about its own axis would flicker, too
+                geom.size *= SHRUNK  # a capsule that is only rotated about its own axis would also flicker
                 geom.pos[:2] += ghost.shift
                 if colour is not None:
                     geom.rgba = colour
@@ -198,7 +198,7 @@ class ViewCameras:
     def __init__(self, viewer: Any, values: ModelValues) -> None:
         self.viewer, self.values = viewer, values
         self.state = ux.UxState()
-        """The choice of the camera as studio stores it."""
+        """Studio's state of the user interface, which includes the chosen camera."""
 
     def choose(self, index: int) -> None:
         """Choose studio's free, flying or tracking camera, or a camera of the model."""

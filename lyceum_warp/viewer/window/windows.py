@@ -194,7 +194,7 @@ class Windows:
                 self._actions.do(protocol.Drive((command[0], command[1], command[2])))
 
     def _numbers(self) -> None:
-        """Let the user change the planner's settings and the task's parameters; send each value after the edit."""
+        """Let the user change the planner's settings and the task's parameters; send a value when its edit ends."""
         status = self._actions.status
         parts: tuple[tuple[Literal["planner", "task"], Any], ...] = ("planner", status.planner), ("task", status.params)
         for of, numbers in parts:

@@ -111,7 +111,7 @@ def test_worlds_are_chosen_by_number_and_by_return(shared_env: SharedEnv) -> Non
         assert frame.status.world == int(expected), choice
         np.testing.assert_array_equal(frame.state, env.get_state()[int(expected), : len(frame.state)].numpy())
     session.obey(protocol.SetWorld(4))
-    assert session.stage.frame().messages == ("there is no world 4: there are 4 worlds, from 0",)
+    assert session.stage.frame().messages == ("there is no world 4: there are 4 worlds, numbered from 0",)
 
 
 def test_controllers_are_switched_and_passive_worlds_have_no_controls(shared_env: SharedEnv) -> None:
