@@ -105,7 +105,7 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         self._pictures.close()
 
     def _rows(self, *buffers: torch.Tensor) -> list[Any]:
-        """The first row of each buffer: the row of the single world."""
+        """Return the single world's row of each buffer."""
         return [array[0] for array in self._host.of(*buffers)]
 
 

@@ -31,7 +31,7 @@ _SPELLED = {
 }  # fmt: skip
 
 _MOST_SUCCESS_STEPS = 2**24
-"""The largest number of success steps: the count is a float32, which is exact up to 2**24."""
+"""The largest value of ``success_steps``: steps are counted in a float32, which is exact up to 2**24."""
 
 _PARTS = 'the parts of its observation, as obs = {"position": 5}'
 
@@ -112,7 +112,7 @@ def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict
 
 
 def obs_slices(source: TaskSource, params: Mapping[str, Any]) -> dict[str, parts.Layout]:
-    """Compute the layouts of observation groups that a task writes into structs; empty if the task has ``obs``.
+    """Compute the layouts of observation groups that are declared as structs; return {} if the task has ``obs``.
 
     Raises:
         ValueError: ``observe`` takes no struct, or a struct has no parts, or has fields that are not parts.
@@ -149,7 +149,7 @@ class BoundTask:
         task: The task's class.
         nworld: Number of worlds. Parameters that differ between worlds have this length.
         model: A model to use instead of the task's own.
-        fields: Fields that the engine keeps in addition to those in ``World``.
+        fields: Fields that the engine provides in addition to those in ``World``.
         dynamics: Model fields that may differ between worlds in addition to those that the task writes.
         physics: Options of the simulation.
         params: Values for the fields of ``Params``; for a scalar, one value or one per world.
@@ -201,7 +201,7 @@ class BoundTask:
             describe(self.model, name, lagged=name in task.lagged, cleared=name in task.cleared, written=name in inputs)
             for name in dict.fromkeys([*own, "time", "ctrl"])
         ]
-        """The fields that the engine keeps: the fields of World and of ``fields=``, time and controls."""
+        """The fields that the engine provides: those of World, those in ``fields``, the time and the controls."""
         self._sort_model_fields(of_model, dynamics)
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)
         """The integration state at which a reset starts, (integration_size,) float64; None for the model's default."""
@@ -210,7 +210,7 @@ class BoundTask:
             given=params or {}, weights=self.source.terms.weights,
         )  # fmt: skip
         self.actions = self._checked_actions()
-        """Sizes of an action's parts, by name; None if actions are controls."""
+        """Sizes of an action's parts, by name; None if the actions are MuJoCo's controls."""
         self.memory = self._memory_layouts()
         """The layouts of the rows ``memory`` and ``lasting_memory``."""
         self.obs_layouts = obs_layouts(self.source, self.params)

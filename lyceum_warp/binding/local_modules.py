@@ -13,7 +13,7 @@ Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
 """The modification time and size of each file; None if the file does not exist."""
 
 _taken: dict[str, Stamps] = {}
-"""The modules in ``sys.modules`` that task files imported from their folders, with their stamps."""
+"""The modules in ``sys.modules`` that task files imported from their folders, and the files' stamps at that time."""
 
 
 def local_modules(file: Path) -> dict[str, Path]:

@@ -1,4 +1,4 @@
-"""Check the values of a task's parameters (the fields of ``Params``), and make the array for its kernels."""
+"""Check the values of a task's parameters (the fields of ``Params``), and pass them to kernels in an array."""
 
 import copy
 from collections.abc import Mapping
@@ -237,7 +237,7 @@ class Parameters:
         return table
 
     def _indices(self, what: str, value: Any, field: str | None) -> Any:
-        """In a table, replace elements of the model by their indices; if ``field`` is given, also replace names."""
+        """Replace model elements in a table by their indices; if ``field`` is given, names are replaced as well."""
         if isinstance(value, list | tuple):
             return [self._indices(what, entry, field) for entry in value]
         if isinstance(value, Element):
@@ -266,7 +266,7 @@ class Parameters:
 
 
 def _element_field(default: Any) -> str | None:
-    """Return the field, such as "site_xpos", to which the elements in a table's default belong.
+    """Return the field that a table's default refers to, such as "site_xpos" if the default lists sites.
 
     The result is None if the default consists of numbers.
     """

@@ -14,7 +14,7 @@ from lyceum_warp.support.upstream import builtin_functions
 
 
 class FunctionSource:
-    """Holds the source of a ``wp.func`` at its definition, even if the file has changed since then.
+    """Holds the source that a ``wp.func`` had when it was defined, even if the file has changed since then.
 
     Raises:
         ValueError: The source is not a single function definition.

@@ -95,7 +95,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
         owners: The task's class and its base classes, without ``Task``.
         world: The task's World.
         params: The task's Params, which its functions take.
-        own: The struct with the defaults of Params: ``params``, or another struct with the same fields.
+        own: The task's own declaration of Params: ``params`` itself, or a struct that differs from it only in defaults.
 
     Raises:
         ValueError: A function takes other arguments than the function that it replaces.
@@ -143,7 +143,7 @@ def _home(function: wp.Function) -> str:
 
 
 def _values(module: types.ModuleType, owners: Sequence[type[Task]]) -> Iterator[Any]:
-    """Yield the values of a module's names, now and at the definition of its tasks, and of these tasks' attributes."""
+    """Yield a module's globals, also those at the definitions of its tasks, and the tasks' attributes."""
     for owner in owners:
         if owner.__module__ == module.__name__:
             own = (value.__func__ if isinstance(value, staticmethod) else value for value in vars(owner).values())
