@@ -80,7 +80,7 @@ class Engine(abc.ABC):
     reset_stage: Stage
     """The stage up to which MuJoCo's forward pass must run after a reset."""
     snapshots: list[Field]
-    """The fields that do not follow from the integration state, in the order of the state vector."""
+    """The fields that cannot be computed from the integration state, in the order of the state vector."""
     integration_size: int
     """The number of floats in one world's integration state (mjSTATE_INTEGRATION)."""
     state_size: int
@@ -143,11 +143,12 @@ class Engine(abc.ABC):
     def step(self, nstep: int) -> None:
         """Advance every world by ``nstep`` substeps under ``ctrl`` and the other inputs, and update the fields.
 
-        The engine first reads the arrays of the fields for which ``written`` is set.
+        At the start of the step, the engine reads the arrays of ``ctrl`` and of the other fields whose ``written`` is
+        True.
         """
 
     def step_phases(self, nstep: int) -> list[Phase]:
-        """The phases of ``step``, for capture.
+        """Return ``step`` as a list of phases, which ``Graphs`` can capture separately.
 
         An engine that is not ``capturable`` can capture some of its phases, such as its copies of fields.
         """

@@ -125,7 +125,7 @@ def shift_plan(
 
 @wp.kernel(enable_backward=False)
 def draw_noise(seed_in: wp.array[int], count_in: wp.array[int], noise_out: wp.array3d[float]):
-    """Draw standard normal numbers by (seed, sample, count, action, step); launched over (nsample, nact).
+    """Draw standard normal numbers, determined by (seed, sample, count, action, step); launched over (nsample, nact).
 
     Each plant has its own seed and count. The samples of each plant are numbered from 0.
     """

@@ -46,7 +46,7 @@ class Findings:
     terminated: wp.array[bool]
     success: wp.array[bool]
     fault: wp.array2d[int]
-    """Faults of each part, (parts, nworld)."""
+    """Faults that the parts of ``judge`` find, (parts, nworld)."""
 
 
 OUTCOMES = {

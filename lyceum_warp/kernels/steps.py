@@ -17,7 +17,7 @@ NAN = wp.constant(int(Done.NAN))
 ALL_FAULTS = wp.constant(int(FAULTS))
 
 EVENT = wp.constant(-2)
-"""Events draw from the substream with this number of each step's random stream."""
+"""The index of the substream from which ``event`` draws, within a step's random stream."""
 STARTUP = wp.constant(-1)
 """The random stream of ``startup`` uses this number instead of an episode's index."""
 

@@ -17,10 +17,10 @@ OBSERVATION = wp.constant(int(Done.OBSERVATION))
 NAN = wp.constant(int(Done.NAN))
 
 OBSERVE = wp.constant(-1)
-"""Each step has a random stream. ``advance`` draws from it, and observation noise draws from its substream with this
-number."""
+"""The index of the substream for observation noise, within a step's random stream; ``advance`` draws from the stream
+itself."""
 
-# the parts that ``judge`` computes; the observation groups follow
+# indices of the parts of ``judge``; each observation group is one more part, from OBSERVE_FIRST
 ENDS = wp.constant(0)
 GAIN = wp.constant(1)
 METRICS = wp.constant(2)
@@ -88,8 +88,8 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
     ):
         """Evaluate a transition or a state in the masked worlds without a fault; launched over (threads, nworld).
 
-        The parts are independent. On a GPU each part runs in a separate thread, which is several times faster than one
-        thread per world.
+        The work has independent parts: the end of the episode, the reward, the metrics, and each observation group. On
+        a GPU each part runs in a separate thread, which is several times faster than one thread per world.
         """
         start, k = wp.tid()
         w = first + k
@@ -158,8 +158,8 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         last good observations. A transition with a fault counts as truncated, so that learners bootstrap from those
         observations.
 
-        Only a transition ends an episode. If a state is evaluated without a transition, ``keep_reason`` keeps the saved
-        reason, and ``found.terminated`` is the result of the task's ``terminated``.
+        Only a transition ends an episode. If a state is evaluated without a transition, ``found.terminated`` is the
+        result of the task's ``terminated``. ``keep_reason`` keeps the done reasons that are already stored.
         """
         k, lane = wp.tid()
         w = first + k

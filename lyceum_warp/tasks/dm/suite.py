@@ -39,7 +39,7 @@ def random_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def random_range(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Return the ranges of the joints in ``p.drawn_joints``, (joints, 2); a hinge without limits has a whole turn."""
+    """Return the ranges of the joints in ``p.drawn_joints``, (joints, 2); +-pi for a hinge without limits."""
     joints = np.searchsorted(model.jnt_qposadr, p.drawn_joints)
     return np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.pi, np.pi])
 
