@@ -30,14 +30,14 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
       ``final_info`` exist only if an episode ended, and ``final_obs`` is an object array with None for the other
       worlds, as Gymnasium's wrappers expect. If ``torch`` is True, ``final_obs`` and ``final_info`` exist after every
       step and hold tensors over all worlds, so that a step need not wait for the device.
-    - DISABLED leaves resets to ``reset(options={"reset_mask": mask})``. An ended world keeps stepping until its reset,
-      and its termination or truncation stays set. A world with a fault is reset at once, but returns its last valid
-      observation.
+    - DISABLED leaves resets to ``reset(options={"reset_mask": mask})``. After the end of its episode, a world keeps
+      stepping until it is reset, and its termination or truncation stays True. A world with a fault is reset at once,
+      but returns its last valid observation.
     - NEXT_STEP resets the world in the next step, which ignores the world's action. In this mode, every step runs
       the kernels of a reset twice. Some wrappers, such as ``NormalizeObservation``, require NEXT_STEP.
 
-    As in Gymnasium's own environments, a first reset without a seed draws one at random, unless the constructor gets
-    ``seed=``. One seed determines the random numbers of all worlds, but every world has different random numbers.
+    If neither the constructor nor the first reset gets a seed, the seed is random, as in Gymnasium's own environments.
+    One seed determines the random numbers of all worlds, but every world has different random numbers.
 
     Args:
         task: A task, as in ``lw.make``, or an environment.
@@ -57,7 +57,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         **words: Options and parameters for ``lw.make``, such as ``device="cuda"`` or ``ctrl_cost_weight=1e-2``.
 
     Raises:
-        ValueError: An argument is unknown or does not fit.
+        ValueError: An argument is unknown or invalid.
         FileNotFoundError: The package with the task's model is not installed.
     """
 

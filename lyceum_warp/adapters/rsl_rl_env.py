@@ -32,7 +32,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         words: Options and parameters, as for ``lw.make``.
 
     Raises:
-        ValueError: An argument does not fit; the message names it.
+        ValueError: An argument is invalid; the message names it.
         ImportError: rsl_rl is missing or its release is not supported; raised when this module is imported.
     """
 

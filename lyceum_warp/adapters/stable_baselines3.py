@@ -41,7 +41,7 @@ class StableBaselines3VecEnv(VecEnv):
         **words: Options and parameters for ``lw.make``.
 
     Raises:
-        ValueError: An argument is unknown or does not fit.
+        ValueError: An argument is unknown or invalid.
         FileNotFoundError: The package with the task's model is not installed.
     """
 

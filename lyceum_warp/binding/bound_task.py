@@ -155,7 +155,7 @@ class BoundTask:
         params: Values for the fields of ``Params``; for a scalar, one value or one per world.
 
     Raises:
-        ValueError: Parts of the task, the parameters or the options do not fit together.
+        ValueError: The task is invalid, or a parameter or an option is invalid for this task.
         FileNotFoundError: The model's file is missing.
     """
 

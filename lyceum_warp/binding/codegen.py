@@ -176,7 +176,7 @@ def _generated(
         scope[f"observe_{number}"] = function
         noisy = draws_noise(function)
         observe.append(f"if group == {number}:")
-        if noisy:  # each group has its own random stream, so its draws do not depend on other groups
+        if noisy:  # each group has its own random stream, so its noise does not depend on the other groups
             observe.append(f"    rng[0] = substream(base, {number})")
         row = f"out.{group}[w]"
         if group in structs:

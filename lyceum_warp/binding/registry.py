@@ -143,8 +143,8 @@ def task_names() -> list[str]:
 def find_task(task: str | Path | type[Task]) -> type[Task]:
     """Find a task's class by name, by file (``path/to/file.py`` or ``path/to/file.py:Class``), or return a given class.
 
-    A file may import modules beside it. If the task's file or a module that it imports from its folder has changed, the
-    file is run again. Existing environments still use the old version.
+    A file may import modules from its folder. If the task's file or a module that it imports from its folder has
+    changed, the file is run again. Existing environments still use the old version.
 
     Raises:
         ValueError: There is no such task, or its file can't be run.

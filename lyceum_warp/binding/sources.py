@@ -85,7 +85,7 @@ class FunctionSource:
         return "helper" if has_source(callee) else "native", callee
 
     def condition(self, node: ast.expr) -> bool | None:
-        """Evaluate a ``wp.static(...)`` condition, of which Warp compiles only one branch.
+        """Evaluate a condition that is a ``wp.static(...)``; Warp compiles only the branch that it selects.
 
         The result is None for other conditions.
         """

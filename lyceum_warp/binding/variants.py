@@ -1,8 +1,8 @@
-"""Copy the functions of a task's family, so that a variant can run them with its own structs and functions.
+"""Copy the functions of a family of tasks, so that each task can run them with structs and functions of its own.
 
-Warp compiles a function for the structs in its annotations. If a variant extends its parent's World, the parent's
-functions are copied. The copies take the variant's World, and call the variant's functions instead of the replaced
-ones. A copy keeps its original's source, so messages name the original's file and line.
+Warp compiles a function for the structs in its annotations. If a task extends its parent's World, the parent's
+functions are therefore copied. The copies take the task's World, and call the task's functions instead of the functions
+that these replace. Copies have the source of the original, so error messages name the original's file and line.
 """
 
 import sys
@@ -86,7 +86,7 @@ _made: dict[Any, Variant] = {}
 
 
 def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any, own: Any) -> Variant | None:
-    """Make a task's variant of its family, or return None if the task has no struct or function of its own.
+    """Copy a family's functions for a task, or return None if the task has no structs or functions of its own.
 
     Tasks with the same structs and replacements share a variant and its compiled kernels.
 

@@ -94,7 +94,7 @@ class Engine(abc.ABC):
         self.fields = {}
         for field in (describe(model, "ctrl"), *fields):
             if self.fields.setdefault(field.name, field) != field:
-                raise ValueError(f"the field {field.name!r} is listed both lagged and current: list it once")
+                raise ValueError(f"the field {field.name!r} is listed twice, as lagged and as current: list it once")
         self.dynamics, self.nominal, self.arrays = {}, {}, {}
         for varied in dynamics:
             check_simple(model, varied.name)
@@ -156,7 +156,7 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def find_faults(self, mask: wp.array) -> None:
-        """Write ``fault`` of the masked worlds: non-finite states, and overflows and warnings since the last call.
+        """Set ``fault`` in the masked worlds, from their states, and from overflows and warnings since the last call.
 
         The method consists of Warp launches on every engine.
         """

@@ -144,10 +144,10 @@ def start_on_terrain(
     later levels.
 
     Args:
-        level: The level, from 0, in memory that resets keep (one number).
-        column: The column, from 0, in memory that resets keep (one number).
-        walked: Written by ``follow_walk``, in memory that resets keep (one number).
-        commanded: Written by ``follow_walk``, in memory that resets keep (one number).
+        level: The level, from 0: one number in lasting memory.
+        column: The column, from 0: one number in lasting memory.
+        walked: One number in lasting memory, written by ``follow_walk``.
+        commanded: One number in lasting memory, written by ``follow_walk``.
         origins: ``lw.Terrain.origins``, (levels, columns).
         patch: Length of a patch's side, m: ``lw.Terrain.patch``.
         rng: The world's random numbers.

@@ -252,7 +252,7 @@ def add_up(
 def combine_models(world_return_in: wp.array[float], worst: bool, return_out: wp.array[float]):
     """Compute the mean or the minimum of each sample's returns over several models; launched over (nsample,).
 
-    The worlds of a sample are consecutive. If a sample fails in one model, its result is a failure.
+    The worlds of a sample are consecutive. A sample that fails in any of the models counts as failed.
     """
     k = wp.tid()
     models = world_return_in.shape[0] // return_out.shape[0]

@@ -177,7 +177,8 @@ def begin_kernels(task: TaskCode) -> BeginKernels:
     ):
         """Begin an episode in the masked worlds, or draw another initial state; launched over (nworld,).
 
-        The engine has already reset these worlds to the fixed initial state. Another draw continues the world's stream.
+        The engine has already reset these worlds to the fixed initial state. Another initial state is drawn with the
+        next numbers of the world's random stream.
         """
         w = first + wp.tid()
         if not mask_in[w]:

@@ -70,5 +70,5 @@ def small_control(action: Row[float]) -> float:
 
 @wp.func
 def log1p(x: float) -> float:
-    """Return log(1 + x), the scale of touch sensors."""
+    """Return log(1 + x), by which dm_control scales touch sensors."""
     return wp.log(1.0 + x)
