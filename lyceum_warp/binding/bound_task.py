@@ -42,7 +42,7 @@ def task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSp
 
 
 def _read_spec(task: type[Task], model: ModelSource | None) -> mujoco.MjSpec:
-    """Load a task's model before its ``edit_model``."""
+    """Load a task's model without applying ``edit_model``."""
     if model is not None:
         return models.load_spec(model)
     if not hasattr(task, "model"):
@@ -152,7 +152,7 @@ class BoundTask:
         fields: Fields that the engine provides in addition to those in ``World``.
         dynamics: Model fields that may differ between worlds in addition to those that the task writes.
         physics: Options of the simulation.
-        params: Values for the fields of ``Params``; for a scalar, one value or one per world.
+        params: Values for the fields of ``Params``; a scalar takes one value, or one value per world.
 
     Raises:
         ValueError: The task is invalid, or a parameter or an option is invalid for this task.
@@ -264,7 +264,7 @@ class BoundTask:
         }
 
     def _rights(self, function: TaskFunction) -> Rights:
-        """Return the fields that a function may write through each argument, by the argument's name."""
+        """Return, for each argument of a function, the fields that the function may write."""
         model = [name for name in self.types if is_model_field(name)]
         memory = tuple(self.source.memory)
         lasting = (*(name for name, part in self.source.memory.items() if part.kind == "lasting_memory"), *model)

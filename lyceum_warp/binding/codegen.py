@@ -209,7 +209,7 @@ def _generated(
 
 
 def _copy(name: str, ndim: int) -> list[str]:
-    """Generate lines that copy one world's row of a field with ``ndim`` axes; several threads divide the row."""
+    """Generate lines that copy one world's row of a field with ``ndim`` axes; each thread copies a part of the row."""
     if ndim == 1:
         return ["    if lane == 0:", f"        target.{name}[w] = source.{name}[w]"]
     lines = [f"    for i1 in range(lane, source.{name}.shape[1], lanes):"]

@@ -209,7 +209,9 @@ def _run(path: Path, name: str, source: bytes) -> None:
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
         where = f"the task file {path}" if line is None else f"the task file {path}, line {line}"
         if isinstance(error, ImportError):
-            raise ImportError(f"{where}: {error}: install the missing module, or put it beside the file") from error
+            raise ImportError(
+                f"{where}: {error}: install the missing module, or put it into the same folder"
+            ) from error
         raise ValueError(f"{where}: {_explained(error)}") from error
     finally:
         linecache.cache.pop(file, None)

@@ -47,8 +47,8 @@ class Variant:
     def seen(self, value: Any, viewer: str = "") -> Any:
         """Return the replacement of a function, a struct or a module of the family.
 
-        ``viewer`` is the name of the module that uses the value. The module that defines a replacement still gets the
-        original function, so that the replacement can call it.
+        ``viewer`` is the name of the module in which the value is used. The module that defines a replacement still
+        gets the original function, so that the replacement can call it.
         """
         if isinstance(value, wp.Function):
             while (other := self._replaced.get(value)) is not None and _home(other) != viewer:
@@ -117,7 +117,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
         if isinstance(value, wp.Function) and hasattr(value, "replaces")
     }
     named = {*structs, *structs.values(), world, params}
-    for module in modules:  # the loop body appends to this list
+    for module in modules:  # the list grows during the loop
         for value in _values(module, owners):
             home = sys.modules.get(_home(value)) if isinstance(value, wp.Function) else value
             if isinstance(home, types.ModuleType) and home not in modules and _names(home, named):
@@ -127,7 +127,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
     taken = {kind for f in functions for overload in overloads(f) for kind in overload.input_types.values()
              if is_struct(kind)}  # fmt: skip
     structs = {struct: new for struct, new in structs.items() if struct in taken}
-    if not structs and not replaced:  # for example, a task that only changes defaults
+    if not structs and not replaced:  # for example, the task changes only defaults
         return None
     key = (tuple(modules), tuple(functions), tuple(structs.items()), tuple(replaced.items()))
     if key not in _made:

@@ -174,7 +174,7 @@ class _Reader:
         """Record the writes in an expression or a statement; return the part of an argument to which it refers."""
         if isinstance(node, ast.Name):
             for name, place in self.places.items():
-                if place is not None and name.startswith(f"{node.id}."):  # the expression uses a whole local struct
+                if place is not None and name.startswith(f"{node.id}."):  # the name of a local struct that holds rows
                     self._note(place, node, follows=False)
             return self.places.get(node.id)
         if isinstance(node, ast.Attribute):

@@ -127,11 +127,11 @@ def capturing() -> Iterator[None]:
 
 
 class _Graph:
-    """Captures functions of launches: in one graph, or in one graph per thread if the functions take long.
+    """Captures functions that consist of launches, in one graph, or in one graph per thread if they take long.
 
     The first call runs the functions directly, and loads their modules. The second call captures and replays the
-    functions; later calls only replay. With workers, the first replays are timed, and the shortest time determines how
-    many threads share the work.
+    functions; later calls only replay. If there are workers, the first replays are timed, and the shortest time
+    determines how many threads share the work.
     """
 
     def __init__(

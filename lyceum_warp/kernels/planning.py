@@ -17,9 +17,9 @@ DRAWS = wp.constant(-3)
 """The stream keys of the samples use this number instead of an episode's index."""
 
 _TILES = f"{__name__}.tiles"
-"""The Warp module of the kernels with tiles. On the CPU, all kernels of a module write the same shared variable, which
-holds the address of the tiles. Kernels without tiles need a separate module, because ``graphs.capture`` serialises only
-kernels with tiles."""
+"""The Warp module of the kernels that use tiles. On the CPU, all kernels of a module write the same shared variable,
+which holds the address of the tiles. Other kernels belong to a separate module, because ``graphs.capture`` serialises
+only kernels that use tiles."""
 
 
 @wp.func

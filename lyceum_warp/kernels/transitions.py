@@ -40,7 +40,7 @@ class JudgeKernels:
 
 
 def judge_kernels(task: TaskCode) -> JudgeKernels:
-    """Make the kernels of ``JudgeKernels`` around a task's functions."""
+    """Make the kernels of ``JudgeKernels``, which call a task's functions."""
     Batch, Params, Observations, World = task.Batch, task.Params, task.Observations, task.World  # noqa: N806
     view, finite_memory = task.view, task.finite_memory
     finite_group, copy_observations = task.finite_group, task.copy_observations
@@ -230,8 +230,8 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
     ):
         """Observe the masked worlds, and find the groups that are finite; launched over (parts, nworld).
 
-        If there is only one part, this kernel also replaces observations that are not finite. Otherwise, launch
-        ``replace_observations`` after it.
+        If ``parts`` is 1, this kernel also replaces observations that are not finite. Otherwise,
+        ``replace_observations`` must be launched next.
         """
         start, k = wp.tid()
         w = first + k
@@ -287,7 +287,7 @@ class RolloutKernels:
 
 
 def rollout_kernels(task: TaskCode) -> RolloutKernels:
-    """Make the kernels of ``RolloutKernels`` around a task's functions.
+    """Make the kernels of ``RolloutKernels``, which call a task's functions.
 
     Row t * nworld + w is world w after t steps. The next state is nworld rows later, so ``before`` and ``after`` are
     views of the same arrays.

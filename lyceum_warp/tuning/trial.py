@@ -194,7 +194,7 @@ class Trials:
         return time.perf_counter() - start
 
     def _velocities(self, env: Env, k: int, start: torch.Tensor | None = None) -> torch.Tensor:
-        """Compute velocities after some steps from the k-th states, (times, nworld, nv) float64; NaN after a fault."""
+        """Compute velocities at some steps after the k-th states, (times, nworld, nv) float64; NaN after a fault."""
         env.set_state(self._starts[k] if start is None else start)
         found, bad = [], torch.zeros(env.nworld, dtype=torch.bool, device=env.obs.device)
         for step, action in enumerate(self._actions[k], 1):

@@ -12,7 +12,7 @@ _ALIGNED = 512
 
 
 class Reserve:
-    """Holds blocks of memory, which are freed with this object, because graphs store their addresses.
+    """Holds blocks of memory for graphs, which store the blocks' addresses; the blocks live as long as this object.
 
     Subclasses implement ``allocate`` and can then serve as Warp allocators.
 

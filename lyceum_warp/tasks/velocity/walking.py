@@ -91,7 +91,7 @@ class Params:
     tilt_variance: float = 0.2
     standing_pose_std: wp.array[float] = lw.from_model(lambda model, p: len(p.joints) * [0.05])  # rad
     walking_pose_std: wp.array[float] = lw.from_model(lambda model, p: len(p.joints) * [0.3])
-    soft_limit: float = 0.9  # share of a joint's range
+    soft_limit: float = 0.9  # fraction of a joint's range
     # desired foot height in a swing (m), longest rewarded single stance (s)
     swing_target: float = 0.1
     longest_step: float = 0.4
