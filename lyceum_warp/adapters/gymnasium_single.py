@@ -93,7 +93,7 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         return obs, float(reward), bool(terminated), bool(truncated), _numbers(info)
 
     def render(self) -> Any:
-        """Render a picture of the world, (height, width, 3) uint8; None without a ``render_mode``.
+        """Render a picture of the world, (height, width, 3) uint8; None if ``render_mode`` is None.
 
         Raises:
             NoVideoError: This machine cannot render.

@@ -164,7 +164,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return obs, rewards, terminations, truncations, infos
 
     def render(self) -> tuple[Any, ...] | None:
-        """Render a picture of each world, (height, width, 3) uint8; None without a ``render_mode``.
+        """Render a picture of each world, (height, width, 3) uint8; None if ``render_mode`` is None.
 
         Raises:
             NoVideoError: This machine cannot render.

@@ -116,7 +116,7 @@ class StableBaselines3VecEnv(VecEnv):
         self._pictures.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Render a picture of each world, (height, width, 3) uint8; a list of None without a ``render_mode``.
+        """Render a picture of each world, (height, width, 3) uint8; a list of None if ``render_mode`` is None.
 
         Raises:
             NoVideoError: This machine cannot render.

@@ -98,7 +98,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
         own: The task's own declaration of Params: ``params`` itself, or a struct that differs from it only in defaults.
 
     Raises:
-        ValueError: A function takes other arguments than the function that it replaces.
+        ValueError: A function's arguments differ from those of the function that it replaces.
     """
     modules = list(dict.fromkeys(sys.modules[owner.__module__] for owner in owners))
     values = [list(_values(module, owners)) for module in modules]
@@ -143,7 +143,7 @@ def _home(function: wp.Function) -> str:
 
 
 def _values(module: types.ModuleType, owners: Sequence[type[Task]]) -> Iterator[Any]:
-    """Yield a module's globals, also those at the definitions of its tasks, and the tasks' attributes."""
+    """Yield the attributes of a module's tasks, and its globals, both when each task was defined and now."""
     for owner in owners:
         if owner.__module__ == module.__name__:
             own = (value.__func__ if isinstance(value, staticmethod) else value for value in vars(owner).values())
@@ -162,7 +162,7 @@ def _names(module: types.ModuleType, structs: set[Any]) -> bool:
 
 
 def _check_replacement(task: str, made: Variant, old: wp.Function, new: wp.Function) -> None:
-    """Refuse a replacement that takes other arguments than the function that it replaces."""
+    """Refuse a replacement whose arguments differ from those of the function that it replaces."""
     wanted, given = (list(made.seen(f, _home(new)).input_types.values()) for f in (old, new))
     same = len(wanted) == len(given) and all(
         a is b if is_struct(a) or is_struct(b) else wp.types.types_equal(a, b)

@@ -86,7 +86,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         threads: int,
         first: int,
     ):
-        """Evaluate a transition or a state in the masked worlds without a fault; launched over (threads, nworld).
+        """Evaluate a transition or a state, in masked worlds that have no fault; launched over (threads, nworld).
 
         The work has independent parts: the end of the episode, the reward, the metrics, and each observation group. On
         a GPU each part runs in a separate thread, which is several times faster than one thread per world.
@@ -153,9 +153,9 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
     ):
         """Combine the results of ``judge`` in the masked worlds; launched over (nworld, lanes).
 
-        Writes the reward, the metrics and their sums, the evaluation, the end of the episode, success and the
-        observations. A transition with a fault has reward 0, metrics 0, the evaluation of the state before it, and the
-        last good observations. A transition with a fault counts as truncated, so that learners bootstrap from those
+        The kernel writes the reward, the metrics and their sums, the evaluation, the end of the episode, success and
+        the observations. A transition with a fault has reward 0, metrics 0, the evaluation of the state before it, and
+        the last good observations. A transition with a fault counts as truncated, so that learners bootstrap from those
         observations.
 
         Only a transition ends an episode. If a state is evaluated without a transition, ``found.terminated`` is the

@@ -48,17 +48,17 @@ class Tuning:
 
     @property
     def best(self) -> Row | None:
-        """Return the fastest setting with the same returns; None without such a setting."""
+        """Return the fastest setting with the same returns; None if there is no such setting."""
         return next((row for row in self.rows if row["verdict"] == "same"), None)
 
     @property
     def flags(self) -> str:
-        """Format the best setting as flags of lyceum-warp train and plan; empty without a best setting."""
+        """Format the best setting as flags of lyceum-warp train and plan; empty if ``best`` is None."""
         return flags(self.best["physics"]) if self.best else ""
 
     @property
     def task_line(self) -> str:
-        """Format the best setting as the line of a task for ``physics="fast"``; empty without a best setting."""
+        """Format the best setting as a task's line for ``physics="fast"``; empty if ``best`` is None."""
         return task_line(self.best["physics"]) if self.best else ""
 
 

@@ -57,7 +57,7 @@ class DeterministicEngine(WarpEngine):
         """
         model, data = super().bare()
         with wp.ScopedDevice(self.device):
-            CanonicalOrder(model, data)  # need not be stored: the model's callbacks refer to it
+            CanonicalOrder(model, data)  # the model's callbacks keep this object alive
         return model, data
 
     def prepare_capture(self) -> None:
