@@ -205,7 +205,7 @@ class Trials:
         return torch.stack(found)
 
     def _distance(self, velocities: list[torch.Tensor]) -> list[float]:
-        """Compute the median distance to the unchanged task's velocities after 1, 10 and 50 steps, relative to their RMS."""
+        """Compute the median distance to the unchanged task's velocities after 1, 10 and 50 steps, in RMS units."""
         exact, found = torch.cat(self._exact, 1), torch.cat(velocities, 1)
         scale = exact.square().nanmean(1, keepdim=True).sqrt().clamp_min(1e-9)
         return ((found - exact) / scale).square().mean(2).sqrt().nanmedian(1).values.tolist()
