@@ -30,7 +30,7 @@ def environment_of(
         autoreset: Whether the environment resets worlds within a step.
 
     Raises:
-        ValueError: An argument does not fit; the message names it.
+        ValueError: An argument is invalid; the message names it.
     """
     if not isinstance(task, Env):
         for word in _OTHER_WORDS.keys() & words.keys():
@@ -38,7 +38,7 @@ def environment_of(
         return make(task, nworld=1 if num_envs is None else whole_number("num_envs", num_envs, low=1),
                     autoreset=autoreset, **words)  # fmt: skip
     if words:
-        raise ValueError(f"a given environment keeps its options: pass {', '.join(words)} to lw.make")
+        raise ValueError(f"the environment already has its options: pass {', '.join(words)} to lw.make")
     if num_envs not in (None, task.nworld):
         raise ValueError(f"the environment has {task.nworld} worlds, not num_envs={num_envs}: omit num_envs")
     if task.autoreset is not autoreset:
@@ -61,7 +61,7 @@ def pictures_of(
 
 
 class ResetSeeds:
-    """Chooses the seed of each reset. The first reset draws a random seed if it gets none, as libraries expect.
+    """Chooses the seed of each reset. If the first reset gets no seed, it uses a random seed, as the libraries expect.
 
     Args:
         seeded: Whether the user has seeded the environment.
@@ -84,7 +84,7 @@ class ResetSeeds:
 
 
 def per_world(value: Any, nworld: int) -> list[Any]:
-    """Return the rows of a tensor with one row per world; repeat any other value for each world."""
+    """Return one value per world: the rows of a tensor with a row per world, or the same value for every world."""
     if isinstance(value, torch.Tensor) and value.ndim and len(value) == nworld:
         return list(value)
     return [value] * nworld

@@ -30,7 +30,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]
         **words: Options and parameters for ``lw.make``; ``seed=0`` gives the same episodes in every run.
 
     Raises:
-        ValueError: An argument is unknown or does not fit.
+        ValueError: An argument is unknown or invalid.
         FileNotFoundError: The package with the task's model is not installed.
     """
 
@@ -43,7 +43,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]
         self._ended = True
 
     def reset(self) -> dm_env.TimeStep:
-        """Start a new random episode, and return its first time step, without reward and discount."""
+        """Start a new random episode, and return its first time step, in which reward and discount are None."""
         self.env.rand_reset(self._seeds(None, lambda: np.random.SeedSequence().entropy))
         self._ended = False
         (obs,) = self._host.of(self.env.obs)

@@ -29,7 +29,7 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         **words: Options and parameters for ``lw.make``.
 
     Raises:
-        ValueError: An argument is unknown or does not fit.
+        ValueError: An argument is unknown or invalid.
         FileNotFoundError: The package with the task's model is not installed.
     """
 
@@ -93,7 +93,7 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         return obs, float(reward), bool(terminated), bool(truncated), _numbers(info)
 
     def render(self) -> Any:
-        """Render a picture of the world, (height, width, 3) uint8; None without a ``render_mode``.
+        """Render a picture of the world, (height, width, 3) uint8; None if ``render_mode`` is None.
 
         Raises:
             NoVideoError: This machine cannot render.
@@ -105,7 +105,7 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         self._pictures.close()
 
     def _rows(self, *buffers: torch.Tensor) -> list[Any]:
-        """The first row of each buffer: the row of the single world."""
+        """Return the single world's row of each buffer."""
         return [array[0] for array in self._host.of(*buffers)]
 
 

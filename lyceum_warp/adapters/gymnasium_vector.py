@@ -26,18 +26,18 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     - SAME_STEP resets the world within that step. The world returns the first observation of its next episode;
       ``infos["final_obs"]`` and ``infos["final_info"]`` hold the last observations and infos of ended episodes, and the
-      masks ``_final_obs`` and ``_final_info`` select their worlds. With NumPy, ``final_obs`` and ``final_info`` exist
-      only if an episode ended, and ``final_obs`` is an object array with None for the other worlds, as Gymnasium's
-      wrappers expect. With ``torch=True``, both entries always exist, as tensors over all worlds, so that a step need
-      not wait for the device.
-    - DISABLED leaves resets to ``reset(options={"reset_mask": mask})``. An ended world keeps stepping until its reset,
-      and its termination or truncation stays set. A world with a fault is reset at once, but returns its last valid
-      observation.
-    - NEXT_STEP resets the world in the next step, which ignores the world's action. With NEXT_STEP, every step has a
-      second reset phase. Some wrappers, such as ``NormalizeObservation``, require NEXT_STEP.
+      masks ``_final_obs`` and ``_final_info`` select their worlds. If ``torch`` is False, ``final_obs`` and
+      ``final_info`` exist only if an episode ended, and ``final_obs`` is an object array with None for the other
+      worlds, as Gymnasium's wrappers expect. If ``torch`` is True, ``final_obs`` and ``final_info`` exist after every
+      step and hold tensors over all worlds, so that a step need not wait for the device.
+    - DISABLED leaves resets to ``reset(options={"reset_mask": mask})``. After the end of its episode, a world keeps
+      stepping until it is reset, and its termination or truncation stays True. A world with a fault is reset at once,
+      but returns its last valid observation.
+    - NEXT_STEP resets the world in the next step, which ignores the world's action. In this mode, every step runs
+      the kernels of a reset twice. Some wrappers, such as ``NormalizeObservation``, require NEXT_STEP.
 
-    As in Gymnasium's own environments, a first reset without a seed draws one at random, unless the constructor gets
-    ``seed=``. One seed determines the random numbers of all worlds, but every world has different random numbers.
+    If neither the constructor nor the first reset gets a seed, the seed is random, as in Gymnasium's own environments.
+    One seed determines the random numbers of all worlds, but every world has different random numbers.
 
     Args:
         task: A task, as in ``lw.make``, or an environment.
@@ -46,8 +46,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             environment with ``autoreset=False``.
         torch: Whether actions and results are tensors on the environment's device instead of NumPy arrays. With
             tensors, a step never waits for the device.
-        copy: Whether to copy results. Without copies, most tensors and most arrays on the CPU are live buffers that the
-            next step overwrites.
+        copy: Whether to copy results. Without copies, most results (tensors, or NumPy arrays on the CPU) are live
+            buffers, and the next step overwrites them.
         dict_obs: Whether observations are dicts of all observation groups; otherwise they are the group ``policy``. By
             default, True if the task has several groups.
         render_mode: "rgb_array" for pictures, or None.
@@ -57,7 +57,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         **words: Options and parameters for ``lw.make``, such as ``device="cuda"`` or ``ctrl_cost_weight=1e-2``.
 
     Raises:
-        ValueError: An argument is unknown or does not fit.
+        ValueError: An argument is unknown or invalid.
         FileNotFoundError: The package with the task's model is not installed.
     """
 
@@ -153,7 +153,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         else:
             self._host.set_action(actions)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
-            env.action.masked_fill_(self._ended[:, None], 0.0)  # NaN in an ignored action must not be a fault
+            env.action.masked_fill_(self._ended[:, None], 0.0)  # the action is ignored, so a NaN in it is not a fault
         env.step()
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             env.rand_reset(mask=self._ended)
@@ -164,7 +164,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return obs, rewards, terminations, truncations, infos
 
     def render(self) -> tuple[Any, ...] | None:
-        """Render a picture of each world, (height, width, 3) uint8; None without a ``render_mode``.
+        """Render a picture of each world, (height, width, 3) uint8; None if ``render_mode`` is None.
 
         Raises:
             NoVideoError: This machine cannot render.

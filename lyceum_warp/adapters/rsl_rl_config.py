@@ -25,8 +25,8 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
     Example:
         >>> runner = OnPolicyRunner(RslRlVecEnv(env), runner_config(env))
 
-    rsl_rl's PPO has no equivalent of ``final_entropy_coef``, ``stagger``, ``tf32`` and the evaluation of the mean
-    policy.
+    rsl_rl's PPO has no equivalent of ``final_entropy_coef``, ``stagger`` and ``tf32``, and it does not evaluate the
+    mean policy.
 
     Args:
         env: The environment; its observation groups are the inputs of the networks.
@@ -47,7 +47,7 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
     return {
         "num_steps_per_env": config.num_steps,
         "save_interval": 50,
-        "check_for_nan": False,  # the check waits for the device, and the environment already ends episodes at NaN
+        "check_for_nan": False,  # the check would wait for the device; the environment itself ends episodes at NaN
         "obs_groups": {"actor": ["policy"], "critic": [value_group(env, config.value_group)]},
         "actor": network | _layers(config.hidden, config.activation) | {"distribution_cfg": distribution},
         "critic": network | _layers(config.value_hidden, config.value_activation),

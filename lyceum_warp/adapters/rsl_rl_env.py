@@ -32,7 +32,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         words: Options and parameters, as for ``lw.make``.
 
     Raises:
-        ValueError: An argument does not fit; the message names it.
+        ValueError: An argument is invalid; the message names it.
         ImportError: rsl_rl is missing or its release is not supported; raised when this module is imported.
     """
 
@@ -115,8 +115,8 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
               a fault has reward 0, and the last valid observation as its final observation.
             - ``final_obs``: a dict of observation groups after the step, before any reset.
             - ``log``: ``metrics/NAME``, means of the task's metrics over about the last 100 ended episodes, and
-              ``faults/worlds``, the number of worlds with a fault. The means are 0 before the first episode ends, and
-              cover all episodes that end in the step.
+              ``faults/worlds``, the number of worlds with a fault. The means are 0 until the first episode has ended.
+              They include all episodes that end in this step.
 
         Raises:
             ValueError: The actions have the wrong shape, type or device.

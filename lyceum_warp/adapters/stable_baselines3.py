@@ -41,7 +41,7 @@ class StableBaselines3VecEnv(VecEnv):
         **words: Options and parameters for ``lw.make``.
 
     Raises:
-        ValueError: An argument is unknown or does not fit.
+        ValueError: An argument is unknown or invalid.
         FileNotFoundError: The package with the task's model is not installed.
     """
 
@@ -116,7 +116,7 @@ class StableBaselines3VecEnv(VecEnv):
         self._pictures.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Render a picture of each world, (height, width, 3) uint8; a list of None without a ``render_mode``.
+        """Render a picture of each world, (height, width, 3) uint8; a list of None if ``render_mode`` is None.
 
         Raises:
             NoVideoError: This machine cannot render.
@@ -145,7 +145,7 @@ class StableBaselines3VecEnv(VecEnv):
             raise ValueError(f"{attr_name!r} is shared by all worlds: call set_attr without indices")
         if attr_name not in self.env.task.parameters.values and hasattr(self, attr_name):
             setattr(self, attr_name, value)
-        else:  # for an unknown name, the error of set_params suggests the closest ones
+        else:  # set_params raises an error for an unknown name and suggests similar ones
             self.env.set_params(**{attr_name: value})
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
@@ -161,7 +161,7 @@ class StableBaselines3VecEnv(VecEnv):
         return [rows[i] for i in self._get_indices(indices)]
 
     def _add_ends(self, infos: list[dict[str, Any]], worlds: np.ndarray) -> None:
-        """Write the info dicts of ended episodes, and set the sums of their worlds to 0."""
+        """Fill the info dicts of worlds whose episodes ended, and set these worlds' returns and lengths to 0."""
         env, count = self.env, self._observations.count
         index = torch.from_numpy(worlds).to(env.obs.device)
         buffers = [*self._observations.final, env.terminated, *self._infos.tensors]

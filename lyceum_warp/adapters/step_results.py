@@ -65,7 +65,8 @@ class HostArrays:
         env: The environment.
         copy: Whether to copy results. Without copies, results on the CPU are the environment's live buffers, which the
             next step overwrites.
-        one_world: Whether an action has the shape (nact,), because the environment has a single world.
+        one_world: Whether actions have the shape (nact,) instead of (nworld, nact); for an environment with a single
+            world.
     """
 
     def __init__(self, env: Env, *, copy: bool = True, one_world: bool = False) -> None:
@@ -126,7 +127,7 @@ class Infos:
         return [*self._plain.values(), *self._metrics.values()]
 
     def named(self, values: list[Any]) -> dict[str, Any]:
-        """Return a dict of the given values, which have the order of ``tensors``."""
+        """Make a dict of values that are listed in the order of ``tensors``."""
         infos = dict(zip(self._plain, values, strict=False))
         for name, table in zip(self._metrics, values[len(self._plain) :], strict=True):
             infos[name] = dict(zip(self._names, table.T, strict=True))

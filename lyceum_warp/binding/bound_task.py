@@ -31,7 +31,7 @@ _SPELLED = {
 }  # fmt: skip
 
 _MOST_SUCCESS_STEPS = 2**24
-"""The largest number of success steps: the count is a float32, which is exact up to 2**24."""
+"""The largest value of ``success_steps``: steps are counted in a float32, which is exact up to 2**24."""
 
 _PARTS = 'the parts of its observation, as obs = {"position": 5}'
 
@@ -42,7 +42,7 @@ def task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSp
 
 
 def _read_spec(task: type[Task], model: ModelSource | None) -> mujoco.MjSpec:
-    """Load a task's model before its ``edit_model``."""
+    """Load a task's model without applying ``edit_model``."""
     if model is not None:
         return models.load_spec(model)
     if not hasattr(task, "model"):
@@ -112,7 +112,7 @@ def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict
 
 
 def obs_slices(source: TaskSource, params: Mapping[str, Any]) -> dict[str, parts.Layout]:
-    """Compute the layouts of observation groups that a task writes into structs; empty if the task has ``obs``.
+    """Compute the layouts of observation groups that are declared as structs; return {} if the task has ``obs``.
 
     Raises:
         ValueError: ``observe`` takes no struct, or a struct has no parts, or has fields that are not parts.
@@ -149,13 +149,13 @@ class BoundTask:
         task: The task's class.
         nworld: Number of worlds. Parameters that differ between worlds have this length.
         model: A model to use instead of the task's own.
-        fields: Fields that the engine keeps in addition to those in ``World``.
+        fields: Fields that the engine provides in addition to those in ``World``.
         dynamics: Model fields that may differ between worlds in addition to those that the task writes.
         physics: Options of the simulation.
-        params: Values for the fields of ``Params``; for a scalar, one value or one per world.
+        params: Values for the fields of ``Params``; a scalar takes one value, or one value per world.
 
     Raises:
-        ValueError: Parts of the task, the parameters or the options do not fit together.
+        ValueError: The task is invalid, or a parameter or an option is invalid for this task.
         FileNotFoundError: The model's file is missing.
     """
 
@@ -201,7 +201,7 @@ class BoundTask:
             describe(self.model, name, lagged=name in task.lagged, cleared=name in task.cleared, written=name in inputs)
             for name in dict.fromkeys([*own, "time", "ctrl"])
         ]
-        """The fields that the engine keeps: the fields of World and of ``fields=``, time and controls."""
+        """The fields that the engine provides: those of World, those in ``fields``, the time and the controls."""
         self._sort_model_fields(of_model, dynamics)
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)
         """The integration state at which a reset starts, (integration_size,) float64; None for the model's default."""
@@ -210,7 +210,7 @@ class BoundTask:
             given=params or {}, weights=self.source.terms.weights,
         )  # fmt: skip
         self.actions = self._checked_actions()
-        """Sizes of an action's parts, by name; None if actions are controls."""
+        """Sizes of an action's parts, by name; None if the actions are MuJoCo's controls."""
         self.memory = self._memory_layouts()
         """The layouts of the rows ``memory`` and ``lasting_memory``."""
         self.obs_layouts = obs_layouts(self.source, self.params)
@@ -264,7 +264,7 @@ class BoundTask:
         }
 
     def _rights(self, function: TaskFunction) -> Rights:
-        """Return the fields that a function may write through each argument, by the argument's name."""
+        """Return, for each argument of a function, the fields that the function may write."""
         model = [name for name in self.types if is_model_field(name)]
         memory = tuple(self.source.memory)
         lasting = (*(name for name, part in self.source.memory.items() if part.kind == "lasting_memory"), *model)

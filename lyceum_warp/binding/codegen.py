@@ -1,7 +1,8 @@
 """Generate the source that turns a task's functions of one world into kernels over a batch of worlds.
 
-The generated source defines a struct of the fields with an additional axis for the worlds, a function that returns a
-view of one world, and default functions. The generator writes text, because Warp compiles functions from their source.
+The generated source defines a struct whose fields have an additional axis for the worlds, a function that returns a
+view of one world, and defaults for the functions that a task omits. The code is generated as text, because Warp
+compiles functions from their source.
 """
 
 import dataclasses
@@ -104,7 +105,7 @@ def kernels_of(
     memory: Mapping[str, Layout],
     structs: Mapping[str, Layout],
 ) -> steps.Kernels:
-    """Return a task's kernels, which tasks with equal functions, structs and sizes share; see ``make_kernels``.
+    """Return a task's kernels; tasks with the same functions, structs and sizes share them (see ``make_kernels``).
 
     Args:
         source: The task.
@@ -175,7 +176,7 @@ def _generated(
         scope[f"observe_{number}"] = function
         noisy = draws_noise(function)
         observe.append(f"if group == {number}:")
-        if noisy:  # each group has its own random stream, so its draws do not depend on other groups
+        if noisy:  # each group has its own random stream, so its noise does not depend on the other groups
             observe.append(f"    rng[0] = substream(base, {number})")
         row = f"out.{group}[w]"
         if group in structs:
@@ -208,7 +209,7 @@ def _generated(
 
 
 def _copy(name: str, ndim: int) -> list[str]:
-    """Generate lines that copy one world's row of a field with ``ndim`` axes; several threads share a row."""
+    """Generate lines that copy one world's row of a field with ``ndim`` axes; each thread copies a part of the row."""
     if ndim == 1:
         return ["    if lane == 0:", f"        target.{name}[w] = source.{name}[w]"]
     lines = [f"    for i1 in range(lane, source.{name}.shape[1], lanes):"]

@@ -83,7 +83,7 @@ class TaskSource:
         return {group: list(function.input_types.values())[2] for group, function in functions.items()}
 
     def _observers(self, owner: type[Task]) -> list[str]:
-        """Return the names of the functions that write groups: those of the class, and uncalled ones of its module."""
+        """Find functions that write observation groups, in the class, and in its module if no function calls them."""
         module = vars(sys.modules[owner.__module__])
         functions = {name: self._seen(value) for name, value in module.items() if isinstance(value, wp.Function)}
         tasks = [kind for kind in (owner, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
@@ -109,7 +109,7 @@ class TaskSource:
         return None
 
     def _seen(self, value: Any) -> Any:
-        """Convert a struct or function of the task's family to the task's own structs; see ``variants``."""
+        """Return the task's copy of a struct or function that it shares with other tasks; see ``variants``."""
         return value if self._variant is None else self._variant.seen(value)
 
     @property

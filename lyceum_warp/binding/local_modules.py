@@ -1,4 +1,4 @@
-"""Find and import the modules beside a task's file, as Python does for a script."""
+"""Find and import modules from the folder of a task's file, as Python does for a script."""
 
 import ast
 import contextlib
@@ -13,11 +13,11 @@ Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
 """The modification time and size of each file; None if the file does not exist."""
 
 _taken: dict[str, Stamps] = {}
-"""The modules in ``sys.modules`` that task files imported from their folders, with their stamps."""
+"""The modules in ``sys.modules`` that task files imported from their folders, and the files' stamps at that time."""
 
 
 def local_modules(file: Path) -> dict[str, Path]:
-    """Find the modules beside a Python file that the file imports, directly or indirectly. The modules are not run.
+    """Find the modules in a Python file's folder that the file imports, directly or indirectly, without running them.
 
     Returns:
         The file of each module by the module's name; for a package without ``__init__.py``, the package's folder.
@@ -81,7 +81,7 @@ def stamps(files: Iterable[Path]) -> Stamps:
 
 @contextlib.contextmanager
 def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
-    """Context in which a task's file can import the modules that ``local_modules`` has found beside it.
+    """Context in which a task's file can import the modules that ``local_modules`` has found in its folder.
 
     A loaded module of the same name is replaced if it has changed or comes from another folder. If the block raises an
     error, ``sys.modules`` is restored.

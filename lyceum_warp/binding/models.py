@@ -1,4 +1,4 @@
-"""Load a task's model, and change it before it is compiled so that both engines run the same physics."""
+"""Load a task's model, and edit it before compilation, so that both engines simulate the same physics."""
 
 import difflib
 import logging
@@ -25,8 +25,7 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
 
     Args:
         source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec, which is copied. A relative
-            path starts at the folder of the task class that declares it. Without an owner, it starts at the current
-            folder.
+            path is relative to the folder of the class ``owner``, or to the current folder if there is no owner.
         owner: The task class that declares the model.
 
     Raises:
@@ -76,7 +75,7 @@ def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFil
 
 
 def keyframe_state(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Return the integration state of a model's keyframe at time 0, (integration_size,) float64.
+    """Return a keyframe as an integration state with time 0, (integration_size,) float64.
 
     Raises:
         ValueError: The model has no such keyframe.

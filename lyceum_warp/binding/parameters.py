@@ -1,4 +1,4 @@
-"""Check the values of a task's parameters (the fields of ``Params``), and make the array for its kernels."""
+"""Check the values of a task's parameters (the fields of ``Params``), and pass them to kernels in an array."""
 
 import copy
 from collections.abc import Mapping
@@ -43,7 +43,7 @@ class Parameters:
         weights: The weights of the task's terms, by name; weights are set like parameters.
 
     Raises:
-        ValueError: A field has the name of an option, a name is unknown, or a value is missing or does not fit.
+        ValueError: A field has the name of an option, a name is unknown, or a value is missing or invalid.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Parameters:
         The copy and the original share arrays.
 
         Raises:
-            ValueError: A name is unknown, or a value is missing or does not fit its field.
+            ValueError: A name is unknown, or a value is missing or invalid.
         """
         known = (*self._struct.vars, *self._weights)
         for name in given:
@@ -130,8 +130,8 @@ class Parameters:
     def array(self, device: wp.Device) -> wp.array:
         """Make the kernels' array of ``Params``: one entry for all worlds, or one per world if any value differs.
 
-        The entries point to tables on the device. This object keeps the tables in memory. A changed table of the same
-        shape is copied in place.
+        The entries contain pointers to tables on the device, and this object keeps these tables alive. If a table's
+        values change but not its shape, the new values are copied into the existing table.
         """
         for name, kind in self.tables.items():
             self._upload(name, kind.dtype, device)
@@ -237,7 +237,7 @@ class Parameters:
         return table
 
     def _indices(self, what: str, value: Any, field: str | None) -> Any:
-        """In a table, replace elements of the model by their indices; if ``field`` is given, also replace names."""
+        """Replace model elements in a table by their indices; if ``field`` is given, names are replaced as well."""
         if isinstance(value, list | tuple):
             return [self._indices(what, entry, field) for entry in value]
         if isinstance(value, Element):
@@ -266,7 +266,7 @@ class Parameters:
 
 
 def _element_field(default: Any) -> str | None:
-    """Return the field, such as "site_xpos", to which the elements in a table's default belong.
+    """Return the field that a table's default refers to, such as "site_xpos" if the default lists sites.
 
     The result is None if the default consists of numbers.
     """

@@ -52,7 +52,7 @@ def parts_of(struct: Any, owner: str) -> dict[str, Part]:
 
 
 def layout(struct: Any, kind: str, params: Mapping[str, Any], owner: str) -> Layout:
-    """Compute the layout of a struct's parts of one kind; a size may be the name of a table in ``params``.
+    """Compute the layout of a struct's parts of the given kind; ``params`` has the tables that sizes may name.
 
     Raises:
         ValueError: A size is neither a positive number nor the name of a table of Params.

@@ -25,8 +25,8 @@ from lyceum_warp.task import Task
 _tasks: dict[str, type[Task]] = {}
 
 _loaded: dict[str, Stamps] = {}
-"""For each task module, the stamps that its file and the modules beside it had when they last ran. A stamp is a
-modification time and a size."""
+"""For each task module, the stamps of its file and of the modules that it imports from its folder, at the time of their
+last run. A stamp is a modification time and a size."""
 
 _LOADING = threading.RLock()
 """A lock that is held while a file is loaded, because imports and linecache are global to the process."""
@@ -62,7 +62,8 @@ def register(task: type[Task]) -> type[Task]:
 
 
 def _may_replace(task: type[Task], known: type[Task]) -> bool:
-    by_path = task.__module__.startswith(_FILE) and known.__module__.startswith(_FILE)  # file names may coincide
+    # two task files may have the same name
+    by_path = task.__module__.startswith(_FILE) and known.__module__.startswith(_FILE)
     return by_path or known.__module__ == task.__module__ or _file(known) == _file(task)
 
 
@@ -142,8 +143,8 @@ def task_names() -> list[str]:
 def find_task(task: str | Path | type[Task]) -> type[Task]:
     """Find a task's class by name, by file (``path/to/file.py`` or ``path/to/file.py:Class``), or return a given class.
 
-    A file may import modules beside it. If the task's file or a module beside it has changed, the file is run again;
-    existing environments keep their task.
+    A file may import modules from its folder. If the task's file or a module that it imports from its folder has
+    changed, the file is run again. Existing environments still use the old version.
 
     Raises:
         ValueError: There is no such task, or its file can't be run.
@@ -170,10 +171,10 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
 
 
 def source_files(task: type[Task]) -> Mapping[Path, bytes]:
-    """Return the contents of a task's file, and of the modules beside it that it imports, as they were loaded.
+    """Return the contents that a task's file, and the modules that it imports from its folder, had when loaded.
 
-    A class that the program imports or defines counts as loaded when ``find_task`` first returns it. A class without a
-    file, as in a notebook, has no sources.
+    If the program itself imports or defines the class, the contents are those at the first ``find_task`` of the class.
+    A class without a file, as in a notebook, has no sources.
     """
     if task not in _sources:
         file = Path(_file(task) or "")
@@ -208,7 +209,9 @@ def _run(path: Path, name: str, source: bytes) -> None:
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
         where = f"the task file {path}" if line is None else f"the task file {path}, line {line}"
         if isinstance(error, ImportError):
-            raise ImportError(f"{where}: {error}: install the missing module, or put it beside the file") from error
+            raise ImportError(
+                f"{where}: {error}: install the missing module, or put it into the same folder"
+            ) from error
         raise ValueError(f"{where}: {_explained(error)}") from error
     finally:
         linecache.cache.pop(file, None)
@@ -256,7 +259,7 @@ def kernel_name(task: type[Task]) -> str:
 def _module_of_file(path: Path) -> ModuleType:
     """Return the module of a task's file, and run the file if necessary.
 
-    A file is run when it is new, and when it or a module beside it has changed.
+    A file is run on first use, and again whenever it or a module that it imports from its folder has changed.
     """
     if not path.is_file():
         raise FileNotFoundError(f"there is no task file {str(path)!r}")

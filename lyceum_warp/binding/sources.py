@@ -14,7 +14,7 @@ from lyceum_warp.support.upstream import builtin_functions
 
 
 class FunctionSource:
-    """Holds the source of a ``wp.func`` at its definition, even if the file has changed since then.
+    """Holds the source that a ``wp.func`` had when it was defined, even if the file has changed since then.
 
     Raises:
         ValueError: The source is not a single function definition.
@@ -85,7 +85,7 @@ class FunctionSource:
         return "helper" if has_source(callee) else "native", callee
 
     def condition(self, node: ast.expr) -> bool | None:
-        """Evaluate a ``wp.static(...)`` condition, of which Warp compiles only one branch.
+        """Evaluate a condition that is a ``wp.static(...)``; Warp compiles only the branch that it selects.
 
         The result is None for other conditions.
         """

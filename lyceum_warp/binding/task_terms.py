@@ -16,10 +16,10 @@ from lyceum_warp.binding.sources import FunctionSource, is_struct, overloads, ru
 from lyceum_warp.task import Row, Task
 
 _STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
-"""The parts of a transition: their names in reward terms and metrics, mapped to their names in the generated text."""
+"""The arguments of reward terms and metrics that refer to a transition, and their names in the generated text."""
 
 _STATE = {"s": "s", "s1": "s", "p": "p"}
-"""The state and the parameters: their names in terminations, mapped to their names in the generated text."""
+"""The arguments of terminations that refer to the state or to Params, and their names in the generated text."""
 
 _OWN = ("weights", "metrics", "total")
 """Other names in the generated text."""
@@ -28,7 +28,7 @@ _HEAD = "s0: World, action: Row[float], s1: World, p: Params, weights: Row[float
 
 
 class Terms:
-    """The terms of a task: ``rewards``, ``terminations`` and metrics without ``measure``.
+    """The terms of a task: its ``rewards``, its ``terminations``, and those metrics that ``measure`` does not write.
 
     Args:
         task: The task's class.
@@ -104,7 +104,7 @@ class Terms:
         return {term: float(weight) for term, weight in rewards.items()}
 
     def _names(self, attribute: str, names: Any, *, written: bool = False) -> tuple[str, ...]:
-        """Check the names in an attribute, and return them, or none if the task writes the function itself."""
+        """Check and return the names in an attribute; return no names if the task defines the function itself."""
         if not isinstance(names, tuple | list) or not all(isinstance(name, str) and name for name in names):
             raise ValueError(
                 f"{attribute} of the task {self._name!r} must be names, such as ('forward', 'cost'), not {names!r}"
@@ -121,7 +121,7 @@ class Terms:
     # text
 
     def _written_text(self, metrics: tuple[str, ...], first: int) -> str:
-        """Generate the text; ``first`` is the number of metrics that ``measure`` writes."""
+        """Generate the text; ``measure`` writes the first ``first`` metrics."""
         parts = []
         if self.weights:
             body = _Body(self, _STEP)

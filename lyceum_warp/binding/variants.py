@@ -1,8 +1,8 @@
-"""Copy the functions of a task's family, so that a variant can run them with its own structs and functions.
+"""Copy the functions of a family of tasks, so that each task can run them with structs and functions of its own.
 
-Warp compiles a function for the structs in its annotations. If a variant extends its parent's World, the parent's
-functions are copied. The copies take the variant's World, and call the variant's functions instead of the replaced
-ones. A copy keeps its original's source, so messages name the original's file and line.
+Warp compiles a function for the structs in its annotations. If a task extends its parent's World, the parent's
+functions are therefore copied. The copies take the task's World, and call the task's functions instead of the functions
+that these replace. Copies have the source of the original, so error messages name the original's file and line.
 """
 
 import sys
@@ -47,8 +47,8 @@ class Variant:
     def seen(self, value: Any, viewer: str = "") -> Any:
         """Return the replacement of a function, a struct or a module of the family.
 
-        ``viewer`` is the name of the module that uses the value. The module that defines a replacement still gets the
-        original function, so that the replacement can call it.
+        ``viewer`` is the name of the module in which the value is used. The module that defines a replacement still
+        gets the original function, so that the replacement can call it.
         """
         if isinstance(value, wp.Function):
             while (other := self._replaced.get(value)) is not None and _home(other) != viewer:
@@ -86,7 +86,7 @@ _made: dict[Any, Variant] = {}
 
 
 def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any, own: Any) -> Variant | None:
-    """Make a task's variant of its family, or return None if the task has no struct or function of its own.
+    """Copy a family's functions for a task, or return None if the task has no structs or functions of its own.
 
     Tasks with the same structs and replacements share a variant and its compiled kernels.
 
@@ -95,10 +95,10 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
         owners: The task's class and its base classes, without ``Task``.
         world: The task's World.
         params: The task's Params, which its functions take.
-        own: The struct with the defaults of Params: ``params``, or another struct with the same fields.
+        own: The task's own declaration of Params: ``params`` itself, or a struct that differs from it only in defaults.
 
     Raises:
-        ValueError: A function takes other arguments than the function that it replaces.
+        ValueError: A function's arguments differ from those of the function that it replaces.
     """
     modules = list(dict.fromkeys(sys.modules[owner.__module__] for owner in owners))
     values = [list(_values(module, owners)) for module in modules]
@@ -117,7 +117,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
         if isinstance(value, wp.Function) and hasattr(value, "replaces")
     }
     named = {*structs, *structs.values(), world, params}
-    for module in modules:  # the loop body appends to this list
+    for module in modules:  # the list grows during the loop
         for value in _values(module, owners):
             home = sys.modules.get(_home(value)) if isinstance(value, wp.Function) else value
             if isinstance(home, types.ModuleType) and home not in modules and _names(home, named):
@@ -127,7 +127,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
     taken = {kind for f in functions for overload in overloads(f) for kind in overload.input_types.values()
              if is_struct(kind)}  # fmt: skip
     structs = {struct: new for struct, new in structs.items() if struct in taken}
-    if not structs and not replaced:  # for example, a task that only changes defaults
+    if not structs and not replaced:  # for example, the task changes only defaults
         return None
     key = (tuple(modules), tuple(functions), tuple(structs.items()), tuple(replaced.items()))
     if key not in _made:
@@ -143,7 +143,7 @@ def _home(function: wp.Function) -> str:
 
 
 def _values(module: types.ModuleType, owners: Sequence[type[Task]]) -> Iterator[Any]:
-    """Yield the values of a module's names, now and at the definition of its tasks, and of these tasks' attributes."""
+    """Yield the attributes of a module's tasks, and its globals, both when each task was defined and now."""
     for owner in owners:
         if owner.__module__ == module.__name__:
             own = (value.__func__ if isinstance(value, staticmethod) else value for value in vars(owner).values())
@@ -162,7 +162,7 @@ def _names(module: types.ModuleType, structs: set[Any]) -> bool:
 
 
 def _check_replacement(task: str, made: Variant, old: wp.Function, new: wp.Function) -> None:
-    """Refuse a replacement that takes other arguments than the function that it replaces."""
+    """Refuse a replacement whose arguments differ from those of the function that it replaces."""
     wanted, given = (list(made.seen(f, _home(new)).input_types.values()) for f in (old, new))
     same = len(wanted) == len(given) and all(
         a is b if is_struct(a) or is_struct(b) else wp.types.types_equal(a, b)

@@ -28,7 +28,7 @@ write."""
 class GuardedRows:
     """Holds an array of n rows, with guard memory around each row.
 
-    Rows contain sentinels, or the first n rows of ``values``.
+    The rows are filled with sentinels, or with the first n rows of ``values`` if this argument is given.
     """
 
     def __init__(self, shape: Sequence[int], dtype: Any, device: wp.Device, values: wp.array | None = None) -> None:
@@ -171,7 +171,7 @@ class Probe:
         """Raise a ValueError if a function wrote outside a field or outside its random stream."""
         for name in sorted(self._writes.get(function, ())):
             rows, parts = self._fields[name], self._memory.get(name)
-            if parts:  # check_task also finds writes to a wrong element within a row
+            if parts:  # writes to a wrong element within a row are left to check_task
                 self._check_memory(function, rows, parts)
             else:
                 self._check(function, rows, name, f"the model has {rows.size}")

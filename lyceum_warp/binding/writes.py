@@ -61,7 +61,7 @@ def written_fields(function: wp.Function) -> frozenset[str]:
 
 
 Rights = Mapping[str, Collection[str] | None]
-"""Fields that a function may write through each argument, by the argument's name; None for a row of results."""
+"""For each argument, by name: the fields that a function may write, or None for an output row."""
 
 
 def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mapping[str, Rights]) -> None:
@@ -108,12 +108,12 @@ def _advice(write: Write, name: str, rights: Mapping[str, Rights]) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class _Place:
-    """A part of an argument of the analysed function: the argument, a field, a row of a table, or an element."""
+    """What an expression refers to: an argument of the analysed function, or a field, a row or an element of it."""
 
     position: int
     field: str | None
     kind: Any
-    """A struct type, or (axes, element type) of an array, or None for an element; reading an element copies it."""
+    """The type of a struct, (axes, element type) of an array, or None for an element, which is read by value."""
 
     def attribute(self, name: str) -> "_Place | None":
         if is_struct(self.kind):
@@ -139,7 +139,8 @@ class _Reader:
 
     Args:
         function: The function.
-        places: For each argument, the part of the analysed function's arguments to which it refers, or None.
+        places: For each argument of ``function``, the place in the analysed function's arguments to which it refers, or
+            None.
         arguments: Names of the arguments of the analysed function.
         writes: The dict to which writes are added.
         seen: The functions that were already read, each together with the places of its arguments.
@@ -157,14 +158,13 @@ class _Reader:
         self.source = FunctionSource(function)
         # a key is a name, or "name.field" for a row in a local struct
         self.places: dict[str, _Place | None] = dict(zip(function.input_types, places, strict=True))
-        # read a loop's body twice, because the loop may use a local struct above the line that puts a row into the
-        # struct
+        # read everything twice: in a loop, a use of a local struct may precede the line that puts a row into the struct
         for _ in range(2):
             for statement in self.source.tree.body:
                 self._read(statement)
 
     def _note(self, place: _Place, node: ast.AST, *, replaced: bool = False, follows: bool = True) -> None:
-        """Record a write; with ``follows=False``, record a use that the analysis cannot follow."""
+        """Record a write; if ``follows`` is False, record instead a use of a row that the analysis cannot follow."""
         use = None if follows else ast.unparse(node).splitlines()[0]
         target = ".".join(filter(None, (self.arguments[place.position], place.field)))
         where = self.source.place(node)
@@ -174,7 +174,7 @@ class _Reader:
         """Record the writes in an expression or a statement; return the part of an argument to which it refers."""
         if isinstance(node, ast.Name):
             for name, place in self.places.items():
-                if place is not None and name.startswith(f"{node.id}."):  # the expression uses a whole local struct
+                if place is not None and name.startswith(f"{node.id}."):  # the name of a local struct that holds rows
                     self._note(place, node, follows=False)
             return self.places.get(node.id)
         if isinstance(node, ast.Attribute):
@@ -196,7 +196,7 @@ class _Reader:
         return None
 
     def _read_all(self, parent: ast.AST, nodes: Any, *, elements: bool = False) -> None:
-        """Read parts of an expression or a statement; note every row that they use as a whole."""
+        """Analyse the children of a syntax node, and record every row that they use as a whole."""
         for node in nodes:
             place = self._read(node)
             if place is not None and (elements or place.kind is not None):

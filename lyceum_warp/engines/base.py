@@ -80,7 +80,7 @@ class Engine(abc.ABC):
     reset_stage: Stage
     """The stage up to which MuJoCo's forward pass must run after a reset."""
     snapshots: list[Field]
-    """The fields that do not follow from the integration state, in the order of the state vector."""
+    """The fields that cannot be computed from the integration state, in the order of the state vector."""
     integration_size: int
     """The number of floats in one world's integration state (mjSTATE_INTEGRATION)."""
     state_size: int
@@ -94,7 +94,7 @@ class Engine(abc.ABC):
         self.fields = {}
         for field in (describe(model, "ctrl"), *fields):
             if self.fields.setdefault(field.name, field) != field:
-                raise ValueError(f"the field {field.name!r} is listed both lagged and current: list it once")
+                raise ValueError(f"the field {field.name!r} is listed twice, as lagged and as current: list it once")
         self.dynamics, self.nominal, self.arrays = {}, {}, {}
         for varied in dynamics:
             check_simple(model, varied.name)
@@ -143,11 +143,12 @@ class Engine(abc.ABC):
     def step(self, nstep: int) -> None:
         """Advance every world by ``nstep`` substeps under ``ctrl`` and the other inputs, and update the fields.
 
-        The engine first reads the arrays of the fields for which ``written`` is set.
+        At the start of the step, the engine reads the arrays of ``ctrl`` and of the other fields whose ``written`` is
+        True.
         """
 
     def step_phases(self, nstep: int) -> list[Phase]:
-        """The phases of ``step``, for capture.
+        """Return ``step`` as a list of phases, which ``Graphs`` can capture separately.
 
         An engine that is not ``capturable`` can capture some of its phases, such as its copies of fields.
         """
@@ -155,7 +156,7 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def find_faults(self, mask: wp.array) -> None:
-        """Write ``fault`` of the masked worlds: non-finite states, and overflows and warnings since the last call.
+        """Set ``fault`` in the masked worlds, from their states, and from overflows and warnings since the last call.
 
         The method consists of Warp launches on every engine.
         """

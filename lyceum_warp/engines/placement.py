@@ -122,8 +122,8 @@ def bytes_per_world(
 def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
     """Return the options to change for an environment with few worlds, such as the environment of an evaluation.
 
-    On a GPU, a step of a few worlds takes nearly as long as a step of thousands of worlds. With engine="auto", few
-    worlds therefore run on the C engine, on CPU cores and in double precision.
+    On a GPU, a step of a few worlds takes nearly as long as a step of thousands of worlds. If the engine is "auto", an
+    environment with few worlds therefore uses the C engine, on CPU cores and in double precision.
     """
     return options_on_cores() if engine == "auto" and engine_name(engine, device) == "warp" else {}
 

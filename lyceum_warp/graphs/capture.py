@@ -42,8 +42,8 @@ class Phase:
     engine: bool = False
     """Whether the phase calls the engine; such a call consists of Warp launches only on some engines."""
     by_world: bool = False
-    """Whether threads can share the worlds: the phase launches kernels only through functions such as
-    ``arrays.launch_worlds``, and no world depends on another world."""
+    """Whether the worlds can be divided among threads. This requires that the phase launches kernels only through
+    functions such as ``arrays.launch_worlds``, and that no world depends on another world."""
 
 
 class Graphs:
@@ -127,11 +127,11 @@ def capturing() -> Iterator[None]:
 
 
 class _Graph:
-    """Captures functions of launches: in one graph, or in one graph per thread if the functions take long.
+    """Captures functions that consist of launches, in one graph, or in one graph per thread if they take long.
 
     The first call runs the functions directly, and loads their modules. The second call captures and replays the
-    functions; later calls only replay. With workers, the first replays are timed, and the shortest time determines how
-    many threads share the work.
+    functions; later calls only replay. If there are workers, the first replays are timed, and the shortest time
+    determines how many threads share the work.
     """
 
     def __init__(

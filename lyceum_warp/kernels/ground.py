@@ -1,8 +1,8 @@
 """Provide Warp functions for rough ground: look up its height in a table, and choose levels of difficulty.
 
-``lw.height_field(name)`` makes a table of heights z at constant distances. The first row holds the coordinates x, the
-first column the coordinates y. Heights between the points are interpolated on MuJoCo's triangles: each cell's diagonal
-runs from the corner with the smallest x and y to the corner with the largest.
+``lw.height_field(name)`` makes a table of the heights at the points of a regular grid. The first row holds the points'
+x coordinates, and the first column their y coordinates. Heights between the points are interpolated on MuJoCo's
+triangles: each cell's diagonal runs from the corner with the smallest x and y to the corner with the largest.
 """
 
 import warp as wp
@@ -144,10 +144,10 @@ def start_on_terrain(
     later levels.
 
     Args:
-        level: The level, from 0, in memory that resets keep (one number).
-        column: The column, from 0, in memory that resets keep (one number).
-        walked: Written by ``follow_walk``, in memory that resets keep (one number).
-        commanded: Written by ``follow_walk``, in memory that resets keep (one number).
+        level: The level, from 0: one number in lasting memory.
+        column: The column, from 0: one number in lasting memory.
+        walked: One number in lasting memory, written by ``follow_walk``.
+        commanded: One number in lasting memory, written by ``follow_walk``.
         origins: ``lw.Terrain.origins``, (levels, columns).
         patch: Length of a patch's side, m: ``lw.Terrain.patch``.
         rng: The world's random numbers.

@@ -1,8 +1,8 @@
 """Check array indices in the instrumented copies of a task's functions that ``check_task`` runs.
 
-``report`` is (places, 3). Each row belongs to one place in the source where an array is indexed. The row holds the
-number of bad indices, the first bad index, and the size of the array. Functions are not inlined, because inlining would
-increase compile times.
+``report`` is (places, 3). Each of its rows belongs to one place in the source at which an array is indexed, and holds
+the number of bad indices, the first bad index, and the size of the array. Functions are not inlined, because inlining
+would increase compile times.
 """
 
 from typing import Any
@@ -44,7 +44,7 @@ def from_end(report: wp.array2d[int], place: int, index: int, size: int) -> int:
 def element(report: wp.array2d[int], place: int, values: Any, index: Any):
     """Return one element of the result of a function call.
 
-    The call is the argument ``values``, so the function is called only once.
+    The instrumented source passes the call as the argument ``values``, so that the call runs only once.
     """
     return values[at(report, place, index, len(values))]
 

@@ -17,9 +17,9 @@ DRAWS = wp.constant(-3)
 """The stream keys of the samples use this number instead of an episode's index."""
 
 _TILES = f"{__name__}.tiles"
-"""The Warp module of the kernels with tiles. On the CPU, all kernels of a module write the same shared variable, which
-holds the address of the tiles. Kernels without tiles need a separate module, because ``graphs.capture`` serialises only
-kernels with tiles."""
+"""The Warp module of the kernels that use tiles. On the CPU, all kernels of a module write the same shared variable,
+which holds the address of the tiles. Other kernels belong to a separate module, because ``graphs.capture`` serialises
+only kernels that use tiles."""
 
 
 @wp.func
@@ -125,7 +125,7 @@ def shift_plan(
 
 @wp.kernel(enable_backward=False)
 def draw_noise(seed_in: wp.array[int], count_in: wp.array[int], noise_out: wp.array3d[float]):
-    """Draw standard normal numbers by (seed, sample, count, action, step); launched over (nsample, nact).
+    """Draw standard normal numbers, determined by (seed, sample, count, action, step); launched over (nsample, nact).
 
     Each plant has its own seed and count. The samples of each plant are numbered from 0.
     """
@@ -252,7 +252,7 @@ def add_up(
 def combine_models(world_return_in: wp.array[float], worst: bool, return_out: wp.array[float]):
     """Compute the mean or the minimum of each sample's returns over several models; launched over (nsample,).
 
-    The worlds of a sample are consecutive. If a sample fails in one model, its result is a failure.
+    The worlds of a sample are consecutive. A sample that fails in any of the models counts as failed.
     """
     k = wp.tid()
     models = world_return_in.shape[0] // return_out.shape[0]

@@ -114,7 +114,7 @@ def quat_to_mat(q: wp.vec4) -> wp.mat33:
 
 @wp.func
 def quat_from_mat(m: wp.mat33) -> wp.vec4:
-    """Convert a rotation matrix, such as a row of ``site_xmat``, to a quaternion: mju_mat2Quat's or its negative.
+    """Convert a rotation matrix, such as a row of ``site_xmat``, to a quaternion: q or -q if mju_mat2Quat returns q.
 
     The trace and the diagonal show which of w, x, y, z is large enough to divide by (Shepperd 1978,
     "Quaternion from rotation matrix").

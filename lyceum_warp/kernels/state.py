@@ -1,8 +1,8 @@
 """Cast and copy masked rows between the arrays of an environment and an engine.
 
-Float64 arrays are often strided views of an engine's own rows, so an unmasked write would round the states of worlds
-outside the mask. Most masks are nearly empty and most rows are short, so ``launch_rows`` uses a single thread per world
-on the CPU, and at most a warp per world on a GPU.
+The float64 arrays are often views of the engine's states. Writes are masked, because copying back a float32 value would
+round the state of a world that should not change. Most masks are nearly empty and most rows are short, so
+``launch_rows`` uses a single thread per world on the CPU, and at most a warp per world on a GPU.
 """
 
 import warp as wp

@@ -46,7 +46,7 @@ class Findings:
     terminated: wp.array[bool]
     success: wp.array[bool]
     fault: wp.array2d[int]
-    """Faults of each part, (parts, nworld)."""
+    """Faults that the parts of ``judge`` find, (parts, nworld)."""
 
 
 OUTCOMES = {
@@ -94,9 +94,9 @@ class TaskCode:
     checks_model: bool  # whether ``valid_model`` is needed
 
     def kernel(self, needed: bool = True) -> Callable[[Any], Any]:
-        """Decorator: make a kernel in the task's module, or None if it is not needed."""
+        """Decorator: turn a function into a kernel of the task's Warp module, or into None if it is not needed."""
         return wp.kernel(module=self.module, enable_backward=False) if needed else lambda body: None
 
     def kernel_for(self, function: str) -> Callable[[Any], Any]:
-        """Decorator: make a kernel if the task has a function, else None."""
+        """Decorator: turn a function into a kernel, or into None if the task does not define ``function``."""
         return self.kernel(function in self.written)

@@ -1,4 +1,4 @@
-"""Make the kernels of a step around the functions of a task: clip actions, begin episodes, share memory."""
+"""Make the kernels of a step that call a task's functions to map actions, begin episodes and share memory."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ NAN = wp.constant(int(Done.NAN))
 ALL_FAULTS = wp.constant(int(FAULTS))
 
 EVENT = wp.constant(-2)
-"""Events draw from the substream with this number of each step's random stream."""
+"""The index of the substream from which ``event`` draws, within a step's random stream."""
 STARTUP = wp.constant(-1)
 """The random stream of ``startup`` uses this number instead of an episode's index."""
 
@@ -35,7 +35,7 @@ class ActKernels:
 
 
 def act_kernels(task: TaskCode) -> ActKernels:
-    """Make the kernels of ``ActKernels`` around a task's functions."""
+    """Make the kernels of ``ActKernels``, which call a task's functions."""
     Batch, Params = task.Batch, task.Params  # noqa: N806
     view, copy_state, valid_model = task.view, task.copy_state, task.valid_model
     control, advance, substep = (task.functions[name] for name in ("control", "advance", "substep"))
@@ -158,7 +158,7 @@ class BeginKernels:
 
 
 def begin_kernels(task: TaskCode) -> BeginKernels:
-    """Make the kernels of ``BeginKernels`` around a task's functions."""
+    """Make the kernels of ``BeginKernels``, which call a task's functions."""
     Batch, Params = task.Batch, task.Params  # noqa: N806
     view = task.view
     initialize, randomize, startup, reject, event = (
@@ -177,7 +177,8 @@ def begin_kernels(task: TaskCode) -> BeginKernels:
     ):
         """Begin an episode in the masked worlds, or draw another initial state; launched over (nworld,).
 
-        The engine has already reset these worlds to the fixed initial state. Another draw continues the world's stream.
+        The engine has already reset these worlds to the fixed initial state. Another initial state is drawn with the
+        next numbers of the world's random stream.
         """
         w = first + wp.tid()
         if not mask_in[w]:
@@ -247,7 +248,7 @@ class SharedKernels:
 
 
 def shared_kernels(task: TaskCode) -> SharedKernels:
-    """Make the kernels of ``SharedKernels`` around a task's functions."""
+    """Make the kernels of ``SharedKernels``, which call a task's functions."""
     Batch, Params, view = task.Batch, task.Params, task.view  # noqa: N806
     tally, share = task.functions["tally"], task.functions["share"]
     view_sums, view_shared = task.views.get(task.Sums), task.views.get(task.Shared)

@@ -101,7 +101,7 @@ def put_upright(qpos: wp.array[float], at: int, position: wp.vec3, yaw: float) -
 
 @wp.func
 def sum_squares(row: wp.array[float], first: int, last: int) -> float:
-    """Sum the squares of a row's elements with first <= i < last, or of all; elements are numbers or vectors."""
+    """Sum the squares of a row's elements (numbers or vectors), or only of those with first <= i < last."""
     total = float(0.0)
     for i in range(first, last):
         total += row[i] * row[i]

@@ -17,10 +17,10 @@ OBSERVATION = wp.constant(int(Done.OBSERVATION))
 NAN = wp.constant(int(Done.NAN))
 
 OBSERVE = wp.constant(-1)
-"""Each step has a random stream. ``advance`` draws from it, and observation noise draws from its substream with this
-number."""
+"""The index of the substream for observation noise, within a step's random stream; ``advance`` draws from the stream
+itself."""
 
-# the parts that ``judge`` computes; the observation groups follow
+# indices of the parts of ``judge``; each observation group is one more part, from OBSERVE_FIRST
 ENDS = wp.constant(0)
 GAIN = wp.constant(1)
 METRICS = wp.constant(2)
@@ -40,7 +40,7 @@ class JudgeKernels:
 
 
 def judge_kernels(task: TaskCode) -> JudgeKernels:
-    """Make the kernels of ``JudgeKernels`` around a task's functions."""
+    """Make the kernels of ``JudgeKernels``, which call a task's functions."""
     Batch, Params, Observations, World = task.Batch, task.Params, task.Observations, task.World  # noqa: N806
     view, finite_memory = task.view, task.finite_memory
     finite_group, copy_observations = task.finite_group, task.copy_observations
@@ -86,10 +86,10 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         threads: int,
         first: int,
     ):
-        """Evaluate a transition or a state in the masked worlds without a fault; launched over (threads, nworld).
+        """Evaluate a transition or a state, in masked worlds that have no fault; launched over (threads, nworld).
 
-        The parts are independent. On a GPU each part runs in a separate thread, which is several times faster than one
-        thread per world.
+        The work has independent parts: the end of the episode, the reward, the metrics, and each observation group. On
+        a GPU each part runs in a separate thread, which is several times faster than one thread per world.
         """
         start, k = wp.tid()
         w = first + k
@@ -153,13 +153,13 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
     ):
         """Combine the results of ``judge`` in the masked worlds; launched over (nworld, lanes).
 
-        Writes the reward, the metrics and their sums, the evaluation, the end of the episode, success and the
-        observations. A transition with a fault has reward 0, metrics 0, the evaluation of the state before it, and the
-        last good observations. A transition with a fault counts as truncated, so that learners bootstrap from those
+        The kernel writes the reward, the metrics and their sums, the evaluation, the end of the episode, success and
+        the observations. A transition with a fault has reward 0, metrics 0, the evaluation of the state before it, and
+        the last good observations. A transition with a fault counts as truncated, so that learners bootstrap from those
         observations.
 
-        Only a transition ends an episode. If a state is evaluated without a transition, ``keep_reason`` keeps the saved
-        reason, and ``found.terminated`` is the result of the task's ``terminated``.
+        Only a transition ends an episode. If a state is evaluated without a transition, ``found.terminated`` is the
+        result of the task's ``terminated``. ``keep_reason`` keeps the done reasons that are already stored.
         """
         k, lane = wp.tid()
         w = first + k
@@ -230,8 +230,8 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
     ):
         """Observe the masked worlds, and find the groups that are finite; launched over (parts, nworld).
 
-        If there is only one part, this kernel also replaces observations that are not finite. Otherwise, launch
-        ``replace_observations`` after it.
+        If ``parts`` is 1, this kernel also replaces observations that are not finite. Otherwise,
+        ``replace_observations`` must be launched next.
         """
         start, k = wp.tid()
         w = first + k
@@ -287,7 +287,7 @@ class RolloutKernels:
 
 
 def rollout_kernels(task: TaskCode) -> RolloutKernels:
-    """Make the kernels of ``RolloutKernels`` around a task's functions.
+    """Make the kernels of ``RolloutKernels``, which call a task's functions.
 
     Row t * nworld + w is world w after t steps. The next state is nworld rows later, so ``before`` and ``after`` are
     views of the same arrays.

@@ -30,8 +30,8 @@ class World:
 @wp.struct
 class Params:
     dt: float
-    far: float = 0.5  # largest distance that counts, m
-    near: float = 0.03  # distance between palm and ball below which the goal counts, m
+    far: float = 0.5  # m; larger distances count as this distance
+    near: float = 0.03  # m; the goal is rewarded only while the palm is closer to the ball
     finger_weight: float = 0.1
     success_distance: float = 0.05
     ball: int = lw.body("table/ball")
@@ -95,7 +95,7 @@ class ArmHandPickup(lw.Task):
     keyframe, frame_skip, horizon, success_steps = "home", 4, 300, 10
     obs = {"joints": 9, "velocity": 9, "ball_velocity": 3, "ball": 3, "palm": 3, "goal": 3, "fingers": 9}
     metrics, action_range = ("palm_distance", "goal_distance", "finger_distances"), (-1.0, 1.0)
-    # for planners, the distance "far" and the weight of closing the hand are larger than in the task
+    # planners get larger values of ``far`` and ``finger_weight`` than the task
     planning = lw.Planning(
         settings=dict(horizon=32, samples=64, temperature=0.1, noise=0.8, fill="repeat", include_plan=False),
         params={"far": 1.0, "finger_weight": 2.0},

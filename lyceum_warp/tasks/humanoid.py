@@ -1,8 +1,9 @@
 """Humanoid: walk forward on two legs without falling over (Gymnasium's Humanoid-v5).
 
 Contact forces are computed in MuJoCo's sensor stage. The model's integrator is RK4, under which the sensor stage runs
-only in the first of a substep's four passes. Gymnasium computes ``cfrc_ext`` again after the last pass. The contact
-forces differ while feet touch the ground; everything else is equal. The solver is Newton instead of the model's PGS.
+only in the first of a substep's four passes. Gymnasium computes ``cfrc_ext`` again after the last pass. While feet
+touch the ground, the task's contact forces therefore differ from Gymnasium's; everything else is equal. The solver is
+Newton instead of the model's PGS.
 """
 
 import warp as wp

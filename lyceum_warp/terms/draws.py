@@ -1,4 +1,4 @@
-"""Draw numbers, and model fields that differ between worlds.
+"""Draw random numbers, and randomize model fields in each world.
 
 Functions that scale or shift a model field start from its current value. In ``startup`` and in ``randomize``, the
 current value is the nominal value, because a reset restores the field first.

@@ -23,7 +23,7 @@ def push_history(history: Row[float], value: Row[float]):
     pushes = int(history[0])
     for i in range(width):
         history[1 + pushes % length * width + i] = value[i]
-    # the counter stays below 2 n, so that it is exact as a float and still gives the number of values
+    # at 2 n, the counter returns to n: it stays exact as a float, and the history stays full
     history[0] = float(wp.where(pushes + 1 < 2 * length, pushes + 1, length))
 
 
@@ -31,8 +31,8 @@ def push_history(history: Row[float], value: Row[float]):
 def read_history(history: Row[float], width: int, age: int, i: int) -> float:
     """Get element i of a value in a history.
 
-    ``age`` counts back from the last value. If the history holds no value of this age, the result is from its first
-    value, or 0 if the history is empty.
+    ``age`` counts back from the last value. If the history has no value of this age, the result is taken from its
+    oldest value, or 0 if the history is empty.
     """
     pushes = int(history[0])
     if pushes == 0:

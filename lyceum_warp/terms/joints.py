@@ -57,7 +57,7 @@ def gait_pose(
     least_command: float,
     running_command: float,
 ) -> float:
-    """Compute ``pose``, with other standard deviations for a running robot: ``command_size`` >= ``running_command``.
+    """Compute ``pose``, but with ``running_pose_std`` if ``command_size`` is at least ``running_command``.
 
     Source: mjlab 1.6.0, ``variable_posture``.
     """

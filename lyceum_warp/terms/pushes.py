@@ -10,10 +10,11 @@ from lyceum_warp.terms.base_motion import orientation
 
 @wp.func
 def push(qpos: Row[float], qvel: Row[float], push_velocity: wp.vec3, push_spin: wp.vec3, rng: Row[wp.uint32]):
-    """Change the base's velocity and angular velocity by draws from U(-push, push); call this in ``event``.
+    """Add random changes to the base's velocity and angular velocity; call this in ``event``.
 
-    The draws are in the world's axes. Source: mjlab 1.6.0, ``push_by_setting_velocity``. The base's free joint must be
-    the model's first joint.
+    The changes are drawn from U(-``push_velocity``, ``push_velocity``) and U(-``push_spin``, ``push_spin``), in the
+    world's axes. Source: mjlab 1.6.0, ``push_by_setting_velocity``. The base's free joint must be the model's first
+    joint.
     """
     velocity = uniform(rng, -push_velocity, push_velocity)
     spin = quat_rotate_inverse(orientation(qpos), uniform(rng, -push_spin, push_spin))

@@ -1,6 +1,6 @@
-"""Draw, time and read velocity commands: (forward velocity, lateral velocity, yaw rate) in the base's axes.
+"""Draw random velocity commands, and time them: (forward velocity, lateral velocity, yaw rate) in the base's axes.
 
-A command has several parts, which are rows of memory. A call draws each part::
+A command is stored in several rows of memory, which one function each fills with random numbers::
 
     terms.draw_timer(s.command_timer, p.command_seconds, rng)
     terms.draw_velocity(s.drawn_velocity, p.command_low, p.command_high, rng)

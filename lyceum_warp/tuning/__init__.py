@@ -1,1 +1,1 @@
-"""Find physics options that are faster at equal returns: `lw.tune`."""
+"""Find physics options that are faster and do not change the returns: `lw.tune`."""

@@ -102,7 +102,7 @@ def flags(physics: Mapping[str, Any]) -> str:
 
 
 def task_line(physics: Mapping[str, Any]) -> str:
-    """Format a setting as a line of Python that gives a task the physics options "fast"."""
+    """Format a setting as a line of Python that defines a task's physics options "fast"."""
     words = ", ".join(f"{name}={value!r}" for name, value in physics.items()).replace("'", '"')
     return f'physics = {{"fast": lw.PhysicsOptions({words})}}'
 

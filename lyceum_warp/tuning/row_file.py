@@ -38,7 +38,7 @@ class RowFile:
 
     Args:
         path: The file; it need not exist.
-        identity: Identity of the rows to use; all other rows are ignored. See the function ``identity``.
+        identity: Only rows with this identity are used; see the function ``identity``.
 
     Raises:
         ValueError: The file is not a file of results.
@@ -54,7 +54,7 @@ class RowFile:
                 row = json.loads(line)
                 found, key = row["identity"], _key(row["physics"])
             except (ValueError, TypeError, KeyError):
-                # replace the incomplete line of a killed process by the next row
+                # a killed process may leave an incomplete last line: the next row replaces it
                 if number == len(lines) and line.startswith(_BEGIN):
                     break
                 raise ValueError(f"line {number} of {path} is not a result of tune: use another file") from None

@@ -1,4 +1,4 @@
-"""Search for a task's fastest physics options with equal returns: `lw.tune`."""
+"""Search for the fastest physics options that do not change a task's returns: `lw.tune`."""
 
 import dataclasses
 import hashlib
@@ -48,17 +48,17 @@ class Tuning:
 
     @property
     def best(self) -> Row | None:
-        """Return the fastest setting with the same returns; None without such a setting."""
+        """Return the fastest setting with the same returns; None if there is no such setting."""
         return next((row for row in self.rows if row["verdict"] == "same"), None)
 
     @property
     def flags(self) -> str:
-        """Format the best setting as flags of lyceum-warp train and plan; empty without a best setting."""
+        """Format the best setting as flags of lyceum-warp train and plan; empty if ``best`` is None."""
         return flags(self.best["physics"]) if self.best else ""
 
     @property
     def task_line(self) -> str:
-        """Format the best setting as the line of a task for ``physics="fast"``; empty without a best setting."""
+        """Format the best setting as a task's line for ``physics="fast"``; empty if ``best`` is None."""
         return task_line(self.best["physics"]) if self.best else ""
 
 
@@ -76,17 +76,17 @@ def tune(
     progress: Callable[[Row], object] | None = None,
     **words: Any,
 ) -> Tuning:
-    """Measure speed and side effects of physics options for a task, and find the fastest options with equal returns.
+    """Measure how physics options change a task's speed and returns, and find the fastest that keep the returns.
 
     Every setting is compared with the unchanged task in the same process: steps per second, memory, faults, divergence,
     and the returns of equal episodes under random actions and under a policy. Settings are first tried alone.
-    Afterwards, the best settings of all groups are combined, and the least useful setting is removed while the returns
-    differ.
+    Afterwards, the best settings of all groups are combined, and as long as the combination changes the returns, its
+    least useful setting is removed.
 
     Args:
         task: Name of a task, path of a task file, or a task class.
-        run: Folder of a run of the same task. The run's policy also plays the episodes, and the run's parameters are
-            the defaults.
+        run: Folder of a run of the same task. Returns are then also compared under the run's policy, and the run's
+            parameters replace the task's defaults.
         which: Policy of the run: "last", "best", or the number of a saved iteration.
         tolerance: Tolerance for the 95 % interval of the difference of returns, relative to the mean absolute return:
             "strict" (2 %), "loose" (5 %) or "any" (only faults count).

@@ -171,8 +171,8 @@ class Trials:
     def _speed(self, env: Env) -> tuple[float, float, float]:
         """Measure steps per second of all worlds, and the median and the lower bound of the speed-up.
 
-        The lower bound is the smaller of the lower quartile and the ratio of the fastest blocks, because other
-        processes may slow down some blocks.
+        The lower bound is the smaller of two numbers, because other processes may slow down some blocks: the lower
+        quartile of the blocks' speed-ups, and the speed-up between the fastest blocks.
         """
         count = self._block * env.nworld
         starts = [repeat % len(self._starts) for repeat in range(self.effort.repeats)]
@@ -194,7 +194,7 @@ class Trials:
         return time.perf_counter() - start
 
     def _velocities(self, env: Env, k: int, start: torch.Tensor | None = None) -> torch.Tensor:
-        """Compute velocities after some steps from the k-th states, (times, nworld, nv) float64; NaN after a fault."""
+        """Compute velocities at some steps after the k-th states, (times, nworld, nv) float64; NaN after a fault."""
         env.set_state(self._starts[k] if start is None else start)
         found, bad = [], torch.zeros(env.nworld, dtype=torch.bool, device=env.obs.device)
         for step, action in enumerate(self._actions[k], 1):
@@ -205,7 +205,7 @@ class Trials:
         return torch.stack(found)
 
     def _distance(self, velocities: list[torch.Tensor]) -> list[float]:
-        """Compute the median distance to the exact velocities after 1, 10 and 50 steps, in units of their RMS."""
+        """Compute the median distance to the unchanged task's velocities after 1, 10 and 50 steps, in RMS units."""
         exact, found = torch.cat(self._exact, 1), torch.cat(velocities, 1)
         scale = exact.square().nanmean(1, keepdim=True).sqrt().clamp_min(1e-9)
         return ((found - exact) / scale).square().mean(2).sqrt().nanmedian(1).values.tolist()

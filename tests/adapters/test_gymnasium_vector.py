@@ -381,7 +381,7 @@ def test_invalid_vector_env_arguments_raise_an_error(options: dict[str, Any], me
 
 
 def test_unsuitable_environment_raises_an_error(made: Callable[..., lw.Env]) -> None:
-    with pytest.raises(ValueError, match="a given environment keeps its options: pass horizon to lw.make"):
+    with pytest.raises(ValueError, match="the environment already has its options: pass horizon to lw.make"):
         GymnasiumVectorEnv(made(), horizon=3)
     with pytest.raises(ValueError, match="the environment has 4 worlds, not num_envs=3"):
         GymnasiumVectorEnv(made(), 3)

@@ -175,7 +175,7 @@ def test_engine_has_arrays_for_the_requested_fields_and_the_controls(engine: typ
     for name, field in made.fields.items():
         array = made.arrays[name]
         assert array.shape == (3, *field.shape) and array.dtype == field.dtype
-    with pytest.raises(ValueError, match="the field 'xpos' is listed both lagged and current: list it once"):
+    with pytest.raises(ValueError, match="the field 'xpos' is listed twice, as lagged and as current: list it once"):
         engine(model, 3, wp.get_device("cpu"), [lagged, describe(model, "xpos")])
 
 

@@ -90,7 +90,7 @@ def test_randomized_fields_that_add_contacts_log_a_warning(
     drawing = TASK.replace("        s.eq_active[i] = True\n", "        s.geom_size[i][0] = 0.05\n")
     lw.make(task_file("drawing.py", drawing), engine="warp", nworld=2)
     (message,) = caplog.messages
-    assert "measured on the model's own geom_size, which the task draws" in message
+    assert "measured on the model's own geom_size, which the task randomizes" in message
     caplog.clear()
     lw.make(task_file("drawing.py", drawing), engine="warp", nworld=2, nconmax=16, njmax=64)
     lw.make(task_file("drawing.py", drawing), nworld=2)

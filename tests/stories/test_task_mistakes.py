@@ -44,7 +44,7 @@ MISTAKES: dict[str, tuple[tuple[str, str], str]] = {
     # the file
     "missing import": (
         ("import warp as wp", "import warp as wp\nimport not_installed.sub"),
-        r"task file .*tiny\.py, line 3: No module named 'not_installed': install the missing module, or put it beside",
+        r"task file .*tiny\.py, line 3: No module named 'not_installed': install the missing module, or put it into",
     ),
     "syntax": (
         ("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0"),

@@ -88,9 +88,9 @@ class MujocoEngine(Engine):
         """The model that the batch steps."""
         # autoreset would hide a fault, because MuJoCo would silently reset the world within a step
         self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        # The batch is not persistent. A persistent batch could reuse the stages computed after the last step, but one
-        # MjData per world does not fit into the CPU's caches: with a persistent batch, the six tasks that need such
-        # stages were 4 to 33 % slower (128 and 1,024 worlds on two cores).
+        # The batch is not persistent (it has no MjData for each world). A persistent batch could reuse the stages
+        # computed after the last step, but one MjData per world does not fit into the CPU's caches: with a persistent
+        # batch, the six tasks that need such stages were 4 to 33 % slower (128 and 1,024 worlds on two cores).
         self.batch = Batch(self.native_model, nworld, self.nthread)
         self._errors_as_warnings = ErrorsAsWarnings(self.batch)
         self._rows = self._alias(self.batch.state)
@@ -116,7 +116,7 @@ class MujocoEngine(Engine):
         """The fields that the separate call computes only in part, such as sensors up to a stage."""
         self._last = [field for field in shown if field not in self._before_stage]
         """The fields that kernel launches copy at the end of a step."""
-        # skip collision detection, which takes most of the position stage, because positions do not depend on contacts
+        # skip collision detection, the slowest part of the position stage: positions do not depend on contacts
         without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if positions and computed else 0
         self._disabled = self.batch.expand("opt.disableflags") if without else np.zeros(0, dtype=int)
         self._step_flags, self._stage_flags = self._disabled.copy(), self._disabled | without

@@ -22,7 +22,7 @@ class CanonicalOrder:
     Args:
         model: MuJoCo Warp's model; its callbacks are set.
         data: MuJoCo Warp's data.
-        between: A function that both callbacks call first.
+        between: A function that each callback calls before it sorts.
 
     Raises:
         ValueError: The model has flexes, or MuJoCo Warp's contacts have an unknown field.

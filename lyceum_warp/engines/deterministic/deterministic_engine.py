@@ -52,12 +52,12 @@ class DeterministicEngine(WarpEngine):
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
         """Make another Model and Data with the same options and sizes, to benchmark MuJoCo Warp alone.
 
-        The launches of this engine share scratch memory, but those of a bare Model and Data do not, so a graph of their
-        step takes about a hundred times as much memory.
+        All launches of this engine share scratch memory. Launches on the returned Model and Data do not, so a graph of
+        their step takes about a hundred times as much memory.
         """
         model, data = super().bare()
         with wp.ScopedDevice(self.device):
-            CanonicalOrder(model, data)  # the model's callbacks hold references to the sorter
+            CanonicalOrder(model, data)  # the model's callbacks keep this object alive
         return model, data
 
     def prepare_capture(self) -> None:

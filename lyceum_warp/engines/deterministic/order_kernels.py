@@ -1,4 +1,4 @@
-"""Sort contacts and constraint rows into an order that does not depend on thread timing: kernels.
+"""Define kernels that sort contacts and constraint rows into an order that does not depend on thread timing.
 
 MuJoCo Warp assigns indices to contacts and constraint rows by atomic counters. On a GPU, the order of contacts and rows
 therefore varies. Sums over them are rounded differently in each run, and runs diverge. These kernels sort contacts by

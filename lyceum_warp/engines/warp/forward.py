@@ -49,14 +49,14 @@ def inertia(model: mjw.Model, data: mjw.Data) -> None:
 
 @functools.cache
 def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
-    """Copy MuJoCo Warp's functions; the first forward pass of the copies skips the parts in ``done``.
+    """Make versions of MuJoCo Warp's functions whose first forward pass skips the parts in ``done``.
 
-    In the copies, some global names are replaced. A step of the copies equals a step of MuJoCo Warp, and nothing
-    changes for other users of MuJoCo Warp.
+    The functions are copies in which some global names are replaced, so MuJoCo Warp itself does not change. The copy of
+    ``step`` computes the same results as MuJoCo Warp's ``step``.
 
     For connect and weld constraints, ``mjw.make_constraint`` reads body velocities before MuJoCo Warp has computed
     them, so it reads stale values of the last forward pass or, after a fault, NaN. In the copies, ``com_vel`` runs
-        right after the positions, in every stage of a Runge-Kutta step.
+    right after the positions, in every stage of a Runge-Kutta step.
     """
     own_smooth = vars(forward_functions()["smooth"])
     smooth = types.SimpleNamespace(**own_smooth | {part.__name__: _nothing for part in done})
@@ -214,7 +214,7 @@ class PartialForward:
     are therefore copied into the group, in as many batches as necessary.
 
     Args:
-        rows: MuJoCo Warp's model for the group.
+        rows: Makes MuJoCo Warp's model for the group, and copies the model fields of the group's worlds into it.
         data: MuJoCo Warp's data of all worlds.
         group: MuJoCo Warp's data of the group.
         states: A buffer for the integration states of all worlds, (nworld, integration size), float32.

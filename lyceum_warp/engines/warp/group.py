@@ -12,7 +12,7 @@ _ALIGNED = 512
 
 
 class Reserve:
-    """Holds blocks of memory, which are freed with this object, because graphs store their addresses.
+    """Holds blocks of memory for graphs, which store the blocks' addresses; the blocks live as long as this object.
 
     Subclasses implement ``allocate`` and can then serve as Warp allocators.
 
@@ -54,15 +54,15 @@ def group_size(nworld: int, device: wp.Device) -> int:
 class Turns:
     """Copies the masked worlds into a group and back, one group at a time, by Warp launches only.
 
-    With an empty mask, nothing runs.
+    If the mask is empty, ``run`` does nothing (unless ``loop`` is False).
 
     Args:
         nworld: Number of worlds.
         size: Number of worlds in the group.
         device: The device of the worlds.
-        loop: Whether turns run in a loop, one for each group. Without a loop, the group must have room for every world,
-            and any mask takes exactly one turn. Deterministic launches require ``loop=False``, because they cannot
-            allocate within a graph's loop.
+        loop: Whether ``run`` loops over as many groups as the mask needs. If False, the group must have room for every
+            world, and ``run`` processes a single group even if the mask is empty. Deterministic launches require
+            ``loop=False``, because they cannot allocate within a graph's loop.
     """
 
     def __init__(self, nworld: int, size: int, device: wp.Device, *, loop: bool = True) -> None:
@@ -73,7 +73,7 @@ class Turns:
         self._memory = Arena(device)
 
     def run(self, mask: wp.array, turn: Callable[[], None]) -> None:
-        """Call ``turn`` for each group; ``turn`` may call ``take`` and ``give``."""
+        """Call ``turn`` once for each group; ``turn`` may copy the group's rows by ``take`` and ``give``."""
         with wp.ScopedDevice(self.device):
             self._count.zero_()
             self._first.zero_()
@@ -130,7 +130,7 @@ class Arena(Reserve):
 
     @contextlib.contextmanager
     def __call__(self) -> Iterator[None]:
-        """Return the context of the launches: a capture uses the reserve; another run counts and reserves bytes."""
+        """Return a context for launches: captures allocate from the reserve, other runs count and reserve bytes."""
         if self.device.is_cpu:
             yield
             return

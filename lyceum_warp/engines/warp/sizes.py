@@ -59,11 +59,12 @@ def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[in
 
 
 def warn_of_unknown_sizes(varied: Collection[str], nconmax: int, njmax: int) -> None:
-    """Log a warning if the numbers of contacts depend on randomized fields, because the probe does not randomize."""
+    """Log a warning if randomized fields affect the number of contacts, because the probe uses nominal values."""
     if names := sorted(_CONTACTS.intersection(varied)):
         log.warning(
-            "nconmax=%d and njmax=%d were measured on the model's own %s, which the task draws: give make() larger "
-            "values if worlds end with contact_overflow or constraint_overflow", nconmax, njmax, ", ".join(names),
+            "nconmax=%d and njmax=%d were measured on the model's own %s, which the task randomizes: "
+            "give make() larger values if worlds end with contact_overflow or constraint_overflow",
+            nconmax, njmax, ", ".join(names),
         )  # fmt: skip
 
 

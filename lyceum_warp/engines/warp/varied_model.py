@@ -114,8 +114,9 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
 class ModelRows:
     """Make the model of a group of worlds.
 
-    The group's model has its own rows of the fields that differ, and shares all other fields. With the model of all
-    worlds, MuJoCo Warp would read a field's row ``world % rows``. This row belongs to another world.
+    The group's model has its own rows of the fields that differ, and shares all other fields. The group needs a model
+    of its own, because for world w of the group MuJoCo Warp would read row w of the model of all worlds, which belongs
+    to another world.
 
     Args:
         whole: The model of all worlds.

@@ -92,7 +92,7 @@ class WarpEngine(Engine):
             self.arrays[varied.name] = self._alias_model(varied)
         self._static = StaticGeoms(model, self.dynamics, device)
         self._constants = self._model_constants()
-        # the state that MuJoCo Warp derives from model fields may differ between worlds
+        # MuJoCo Warp's reset would derive a different initial state for each world from these model fields
         self._start: wp.array | None = None
         if initial is not None or self.dynamics.keys() & {"qpos0", "body_pos", "body_quat"}:
             self._start = wp.array(self.initial, dtype=float, device=device)

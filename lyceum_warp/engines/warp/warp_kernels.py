@@ -1,4 +1,4 @@
-"""Copy masked worlds into a small group and back, place static geoms, and correct constants: kernels.
+"""Define kernels that copy masked worlds into a small group and back, place static geoms, and correct constants.
 
 Each masked world has a rank; a group holds consecutive ranks from ``first``.
 """

@@ -119,10 +119,10 @@ class ManipulatorBringBall(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Count contacts, so that no episode starts with a contact, give each world its own target, and remove props.
+        """Add a sensor for contacts (see ``reject``), give each world its own target, and remove unused objects.
 
-        Also add a keyframe with the ball in the hand. The probe of MuJoCo Warp's capacities would find too few
-        constraints if it started only in the model's initial state.
+        Also add a keyframe with the ball in the hand. From the model's initial state alone, the probe that sizes MuJoCo
+        Warp's buffers would find too few constraints.
         """
         suite.count_contacts(spec)
         for name in ("peg", "target_peg", "cup", "slot"):

@@ -88,7 +88,7 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    """Start in a random orientation, just above the floor: at the lowest multiple of 1 cm without contact."""
+    """Start in a random orientation, just above the floor: at the lowest of the tried heights without contact."""
     quat = lw.quat_random(rng)
     lw.put(s.qpos, 3, quat)
     down = lw.quat_rotate_inverse(quat, wp.vec3(0.0, 0.0, -1.0))

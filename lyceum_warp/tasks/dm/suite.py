@@ -39,7 +39,7 @@ def random_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def random_range(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Return the ranges of the joints in ``p.drawn_joints``, (joints, 2); a hinge without limits has a whole turn."""
+    """Return the ranges of the joints in ``p.drawn_joints``, (joints, 2); +-pi for a hinge without limits."""
     joints = np.searchsorted(model.jnt_qposadr, p.drawn_joints)
     return np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.pi, np.pi])
 
@@ -70,5 +70,5 @@ def small_control(action: Row[float]) -> float:
 
 @wp.func
 def log1p(x: float) -> float:
-    """Return log(1 + x), the scale of touch sensors."""
+    """Return log(1 + x), by which dm_control scales touch sensors."""
     return wp.log(1.0 + x)

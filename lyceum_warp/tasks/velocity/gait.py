@@ -1,10 +1,11 @@
 """Make robots with two legs step in time with a gait clock.
 
-Both observation groups contain the clock, and the reward compares the feet with it. The clock turns at
-``gait_frequency``. Each foot stands for the first ``stance_share`` of its cycle and swings for the rest; the feet are
-half a cycle apart. Without the clock, policies learn to make 5 to 7 short steps a second with each foot. The clock's
-cycle lasts 0.8 s, as in unitree_rl_gym and nanoG1. Two costs of fast motion grow with the steps of a world, because a
-robot that pays them from the start learns to stand still.
+The clock tells each foot when to stand and when to swing: it is part of both observation groups, and the reward depends
+on how well the feet follow it. The clock turns at ``gait_frequency``. Each foot stands for the first ``stance_share``
+of its cycle and swings for the rest; the feet are half a cycle apart. Without the clock, policies learn to make 5 to 7
+short steps a second with each foot. The clock's cycle lasts 0.8 s, as in unitree_rl_gym and nanoG1. Two costs of fast
+motion start small and grow with the number of steps, because a robot that pays them in full from the start learns to
+stand still.
 """
 
 import warp as wp
@@ -86,7 +87,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 @wp.func
 def gait_clock(clock: Row[wp.vec2], contact_time: Row[float], stance_share: float, active: float) -> float:
-    """Return the share of the feet that stand or swing as the clock requires."""
+    """Return the fraction of the feet that do what the clock requires, which is to stand or to swing."""
     right = float(0.0)
     for foot in range(contact_time.shape[0]):
         stands = swing(clock, foot, stance_share) < 0.0
@@ -96,7 +97,7 @@ def gait_clock(clock: Row[wp.vec2], contact_time: Row[float], stance_share: floa
 
 @wp.func
 def foot_lift_l2(active: float, s: World, p: Params) -> float:
-    """Return the sum over the feet of ((height - half a sine wave in the swing) / ``foot_lift``)^2."""
+    """Return the sum of ((height - target) / ``foot_lift``)^2 over the feet; a swing's target is half a sine wave."""
     total = float(0.0)
     for foot in range(p.feet.shape[0]):
         x, _ = walking.foot_motion(s, p, foot)

@@ -1,8 +1,8 @@
 """Define velocity tasks for walking robots, which follow commanded velocities and yaw rates on flat ground.
 
-Actions are offsets of the joints' servo targets from the default pose. The file of a robot lists the model, the
-actuated joints and the feet, and sets parameters of the robot. Tables are computed from the model. Observations,
-rewards, commands, pushes and resets are taken from mjlab 1.6.0's velocity tasks.
+Actions are offsets of the joints' servo targets from the default pose. Each robot has a file, which lists the model,
+the actuated joints and the feet, and sets the robot's parameters. The tables in ``Params`` are computed from the model.
+Observations, rewards, commands, pushes and resets are taken from mjlab 1.6.0's velocity tasks.
 
 The robot's base is the body of the model's first joint, which is a free joint. Functions read the state after the last
 substep. Only the forces on the feet are older: MuJoCo computes them at the start of the last substep. These forces are
@@ -91,7 +91,7 @@ class Params:
     tilt_variance: float = 0.2
     standing_pose_std: wp.array[float] = lw.from_model(lambda model, p: len(p.joints) * [0.05])  # rad
     walking_pose_std: wp.array[float] = lw.from_model(lambda model, p: len(p.joints) * [0.3])
-    soft_limit: float = 0.9  # share of a joint's range
+    soft_limit: float = 0.9  # fraction of a joint's range
     # desired foot height in a swing (m), longest rewarded single stance (s)
     swing_target: float = 0.1
     longest_step: float = 0.4
