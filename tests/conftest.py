@@ -127,8 +127,8 @@ def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
 
 @pytest.hookimpl(tryfirst=True)  # this hook must run before pytest deselects tests by marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """If a test has the mark ``quick``, mark as ``long`` all cases that the mark does not name. Skip tests if their GPU
-    or models are missing."""
+    """If a test has the mark ``quick``, mark as ``long`` every case that is not listed in this mark. Skip tests if
+    their GPU or models are missing."""
     _mark_long(items)
     for item in items:
         if (missing := _missing_model(_task(item))) is not None:

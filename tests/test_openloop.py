@@ -231,7 +231,7 @@ def test_rollout_of_a_task_equals_steps(task: str, engine: str) -> None:
 
 @pytest.fixture
 def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Return a list. Each rollout that runs as one native call adds an entry to it."""
+    """Return a list, to which each rollout that runs as one native call appends an entry."""
     calls, original = [], NativeRollout.run
 
     def counting(self: NativeRollout, *args: Any) -> None:

@@ -129,7 +129,7 @@ def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
         lw.load(six, which="worst")
 
 
-def test_without_evaluations_the_best_policy_is_the_one_that_sampled_the_best_iteration(tmp_path: Path) -> None:
+def test_best_policy_without_evaluations_is_the_one_whose_samples_had_the_highest_return(tmp_path: Path) -> None:
     """The policy before an iteration's update samples that iteration's episodes."""
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), tmp_path / "run", iterations=4, keep_every=1)
@@ -362,7 +362,7 @@ def test_train_command_accepts_ppo(six: Path, tmp_path: Path) -> None:
     assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # PPO does not use the settings of NPG
 
 
-def test_run_contains_the_transfer_verdict_of_its_policy(env: lw.Env, tmp_path: Path) -> None:
+def test_run_folder_contains_the_result_of_the_transfer_test(env: lw.Env, tmp_path: Path) -> None:
     """By default, the transfer test runs only if the physics are not exact, because compiling the other engine's
     kernels may take minutes."""
     run = lw.train(algorithm(env), tmp_path / "exact", iterations=1)

@@ -56,10 +56,10 @@ def outcomes_with_faults(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_rows_that_several_threads_compute_equal_rows_that_one_thread_computes(
+def test_several_threads_per_world_give_the_same_results_as_one_thread(
     engine: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a GPU, the lanes of a warp share a world's rows, and each observation group has its own threads.
+    """On a GPU, the lanes of a warp divide the work for a world, and each observation group has separate threads.
 
     On the CPU, the lanes of a warp and the threads of a world run one after another.
     """
@@ -76,7 +76,7 @@ def test_rows_that_several_threads_compute_equal_rows_that_one_thread_computes(
 
 
 def test_results_do_not_depend_on_how_threads_divide_the_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each of three threads replays the launches around the C engine for a part of the four worlds."""
+    """Three threads replay the launches before and after the C engine's calls, each for a part of the four worlds."""
     together, counts = outcomes_with_faults("mujoco")
     monkeypatch.setattr(capture, "SECONDS_A_THREAD", 1e-9)
     monkeypatch.setattr(mujoco_engine, "cpu_cores", lambda: 3)

@@ -228,7 +228,7 @@ def test_equal_seeds_give_equal_worlds_and_resets_without_seeds_differ(
     assert len(np.unique(first[:, 0])) == N
 
 
-def test_first_reset_without_a_seed_draws_one(hopper: GymnasiumVectorEnv) -> None:
+def test_first_reset_without_a_seed_uses_a_random_seed(hopper: GymnasiumVectorEnv) -> None:
     def first(**options: Any) -> np.ndarray:
         return GymnasiumVectorEnv("hopper", 2, **options).reset()[0]
 
@@ -255,7 +255,7 @@ OBSERVATION_WRAPPERS = {
     "DtypeObservation": lambda envs: wrappers.vector.DtypeObservation(envs, np.float64),
     "TransformObservation": lambda envs: wrappers.vector.TransformObservation(envs, lambda obs: np.clip(obs, -9, 9)),
 }
-"""Observation wrappers; Gymnasium does not allow them in the mode SAME_STEP."""
+"""Observation wrappers; Gymnasium does not allow them in the autoreset mode SAME_STEP."""
 
 OTHER_WRAPPERS = {
     "ClipAction": wrappers.vector.ClipAction,

@@ -48,7 +48,7 @@ def test_returned_observations_are_not_overwritten_by_the_next_step(env: lw.Env)
         assert all(torch.equal(obs[group], before[group]) for group in ("policy", "critic"))
 
 
-def test_time_limit_applies_to_assigned_episode_lengths(env: lw.Env) -> None:
+def test_assigned_episode_lengths_change_when_the_time_limit_is_reached(env: lw.Env) -> None:
     worlds = RslRlVecEnv(env)
     worlds.episode_length_buf = torch.tensor([0, 9, 8, 3])
     *_, extras = worlds.step(torch.zeros(4, 1))

@@ -75,7 +75,7 @@ def test_error_of_an_unreadable_model_file_names_the_file(tmp_path: Path) -> Non
         load_spec(tmp_path / "robot.xml")
 
 
-def test_error_without_gymnasium_robotics_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_names_the_extra_if_gymnasium_robotics_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if "robotics" in name else find(name, *a))
     with pytest.raises(FileNotFoundError, match=r"gymnasium-robotics, .*: pip install 'lyceum-warp\[hand\]'"):

@@ -93,7 +93,7 @@ class Block(lw.Task):
 
 
 class WatchedWindow(Window):
-    """A viewer session that stores the last frame and the user's commands, and sends commands of the test."""
+    """A viewer window that stores the last frame and the user's commands, and also sends commands that a test adds."""
 
     def __init__(self, *given: Any) -> None:
         self.last: Frame | None = None
@@ -477,7 +477,7 @@ def test_pages_of_other_sites_cannot_reach_the_viewer(viewer: Viewer, context: B
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        for host in ("localhost", "127.0.0.1"):  # the second page belongs to the viewer's site
+        for host in ("localhost", "127.0.0.1"):  # the second page has the viewer's host but another port
             page = context.new_page()
             page.goto(f"http://{host}:{server.server_address[1]}/")
             assert not page.evaluate(opens, f"{base.replace('http', 'ws')}state")

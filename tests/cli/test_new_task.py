@@ -95,7 +95,7 @@ def test_new_task_observes_only_sensors_if_they_measure_every_joint(folder: Path
 
 @pytest.mark.parametrize("model", [*MOVING.values(), *SENSING.values(), *PLUGINS.values()],
                          ids=[*MOVING, *SENSING, *PLUGINS])  # fmt: skip
-def test_new_task_for_any_model_has_matching_sizes(model: str, folder: Path) -> None:
+def test_observations_of_a_new_task_have_the_sizes_of_the_model(model: str, folder: Path) -> None:
     task = BoundTask(find_task(new("walk", model)))
     sizes = {"position": task.model.nq, "velocity": task.model.nv, "activation": task.model.na}
     found = dict(task.obs_layouts["policy"])

@@ -499,7 +499,9 @@ def test_killed_run_can_be_resumed(trained: Path, tmp_path: Path) -> None:
     assert len(metrics(out)) == total
 
 
-def test_train_prints_the_transfer_verdict_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_train_prints_the_result_of_the_transfer_test_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     options = ["--iterations", "1", "--horizon", "20"]
     assert train(tmp_path / "exact", *options) == 0
     assert "transfer:" not in capsys.readouterr().out

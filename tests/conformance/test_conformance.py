@@ -35,9 +35,10 @@ def settled_again() -> None:
 
 
 def options(task: str, engine: str) -> dict[str, int]:
-    """Return the number of steps of the long rules; hopper takes enough steps to find a leak of one number per step.
+    """Return how many steps the long rules take.
 
-    On a CPU, a step of the Warp engine takes milliseconds, so other tasks take few steps on this engine.
+    For hopper, the steps suffice to find a leak of one number per step. On a CPU, a step of the Warp engine takes
+    milliseconds, so the rules take only a few steps of other tasks on this engine.
     """
     every = task in EVERY_RULE[engine]
     if engine == "mujoco":
@@ -67,7 +68,7 @@ def test_task_follows_the_quick_rules(task: str, engine: str) -> None:
     done = OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
     checks = [check for check in CHECKS if check not in done]
     if engine == "warp" and "rough" in task:
-        # this rule compares with the C engine, which creates more contacts with a height field than MuJoCo Warp does
+        # this rule compares both engines, but the C engine creates more contacts with a height field than MuJoCo Warp
         checks.remove(check_dynamics)
     check_task(task, engine=engine, checks=checks, **options(task, engine))
 

@@ -185,7 +185,7 @@ FULL_BREAKS: list[Break] = [
 SETTLED_BREAKS: list[Break] = [
     ("settle", MujocoEngine, "settle", at_once),
 ]
-"""Patches that violate each rule, for a variant of the task that settles after a reset."""
+"""Patches that violate each rule, for a variant of this task that takes substeps before each episode."""
 
 ALL_BREAKS = [
     *(("hopper", *broken) for broken in BREAKS),

@@ -1,4 +1,4 @@
-"""Test per-world model fields, inputs, initial states and settling on every engine."""
+"""Test per-world model fields, inputs, initial states and substeps before an episode on every engine."""
 
 import copy
 from collections.abc import Mapping
@@ -272,7 +272,7 @@ def test_rollout_uses_the_model_fields_of_each_state(
 
 
 class WholeWarpEngine(WarpEngine):
-    """A Warp engine that settles with forward passes of all worlds, as the deterministic engine does."""
+    """A Warp engine whose ``settle`` computes forward passes of all worlds, as the deterministic engine's does."""
 
     partial_refresh = False
 
@@ -300,7 +300,7 @@ def test_settling_advances_only_masked_worlds(engine: type[Engine]) -> None:
     assert not made.fault.numpy().any()
 
 
-def test_captured_graphs_apply_model_fields_and_settle_worlds() -> None:
+def test_graphs_give_the_same_results_as_direct_calls_of_apply_model_and_settle() -> None:
     captured, direct = (make(WarpEngine, *DRAWN) for _ in range(2))
     mask = worlds(N, 0, 2)
 

@@ -1,4 +1,4 @@
-"""Test which kernels a rehearsal lists for a function, and whether Warp has the names that rehearsals replace."""
+"""Test rehearsals, which list the kernels that a function would launch, and the names of Warp that they replace."""
 
 import inspect
 import subprocess

@@ -1,4 +1,4 @@
-"""Test that worker threads run calls in parallel, raise the error of any call, and end with their pool."""
+"""Test that worker threads run calls in parallel and end with their pool, and that errors in calls are raised."""
 
 import gc
 import signal

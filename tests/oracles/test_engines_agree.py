@@ -41,7 +41,7 @@ PARAMS: dict[str, dict[str, Any]] = {
     "go1_velocity": {"fall_angle": 0.5},
     "soft_ball": {"reach": 0.15},
 }
-"""Parameters by task. With these parameters, random field values end some episodes. For some robots, the solver's
+"""Parameters by task. With these parameters, some episodes end under random field values. For some robots, the solver's
 limits are raised, because the engines agree up to rounding only if the solver converges."""
 
 
@@ -269,7 +269,7 @@ def test_equal_positions_and_velocities_give_equal_observations_on_both_engines(
         results = []
         for env in (engines.c, engines.warp):
             env.set_state(state.to(env.action.device))
-            # a state includes fields of the last substep; the reset phases recompute these fields on each engine
+            # the state contains fields of the last substep, so the reset phases recompute these fields on each engine
             for phase in env.worlds.reset_phases(randomly=False):
                 if phase.name not in ("restart", "settle"):
                     phase.run()

@@ -47,11 +47,10 @@ WITH_FORCES = [task for task in TASKS if "cfrc_ext" in fields(task)]
 
 
 class SensorStage:
-    """A mixin that makes Gymnasium environments use the Newton solver, and contact forces of the last substep's sensor
-    stage.
+    """A mixin for Gymnasium environments: they use the Newton solver and the contact forces of the last substep.
 
     Gymnasium computes ``cfrc_ext`` again after the last substep. With the mixin, a sensor makes MuJoCo compute this
-    field, as in lyceum_warp.
+    field in the sensor stage of the substep, as in lyceum_warp.
     """
 
     def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -319,8 +318,8 @@ RANGES = [(task, name) for task in HEALTHY for name in inspect.signature(unchang
 
 @pytest.mark.parametrize(("task", "bounded"), [*((task, None) for task in HEALTHY), *RANGES])
 def test_terminal_states_are_those_of_gymnasium(task: str, bounded: str | None) -> None:
-    """Random states lie on both sides of the bounds of termination. A case checks either all bounds, or one range while
-    the other ranges are too wide to matter."""
+    """Random states lie on both sides of the bounds of termination. A case checks either all bounds, or a single
+    range; the other ranges are then too wide to matter."""
     wide = {name: (-1e6, 1e6) for other, name in RANGES if other == task and bounded not in (None, name)}
     if bounded is not None and math.isinf(max(keywords(task)[bounded])):
         wide[bounded] = (keywords(task)[bounded][0], 2.0)
@@ -435,8 +434,8 @@ def keywords(task: str) -> dict[str, Any]:
 
 
 def variants(default: Any) -> list[Any]:
-    """Return values that differ from the default. If the default is a range, return the sides of the range to move
-    inwards."""
+    """Return values that differ from the default. For a range, the values are names of its sides, which a test
+    moves inwards."""
     if isinstance(default, bool):
         return [not default]
     if isinstance(default, tuple):

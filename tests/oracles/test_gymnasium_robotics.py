@@ -222,8 +222,8 @@ MakePair = Callable[..., Pair]
 
 @pytest.fixture
 def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
-    """Return ``make_pair(theirs, sparse=True)``, which pairs an environment of this package with one of
-    Gymnasium-Robotics."""
+    """Return ``make_pair(theirs, **params)``, which pairs an environment of this package with the Gymnasium-Robotics
+    environment ``theirs``."""
 
     def make(theirs: Any = None, **params: Any) -> Pair:
         ours = shared_env(task, autoreset=False, horizon=0, nthread=1, **params)

@@ -28,7 +28,7 @@ with run_lock(Path(sys.argv[1])):
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[str]:
-    """Lock a folder in another process, yield the process as errors name it, and kill it at the end."""
+    """Lock a folder in another process; yield the process in the words of the errors, and kill it at the end."""
     command = [sys.executable, "-c", OTHER, str(folder)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None and other.stdout.readline() == "locked\n"

@@ -166,7 +166,7 @@ def test_run_with_an_edited_path_raises_an_error(
     with pytest.raises(ValueError, match=r"was not made by you .*--trust") as refusal:
         run_env(run, saved.options, saved.params)
     assert str(file) in str(refusal.value) and not witness.exists()
-    if attack in (names_a_table, names_a_model):  # the given task reads a table that the folder names
+    if attack in (names_a_table, names_a_model):  # a given task would also read the file that the run's folder names
         with pytest.raises(ValueError, match=r"was not made by you .*--trust"):
             run_env(run, saved.options, saved.params, task="point_mass")
 

@@ -297,7 +297,7 @@ def test_a_planner_uses_the_model_in_the_state_unless_nominal_model_is_set(task:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_inputs_that_a_reset_draws_affect_steps_and_rollouts(engine: str) -> None:
+def test_inputs_randomized_at_a_reset_affect_steps_and_rollouts(engine: str) -> None:
     env = lw.make(Windy, nworld=2, engine=engine, autoreset=False, horizon=0)
     loop = OpenLoop(lw.make(Windy, nworld=2, engine=engine, autoreset=False, seed=3), 6)
     state = env.get_state()[0].clone()

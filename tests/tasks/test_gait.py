@@ -46,7 +46,7 @@ def test_gait_clock_reward_is_the_share_of_feet_that_follow_the_clock(g1: lw.Env
     assert seen == {0.0, 1.0, 2.0}
 
 
-def test_costs_of_fast_motion_grow_with_the_steps_of_a_world(g1: lw.Env) -> None:
+def test_costs_of_fast_motion_grow_with_the_number_of_steps_of_a_world(g1: lw.Env) -> None:
     action = torch.linspace(-0.2, 0.2, 12).repeat(8, 1)
     costs = []
     for steps in (0.0, 1000.0, 4000.0, 9000.0):

@@ -344,7 +344,7 @@ def test_connection_of_a_client_that_does_not_read_is_closed(monkeypatch: pytest
             client.connect(("127.0.0.1", proxy.port))
             client.sendall(f"GET {path}/ HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: {key}\r\n\r\n".encode())
             wait_until(lambda: upstream.ended == 1)
-            with pytest.raises(ConnectionError):  # a connection that waits for the client would accept these bytes
+            with pytest.raises(ConnectionError):  # an open connection would accept these bytes
                 for _ in range(1000):
                     client.send(b"x")
                     time.sleep(0.01)
