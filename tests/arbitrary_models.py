@@ -1,4 +1,4 @@
-"""Define XML models with every kind of element, and list the rules whose results depend on the model."""
+"""Define XML models with every kind of element, and list the rules of ``check_task`` that depend on the model."""
 
 from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import episode_rules as episodes

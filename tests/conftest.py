@@ -38,7 +38,7 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def known_sizes(pytestconfig: pytest.Config) -> Iterator[None]:
     """Cache the probed sizes of contact buffers between runs of the tests.
 
-    A probe takes seconds for a large model. For another release of MuJoCo or another probe, the cache starts empty.
+    A probe takes seconds for a large model. If the probe or the version of MuJoCo changes, the cache starts empty.
     """
     sizes, cache = sys.modules.get("lyceum_warp.engines.warp.sizes"), getattr(pytestconfig, "cache", None)
     if sizes is None or cache is None:

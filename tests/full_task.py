@@ -178,7 +178,7 @@ def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uin
 
 class Full(lw.Task):
     """A task with every function and attribute; episodes begin at a keyframe, and invalid initial states are
-    redrawn."""
+    replaced by new random states."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))
     frame_skip = 3

@@ -239,7 +239,7 @@ def in_new_process(program: str) -> str:
     return result.stdout
 
 
-def test_no_submodule_has_a_public_name() -> None:
+def test_no_submodule_has_the_name_of_a_public_function() -> None:
     """An import of such a submodule would set an attribute of the package. This attribute would hide the function with
     the same name."""
     assert not {room(name) for name in MODULES} & set(lw.__all__)

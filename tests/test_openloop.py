@@ -285,8 +285,8 @@ def test_parameters_may_change_between_rollouts(engine: str) -> None:
 @pytest.mark.quick("Forgetful-mujoco", "Servo-warp")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Forgetful, Servo])
-def test_worlds_draw_random_numbers_from_the_given_keys(task: type[lw.Task], engine: str) -> None:
-    """Steps from states with these keys draw the same random numbers."""
+def test_random_numbers_of_worlds_depend_on_the_given_keys(task: type[lw.Task], engine: str) -> None:
+    """Steps from states with these keys use the same random numbers."""
     env = lw.make(task, engine=engine, nworld=4, autoreset=False)
     numbers = np.array([5, 2**32 - 1, 77, 1234567890], dtype=np.uint32)
     keys = wp.zeros(4, dtype=wp.uint32, device="cpu")

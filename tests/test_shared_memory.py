@@ -195,7 +195,7 @@ def test_sums_of_shared_memory_are_added_over_processes(env: lw.Env) -> None:
     assert env.shared["falls"].sum() == ended.sum()
 
 
-def test_task_with_shared_memory_follows_the_rules() -> None:
+def test_task_with_shared_memory_passes_check_task() -> None:
     check_task(Balance, nworld=4, steps=20)
 
 

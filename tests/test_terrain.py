@@ -221,5 +221,5 @@ def test_level_of_a_world_rises_after_walking_far_and_falls_after_standing(share
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_task_on_terrain_follows_all_rules(engine: str) -> None:
+def test_task_on_terrain_passes_check_task(engine: str) -> None:
     check_task(OnTerrain, engine=engine, steps=20)

@@ -82,7 +82,7 @@ def test_resume_with_another_task_or_engine_raises_an_error(six: Path, env: lw.E
             lw.train(algorithm(given), folder, iterations=9, resume=True)
 
 
-def test_learner_after_some_iterations_starts_a_complete_run(six: Path, tmp_path: Path) -> None:
+def test_training_of_a_learner_after_some_iterations_writes_a_complete_run(six: Path, tmp_path: Path) -> None:
     npg, folder = algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run"
     for _ in range(3):
         next(npg)
@@ -336,7 +336,7 @@ def test_flags_with_default_values_override_the_settings_of_the_source_run(
     refused(capsys, "has gamma 0.9, not 0.995")
 
 
-def test_evaluation_and_training_with_equal_seeds_draw_different_initial_states(env: lw.Env) -> None:
+def test_evaluation_and_training_with_equal_seeds_have_different_initial_states(env: lw.Env) -> None:
     env.rand_reset(1)
     trained_on = env.obs.clone()
     seen: list[torch.Tensor] = []

@@ -148,7 +148,7 @@ def test_state_contains_the_count_of_success_steps_and_a_reset_clears_it(engine:
     assert env.success.tolist() == [False, True, True]
     env.set_state(full)
     assert env.success.tolist() == [False, True, True]
-    env.set_params(success_distance=0.0)  # a state counts as a success only if it satisfies the goal
+    env.set_params(success_distance=0.0)  # set_state restores a success only if the state satisfies the goal
     env.set_state(full)
     assert not env.success.any()
 
@@ -183,7 +183,7 @@ def test_captured_graphs_use_new_parameters_that_differ_between_worlds(engine: s
     torch.testing.assert_close(env.reward[0] - env.reward[1], torch.tensor(3.0))
 
 
-def test_random_streams_depend_on_the_index_of_a_world_over_all_processes() -> None:
+def test_random_numbers_depend_on_the_index_of_a_world_over_all_processes() -> None:
     whole, part = lw.make("point_mass", nworld=4), lw.make("point_mass", nworld=2, first_world=2)
     for env in (whole, part):
         env.rand_reset(7)

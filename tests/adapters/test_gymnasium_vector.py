@@ -132,7 +132,7 @@ def test_results_of_a_step_do_not_change_in_the_next_step(hopper: GymnasiumVecto
     assert not np.shares_memory(first[0], second[0])
 
 
-def test_step_returns_the_buffers_themselves_if_copies_are_disabled(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_step_does_not_copy_the_buffers_if_copies_are_disabled(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector(torch=True, copy=False)
     obs, _ = envs.reset(seed=0)
     assert obs["policy"].data_ptr() == envs.env.obs.data_ptr()
@@ -205,7 +205,9 @@ def test_next_step_mode_resets_a_world_in_the_step_after_its_end(vector: Callabl
 
 
 @pytest.mark.parametrize("tensors", [False, True], ids=["numpy", "torch"])
-def test_ignored_invalid_action_causes_no_fault(tensors: bool, vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_invalid_action_for_a_world_that_is_being_reset_causes_no_fault(
+    tensors: bool, vector: Callable[..., GymnasiumVectorEnv]
+) -> None:
     envs = vector(autoreset_mode=AutoresetMode.NEXT_STEP, torch=tensors)
     envs.reset(seed=5)
     faults, ended, ends = envs.env.fault_counts, np.zeros(N, dtype=bool), 0

@@ -18,7 +18,7 @@ def env(shared_env: SharedEnv) -> lw.Env:
     return shared_env(Metered, nworld=4, horizon=10, far=1e3)
 
 
-def test_step_returns_all_observation_groups_and_the_buffers(env: lw.Env) -> None:
+def test_step_returns_all_observation_groups_and_does_not_copy_the_buffers(env: lw.Env) -> None:
     worlds = RslRlVecEnv(env)
     assert (worlds.num_envs, worlds.num_actions, worlds.max_episode_length) == (4, 1, 10)
     assert worlds.device == env.obs.device and worlds.cfg["task"] == "metered" and worlds.unwrapped is env

@@ -69,7 +69,9 @@ INCOMPLETE = {
 
 
 @pytest.mark.parametrize(("old", "new", "message"), INCOMPLETE.values(), ids=INCOMPLETE)
-def test_error_of_an_incomplete_file_names_the_missing_part(old: str, new: str, message: str, tmp_path: Path) -> None:
+def test_error_of_an_incomplete_file_names_the_missing_struct_or_function(
+    old: str, new: str, message: str, tmp_path: Path
+) -> None:
     with pytest.raises(ValueError, match=message):
         source_of(tmp_path, tiny_task.changed((old, new)))
 

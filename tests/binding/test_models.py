@@ -109,7 +109,7 @@ PAIRS = """<mujoco model="pairs"><worldbody>
 
 
 def test_contact_pair_that_is_listed_twice_creates_one_contact(caplog: pytest.LogCaptureFixture) -> None:
-    """Otherwise MuJoCo would create two contacts, and MuJoCo Warp only one."""
+    """Without this change, MuJoCo would create two contacts, and MuJoCo Warp would create one."""
     assert mujoco.MjModel.from_xml_string(PAIRS).npair == 2
     with caplog.at_level("INFO"):
         model = compile_model(mujoco.MjSpec.from_string(PAIRS), (), PHYSICS)
@@ -200,7 +200,7 @@ def test_model_with_a_relative_path_and_its_meshes_are_found_from_another_folder
     assert env.replicate().model.nmesh == 1
 
 
-def test_error_of_xml_text_as_model_suggests_an_mjspec() -> None:
+def test_error_of_a_model_given_as_xml_text_suggests_an_mjspec() -> None:
     with pytest.raises(
         ValueError, match=r"^the model '<mujoco><asset><mesh \.\.\.' is XML.*mujoco.MjSpec.from_string\(\.\.\.\)"
     ):

@@ -200,7 +200,7 @@ def test_invalid_term_raises_a_one_line_error_that_names_it(
 
 
 @ENGINES
-def test_task_with_terms_follows_all_rules(engine: str) -> None:
+def test_task_with_terms_passes_check_task(engine: str) -> None:
     quick = [check for check in CHECKS if check is not check_memory]
     assert not check_task(Terms, engine=engine, steps=40, checks=quick).unused
 

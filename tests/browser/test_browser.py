@@ -225,7 +225,7 @@ def push(action: float) -> Callable[[torch.Tensor], torch.Tensor]:
 
 @pytest.fixture(scope="module")
 def launch() -> Iterator[Callable[[], Browser]]:
-    """Start a headless browser: LYCEUM_WARP_BROWSER, playwright's own, or the system's."""
+    """Start a headless browser: that of LYCEUM_WARP_BROWSER, playwright's browser, or the system's."""
     with sync_playwright() as playwright:  # playwright runs an event loop in this thread until it is closed
         candidates = [os.environ.get("LYCEUM_WARP_BROWSER"), playwright.chromium.executable_path]
         candidates += map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"))

@@ -1,4 +1,4 @@
-"""Test that every rule fails if an environment is patched to violate it."""
+"""Test that every rule of ``check_task`` fails if an environment is patched to violate it."""
 
 import itertools
 from collections.abc import Callable, Iterable
@@ -209,14 +209,14 @@ def test_violated_rule_is_reported(
 
 @pytest.mark.quick("Full")
 @pytest.mark.parametrize("task", [Full, Settled])
-def test_task_with_every_feature_follows_the_rules(task: type[lw.Task]) -> None:
+def test_task_with_every_feature_passes_check_task(task: type[lw.Task]) -> None:
     check_task(task, engine="mujoco", steps=60)
 
 
 @pytest.mark.quick("Weighed-warp", "Practiced-warp", "Gifted-mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("task", [Weighed, Practiced, Gifted])
-def test_task_that_observes_lasting_memory_follows_the_rules(task: type[lw.Task], engine: str) -> None:
+def test_task_that_observes_lasting_memory_passes_check_task(task: type[lw.Task], engine: str) -> None:
     checks = [check for check in CHECKS if engine == "mujoco" or check.__name__ == "check_reset"]
     check_task(task, engine=engine, nworld=3, steps=60, frame_skip=1, checks=checks)
 

@@ -383,7 +383,7 @@ SLIDERS = """<mujoco><worldbody>
 
 
 def test_inverse_weights_of_sliding_or_rotating_bodies_equal_those_of_a_compiled_model() -> None:
-    """In directions in which a body cannot move, MuJoCo's inverse weight is 0; MuJoCo Warp's ``set_const`` differs."""
+    """In directions in which a body cannot move, MuJoCo's inverse weight is 0, unlike MuJoCo Warp's ``set_const``."""
     model = mujoco.MjModel.from_xml_string(SLIDERS)
     engine = make(WarpEngine, "body_mass", nworld=2, model=model)
     for scale in (1.0, 2.0):

@@ -1,4 +1,4 @@
-"""Resolve device names and engine="auto", and choose devices for few worlds and for a planner's samples."""
+"""Resolve device names and engine="auto", and choose devices for a few worlds and for a planner's samples."""
 
 import types
 from typing import Any

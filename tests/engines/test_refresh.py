@@ -290,7 +290,7 @@ def test_limit_sensor_is_zero_after_the_joint_leaves_its_limit(kind: type[Engine
         check_current(engine)
 
 
-def test_worlds_that_share_an_mjdata_keep_their_own_fields() -> None:
+def test_worlds_that_share_an_mjdata_have_separate_fields() -> None:
     """After a step, a stage of the physics runs for one world after another in the same MjData. Fields that this stage
     does not compute contain another world's values there."""
     model, device = model_of(SENSORS["mixed"]), wp.get_device("cpu")

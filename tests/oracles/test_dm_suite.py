@@ -37,7 +37,7 @@ def stored(task: str) -> dict[str, np.ndarray]:
 
 
 def rows(task: str, name: str) -> np.ndarray:
-    """Return the rows of all segments."""
+    """Stack the arrays of all segments."""
     values = stored(task)[name]
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])
 

@@ -155,7 +155,7 @@ class Pair:
         return np.float32(self.middle + 1.33 * self.reach * self.rng.uniform(-1.0, 1.0, self.middle.shape))
 
     def step(self) -> Step:
-        if self.rng.random() < 0.7:  # otherwise the last action is repeated, so that the robot moves further
+        if self.rng.random() < 0.7:  # with probability 0.3, repeat the last action, so that the robot moves further
             self.held = self.action()
         self.ours.step(torch.from_numpy(self.held[None]))
         obs, reward, terminated, truncated, info = self.theirs.step(self.held.astype(np.float64))

@@ -47,7 +47,7 @@ def test_second_writer_raises_an_error_until_the_first_writer_ends(tmp_path: Pat
         pass
 
 
-def test_run_that_another_process_writes_is_resumed_only_with_take_over(
+def test_run_that_another_process_writes_is_resumed_only_with_the_flag_take_over(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"

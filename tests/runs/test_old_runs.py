@@ -28,7 +28,9 @@ def test_policy_and_value_function_of_an_old_run_are_loaded(old_run: Path) -> No
     assert value.discount == 0.995
 
 
-def test_old_run_is_evaluated_with_its_own_physics(old_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_old_run_is_evaluated_with_the_physics_of_its_training(
+    old_run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["eval", str(old_run), "--episodes", "2"]) == 0
     assert "hopper: 2 episodes of the mean policy" in capsys.readouterr().out
 

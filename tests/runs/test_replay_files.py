@@ -82,10 +82,10 @@ def test_an_interrupted_run_continues_identically(whole: list[dict[str, Any]], t
     np.testing.assert_equal(numbers(tmp_path / "run"), whole)
 
 
-def test_save_writes_only_the_parts_of_the_buffer_that_have_grown(
+def test_save_writes_only_those_files_of_the_buffer_that_have_grown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The buffer of 200 steps is saved in parts of 4 steps, and each iteration fills three parts."""
+    """The buffer of 200 steps is saved in files of 4 steps each, and each iteration fills three files."""
     written: list[str] = []
     write: Callable[..., None] = replay_files.write_content
 

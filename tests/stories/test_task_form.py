@@ -1,7 +1,7 @@
 """Test features of the task form through the public interface, such as randomized dynamics, observation groups and
 noise.
 
-The rules of ``check_task`` cover each feature for any task; these tests need particular tasks.
+``check_task`` tests each feature for any task; the tests in this file need particular tasks.
 """
 
 from pathlib import Path
@@ -56,7 +56,7 @@ def draw_wind(s: WindyWorld, p: PuckParams, rng: Row[wp.uint32]):
 
 
 class Windy(lw.Task):
-    """A force that is drawn at a reset and stays constant during the episode."""
+    """A random force that is chosen at a reset and stays constant during the episode."""
 
     model = Drawn.model
     obs = {"x": 1, "wind": 1}

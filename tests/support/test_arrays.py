@@ -26,7 +26,7 @@ def test_torch_view_shares_memory_with_the_warp_array() -> None:
     assert array.numpy().tolist() == [[2.0] * 3] * 2
 
 
-def test_launch_over_rows_writes_only_masked_rows() -> None:
+def test_launch_rows_writes_only_masked_rows() -> None:
     source, target = (wp.full((3, 4), value, dtype=float, device="cpu") for value in (1.0, 2.0))
     mask = wp.array([True, False, True], dtype=bool, device="cpu")
     launch_rows(state.copy_rows, mask, source, target)

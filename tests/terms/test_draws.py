@@ -1,4 +1,4 @@
-"""Check the distributions of drawn numbers and model fields."""
+"""Check the distributions of random numbers and of randomized model fields."""
 
 import numpy as np
 from checks import check_uniform

@@ -42,7 +42,7 @@ def test_learning_curve_of_a_task_with_metrics_has_a_panel_for_them(tmp_path: Pa
     assert sizes[1] > sizes[0]
 
 
-def test_learning_curve_of_a_run_without_rows_raises_an_error(run: Run) -> None:
+def test_learning_curve_of_a_run_without_complete_iterations_raises_an_error(run: Run) -> None:
     pytest.importorskip("matplotlib")
     cut_rows(run.metrics, 0)
     with pytest.raises(ValueError, match="has no complete iteration to plot: continue its training"):

@@ -22,7 +22,7 @@ def pushed(env: lw.Env, world: int) -> bool:
     return bool(env.get_state()[world, env.state_space.parts["xfrc_applied"]].any())
 
 
-def test_a_push_ends_when_another_world_is_shown(shared_env: SharedEnv) -> None:
+def test_push_ends_when_the_viewer_shows_another_world(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True)
     for command, pushes in ((PUSH, (True, False)), (protocol.SetWorld(1), (False, False)),

@@ -1,4 +1,4 @@
-"""Test that a user's velocity command replaces the command that the task draws."""
+"""Test that a user's velocity command replaces the random command of the task."""
 
 import numpy as np
 import torch
@@ -21,7 +21,9 @@ def test_command_of_the_user_is_observed_until_it_is_released(shared_env: Shared
         status = stage.frame().status
         assert status.driven and np.allclose(status.command, command)
         np.testing.assert_allclose(env.obs[0, 45:], command)
-        session.obey(protocol.Reset(random=True))  # the task draws a command, which the next frame replaces
+        session.obey(
+            protocol.Reset(random=True)
+        )  # the task chooses a random command, and the next frame replaces it by the user's command
         stage.frame()
     for end in (protocol.Drive(None), protocol.SetWorld(1)):
         session.obey(protocol.Drive(command))
