@@ -1,5 +1,5 @@
-"""Test that a task with every feature passes ``check_task`` on a GPU, agrees with the C engine, and does not wait for the
-device."""
+"""Test that a task with every feature passes ``check_task`` on a GPU, agrees with the C engine, and never waits for
+the device."""
 
 import pytest
 import torch
