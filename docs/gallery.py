@@ -116,6 +116,8 @@ SHOWS = {
     "dm/walker_walk": Show(start=1.0, seconds=3.0),
     "half_cheetah": Show(start=0.5, seconds=3.0),
     "hopper": Show(start=1.0, seconds=2.5, replan_every=4),
+    **{f"g1_{name}": Show(seconds=3.0, camera=FreeCamera(track=1, distance=2.8, azimuth=135.0, elevation=-15.0))
+       for name in ("stand", "walk")},
     "humanoid": Show(
         {"horizon": 48, "knots": 6, "noise": 0.25, "temperature": 1.0}, start=1.0, seconds=3.0,
         camera=FreeCamera(lookat=(3.2, 0.0, 0.9), distance=4.8, azimuth=90.0, elevation=-8.0),

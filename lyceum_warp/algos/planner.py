@@ -26,6 +26,7 @@ shifts, perturbs and averages the knots of a spline, and interpolates actions fr
 
 import copy
 import itertools
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, TypeAlias
@@ -45,6 +46,7 @@ from lyceum_warp.algos.policy_check import check_value
 from lyceum_warp.algos.predictive_sampling import BestSample
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.binding.registry import find_task
+from lyceum_warp.done import Done
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.capture import Calls, Phase
 from lyceum_warp.kernels import knots, planning
@@ -54,6 +56,8 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import described, whole_number
 from lyceum_warp.task import Task
 from lyceum_warp.world_arrays import memory_columns
+
+log = logging.getLogger(__name__)
 
 _BUFFERS = (
     "actions", "nominal", "knot_actions", "standard_noise", "adapted_noise", "sampled", "model_returns", "returns",
@@ -194,6 +198,7 @@ class Planner:
         first, others = self._program(first=True), self._program(first=False)
         self._calls = first + others * (self.config.iterations - 1)
         self.reset(seeds)
+        self._warned = False
         self._made = True
 
     def _drawn_fields(self) -> list[str]:
@@ -327,7 +332,28 @@ class Planner:
         self._shift_view.fill_(whole_number("shift", shift, low=0))
         for call in self._calls:
             call()
-        return self._action.to(state.device, copy=True)
+        action = self._action.to(state.device, copy=True)
+        # after a copy to the CPU, reading the summary does not wait for the device
+        if action.device.type == "cpu" and not self._warned and (self._summary.numpy()[:, 0] == -np.inf).any():
+            self._warned = True
+            self._warn_of_failed_samples()
+        return action
+
+    def _warn_of_failed_samples(self) -> None:
+        """Log that all samples of a plan failed, with the faults and a fix."""
+        faults = Done(int(np.bitwise_or.reduce(self._loop.fault.cpu().numpy())))
+        substep, frame_skip = self.env.model.opt.timestep, self.env.task.frame_skip
+        if faults:
+            reason = f"faults: {faults.name}"
+            fix = (
+                f"try shorter substeps, such as timestep={0.5 * substep:g}, frame_skip={2 * frame_skip}, or less noise"
+            )
+        else:
+            reason, fix = "returns are not finite", "check the task's reward and the value function"
+        log.warning(
+            "all %d samples of a plan of %s failed (%s), so the planner keeps its last plan: %s; further failures are "
+            "not reported", self.samples, self.env.task.name, reason, fix,
+        )  # fmt: skip
 
     def _program(self, *, first: bool) -> Calls:
         """List the calls that make one improvement; the first improvement also shifts the plan in time."""

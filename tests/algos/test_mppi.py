@@ -283,7 +283,9 @@ def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("update", ["mppi", "cem", "predictive_sampling"])
-def test_plan_is_shifted_in_time_but_keeps_its_actions_if_all_samples_fail(update: str, engine: str) -> None:
+def test_plan_is_shifted_in_time_but_keeps_its_actions_if_all_samples_fail(
+    update: str, engine: str, caplog: pytest.LogCaptureFixture
+) -> None:  # fmt: skip
     plan = MPPI(Picky, engine=engine, horizon=5, samples=8, noise=0.1, limit=10.0, seed=3, update=update)
     plan(plan.state_of())
     for _ in range(3):
@@ -299,6 +301,20 @@ def test_plan_is_shifted_in_time_but_keeps_its_actions_if_all_samples_fail(updat
         plan.env.set_params(limit=10.0)
         plan(plan.state_of())
         assert plan.summary["failed_samples"] == 0 and torch.isfinite(plan.actions).all()
+    (message,) = caplog.messages
+    assert message == (
+        "all 8 samples of a plan of picky failed (returns are not finite), so the planner keeps its last plan: check "
+        "the task's reward and the value function; further failures are not reported"
+    )
+
+
+def test_planner_with_unstable_physics_suggests_shorter_substeps(caplog: pytest.LogCaptureFixture) -> None:
+    plan = MPPI(Picky, horizon=4, samples=8, noise=1e3, include_plan=False, limit=1e9, model=rail(1e10))
+    plan(plan.state_of())
+    (message,) = caplog.messages
+    assert "all 8 samples of a plan of picky failed (faults: NAN" in message
+    step = plan.env.model.opt.timestep
+    assert f"try shorter substeps, such as timestep={step / 2:g}, frame_skip={2 * plan.env.task.frame_skip}" in message
 
 
 @pytest.mark.parametrize("update, elites", [("cem", 3), ("cem", 7), ("predictive_sampling", None)])

@@ -231,6 +231,31 @@ def test_reward_of_acrobot_planners_depends_on_the_energy(shared_env: SharedEnv)
     np.testing.assert_allclose(rewards, [3.0, 0.0, 1.0], atol=0.1)
 
 
+def test_effort_of_acrobot_planners_is_the_torque_that_balances_the_arms(shared_env: SharedEnv) -> None:
+    """Feedback that minimizes the effort of the linearized task spends the expected effort."""
+    env = shared_env("dm/acrobot_swingup", nworld=1, autoreset=False)
+    effort, dt = np.asarray(env.task.params["balance_effort"]).reshape(4, 4), env.timestep
+    state = env.get_state()
+    parts = env.state_space.split(state)
+    step = np.zeros((5, 4))
+    for column in range(5):  # the effect of each part of the state, and of the action
+        x = 1e-3 * np.eye(5)[column]
+        parts["qpos"][0], parts["qvel"][0] = torch.tensor(x[:2]), torch.tensor(x[2:4])
+        env.set_state(state)
+        env.action.fill_(x[4])
+        env.step()
+        after = env.state_space.split(env.get_state())
+        step[column] = np.concatenate([after["qpos"][0].numpy(), after["qvel"][0].numpy()]) / 1e-3
+    dynamics, pushed = step[:4].T, step[4]
+    gain = pushed @ effort @ dynamics / (dt + pushed @ effort @ pushed)
+    x = np.array([0.01, -0.005, 0.01, 0.02])
+    expected, spent = x @ effort @ x, 0.0
+    for _ in range(1000):
+        action = -gain @ x
+        spent, x = spent + dt * action * action, dynamics @ x + pushed * action
+    assert np.abs(x).max() < 1e-6 and spent == pytest.approx(expected, rel=0.02)
+
+
 def test_planners_of_finger_spin_are_rewarded_below_the_target_velocity(shared_env: SharedEnv) -> None:
     env = shared_env("dm/finger_spin", nworld=3, autoreset=False, spin_margin=30.0)
     state = env.get_state()

@@ -1,5 +1,6 @@
-"""Test the balance tasks: servos, pushes, the capture point, and plans that keep the humanoid upright."""
+"""Test the balance tasks: servos, pushes, the capture point, the G1's gait, and plans that keep robots upright."""
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -52,15 +53,41 @@ def test_capture_metric_is_the_distance_between_capture_point_and_feet(shared_en
     assert moving - still == pytest.approx(np.sqrt(height / 9.81), rel=0.15)
 
 
-def test_humanoid_stands_with_a_planner_and_falls_without_one(shared_env: SharedEnv) -> None:
-    env = shared_env("humanoid_stand", autoreset=False)
-    plan = lw.MPPI("humanoid_stand", samples=16, nthread=1)
-    assert plan.env.options.physics.timestep == 0.015 and plan.timestep == env.timestep
+@pytest.mark.parametrize(("task", "least"), [("humanoid_stand", 1.1), ("g1_stand", 0.65)])
+def test_robot_stands_with_a_planner_and_falls_without_one(shared_env: SharedEnv, task: str, least: float) -> None:
+    env = shared_env(task, autoreset=False)
+    plan = lw.MPPI(task, samples=16, nthread=1)
+    assert plan.timestep == env.timestep and plan.env.options.physics.timestep > env.model.opt.timestep
     planned = lw.control(env, plan, seed=0, steps=120)
-    fallen = lw.control(env, lambda state, obs: torch.zeros(17), seed=0, steps=120)
+    fallen = lw.control(env, lambda state, obs: torch.zeros(env.action_space.size), seed=0, steps=120)
     height = planned.states[:, planned.state_parts["qpos"][0] + 2]
-    assert planned.steps == 120 and height.min() > 1.1
+    assert planned.steps == 120 and height.min() > least
     assert fallen.steps < 120
+
+
+def test_upper_body_of_the_g1_is_rigid_in_the_pose_of_the_keyframe(shared_env: SharedEnv) -> None:
+    env, full = shared_env("g1_stand", nworld=1), shared_env("g1_velocity", nworld=1).model
+    data = {}
+    for model, qpos in ((env.model, env.field("qpos")[0].numpy()), (full, full.key("knees_bent").qpos)):
+        data[model] = mujoco.MjData(model)
+        data[model].qpos[:] = qpos
+        data[model].qpos[:7] = 0.0, 0.0, 0.8, 1.0, 0.0, 0.0, 0.0
+        mujoco.mj_kinematics(model, data[model])
+        mujoco.mj_comPos(model, data[model])
+    hands = [data[model].geom("left_hand_collision").xpos for model in data]
+    assert env.model.nv == 18 and np.allclose(*hands, atol=0.02)
+    assert np.allclose(*(one.subtree_com[0] for one in data.values()), atol=0.01)
+
+
+def test_g1_walk_lifts_the_feet_in_turn_without_actions(shared_env: SharedEnv) -> None:
+    env = shared_env("g1_walk", autoreset=False, fields=["ctrl"])
+    env.reset()
+    knees = []
+    for _ in range(40):  # a cycle of 0.8 s
+        env.step(torch.zeros(1, 12))
+        knees.append(env.field("ctrl")[0, [3, 9]] - 0.669)
+    left, right = torch.stack(knees).T
+    assert left.max() > 0.59 and right.max() > 0.59 and torch.minimum(left, right).abs().max() < 1e-6
 
 
 def test_humanoid_that_must_get_up_starts_lying_and_does_not_terminate_while_lying(shared_env: SharedEnv) -> None:

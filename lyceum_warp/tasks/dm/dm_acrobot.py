@@ -3,6 +3,7 @@
 from typing import Any
 
 import mujoco
+import numpy as np
 import warp as wp
 
 import lyceum_warp as lw
@@ -12,17 +13,43 @@ from lyceum_warp.tasks.dm import suite
 
 @wp.struct
 class World:
-    qpos: Row[float]
+    qpos: Row[float]  # shoulder, elbow
     qvel: Row[float]
-    site_xpos: Row[wp.vec3]
-    energy: Row[float]  # potential, kinetic
 
 
-def upright_energy(model: mujoco.MjModel, p: Any) -> float:
-    """Return the energy at rest in the upright pose, J."""
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    return data.energy.sum()
+def lengths(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """Return the lengths of the upper and the lower arm, m."""
+    return np.array([model.body("lower_arm").pos[2], model.site_pos[p.tip, 2]])
+
+
+def inertia(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """Return a, b, c of the mass matrix [[a + 2 c cos(q2), b + c cos(q2)], [b + c cos(q2), b]], kg m^2."""
+    mass, center, around = model.body_mass[1:], model.body_ipos[1:, 2], model.body_inertia[1:, 1]
+    upper, lower = around + mass * center**2
+    return np.array([upper + lower + mass[1] * p.lengths[0] ** 2, lower, mass[1] * p.lengths[0] * center[1]])
+
+
+def lift(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """Return e1, e2 of the potential energy e1 cos(q1) + e2 cos(q1 + q2), J."""
+    mass, center = model.body_mass[1:], model.body_ipos[1:, 2]
+    return -model.opt.gravity[2] * np.array([mass[0] * center[0] + mass[1] * p.lengths[0], mass[1] * center[1]])
+
+
+def balance_effort(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """Return the matrix P of the effort x^T P x that balancing takes from a state x = (qpos, qvel) near upright, s.
+
+    The effort is the smallest integral of the squared action that brings the arms to rest in the upright pose. With
+    the linearized dynamics dx/dt = A x + B u and the unstable modes z_i = w_i^T x, where A^T w_i = r_i w_i and b_i =
+    w_i^T B, the effort is z^T G^-1 z with G_ij = b_i b_j / (r_i + r_j).
+    """
+    (a, b, c), (e1, e2) = p.inertia, p.lift
+    mobility = np.linalg.inv([[a + 2.0 * c, b + c], [b + c, b]])
+    to_velocity = np.block([mobility @ [[e1 + e2, e2], [e2, e2]], -mobility * model.dof_damping])
+    rates, modes = np.linalg.eig(np.vstack([np.eye(2, 4, 2), to_velocity]).T)
+    rates, modes = rates[rates > 0.0], modes[:, rates > 0.0]
+    pushed = modes[2:].T @ mobility[:, 1] * model.actuator_gear[0, 0]
+    gramian = np.outer(pushed, pushed) / np.add.outer(rates, rates)
+    return modes @ np.linalg.solve(gramian, modes.T)
 
 
 @wp.struct
@@ -30,10 +57,15 @@ class Params:
     margin: float = 1.0  # m
     energy_weight: float = 0.0  # for planners
     energy_margin: float = 40.0  # J, from hanging to upright
-    upright_energy: float = lw.from_model(upright_energy)
+    balance_weight: float = 0.0  # for planners
+    balance_margin: float = 0.02  # s of the largest torque
     tip: int = lw.site("tip")
     target: int = lw.site("target")
     target_size: float = lw.from_model(lambda model, p: model.site_size[p.target, 0])
+    lengths: wp.vec2 = lw.from_model(lengths)
+    inertia: wp.vec3 = lw.from_model(inertia)
+    lift: wp.vec2 = lw.from_model(lift)
+    balance_effort: wp.mat44 = lw.from_model(balance_effort)
 
 
 @wp.func
@@ -44,13 +76,34 @@ def observe(s: World, p: Params, obs: Row[float]):
 
 
 @wp.func
+def missing_energy(s: World, p: Params) -> float:
+    """Return the energy at rest in the upright pose minus the energy, J."""
+    v1, v2, cosine = s.qvel[0], s.qvel[1], wp.cos(s.qpos[1])
+    inertia_upper, coupling = p.inertia[0] + 2.0 * p.inertia[2] * cosine, p.inertia[1] + p.inertia[2] * cosine
+    kinetic = 0.5 * (inertia_upper * v1 * v1 + p.inertia[1] * v2 * v2) + coupling * v1 * v2
+    return p.lift[0] * (1.0 - wp.cos(s.qpos[0])) + p.lift[1] * (1.0 - wp.cos(s.qpos[0] + s.qpos[1])) - kinetic
+
+
+@wp.func
+def turned(angle: float) -> float:  # between -pi and pi
+    return angle - 2.0 * wp.pi * wp.round(angle / (2.0 * wp.pi))
+
+
+@wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    distance = wp.length(s1.site_xpos[p.target] - s1.site_xpos[p.tip])
-    near = lw.tolerance(distance, wp.vec2(0.0, p.target_size), p.margin)
-    if p.energy_weight == 0.0:
-        return near
-    missing = p.upright_energy - s1.energy[0] - s1.energy[1]
-    return near + p.energy_weight * lw.tolerance(missing, wp.vec2(0.0), p.energy_margin, lw.Sigmoid.LINEAR, 0.0)
+    upper, lower = s1.qpos[0], s1.qpos[0] + s1.qpos[1]
+    # the tip relative to the target, which is the tip in the upright pose
+    x = p.lengths[0] * wp.sin(upper) + p.lengths[1] * wp.sin(lower)
+    z = p.lengths[0] * (wp.cos(upper) - 1.0) + p.lengths[1] * (wp.cos(lower) - 1.0)
+    total = lw.tolerance(wp.sqrt(x * x + z * z), wp.vec2(0.0, p.target_size), p.margin)
+    if p.energy_weight > 0.0:
+        near = lw.tolerance(missing_energy(s1, p), wp.vec2(0.0), p.energy_margin, lw.Sigmoid.LINEAR, 0.0)
+        total += p.energy_weight * near
+    if p.balance_weight > 0.0:
+        state = wp.vec4(turned(s1.qpos[0]), turned(s1.qpos[1]), s1.qvel[0], s1.qvel[1])
+        effort = wp.dot(state, p.balance_effort * state)
+        total += p.balance_weight * lw.tolerance(effort, wp.vec2(0.0), p.balance_margin, lw.Sigmoid.RECIPROCAL, 0.5)
+    return total
 
 
 @wp.func
@@ -65,9 +118,9 @@ class AcrobotSwingup(lw.Task):
     obs = {"orientations": 4, "velocity": 2}
     # the motor is too weak to lift the arms at once, so the planner is rewarded for the energy that it pumps in
     planning = lw.Planning(
-        settings={"horizon": 50, "samples": 64, "noise": 2.0, "temperature": 0.2},
-        options={"timestep": 0.02, "integrator": "euler"},
-        params={"margin": 2.0, "energy_weight": 2.0},
+        settings={"horizon": 25, "samples": 24, "noise": 2.0, "temperature": 0.2},
+        options={"timestep": 0.04, "integrator": "rk4"},
+        params={"margin": 2.0, "energy_weight": 2.0, "balance_weight": 4.0},
     )
 
 

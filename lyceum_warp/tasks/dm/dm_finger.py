@@ -64,11 +64,13 @@ def reject(s: World, p: Params) -> bool:
 class FingerSpin(lw.Task):
     model, frame_skip = suite.model("finger"), 2
     obs = {"position": 4, "velocity": 3, "touch": 2}
-    # planners get a reward that rises with the speed, and hold each torque for two steps
+    # planners get a reward that rises with the speed, also above the task's speed, and hold each torque for two steps
     planning = lw.Planning(
-        settings={"horizon": 16, "samples": 32, "knots": 8, "spline": "zero", "noise": 1.0},
-        params={"spin_margin": 30.0},
-    )
+        settings={
+            "horizon": 16, "samples": 32, "knots": 8, "spline": "zero", "noise": 2.0, "temperature": 0.02,
+        },
+        params={"spin_velocity": 20.0, "spin_margin": 35.0},
+    )  # fmt: skip
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
