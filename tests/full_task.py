@@ -1,4 +1,4 @@
-"""Define a task that uses every feature of the task form: a puck on the floor, and a movable paddle."""
+"""Define a task that uses every feature of tasks: a puck on the floor, and a movable paddle."""
 
 from typing import Any
 

@@ -109,7 +109,7 @@ def test_shared_memory_is_updated_from_sums_over_worlds_and_steps(env: lw.Env) -
     for _ in range(2):
         before = env.shared["falls"].clone()
         angles, ended = steps(env, 30)
-        assert torch.equal(env.shared["falls"], before)  # steps only change the sums
+        assert torch.equal(env.shared["falls"], before)  # steps change only the sums, not yet the shared memory
         env.update_shared()
         falls = torch.zeros(3).index_add_(0, level, ended.sum(0).float())
         assert falls.sum() > 5
@@ -142,7 +142,7 @@ def test_states_do_not_contain_shared_memory(env: lw.Env) -> None:
     assert torch.equal(env.get_shared(), 2.0 * kept)
 
 
-def test_scratch_worlds_replicas_and_planners_use_shared_memory(env: lw.Env) -> None:
+def test_getters_replicas_and_planners_use_shared_memory(env: lw.Env) -> None:
     env.rand_reset(seed=5)
     env.shared["falls"].copy_(torch.tensor([1.0, 2.0, 3.0]))
     env.shared["mean_angle"].fill_(0.5)

@@ -1,4 +1,4 @@
-"""Use many worlds as a Gymnasium vector environment, with its autoreset modes, wrappers and errors."""
+"""Use many worlds as a Gymnasium vector environment; test autoreset modes, wrappers and errors."""
 
 from collections.abc import Callable, Iterator
 from typing import Any

@@ -68,7 +68,7 @@ def test_invalid_episode_lengths_raise_an_error(env: lw.Env, steps: torch.Tensor
         RslRlVecEnv(env).episode_length_buf = steps
 
 
-def test_fault_counts_as_time_out_and_termination_does_not(shared_env: SharedEnv) -> None:
+def test_fault_counts_as_a_time_out_but_termination_does_not(shared_env: SharedEnv) -> None:
     env = shared_env(Metered, nworld=4, horizon=10)
     worlds = RslRlVecEnv(env)
     worlds.episode_length_buf = torch.tensor([0, 0, 9, 9])

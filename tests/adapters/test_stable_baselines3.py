@@ -1,4 +1,4 @@
-"""Use many worlds as a Stable-Baselines3 vector environment, with its learners, wrappers and errors."""
+"""Use many worlds as a vector environment for the learners and wrappers of Stable-Baselines3, and check errors."""
 
 import warnings
 

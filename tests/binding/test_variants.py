@@ -19,7 +19,7 @@ ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
 
 
 @ENGINES
-def test_variant_has_the_terms_of_its_parent_and_its_own(engine: str) -> None:
+def test_variant_has_the_terms_of_its_parent_and_additional_terms(engine: str) -> None:
     parent, env = (lw.make(task, nworld=3, engine=engine, seed=2, horizon=0) for task in (Terms, Variant))
     assert env.task.params["target"] == 0.1 and env.task.params["border"] == parent.task.params["border"]
     assert list(env.state_space.parts)[-3:] == ["pushes", "work", "metrics"]

@@ -167,7 +167,7 @@ def uses_rows(s: Uses, p: Params):
     row = s.before
     for i in range(int(p.gain)):
         if i > 0:
-            row[0] = 1.0  # from the second iteration on, the name refers to a different row
+            row[0] = 1.0  # from the second iteration on, the name refers to a different array
         row = s.after
     first, second = Uses(), Uses()
     first.before = s.in_a_struct

@@ -70,7 +70,7 @@ def test_new_task_passes_check_task_on_both_engines(engine: str, folder: Path) -
     check_task(str(file), engine=engine, nworld=2, horizon=6, frame_skip=1, checks=MODEL_CHECKS)
 
 
-def test_a_new_task_observes_the_state_and_the_sensors_that_measure_it(folder: Path) -> None:
+def test_new_task_observes_the_state_and_the_sensors_that_measure_the_state(folder: Path) -> None:
     env = lw.make(str(new("everything", RICH)), nworld=2, seed=3)
     task = env.task.task
     assert task.obs == {"position": 13, "velocity": 11, "activation": 1, "sensors": 4}

@@ -221,7 +221,7 @@ def test_task_that_observes_lasting_memory_passes_check_task(task: type[lw.Task]
     check_task(task, engine=engine, nworld=3, steps=60, frame_skip=1, checks=checks)
 
 
-def test_task_with_every_feature_follows_the_task_form_rules_on_the_warp_engine() -> None:
+def test_task_with_every_feature_passes_the_checks_of_these_features_on_the_warp_engine() -> None:
     rules = ("groups", "events", "inputs", "dynamics", "rejection")
     checks = [check for check in CHECKS if check.__name__.removeprefix("check_") in rules]
     check_task(Full, engine="warp", nworld=2, frame_skip=1, checks=checks)

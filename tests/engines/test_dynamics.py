@@ -225,12 +225,12 @@ def test_restored_state_restores_its_model_fields(engine: type[Engine]) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_model_with_restored_nominal_values_gives_the_original_steps(engine: type[Engine]) -> None:
+def test_steps_equal_the_original_steps_after_nominal_model_values_are_restored(engine: type[Engine]) -> None:
     made, untouched = make(engine, *DRAWN), make(engine, *DRAWN)
     draw(made)
     for name, nominal in made.nominal.items():
         made.arrays[name].numpy()[:] = nominal.numpy()
-    for _ in range(2):  # in the second pass, the model is nominal
+    for _ in range(2):  # in the second pass, all model fields are already nominal
         made.apply_model(worlds())
     np.testing.assert_array_equal(run(made), run(untouched))
 

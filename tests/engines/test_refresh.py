@@ -220,7 +220,7 @@ def test_acceleration_sensors_keep_their_values_from_the_last_substep(kind: type
     assert np.abs(left[:, late]).max() > 0
     engine.refresh_current(everyone(engine))
     np.testing.assert_array_equal(shown(engine)["sensordata"], left)
-    # push two worlds, as an event does
+    # change the velocities of two worlds, as a push event does
     before, chosen = state_of(engine), only(engine, 0, 2)
     write(engine, "qvel", chosen.numpy(), engine.arrays["qvel"].numpy() + 1.0)
     engine.commit(chosen)

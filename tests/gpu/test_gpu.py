@@ -1,4 +1,4 @@
-"""Test on a GPU that no step waits for the host, graphs equal direct launches, and runs are reproducible."""
+"""Test on a GPU that steps do not wait for the device, graphs equal direct launches, and runs are reproducible."""
 
 import contextlib
 import gc

@@ -1,4 +1,4 @@
-"""Test rehearsals, which list the kernels that a function would launch, and the names of Warp that they replace."""
+"""Test rehearsals: a rehearsal replaces functions of Warp to list the kernels that a function would launch."""
 
 import inspect
 import subprocess

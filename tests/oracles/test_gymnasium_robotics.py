@@ -86,7 +86,7 @@ class Pair:
         self.theirs.reset(seed=0)
         self.rng = np.random.default_rng(0)
         self.goals = 0
-        """Number of steps of the current episode in which Gymnasium-Robotics has reported the goal as achieved."""
+        """Number of steps of the current episode after which Gymnasium-Robotics reported the goal as achieved."""
         self._simulate, self.theirs.do_simulation = self.theirs.do_simulation, self._with_our_controls
 
     def _with_our_controls(self, ctrl: np.ndarray, frames: int) -> None:

@@ -204,7 +204,9 @@ def test_runs_of_this_user_stay_trusted_after_a_move_and_a_task_edit(made: Path,
         file.write_text(SOURCE)
 
 
-def test_run_of_a_task_of_the_package_needs_no_trust(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_of_a_task_of_the_package_is_used_without_being_trusted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     assert train(tmp_path / "run", "--iterations", "1", "--horizon", "8") == 0
     assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "1"]) == 0

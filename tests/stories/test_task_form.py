@@ -1,5 +1,4 @@
-"""Test features of the task form through the public interface, such as randomized dynamics, observation groups and
-noise.
+"""Test features of tasks through the public interface, such as randomized dynamics, observation groups and noise.
 
 ``check_task`` tests each feature for any task; the tests in this file need particular tasks.
 """
@@ -158,7 +157,7 @@ def test_model_fields_can_be_set_in_an_environment_of_any_task(engine: str) -> N
     assert torch.equal(other.field("body_mass"), masses)
 
 
-def test_getters_use_the_dynamics_of_the_given_state() -> None:
+def test_getters_use_the_model_fields_in_the_given_state() -> None:
     env = lw.make(Drawn, nworld=2, horizon=0)
     before = env.get_state()
     action = random_actions(env, 1)[0]
@@ -523,7 +522,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
 
 
 @pytest.mark.parametrize(("changes", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_error_in_the_task_form_raises_one_line_that_names_it(
+def test_error_in_a_task_definition_raises_one_line_that_names_it(
     changes: list[tuple[str, str]], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=message) as caught:

@@ -308,7 +308,7 @@ def test_controls_are_computed_by_the_task_or_scaled_to_their_ranges(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_memory_advances_with_random_numbers_and_is_cleared_by_a_reset(module: ModuleType, engine: str) -> None:
+def test_task_memory_changes_in_every_step_and_is_cleared_by_a_reset(module: ModuleType, engine: str) -> None:
     env = lw.make("follow_target", engine=engine, nworld=2, horizon=3, seed=4)
     first = []
     for i in range(2):

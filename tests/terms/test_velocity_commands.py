@@ -11,7 +11,7 @@ def near(share: np.ndarray, wanted: float) -> bool:
     return bool(abs(share.mean() - wanted) < 5.0 * np.sqrt(wanted * (1.0 - wanted) / len(share)))
 
 
-def test_velocity_command_is_drawn_from_its_ranges() -> None:
+def test_velocity_commands_are_uniform_within_their_ranges() -> None:
     low, high = np.array([-1.0, -0.5, -2.0]), np.array([3.0, 0.5, 0.0])
     velocity = call("draw_velocity", drawn_velocity=np.zeros((1, 3)), command_low=low, command_high=high)
     check_uniform((velocity.after["drawn_velocity"][:, 0] - (low + high) / 2) / ((high - low) / 2))
