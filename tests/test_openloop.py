@@ -264,7 +264,7 @@ def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_rollout_of_every_kind_of_task_equals_steps(
     task: type[lw.Task], native: bool, options: dict[str, Any], engine: str, native_calls: list[int]
 ) -> None:
-    """The tasks have random memory, per-world parameters, RK4 with derived fields, a ``control`` function, or
+    """The tasks have random task memory, per-world parameters, RK4 with derived fields, a ``control`` function, or
     sensors."""
     loop = rollouts(task, 6, engine=engine, **options)
     check_against_stepping(loop, lw.make(task, engine=engine, nworld=4, autoreset=False, **options))

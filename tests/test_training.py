@@ -20,7 +20,7 @@ from lyceum_warp.runs.folder import Run
 
 @pytest.fixture
 def env(shared_env: SharedEnv) -> lw.Env:
-    """Tests that compare numbers make their own environments, because each algorithm continues its random streams."""
+    """Tests that compare numbers do not use this environment, because each algorithm advances its random streams."""
     return shared_env("point_mass", nworld=2)
 
 
@@ -130,7 +130,7 @@ def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
 
 
 def test_best_policy_without_evaluations_is_the_one_whose_samples_had_the_highest_return(tmp_path: Path) -> None:
-    """The policy before an iteration's update samples that iteration's episodes."""
+    """In each iteration, the policy samples episodes before it is updated."""
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), tmp_path / "run", iterations=4, keep_every=1)
     returns = [float(row["return_mean"]) for row in metrics(tmp_path / "run")]

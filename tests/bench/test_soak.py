@@ -17,7 +17,7 @@ FAULTS = ("--short", "--parts", "faults", "--threads", "1", "--nworld", "16")
 
 @pytest.fixture
 def work(request: pytest.FixtureRequest, pytestconfig: pytest.Config, tmp_path: Path) -> Path:
-    """Return an empty folder for states, whose path is the same in every run of the tests."""
+    """Return an empty folder for saved states; the path is the same in every run of the tests."""
     cache = getattr(pytestconfig, "cache", None)
     folder: Path = cache.mkdir(request.node.name) if cache else tmp_path / "work"
     for file in folder.glob("*.pt"):

@@ -157,8 +157,8 @@ def test_error_of_an_invalid_model_names_the_model() -> None:
 
 
 def test_replica_has_the_model_of_its_original_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A replica ignores later edits of the MjSpec, and a ``model`` function that returns a different model at each
-    call."""
+    """A replica ignores later edits of the MjSpec, and does not call a ``model`` function again, which may return a
+    different model at each call."""
     spec = lw.gymnasium_model("hopper.xml").spec()
     env = lw.make("hopper", model=spec)
     spec.geom("torso_geom").density = 5000

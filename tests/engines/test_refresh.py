@@ -291,8 +291,8 @@ def test_limit_sensor_is_zero_after_the_joint_leaves_its_limit(kind: type[Engine
 
 
 def test_worlds_that_share_an_mjdata_have_separate_fields() -> None:
-    """After a step, a stage of the physics runs for one world after another in the same MjData. Fields that this stage
-    does not compute contain another world's values there."""
+    """After a step, a stage of the physics runs for one world after another in the same MjData. Fields outside
+    this stage contain the values of another world in this MjData."""
     model, device = model_of(SENSORS["mixed"]), wp.get_device("cpu")
     for lagged, current in ((), ("xpos",)), (("cvel",), ("xpos",)), (("cvel", "xpos"), ("sensordata",)):
         fields = [describe(model, name, lagged=name in lagged) for name in (*lagged, *current, "qacc", "qvel")]

@@ -1,4 +1,4 @@
-"""Run attacks in a subprocess, each with a limited time and memory, and collect the problems.
+"""Run attacks in a subprocess, limit the time and the memory of each attack, and collect the problems.
 
 An attack program calls ``serve``; a test calls ``attacks``. ``python tests/fuzz/PROGRAM.py CASE ...`` repeats single
 cases, prints their tracebacks, and writes files into the current directory.

@@ -1,8 +1,8 @@
 """Compare the C engine with the Warp engine for every task of the package.
 
 Both engines run the same task functions on different physics: the C engine uses float64, and the Warp engine uses
-float32. With pyramidal friction cones, MuJoCo Warp uses a different contact frame for a capsule on a plane, so
-trajectories differ. These tests use elliptic cones, which do not depend on the contact frame.
+float32. With pyramidal friction cones, trajectories differ, because MuJoCo and MuJoCo Warp use different contact
+frames for a capsule on a plane. These tests use elliptic cones, which do not depend on the contact frame.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ quick = pytest.mark.quick(
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 FORCE_PARTS = ("contact_force", "touch", "imu", "force_torque")
-"""Observation parts that depend on constraint forces, which are exact only to the solver's tolerance."""
+"""Parts of observations that depend on constraint forces; these forces are exact only to the solver's tolerance."""
 
 
 WALKERS = tuple(name for name in VELOCITY if name != "go1_velocity")

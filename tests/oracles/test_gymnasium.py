@@ -255,7 +255,7 @@ def test_evaluation_metric_of_a_pendulum_is_its_angle_or_height(
 
 
 def test_force_at_the_end_of_the_rail_equals_that_of_gymnasium() -> None:
-    """The test places the cart at the end of the rail, because the pole falls earlier under random actions."""
+    """The test places the cart at the end of the rail, because under random actions, the pole falls too early."""
     pair = Pair(make_ours("inverted_double_pendulum"), make_theirs("inverted_double_pendulum"))
 
     def drive_to_the_end(data: mujoco.MjData) -> None:

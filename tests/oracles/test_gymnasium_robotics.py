@@ -350,7 +350,8 @@ def test_fixed_resets_give_the_initial_positions_of_the_model(make_pair: MakePai
 
 @pytest.mark.usefixtures("freed")
 def test_random_resets_have_the_distribution_of_gymnasium_robotics(task: str) -> None:
-    """Compare each number of the first observations by a Kolmogorov-Smirnov test, and their correlations."""
+    """Compare the numbers in the first observations: their distributions by Kolmogorov-Smirnov tests, and their
+    correlations."""
     n, m = 400, 1000
     env, original = lw.make(task, engine="mujoco", nworld=m, nthread=1), registered(task)
     ours = env.obs.numpy().astype(np.float64)

@@ -1,4 +1,4 @@
-"""Test that the code and files in another user's run folder are not used until this user trusts the folder."""
+"""Test that the code and files in a run folder of another user are not used until the folder is trusted."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Test the results of lw.tune, its resumption from their file, and its errors."""
+"""Test the results of lw.tune, resumption from the file of results, and errors."""
 
 import dataclasses
 from collections.abc import Iterator
