@@ -48,7 +48,7 @@ def model() -> mujoco.MjModel:
         ("energy", (2,), wp.float32),
     ],
 )
-def test_field_has_the_shape_of_mujoco_with_vectors_as_elements(
+def test_field_has_the_type_of_its_elements_and_the_size_of_the_mujoco_array(
     name: str, shape: tuple[int, ...], dtype: type, model: mujoco.MjModel
 ) -> None:
     field = describe(model, name)

@@ -474,7 +474,7 @@ def test_rollout_with_automatic_resets_or_an_invalid_horizon_raises_an_error(sha
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_several_initial_states_divide_the_worlds_evenly(engine: str) -> None:
+def test_worlds_are_divided_evenly_among_several_initial_states(engine: str) -> None:
     env = lw.make("hopper", engine=engine, nworld=6, autoreset=False, seed=1)
     starts = lw.make("hopper", nworld=3, seed=5, autoreset=False).get_state()
     loop, alone = OpenLoop(env, 3, states=3), OpenLoop(lw.make("hopper", engine=engine, nworld=2, autoreset=False), 3)

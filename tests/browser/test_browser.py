@@ -284,7 +284,7 @@ def tab(shared_tab: Tab) -> Tab:
 
 
 @pytest.mark.long
-def test_keys_and_buttons_can_pause_make_a_step_and_choose_a_controller(tab: Tab) -> None:
+def test_keys_and_buttons_pause_the_worlds_make_a_step_and_choose_a_controller(tab: Tab) -> None:
     viewer = tab.viewer
     before = viewer.session.stage.env.get_state()
     tab.press("Shift+ArrowRight", lambda: viewer.status.step >= 50)

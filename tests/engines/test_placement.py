@@ -112,7 +112,7 @@ def test_too_many_worlds_for_the_memory_raise_an_error_before_the_engine_is_made
         open_engine(engine, model, 6, cpu, [], reserved=each)
 
 
-def test_few_worlds_run_on_the_cpu_instead_of_a_gpu_only_with_engine_auto() -> None:
+def test_small_numbers_of_worlds_run_on_the_cpu_instead_of_a_gpu_only_with_engine_auto() -> None:
     assert options_for_few_worlds("auto", "cuda:0") == ON_CPU
     for engine, device in (("auto", "cpu"), ("auto", None), ("warp", "cuda:0"), ("mujoco", "cpu"), (ToyEngine, "cuda")):
         assert options_for_few_worlds(engine, device) == {}

@@ -386,7 +386,7 @@ def open_tab(proxy: Proxy, path: str = "/ui") -> ClientConnection:
                    additional_headers={"Cookie": cookie})  # fmt: skip
 
 
-def test_two_tabs_communicate_at_the_same_time_and_one_may_close(echo: Echo) -> None:
+def test_proxy_serves_two_tabs_at_the_same_time_and_one_may_close(echo: Echo) -> None:
     proxy, opened, _ = echo
     with open_tab(proxy) as one:
         with open_tab(proxy, "/state?sid=b") as two:
