@@ -130,7 +130,7 @@ def test_unsuitable_environments_and_actions_raise_an_error(env: lw.Env, shared_
 
 
 @pytest.mark.long
-def test_rsl_rl_runner_learns(tmp_path: Path) -> None:
+def test_rsl_rl_runner_trains_a_policy(tmp_path: Path) -> None:
     """The best possible return is about 250; an untrained policy has a negative mean return."""
     from rsl_rl.runners import OnPolicyRunner  # the import takes a second
 

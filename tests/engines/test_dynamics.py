@@ -278,7 +278,7 @@ class WholeWarpEngine(WarpEngine):
 
 
 @pytest.mark.parametrize("engine", [*ENGINES, WholeWarpEngine])
-def test_settling_advances_only_masked_worlds(engine: type[Engine]) -> None:
+def test_settle_advances_only_masked_worlds(engine: type[Engine]) -> None:
     fields = ("xpos", "qfrc_constraint")
     made, alone = make(engine, *DRAWN, fields=fields), make(engine, *DRAWN, fields=fields)
     for either in (made, alone):

@@ -227,7 +227,7 @@ def judge(env: lw.Env, before: Outcome, action: torch.Tensor, after: Outcome) ->
 
 
 @quick
-def test_both_engines_have_the_same_spaces(engines: Engines) -> None:
+def test_observation_and_action_spaces_are_the_same_on_both_engines(engines: Engines) -> None:
     """The state of one engine can be set on the other engine."""
     assert engines.c.state_space == engines.warp.state_space
     assert engines.c.obs_space == engines.warp.obs_space

@@ -17,7 +17,7 @@ def clock(env: lw.Env) -> torch.Tensor:
     return env.obs_space.split(env.obs)["clock"].clone()
 
 
-def test_the_clock_turns_at_the_gait_frequency(g1: lw.Env) -> None:
+def test_gait_clock_turns_at_the_gait_frequency(g1: lw.Env) -> None:
     g1.rand_reset(seed=0)
     begin = clock(g1)
     angle = 2.0 * np.pi * g1.task.params["gait_frequency"] * g1.timestep

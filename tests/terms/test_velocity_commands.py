@@ -34,7 +34,7 @@ def test_the_given_share_of_commands_has_only_a_forward_velocity() -> None:
     np.testing.assert_allclose(after[~forward], before[~forward, 0], rtol=1e-6)
 
 
-def test_timer_expires_after_its_seconds() -> None:
+def test_timer_expires_after_the_given_seconds() -> None:
     timer, due = np.array([0.1]), []
     for _ in range(6):
         due.append(bool(call("is_due", timer=timer).result[0]))

@@ -21,7 +21,7 @@ def episode(env: lw.Env) -> Trajectory:
 
 
 @pytest.mark.parametrize("case", ["one episode", "two episodes", "async", "one step"])
-def test_episodes_are_drawn_as_png(case: str, episode: Trajectory, env: lw.Env, tmp_path: Path) -> None:
+def test_episodes_are_plotted_as_png(case: str, episode: Trajectory, env: lw.Env, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     match case:
         case "one episode":

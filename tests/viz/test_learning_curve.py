@@ -49,7 +49,7 @@ def test_learning_curve_of_a_run_without_complete_iterations_raises_an_error(run
         learning_curve(run)
 
 
-def test_rewards_are_drawn_if_no_episode_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_learning_curve_shows_rewards_if_no_episode_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
     figures = []
     monkeypatch.setattr(module, "save_png", lambda figure, out: figures.append(figure))
