@@ -1,11 +1,11 @@
-"""Define XML models with every kind of element, and list the rules whose results depend on the model."""
+"""Define XML models with every kind of element, and list the rules of ``check_task`` that depend on the model."""
 
 from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import episode_rules as episodes
 from lyceum_warp.testing import fault_rules as faults
 from lyceum_warp.testing import state_rules as state
 
-# rules that depend on the model; only these run if an engine is slow on the CPU or a model is slow to compile
+# the rules that depend on the model; only these run for engines that are slow on the CPU and models that compile slowly
 MODEL_CHECKS = (
     buffers.check_spaces,
     state.check_restoring,

@@ -38,7 +38,7 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def known_sizes(pytestconfig: pytest.Config) -> Iterator[None]:
     """Cache the probed sizes of contact buffers between runs of the tests.
 
-    A probe takes seconds for a large model. For another release of MuJoCo or another probe, the cache starts empty.
+    A probe takes seconds for a large model. If the probe or the version of MuJoCo changes, the cache starts empty.
     """
     sizes, cache = sys.modules.get("lyceum_warp.engines.warp.sizes"), getattr(pytestconfig, "cache", None)
     if sizes is None or cache is None:
@@ -127,8 +127,8 @@ def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
 
 @pytest.hookimpl(tryfirst=True)  # this hook must run before pytest deselects tests by marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """If a test has the mark ``quick``, mark as ``long`` all cases that the mark does not name. Skip tests if their GPU
-    or models are missing."""
+    """If a test has the mark ``quick``, mark as ``long`` every case that is not listed in this mark. Skip tests if
+    their GPU or models are missing."""
     _mark_long(items)
     for item in items:
         if (missing := _missing_model(_task(item))) is not None:

@@ -185,8 +185,8 @@ def count_steps(s0: PracticedWorld, action: Row[float], s1: PracticedWorld, p: P
 
 
 class Practiced(lw.Task):
-    """A task in which the puck's initial distance grows with ``practice``, a number that is observed and kept in
-    lasting memory."""
+    """A task in which the puck starts further away as the number ``practice`` grows. This number is in lasting memory,
+    and the task observes it."""
 
     model = Drawn.model
     frame_skip = 3

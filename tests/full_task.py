@@ -1,4 +1,4 @@
-"""Define a task that uses every feature of the task form: a puck on the floor, and a movable paddle."""
+"""Define a task that uses every feature of tasks: a puck on the floor, and a movable paddle."""
 
 from typing import Any
 
@@ -178,7 +178,7 @@ def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uin
 
 class Full(lw.Task):
     """A task with every function and attribute; episodes begin at a keyframe, and invalid initial states are
-    redrawn."""
+    replaced by new random states."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))
     frame_skip = 3

@@ -182,7 +182,10 @@ def test_tasks_in_own_task_md_pass_check_task(empty_folder: Path, monkeypatch: p
 
 
 def generated(folder: str, kind: str) -> list[str]:
-    """Return the words in comments of a folder's pages. docs/conf.py replaces these comments by generated sections."""
+    """Return the words in all comments ``<!-- kind: ... -->`` of a folder's pages.
+
+    docs/conf.py replaces these comments by generated sections.
+    """
     pages = sorted((ROOT / "docs" / folder).glob("*.md"))
     return [word for page in pages for word in words_of(page, kind)]
 
@@ -238,8 +241,8 @@ def test_gallery_is_up_to_date_and_its_pictures_are_small() -> None:
     assert max(sizes.values()) < 100_000 and sum(sizes.values()) < 4_000_000
 
 
-def test_map_of_the_rooms_is_up_to_date() -> None:
-    """The program ``python docs/rooms.py`` generates the map from the docstrings."""
+def test_generated_map_of_the_package_is_up_to_date() -> None:
+    """The program ``python docs/rooms.py`` writes the map of docs/architecture.md from the docstrings of modules."""
     page = (ROOT / "docs" / "architecture.md").read_text()
     assert runpy.run_path(str(ROOT / "docs" / "rooms.py"))["written"](page) == page
 

@@ -30,7 +30,7 @@ def test_error_of_an_unavailable_field_suggests_a_fix() -> None:
     assert lw.make("reach", fields=["xpos"]).field("xpos").shape[2] == 3
 
 
-def test_time_and_controls_are_always_available() -> None:
+def test_time_and_controls_are_available_in_every_environment() -> None:
     env = lw.make("hopper", nworld=2)
     env.step(torch.full((2, 3), 0.5))
     assert torch.equal(env.time, torch.full((2,), env.timestep))
@@ -108,7 +108,7 @@ def test_engine_of_a_deleted_environment_is_freed_before_a_fork(engine: str) -> 
         gc.enable()
 
 
-def test_environment_copies_the_parameters_of_the_environment_that_it_follows() -> None:
+def test_follow_copies_the_parameters_of_another_environment() -> None:
     first = lw.make("hopper", nworld=2, healthy_reward=3.0)
     second = first.replicate(nworld=4, ctrl_cost_weight=0.5)
     second.follow(first)

@@ -68,7 +68,7 @@ def test_example_random_search_writes_a_complete_run_folder(run, tmp_path: Path)
     assert cli.main(["train", "--resume", "twice", "--iterations", "9"]) == 2
 
 
-@pytest.mark.long  # tests of SAC and of random_search.py cover the parts of TD3
+@pytest.mark.long  # the tests of SAC and of random_search.py already cover the components of TD3
 def test_example_td3_learns_and_resumes_with_its_replay_buffer(run, tmp_path: Path) -> None:
     ended = numbers(r": (\d+) episodes", run("td3.py", "--out", "once", "--iterations", "4"))
     assert ended[0] > 50 > 25 > ended[-1]  # the last policy keeps the pole up for longer than the first
@@ -86,7 +86,7 @@ def test_example_plan_reaches_the_target_in_each_episode(run) -> None:
 
 
 @pytest.mark.long
-def test_example_own_task_follows_the_rules_and_runs() -> None:
+def test_example_own_task_passes_check_task_and_runs() -> None:
     # this runs in a subprocess, because the task is registered and its module is __main__
     command = [sys.executable, str(EXAMPLES / "own_task.py")]
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
@@ -100,7 +100,7 @@ def test_example_own_task_follows_the_rules_and_runs() -> None:
 
 
 @pytest.mark.long
-def test_example_commanded_speed_follows_the_rules_on_both_engines() -> None:
+def test_example_commanded_speed_passes_check_task_on_both_engines() -> None:
     command = [sys.executable, str(EXAMPLES / "commanded_speed.py")]
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=900)

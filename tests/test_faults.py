@@ -275,7 +275,7 @@ def test_state_of_wrong_shape_or_with_non_finite_values_raises_an_error(env: lw.
     with pytest.raises(ValueError, match="the state of world 2 has -inf in its 'qvel'"):
         env.set_state(bad, mask)
     assert torch.equal(env.get_state(), state), "a refused state has changed something"
-    env.set_state(bad, ~mask & (torch.arange(N) != 1))  # rows outside the mask are not read
+    env.set_state(bad, ~mask & (torch.arange(N) != 1))  # actions of worlds outside the mask are not read
     assert torch.equal(env.get_state(), state)
 
 

@@ -48,7 +48,7 @@ def model() -> mujoco.MjModel:
         ("energy", (2,), wp.float32),
     ],
 )
-def test_field_has_the_shape_of_mujoco_with_vectors_as_elements(
+def test_field_has_the_type_of_its_elements_and_the_size_of_the_mujoco_array(
     name: str, shape: tuple[int, ...], dtype: type, model: mujoco.MjModel
 ) -> None:
     field = describe(model, name)
@@ -101,7 +101,7 @@ def test_field_that_needs_a_sensor_raises_an_error_without_one(name: str, model:
         ("mocap_pos", "target", slice(0, 1)),
     ],
 )
-def test_named_element_has_the_indices_of_its_rows(
+def test_name_of_an_element_is_converted_to_its_indices_in_a_field(
     name: str, element: str, where: slice, model: mujoco.MjModel
 ) -> None:
     assert elements(model, name, element) == where

@@ -37,16 +37,16 @@ LEVELS = {
     "adapters": 13, "viewer": 13,
     "cli": 14, "gym": 14,
 }  # fmt: skip
-"""Level of every room (a module or folder of the package); a room imports only from lower levels and from itself."""
+"""Level of every top-level module and subpackage; each imports only from lower levels and from itself."""
 
 TESTED_BY = {
     "done": "test_faults.py", "task": "binding", "testing": "conformance",
     "world_arrays": "test_worlds.py",
 }  # fmt: skip
-"""Test files or folders of rooms that have no tests with the same name."""
+"""Tests of those modules and subpackages whose test file or folder has another name."""
 
 ACROSS = {"browser", "conformance", "fuzz", "gpu", "oracles", "stories"}
-"""Folders of tests that belong to no single room."""
+"""Folders of tests that test several modules or subpackages."""
 
 NAMEDTUPLE = {"_fields", "_asdict", "_replace", "_make"}
 """Public names that begin with an underscore."""
@@ -88,7 +88,7 @@ def imports() -> dict[str, set[str]]:
     return {name: imported_modules(name) for name in MODULES}
 
 
-def test_imports_point_to_lower_rooms() -> None:
+def test_modules_import_only_from_lower_levels() -> None:
     assert set(LEVELS) == {room(name) for name in MODULES} - {"__init__", "tasks"}
     for name in MODULES:
         if (own := room(name)) in LEVELS:
@@ -108,7 +108,7 @@ def test_no_module_imports_itself_indirectly() -> None:
     def visit(name: str, path: tuple[str, ...]) -> None:
         assert name not in path, " imports ".join([*path[path.index(name) :], name])
         if name not in finished:
-            # only task modules import this room, and no module imports tasks
+            # only task modules import this module, and no module imports tasks
             for other in imports()[name] - {"lyceum_warp"}:
                 visit(other, (*path, name))
             finished.add(name)
@@ -117,7 +117,7 @@ def test_no_module_imports_itself_indirectly() -> None:
         visit(name, ())
 
 
-def test_viewer_window_does_not_import_torch_warp_or_other_rooms() -> None:
+def test_viewer_window_does_not_import_torch_warp_or_other_subpackages() -> None:
     """The window runs in a subprocess. This subprocess must start quickly and stay small."""
     window = sorted(name for name in MODULES if name.startswith("lyceum_warp.viewer.window"))
     code = f"import sys, {', '.join(window)}; print(*sys.modules)"
@@ -211,7 +211,7 @@ def private_names_of_others(tree: ast.AST) -> Iterator[str]:
             yield ast.unparse(node)
 
 
-def test_only_upstream_modules_use_private_names_of_other_packages() -> None:
+def test_private_names_of_other_packages_are_used_only_in_the_upstream_module() -> None:
     found = {name: names for name, tree in trees().items() if (names := set(private_names_of_others(tree)))}
     modules = ("collision_convex", "collision_primitive", "collision_sdf", "forward", "util_pkg")
     known = {"wp._src", *(f"mujoco_warp._src.{module}" for module in modules)}
@@ -239,7 +239,7 @@ def in_new_process(program: str) -> str:
     return result.stdout
 
 
-def test_no_submodule_has_a_public_name() -> None:
+def test_no_submodule_has_the_name_of_a_public_function() -> None:
     """An import of such a submodule would set an attribute of the package. This attribute would hide the function with
     the same name."""
     assert not {room(name) for name in MODULES} & set(lw.__all__)
@@ -264,13 +264,13 @@ def test_warp_prints_nothing_if_a_task_file_imports_it_first() -> None:
     assert in_new_process(program) == "1\n"
 
 
-def test_every_room_has_tests_with_the_same_name() -> None:
+def test_every_module_or_subpackage_has_tests_with_the_same_name() -> None:
     for own in {room(name) for name in MODULES} - {"__init__"}:
         places = [TESTS / TESTED_BY[own]] if own in TESTED_BY else [TESTS / own, TESTS / f"test_{own}.py"]
         assert any(place.exists() for place in places), f"no tests of {own}: none of {', '.join(map(str, places))}"
 
 
-def test_every_folder_of_tests_belongs_to_a_room_or_is_listed() -> None:
+def test_every_folder_of_tests_belongs_to_a_subpackage_or_is_listed() -> None:
     folders = {path.parent.relative_to(TESTS).as_posix() for path in TESTS.rglob("test_*.py")} - {"."}
     rooms = {path.parent.relative_to(ROOT).as_posix() for path in MODULES.values()}
     assert folders <= rooms | ACROSS | {"bench"}

@@ -5,7 +5,7 @@ import lyceum_warp as lw
 PARTS = {"gravity": slice(0, 3), "foot_height": slice(3, 5)}
 
 
-def test_mirror_combines_reflections_of_parts() -> None:
+def test_mirror_combines_the_reflections_of_several_parts() -> None:
     mirror = lw.Mirror({"gravity": (1, -1, 1), "foot_height": ([1, 0], [1, 1]), "other": (-1,)})
     assert mirror.columns(PARTS, task="walker") == ([0, 1, 2, 4, 3], [1.0, -1.0, 1.0, 1.0, 1.0])
     whole = lw.Mirror({"action": ([1, 0], [-1, -1])})

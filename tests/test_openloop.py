@@ -231,7 +231,7 @@ def test_rollout_of_a_task_equals_steps(task: str, engine: str) -> None:
 
 @pytest.fixture
 def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Return a list. Each rollout that runs as one native call adds an entry to it."""
+    """Return a list, to which each rollout that runs as one native call appends an entry."""
     calls, original = [], NativeRollout.run
 
     def counting(self: NativeRollout, *args: Any) -> None:
@@ -264,7 +264,7 @@ def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_rollout_of_every_kind_of_task_equals_steps(
     task: type[lw.Task], native: bool, options: dict[str, Any], engine: str, native_calls: list[int]
 ) -> None:
-    """The tasks have random memory, per-world parameters, RK4 with derived fields, a ``control`` function, or
+    """The tasks have random task memory, per-world parameters, RK4 with derived fields, a ``control`` function, or
     sensors."""
     loop = rollouts(task, 6, engine=engine, **options)
     check_against_stepping(loop, lw.make(task, engine=engine, nworld=4, autoreset=False, **options))
@@ -285,8 +285,8 @@ def test_parameters_may_change_between_rollouts(engine: str) -> None:
 @pytest.mark.quick("Forgetful-mujoco", "Servo-warp")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Forgetful, Servo])
-def test_worlds_draw_random_numbers_from_the_given_keys(task: type[lw.Task], engine: str) -> None:
-    """Steps from states with these keys draw the same random numbers."""
+def test_random_numbers_of_worlds_depend_on_the_given_keys(task: type[lw.Task], engine: str) -> None:
+    """Steps from states with these keys use the same random numbers."""
     env = lw.make(task, engine=engine, nworld=4, autoreset=False)
     numbers = np.array([5, 2**32 - 1, 77, 1234567890], dtype=np.uint32)
     keys = wp.zeros(4, dtype=wp.uint32, device="cpu")
@@ -474,7 +474,7 @@ def test_rollout_with_automatic_resets_or_an_invalid_horizon_raises_an_error(sha
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_several_initial_states_divide_the_worlds_evenly(engine: str) -> None:
+def test_worlds_are_divided_evenly_among_several_initial_states(engine: str) -> None:
     env = lw.make("hopper", engine=engine, nworld=6, autoreset=False, seed=1)
     starts = lw.make("hopper", nworld=3, seed=5, autoreset=False).get_state()
     loop, alone = OpenLoop(env, 3, states=3), OpenLoop(lw.make("hopper", engine=engine, nworld=2, autoreset=False), 3)

@@ -114,7 +114,7 @@ def test_replica_has_the_options_of_the_original_except_for_given_changes() -> N
         ("qqq", ""),
     ],
 )
-def test_suggestion_for_a_misspelt_or_foreign_option_name_is_the_right_option(word: str, expected: str) -> None:
+def test_misspelt_option_names_and_names_from_other_libraries_get_a_suggestion(word: str, expected: str) -> None:
     assert suggestion(word) == expected
 
 

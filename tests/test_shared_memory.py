@@ -109,7 +109,7 @@ def test_shared_memory_is_updated_from_sums_over_worlds_and_steps(env: lw.Env) -
     for _ in range(2):
         before = env.shared["falls"].clone()
         angles, ended = steps(env, 30)
-        assert torch.equal(env.shared["falls"], before)  # steps only change the sums
+        assert torch.equal(env.shared["falls"], before)  # steps change only the sums, not yet the shared memory
         env.update_shared()
         falls = torch.zeros(3).index_add_(0, level, ended.sum(0).float())
         assert falls.sum() > 5
@@ -142,7 +142,7 @@ def test_states_do_not_contain_shared_memory(env: lw.Env) -> None:
     assert torch.equal(env.get_shared(), 2.0 * kept)
 
 
-def test_scratch_worlds_replicas_and_planners_use_shared_memory(env: lw.Env) -> None:
+def test_getters_replicas_and_planners_use_shared_memory(env: lw.Env) -> None:
     env.rand_reset(seed=5)
     env.shared["falls"].copy_(torch.tensor([1.0, 2.0, 3.0]))
     env.shared["mean_angle"].fill_(0.5)
@@ -191,15 +191,15 @@ def test_sums_of_shared_memory_are_added_over_processes(env: lw.Env) -> None:
     env.rand_reset(seed=7)
     env.set_shared(torch.zeros_like(env.get_shared()))
     _, ended = steps(env, 30)
-    env.update_shared(lambda sums: sums.mul_(2))  # another process with the same sums
+    env.update_shared(lambda sums: sums.mul_(2))  # as if another process had computed the same sums
     assert env.shared["falls"].sum() == ended.sum()
 
 
-def test_task_with_shared_memory_follows_the_rules() -> None:
+def test_task_with_shared_memory_passes_check_task() -> None:
     check_task(Balance, nworld=4, steps=20)
 
 
-def test_writing_shared_memory_outside_share_raises_an_error() -> None:
+def test_writing_shared_memory_in_a_function_other_than_share_raises_an_error() -> None:
     @wp.func
     def writes(s0: World, action: Row[float], s1: World, p: Params) -> float:
         s1.shared.falls[0] = 1.0
@@ -224,7 +224,7 @@ def test_make_raises_an_error_for_writes_beyond_shared_memory(name: str, row: st
         lw.make(type("Beyond", (Balance,), {name: function}))
 
 
-def test_share_without_tally_raises_an_error(tmp_path: Path) -> None:
+def test_task_that_defines_share_without_tally_raises_an_error(tmp_path: Path) -> None:
     file = write(tmp_path, with_function("def share(shared: World, sums: World, p: Params):\n    pass"))
     with pytest.raises(ValueError, match="needs a struct Shared, listed in World as shared: Shared, a struct Sums"):
         lw.make(str(file))

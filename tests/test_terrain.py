@@ -67,7 +67,7 @@ def test_equal_seeds_give_equal_fields_and_a_new_column_does_not_change_others()
     np.testing.assert_array_equal(lw.Terrain({"rough": 1, "steps": 1}, levels=2, seed=3).heights, field)
     assert (lw.Terrain({"rough": 1, "steps": 1}, levels=2, seed=4).heights != field).any()
     more = lw.Terrain({"rough": 1, "steps": 1, "flat": 2}, levels=3, seed=3, scale={"rough": 0.12, "steps": 0.3})
-    # the amounts are 1.5 times as large, so the first two of three levels equal the two levels without this change
+    # with one more level and 1.5 times the height, the first two levels are the same as before
     np.testing.assert_allclose(more.heights[40:200, 40:200], field[40:200, 40:200], atol=1e-12)
 
 
@@ -221,5 +221,5 @@ def test_level_of_a_world_rises_after_walking_far_and_falls_after_standing(share
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_task_on_terrain_follows_all_rules(engine: str) -> None:
+def test_task_on_terrain_passes_check_task(engine: str) -> None:
     check_task(OnTerrain, engine=engine, steps=20)

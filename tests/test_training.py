@@ -20,7 +20,7 @@ from lyceum_warp.runs.folder import Run
 
 @pytest.fixture
 def env(shared_env: SharedEnv) -> lw.Env:
-    """Tests that compare numbers make their own environments, because each algorithm continues its random streams."""
+    """Tests that compare numbers do not use this environment, because each algorithm advances its random streams."""
     return shared_env("point_mass", nworld=2)
 
 
@@ -82,7 +82,7 @@ def test_resume_with_another_task_or_engine_raises_an_error(six: Path, env: lw.E
             lw.train(algorithm(given), folder, iterations=9, resume=True)
 
 
-def test_learner_after_some_iterations_starts_a_complete_run(six: Path, tmp_path: Path) -> None:
+def test_training_of_a_learner_after_some_iterations_writes_a_complete_run(six: Path, tmp_path: Path) -> None:
     npg, folder = algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run"
     for _ in range(3):
         next(npg)
@@ -129,8 +129,8 @@ def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
         lw.load(six, which="worst")
 
 
-def test_without_evaluations_the_best_policy_is_the_one_that_sampled_the_best_iteration(tmp_path: Path) -> None:
-    """The policy before an iteration's update samples that iteration's episodes."""
+def test_best_policy_without_evaluations_is_the_one_whose_samples_had_the_highest_return(tmp_path: Path) -> None:
+    """In each iteration, the policy samples episodes before it is updated."""
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), tmp_path / "run", iterations=4, keep_every=1)
     returns = [float(row["return_mean"]) for row in metrics(tmp_path / "run")]
@@ -336,7 +336,7 @@ def test_flags_with_default_values_override_the_settings_of_the_source_run(
     refused(capsys, "has gamma 0.9, not 0.995")
 
 
-def test_evaluation_and_training_with_equal_seeds_draw_different_initial_states(env: lw.Env) -> None:
+def test_evaluation_and_training_with_equal_seeds_have_different_initial_states(env: lw.Env) -> None:
     env.rand_reset(1)
     trained_on = env.obs.clone()
     seen: list[torch.Tensor] = []
@@ -362,7 +362,7 @@ def test_train_command_accepts_ppo(six: Path, tmp_path: Path) -> None:
     assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # PPO does not use the settings of NPG
 
 
-def test_run_contains_the_transfer_verdict_of_its_policy(env: lw.Env, tmp_path: Path) -> None:
+def test_run_folder_contains_the_result_of_the_transfer_test(env: lw.Env, tmp_path: Path) -> None:
     """By default, the transfer test runs only if the physics are not exact, because compiling the other engine's
     kernels may take minutes."""
     run = lw.train(algorithm(env), tmp_path / "exact", iterations=1)

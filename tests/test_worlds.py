@@ -56,10 +56,10 @@ def outcomes_with_faults(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_rows_that_several_threads_compute_equal_rows_that_one_thread_computes(
+def test_several_threads_per_world_give_the_same_results_as_one_thread(
     engine: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a GPU, the lanes of a warp share a world's rows, and each observation group has its own threads.
+    """On a GPU, the lanes of a warp divide the work for a world, and each observation group has separate threads.
 
     On the CPU, the lanes of a warp and the threads of a world run one after another.
     """
@@ -76,7 +76,7 @@ def test_rows_that_several_threads_compute_equal_rows_that_one_thread_computes(
 
 
 def test_results_do_not_depend_on_how_threads_divide_the_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each of three threads replays the launches around the C engine for a part of the four worlds."""
+    """Three threads replay the launches before and after the C engine's calls, each for a part of the four worlds."""
     together, counts = outcomes_with_faults("mujoco")
     monkeypatch.setattr(capture, "SECONDS_A_THREAD", 1e-9)
     monkeypatch.setattr(mujoco_engine, "cpu_cores", lambda: 3)
@@ -148,7 +148,7 @@ def test_state_contains_the_count_of_success_steps_and_a_reset_clears_it(engine:
     assert env.success.tolist() == [False, True, True]
     env.set_state(full)
     assert env.success.tolist() == [False, True, True]
-    env.set_params(success_distance=0.0)  # a state counts as a success only if it satisfies the goal
+    env.set_params(success_distance=0.0)  # set_state restores a success only if the state satisfies the goal
     env.set_state(full)
     assert not env.success.any()
 
@@ -183,7 +183,7 @@ def test_captured_graphs_use_new_parameters_that_differ_between_worlds(engine: s
     torch.testing.assert_close(env.reward[0] - env.reward[1], torch.tensor(3.0))
 
 
-def test_random_streams_depend_on_the_index_of_a_world_over_all_processes() -> None:
+def test_random_numbers_depend_on_the_index_of_a_world_over_all_processes() -> None:
     whole, part = lw.make("point_mass", nworld=4), lw.make("point_mass", nworld=2, first_world=2)
     for env in (whole, part):
         env.rand_reset(7)

@@ -50,7 +50,7 @@ def hundredths(values: torch.Tensor) -> list[int]:
 
 
 class SamplingPlanner:
-    """A planner of zero actions that reports the given numbers of failed samples, one number per plan."""
+    """A planner that returns only zero actions, and reports the given number of failed samples for each plan."""
 
     def __init__(self, *failed: float) -> None:
         self.samples, self.failed, self.calls = 8, failed, 0

@@ -1,4 +1,4 @@
-"""Use many worlds as a Gymnasium vector environment, with its autoreset modes, wrappers and errors."""
+"""Use many worlds as a Gymnasium vector environment; test autoreset modes, wrappers and errors."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -132,7 +132,7 @@ def test_results_of_a_step_do_not_change_in_the_next_step(hopper: GymnasiumVecto
     assert not np.shares_memory(first[0], second[0])
 
 
-def test_step_returns_the_buffers_themselves_if_copies_are_disabled(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_step_does_not_copy_the_buffers_if_copies_are_disabled(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector(torch=True, copy=False)
     obs, _ = envs.reset(seed=0)
     assert obs["policy"].data_ptr() == envs.env.obs.data_ptr()
@@ -205,7 +205,9 @@ def test_next_step_mode_resets_a_world_in_the_step_after_its_end(vector: Callabl
 
 
 @pytest.mark.parametrize("tensors", [False, True], ids=["numpy", "torch"])
-def test_ignored_invalid_action_causes_no_fault(tensors: bool, vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_invalid_action_for_a_world_that_is_being_reset_causes_no_fault(
+    tensors: bool, vector: Callable[..., GymnasiumVectorEnv]
+) -> None:
     envs = vector(autoreset_mode=AutoresetMode.NEXT_STEP, torch=tensors)
     envs.reset(seed=5)
     faults, ended, ends = envs.env.fault_counts, np.zeros(N, dtype=bool), 0
@@ -228,7 +230,7 @@ def test_equal_seeds_give_equal_worlds_and_resets_without_seeds_differ(
     assert len(np.unique(first[:, 0])) == N
 
 
-def test_first_reset_without_a_seed_draws_one(hopper: GymnasiumVectorEnv) -> None:
+def test_first_reset_without_a_seed_uses_a_random_seed(hopper: GymnasiumVectorEnv) -> None:
     def first(**options: Any) -> np.ndarray:
         return GymnasiumVectorEnv("hopper", 2, **options).reset()[0]
 
@@ -255,7 +257,7 @@ OBSERVATION_WRAPPERS = {
     "DtypeObservation": lambda envs: wrappers.vector.DtypeObservation(envs, np.float64),
     "TransformObservation": lambda envs: wrappers.vector.TransformObservation(envs, lambda obs: np.clip(obs, -9, 9)),
 }
-"""Observation wrappers; Gymnasium does not allow them in the mode SAME_STEP."""
+"""Observation wrappers; Gymnasium does not allow them in the autoreset mode SAME_STEP."""
 
 OTHER_WRAPPERS = {
     "ClipAction": wrappers.vector.ClipAction,

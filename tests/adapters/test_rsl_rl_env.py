@@ -18,7 +18,7 @@ def env(shared_env: SharedEnv) -> lw.Env:
     return shared_env(Metered, nworld=4, horizon=10, far=1e3)
 
 
-def test_step_returns_all_observation_groups_and_the_buffers(env: lw.Env) -> None:
+def test_step_returns_all_observation_groups_and_does_not_copy_the_buffers(env: lw.Env) -> None:
     worlds = RslRlVecEnv(env)
     assert (worlds.num_envs, worlds.num_actions, worlds.max_episode_length) == (4, 1, 10)
     assert worlds.device == env.obs.device and worlds.cfg["task"] == "metered" and worlds.unwrapped is env
@@ -48,7 +48,7 @@ def test_returned_observations_are_not_overwritten_by_the_next_step(env: lw.Env)
         assert all(torch.equal(obs[group], before[group]) for group in ("policy", "critic"))
 
 
-def test_time_limit_applies_to_assigned_episode_lengths(env: lw.Env) -> None:
+def test_assigned_episode_lengths_change_when_the_time_limit_is_reached(env: lw.Env) -> None:
     worlds = RslRlVecEnv(env)
     worlds.episode_length_buf = torch.tensor([0, 9, 8, 3])
     *_, extras = worlds.step(torch.zeros(4, 1))
@@ -68,7 +68,7 @@ def test_invalid_episode_lengths_raise_an_error(env: lw.Env, steps: torch.Tensor
         RslRlVecEnv(env).episode_length_buf = steps
 
 
-def test_fault_counts_as_time_out_and_termination_does_not(shared_env: SharedEnv) -> None:
+def test_fault_counts_as_a_time_out_but_termination_does_not(shared_env: SharedEnv) -> None:
     env = shared_env(Metered, nworld=4, horizon=10)
     worlds = RslRlVecEnv(env)
     worlds.episode_length_buf = torch.tensor([0, 0, 9, 9])
@@ -130,7 +130,7 @@ def test_unsuitable_environments_and_actions_raise_an_error(env: lw.Env, shared_
 
 
 @pytest.mark.long
-def test_rsl_rl_runner_learns(tmp_path: Path) -> None:
+def test_rsl_rl_runner_trains_a_policy(tmp_path: Path) -> None:
     """The best possible return is about 250; an untrained policy has a negative mean return."""
     from rsl_rl.runners import OnPolicyRunner  # the import takes a second
 

@@ -1,4 +1,4 @@
-"""Use many worlds as a Stable-Baselines3 vector environment, with its learners, wrappers and errors."""
+"""Use many worlds as a vector environment for the learners and wrappers of Stable-Baselines3, and check errors."""
 
 import warnings
 
@@ -144,7 +144,7 @@ def test_get_attr_set_attr_and_env_method_reach_the_worlds() -> None:
         ("reward", "the task 'hopper' has no parameter 'reward': "),
     ],
 )
-def test_setting_an_attribute_without_effect_raises_an_error(
+def test_setting_an_attribute_that_would_have_no_effect_raises_an_error(
     name: str, message: str, hopper: StableBaselines3VecEnv
 ) -> None:
     with pytest.raises(ValueError, match=message) as error:

@@ -17,7 +17,7 @@ CASES = [
     ]
     for tensors in (False, True)
 ]
-"""TorchRL 0.14 supports observation groups and nested infos only in the mode DISABLED."""
+"""TorchRL 0.14 supports observation groups and nested infos only in the autoreset mode DISABLED."""
 
 
 def wrapped(mode: str, *, tensors: bool, task: Any) -> Any:

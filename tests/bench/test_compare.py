@@ -78,7 +78,7 @@ def test_a_failure_of_one_checkout_is_reported(task: str, text: str, report: dic
 
 
 @pytest.mark.long
-def test_a_working_tree_equals_itself(capsys: pytest.CaptureFixture[str]) -> None:
+def test_comparison_of_a_working_tree_with_itself_finds_no_difference(capsys: pytest.CaptureFixture[str]) -> None:
     options = compare.Options(str(ROOT), tasks=("point_mass",), **(QUICK | {"parts": ("env", "plans")}))
     assert compare.run(options) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -132,7 +132,7 @@ def test_names_in_only_one_checkout_are_reported_as_added_or_removed() -> None:
 
 
 @pytest.mark.long
-def test_revision_equals_itself_in_every_part(tmp_path: Path) -> None:
+def test_comparison_of_a_revision_with_itself_finds_no_difference(tmp_path: Path) -> None:
     if not (ROOT / ".git").exists():
         pytest.skip("needs the repository")
     options = ["--tasks", "point_mass", "--iterations", "4", "--steps", "4"]

@@ -20,7 +20,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made.folder
 
 
-def test_gate_experiment_tests_each_policy_only_once(
+def test_experiment_gate_evaluates_each_policy_only_once(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["--short", "--policy", str(run), "--out", str(tmp_path / "gate.jsonl")]
@@ -40,7 +40,7 @@ def test_velocity_error_of_a_standing_robot_equals_its_command(run: Path) -> Non
     assert not played.fell.any()
 
 
-def test_gate_fails_if_any_limit_is_exceeded() -> None:
+def test_policy_that_violates_any_limit_does_not_pass() -> None:
     good = {"falls": 1, "perf": 0.9, "action_change": 0.21, "roll_pitch_rate": 0.2, "yaw_rate": 0.1,
             "joint_velocity": 1.0}  # fmt: skip
     assert gate.passes("nanoG1", good)

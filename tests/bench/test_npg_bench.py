@@ -50,14 +50,14 @@ def test_gymnasium_fills_the_rollout_buffer_with_the_same_values() -> None:
         for name in ("obs", "action", "final_obs", "reward", "step", "terminated", "done", "episode_length"):
             mine, theirs = (getattr(rollout, name)[:until, world] for rollout in (ours, fed))
             assert torch.allclose(mine.float(), theirs.float(), atol=1e-4), name
-        # the first episodes are shortened, and count in neither buffer
+        # the first episodes are shortened, so neither buffer counts their returns
         assert torch.equal(ours.episode_return[:until, world].isnan(), fed.episode_return[:until, world].isnan())
     later = fed.done.cumsum(0).roll(1, 0) > 0
     assert not fed.episode_return[1:][later[1:]].isnan().any()
 
 
 @pytest.mark.parametrize("mode", ["sync", "async"])
-def test_first_episodes_of_gymnasium_start_at_the_step_counts_of_the_environment(mode: str) -> None:
+def test_first_gymnasium_episodes_continue_from_the_step_counters_of_the_environment(mode: str) -> None:
     env = lw.make("swimmer", nworld=2, nthread=1)
     state = env.get_state()
     state[:, env.state_space.parts["step"]] = torch.tensor([[995.0], [998.0]], dtype=torch.float64)

@@ -56,7 +56,7 @@ def test_throughput_is_measured_for_several_numbers_of_cores_and_worlds(
     assert f"| {ours:,.0f}; {ours / native:.2f} |" in printed
 
 
-def test_suite_and_dm_control_are_measured_with_equal_numbers_of_worlds() -> None:
+def test_dm_control_tasks_are_measured_with_equal_numbers_of_worlds_by_every_library() -> None:
     options = throughput.Options(parts=("suite",), tasks=("dm/cheetah_run", "dm/quadruped_walk"), threads=2, repeats=1)
     found = [(case.task, case.worlds, case.contestant) for case in throughput.cases(options)]
     assert found.count(("dm/cheetah_run", 16, "envpool")) == 1 and len(found) == 3 * (3 + 2)
@@ -65,7 +65,7 @@ def test_suite_and_dm_control_are_measured_with_equal_numbers_of_worlds() -> Non
 
 
 @pytest.mark.parametrize("task", ["cartpole", "herb_reach"])
-def test_python_tasks_give_the_observations_and_rewards_of_this_package(
+def test_gymnasium_versions_of_tasks_return_the_same_observations_and_rewards(
     task: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From equal states and actions, Gymnasium's environment returns the same observations and rewards."""

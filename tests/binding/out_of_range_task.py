@@ -1,4 +1,4 @@
-"""Define a task in which one function writes before or behind its array; a parameter chooses the function."""
+"""Define a task in which a function writes outside its array; a parameter chooses the function."""
 
 import warp as wp
 

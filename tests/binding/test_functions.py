@@ -15,7 +15,7 @@ MEANT = {
     for name, function in FUNCTIONS.items()
     if name not in ("tally", "share")  # these functions must be defined together, and need additional structs
 }
-"""Every function of ``task.FUNCTIONS``, as a task's file defines it."""
+"""The source of each function of ``task.FUNCTIONS`` in a task's file."""
 
 
 def source_of(folder: Path, text: str) -> TaskSource:
@@ -69,7 +69,9 @@ INCOMPLETE = {
 
 
 @pytest.mark.parametrize(("old", "new", "message"), INCOMPLETE.values(), ids=INCOMPLETE)
-def test_error_of_an_incomplete_file_names_the_missing_part(old: str, new: str, message: str, tmp_path: Path) -> None:
+def test_error_of_an_incomplete_file_names_the_missing_struct_or_function(
+    old: str, new: str, message: str, tmp_path: Path
+) -> None:
     with pytest.raises(ValueError, match=message):
         source_of(tmp_path, tiny_task.changed((old, new)))
 
@@ -123,7 +125,7 @@ USERS = {
 
 
 @pytest.mark.parametrize("user", USERS)
-def test_unlisted_observe_function_raises_an_error_if_nothing_calls_it(user: str, tmp_path: Path) -> None:
+def test_observe_function_of_a_missing_group_raises_an_error_unless_it_is_called(user: str, tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, tiny_task.changed(("class Tiny", f"{CRITIC}class Tiny")) + USERS[user])
     task = find_task(f"{file}:Tiny")
     source = TaskSource(task, task_name(task))

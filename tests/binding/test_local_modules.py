@@ -71,7 +71,7 @@ def test_a_changed_module_is_reloaded(tmp_path: Path) -> None:
     assert (find_task(file).frame_skip, first.frame_skip) == (17, 6)
 
 
-def test_module_that_raises_does_not_replace_loaded_modules(tmp_path: Path) -> None:
+def test_module_whose_import_fails_does_not_replace_loaded_modules(tmp_path: Path) -> None:
     file = shared(tmp_path, 8)
     first, module = find_task(file), sys.modules["aaa_size"]
     (tmp_path / "aaa_size.py").write_text("from aaa_inner.number import SKIP\n1 / 0\n")

@@ -75,7 +75,7 @@ def test_error_of_an_unreadable_model_file_names_the_file(tmp_path: Path) -> Non
         load_spec(tmp_path / "robot.xml")
 
 
-def test_error_without_gymnasium_robotics_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_names_the_extra_if_gymnasium_robotics_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if "robotics" in name else find(name, *a))
     with pytest.raises(FileNotFoundError, match=r"gymnasium-robotics, .*: pip install 'lyceum-warp\[hand\]'"):
@@ -109,7 +109,7 @@ PAIRS = """<mujoco model="pairs"><worldbody>
 
 
 def test_contact_pair_that_is_listed_twice_creates_one_contact(caplog: pytest.LogCaptureFixture) -> None:
-    """Otherwise MuJoCo would create two contacts, and MuJoCo Warp only one."""
+    """Without this change, MuJoCo would create two contacts, and MuJoCo Warp would create one."""
     assert mujoco.MjModel.from_xml_string(PAIRS).npair == 2
     with caplog.at_level("INFO"):
         model = compile_model(mujoco.MjSpec.from_string(PAIRS), (), PHYSICS)
@@ -157,8 +157,8 @@ def test_error_of_an_invalid_model_names_the_model() -> None:
 
 
 def test_replica_has_the_model_of_its_original_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A replica ignores later edits of the MjSpec, and a ``model`` function that returns a different model at each
-    call."""
+    """A replica ignores later edits of the MjSpec, and does not call a ``model`` function again, which may return a
+    different model at each call."""
     spec = lw.gymnasium_model("hopper.xml").spec()
     env = lw.make("hopper", model=spec)
     spec.geom("torso_geom").density = 5000
@@ -200,7 +200,7 @@ def test_model_with_a_relative_path_and_its_meshes_are_found_from_another_folder
     assert env.replicate().model.nmesh == 1
 
 
-def test_error_of_xml_text_as_model_suggests_an_mjspec() -> None:
+def test_error_of_a_model_given_as_xml_text_suggests_an_mjspec() -> None:
     with pytest.raises(
         ValueError, match=r"^the model '<mujoco><asset><mesh \.\.\.' is XML.*mujoco.MjSpec.from_string\(\.\.\.\)"
     ):

@@ -257,8 +257,8 @@ def test_functions_read_new_tables_after_graphs_are_captured(engine: str) -> Non
     torch.testing.assert_close(env.reward[1], 2.0 * env.reward[0])
 
 
-def test_replicas_planners_and_evaluations_get_the_tables() -> None:
-    """Changed tables take effect in a larger replica, in scratch worlds, in environments that called ``follow``, in a
+def test_changed_tables_reach_replicas_planners_and_evaluations() -> None:
+    """Changed tables take effect in a larger replica, in ``get_obs``, in environments that called ``follow``, in a
     planner, and in the evaluation of a policy."""
     motion = np.array([[0.25, 0.0]])
     env = lw.make(Follow, motion=motion, gain=[1.0, 2.0], nworld=2)

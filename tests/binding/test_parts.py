@@ -102,7 +102,7 @@ def test_states_and_observations_contain_all_parts_in_order(engine: str) -> None
     assert env.obs[:, 5].tolist() == [6.0, 7.0]
 
 
-def test_table_determines_the_sizes_of_parts_permanently() -> None:
+def test_table_that_would_change_the_sizes_of_parts_raises_an_error() -> None:
     env = lw.make(Marked, places=[1.0, 2.0])
     assert env.obs.shape == (1, 5)
     env.set_params(places=[3.0, 4.0])

@@ -43,7 +43,7 @@ def test_edit_of_the_model_raises_an_error(edit: Callable[[mujoco.MjModel], obje
     assert (model.body_mass == mujoco.MjModel.from_xml_string(XML).body_mass).all()
 
 
-def test_a_copy_can_be_edited() -> None:
+def test_copy_of_a_read_only_model_can_be_edited() -> None:
     model = read_only(mujoco.MjModel.from_xml_string(XML))
     for other in (copy.copy(model), copy.deepcopy(model)):
         assert type(other) is mujoco.MjModel

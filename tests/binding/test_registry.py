@@ -40,7 +40,7 @@ def test_every_task_of_the_package_is_found_by_its_name() -> None:
         assert task_name(find_task(name)) == name
 
 
-def test_task_name_with_a_namespace_finds_its_own_class_and_gives_a_valid_file_name() -> None:
+def test_task_name_with_a_namespace_finds_its_task_and_gives_a_valid_file_name() -> None:
     assert find_task("dm/humanoid_walk") is not find_task("humanoid_walk")
     assert file_name("dm/humanoid_walk") == "dm-humanoid_walk" and file_name("hopper") == "hopper"
     with pytest.raises(ValueError, match="no task 'dm/walker_wlk': did you mean dm/walker_walk"):
@@ -73,7 +73,7 @@ def test_a_registered_class_is_found_by_name(load: Load) -> None:
     assert find_task("registered_here") is module.RegisteredHere
 
 
-def test_task_name_of_another_file_or_of_the_package_raises_an_error(load: Load) -> None:
+def test_registering_a_name_that_is_already_taken_raises_an_error(load: Load) -> None:
     load("first_taker", "import lyceum_warp as lw\n@lw.register\nclass TakenHere(lw.Task):\n    pass\n")
     with pytest.raises(ValueError, match=r"'taken_here' is taken by first_taker.TakenHere: rename yours"):
         load("second_taker", "import lyceum_warp as lw\n@lw.register\nclass TakenHere(lw.Task):\n    pass\n")

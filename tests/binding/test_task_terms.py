@@ -77,7 +77,7 @@ def test_weights_are_set_like_parameters_and_may_differ_between_worlds(engine: s
 
 
 @ENGINES
-def test_rollout_returns_the_rewards_of_separate_steps(engine: str) -> None:
+def test_rollout_returns_the_same_rewards_as_separate_steps(engine: str) -> None:
     env = lw.make(Terms, nworld=3, engine=engine, autoreset=False, horizon=0, near=[1.0, 2.0, 3.0])
     loop = OpenLoop(lw.make(Terms, nworld=3, engine=engine, autoreset=False, near=[1.0, 2.0, 3.0]), 4)
     loop.state.copy_(env.get_state()[0])
@@ -200,7 +200,7 @@ def test_invalid_term_raises_a_one_line_error_that_names_it(
 
 
 @ENGINES
-def test_task_with_terms_follows_all_rules(engine: str) -> None:
+def test_task_with_terms_passes_check_task(engine: str) -> None:
     quick = [check for check in CHECKS if check is not check_memory]
     assert not check_task(Terms, engine=engine, steps=40, checks=quick).unused
 

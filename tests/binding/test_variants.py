@@ -19,7 +19,7 @@ ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
 
 
 @ENGINES
-def test_variant_has_the_terms_of_its_parent_and_its_own(engine: str) -> None:
+def test_variant_has_the_terms_of_its_parent_and_additional_terms(engine: str) -> None:
     parent, env = (lw.make(task, nworld=3, engine=engine, seed=2, horizon=0) for task in (Terms, Variant))
     assert env.task.params["target"] == 0.1 and env.task.params["border"] == parent.task.params["border"]
     assert list(env.state_space.parts)[-3:] == ["pushes", "work", "metrics"]
@@ -31,7 +31,7 @@ def test_variant_has_the_terms_of_its_parent_and_its_own(engine: str) -> None:
         env.step(action)
         work += action[:, 0] * (env.field("qpos")[:, 0] - x) + 0.001 * env.time
         torch.testing.assert_close(env.metrics["lasting"], 0.5 * env.timestep * 2.0 * work, atol=1e-7, rtol=1e-4)
-        # the variant's helper doubles the change, and its default target divides the change by 3
+        # the variant's helper doubles this metric, and its default target divides the metric by 3
         torch.testing.assert_close(env.metrics["change"], parent.metrics["change"] * 2 / 3, rtol=1e-4, atol=1e-7)
         assert torch.equal(env.metrics["effort"], parent.metrics["effort"])
     total = sum(env.metrics[name] for name in Variant.rewards)
@@ -45,7 +45,7 @@ def test_variants_of_the_same_structs_share_kernels_and_do_not_change_their_pare
 
 
 @ENGINES
-def test_variant_follows_all_rules(engine: str) -> None:
+def test_variant_passes_check_task(engine: str) -> None:
     quick = [check for check in CHECKS if check is not check_memory]
     assert not check_task(Variant, engine=engine, steps=30, checks=quick).unused
 

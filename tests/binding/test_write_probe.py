@@ -24,8 +24,8 @@ ROWS = {
     "randomize": (11, 6, "qpos", "the model has 6"),
     "randomize of a stream": (12, 1, "rng", "a stream has 1"),
 }
-"""For each function: its number in the task, the size and name of the row that it writes, and the words of the error
-about this size."""
+"""For each function: the parameter value that selects it, the size and name of the array that it writes, and what the
+error says about this size."""
 
 PROGRAM = """
 import sys
@@ -58,7 +58,7 @@ def test_writes_out_of_range_raise_an_error_before_they_damage_the_heap() -> Non
 
 
 @pytest.mark.parametrize("index", [0, 5, -1, -6])
-def test_positive_and_negative_indices_within_a_row_are_accepted(index: int) -> None:
+def test_positive_and_negative_indices_within_an_array_are_accepted(index: int) -> None:
     env = lw.make(str(TASK), function=10, index=index)
     env.reset()
     assert env.field("qpos")[0, index] == 1.0

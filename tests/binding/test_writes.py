@@ -167,7 +167,7 @@ def uses_rows(s: Uses, p: Params):
     row = s.before
     for i in range(int(p.gain)):
         if i > 0:
-            row[0] = 1.0  # from the second iteration on, the name refers to a different row
+            row[0] = 1.0  # from the second iteration on, the name refers to a different array
         row = s.after
     first, second = Uses(), Uses()
     first.before = s.in_a_struct
@@ -182,7 +182,7 @@ def uses_rows(s: Uses, p: Params):
     poke(s.by_native)
 
 
-def test_a_row_that_cannot_be_traced_counts_as_written() -> None:
+def test_array_whose_uses_cannot_be_traced_counts_as_written() -> None:
     assert {write.field for write in find_writes(uses_rows) if write.use is not None} == {*Uses.vars}
 
 

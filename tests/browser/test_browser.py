@@ -93,7 +93,7 @@ class Block(lw.Task):
 
 
 class WatchedWindow(Window):
-    """A viewer session that stores the last frame and the user's commands, and sends commands of the test."""
+    """A viewer window that stores the last frame and the user's commands, and also sends commands that a test adds."""
 
     def __init__(self, *given: Any) -> None:
         self.last: Frame | None = None
@@ -225,7 +225,7 @@ def push(action: float) -> Callable[[torch.Tensor], torch.Tensor]:
 
 @pytest.fixture(scope="module")
 def launch() -> Iterator[Callable[[], Browser]]:
-    """Start a headless browser: LYCEUM_WARP_BROWSER, playwright's own, or the system's."""
+    """Start a headless browser: that of LYCEUM_WARP_BROWSER, playwright's browser, or the system's."""
     with sync_playwright() as playwright:  # playwright runs an event loop in this thread until it is closed
         candidates = [os.environ.get("LYCEUM_WARP_BROWSER"), playwright.chromium.executable_path]
         candidates += map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"))
@@ -284,7 +284,7 @@ def tab(shared_tab: Tab) -> Tab:
 
 
 @pytest.mark.long
-def test_keys_and_buttons_can_pause_make_a_step_and_choose_a_controller(tab: Tab) -> None:
+def test_keys_and_buttons_pause_the_worlds_make_a_step_and_choose_a_controller(tab: Tab) -> None:
     viewer = tab.viewer
     before = viewer.session.stage.env.get_state()
     tab.press("Shift+ArrowRight", lambda: viewer.status.step >= 50)
@@ -477,7 +477,7 @@ def test_pages_of_other_sites_cannot_reach_the_viewer(viewer: Viewer, context: B
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        for host in ("localhost", "127.0.0.1"):  # the second page belongs to the viewer's site
+        for host in ("localhost", "127.0.0.1"):  # the second page has the viewer's host but another port
             page = context.new_page()
             page.goto(f"http://{host}:{server.server_address[1]}/")
             assert not page.evaluate(opens, f"{base.replace('http', 'ws')}state")

@@ -73,7 +73,7 @@ def test_every_physics_option_has_a_flag() -> None:
     assert sorted(names) == sorted(options) and given(Physics()) == {}
 
 
-def test_every_environment_option_has_a_flag_or_is_listed_as_an_option_without_flag() -> None:
+def test_every_environment_option_without_a_flag_is_listed() -> None:
     names = {field.name for field in dataclasses.fields(EnvOptions)}
     for flags, others in ((EnvFlags, set()), (Placement, {"horizon"})):
         assert {field.name for field in dataclasses.fields(flags)} == names - {*NO_FLAGS} - others

@@ -107,7 +107,7 @@ def test_final_table_omits_empty_columns(first: lw.Iteration) -> None:
 def test_final_table_counts_faults_and_outliers_of_all_iterations(first: lw.Iteration) -> None:
     row = first.row() | {"faults": 1.0, "outliers": 3.0}
     assert "2 faults and 6 outliers in all 2 iterations" in " ".join(table([row, row]).split())
-    assert "fault" not in table([first.row(), {"iteration": 2.0}])  # a row of an earlier release
+    assert "fault" not in table([first.row(), {"iteration": 2.0}])  # an earlier release wrote this row
 
 
 @pytest.mark.parametrize("width, absent", [(60, {"samples", "std"}), (80, set()), (40, {"samples", "std", "KL"})])

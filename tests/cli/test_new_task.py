@@ -65,12 +65,12 @@ def new(name: str, xml: str) -> Path:
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_new_task_follows_the_rules_on_both_engines(engine: str, folder: Path) -> None:
+def test_new_task_passes_check_task_on_both_engines(engine: str, folder: Path) -> None:
     file = new("everything", RICH)
     check_task(str(file), engine=engine, nworld=2, horizon=6, frame_skip=1, checks=MODEL_CHECKS)
 
 
-def test_a_new_task_observes_the_state_and_the_sensors_that_measure_it(folder: Path) -> None:
+def test_new_task_observes_the_state_and_the_sensors_that_measure_the_state(folder: Path) -> None:
     env = lw.make(str(new("everything", RICH)), nworld=2, seed=3)
     task = env.task.task
     assert task.obs == {"position": 13, "velocity": 11, "activation": 1, "sensors": 4}
@@ -95,7 +95,7 @@ def test_new_task_observes_only_sensors_if_they_measure_every_joint(folder: Path
 
 @pytest.mark.parametrize("model", [*MOVING.values(), *SENSING.values(), *PLUGINS.values()],
                          ids=[*MOVING, *SENSING, *PLUGINS])  # fmt: skip
-def test_new_task_for_any_model_has_matching_sizes(model: str, folder: Path) -> None:
+def test_observations_of_a_new_task_have_the_sizes_of_the_model(model: str, folder: Path) -> None:
     task = BoundTask(find_task(new("walk", model)))
     sizes = {"position": task.model.nq, "velocity": task.model.nv, "activation": task.model.na}
     found = dict(task.obs_layouts["policy"])
@@ -107,7 +107,7 @@ def test_new_task_for_any_model_has_matching_sizes(model: str, folder: Path) -> 
 @pytest.mark.long
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("model", [*MOVING.values(), *SENSING.values()], ids=[*MOVING, *SENSING])
-def test_new_task_for_any_model_follows_the_rules(model: str, engine: str, folder: Path) -> None:
+def test_new_task_for_any_model_passes_check_task(model: str, engine: str, folder: Path) -> None:
     file = new("walk", model)
     check_task(str(file), engine=engine, nworld=2, steps=10, horizon=6, frame_skip=2, checks=QUICK_CHECKS)
 
@@ -126,7 +126,7 @@ def package_models() -> list[Path]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("model", package_models(), ids=lambda path: f"{path.parent.name}-{path.stem}")
-def test_new_task_for_a_model_of_another_package_follows_the_rules(model: Path, folder: Path) -> None:
+def test_new_task_for_a_model_of_another_package_passes_check_task(model: Path, folder: Path) -> None:
     assert cli.main(["new", "walk", "--model", str(model)]) == 0
     check_task("walk.py", engine="mujoco", nworld=2, steps=10, horizon=6, frame_skip=2, checks=QUICK_CHECKS)
 

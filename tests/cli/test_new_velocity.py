@@ -68,7 +68,7 @@ def new(*words: str) -> int:
 
 
 @pytest.mark.long
-def test_new_velocity_file_is_short_and_its_task_follows_the_rules(folder: Path) -> None:
+def test_new_velocity_file_is_short_and_its_task_passes_check_task(folder: Path) -> None:
     assert new("ant_walk", "--model", "gymnasium:ant.xml") == 0
     text = Path("ant_walk.py").read_text()
     assert len(text.splitlines()) < 60 and max(map(len, text.splitlines())) <= 120

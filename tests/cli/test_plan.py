@@ -97,7 +97,7 @@ def test_command_plan_makes_a_video_of_the_first_episode(tmp_path: Path, capsys:
     assert Path(video).read_bytes()[4:8] == b"ftyp"
 
 
-def test_plant_runs_at_its_own_rate_if_the_flag_real_time_is_given(
+def test_flag_real_time_runs_the_plant_asynchronously_in_real_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert plan(tmp_path / "run", *QUIET, "--real-time") == 0
@@ -108,7 +108,7 @@ def test_plant_runs_at_its_own_rate_if_the_flag_real_time_is_given(
 
 
 def measured_by(microseconds: float) -> Any:
-    """Return a function that replaces the measurement; its planning times are proportional to samples and horizon."""
+    """Return a replacement for ``planning_time``: the time is proportional to samples and horizon."""
     return lambda plant, planner: 1e-6 * microseconds * planner.samples * planner.horizon
 
 
@@ -194,7 +194,7 @@ def test_flag_planner_param_changes_only_the_planner_worlds(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("options, name, integrator", [
-    ([], "euler", mujoco.mjtIntegrator.mjINT_EULER),  # the task's planning sets this parameter
+    ([], "euler", mujoco.mjtIntegrator.mjINT_EULER),  # the task's attribute ``planning`` sets this integrator
     (["--integrator", "implicitfast"], "implicitfast", mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
 ])  # fmt: skip
 def test_physics_options_change_only_the_planner_worlds(
@@ -213,7 +213,7 @@ def test_physics_options_change_only_the_planner_worlds(
     assert (settings["integrator"], settings["deterministic"]) == (name, True)
 
 
-def test_name_of_each_plan_update_is_saved_and_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_chosen_plan_update_is_saved_and_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flags = ["--knots", "4", "--spline", "linear", "--include-plan", "--replan-every", "3", "--steps", "9"]
     shown = {
         ("cem", "--elites", "3", "--min-noise", "0.02"): "CEM, 8 samples",
@@ -321,7 +321,7 @@ def test_interrupted_episode_is_saved(
 @pytest.mark.parametrize(
     ("words", "fill"), [(["-0.5"], -0.5), (["-0.5", "0.25"], [-0.5, 0.25]), (["repeat"], "repeat")]
 )
-def test_option_fill_accepts_a_word_a_number_or_an_action(words: list[str], fill: object, tmp_path: Path) -> None:
+def test_flag_fill_accepts_repeat_a_number_or_an_action(words: list[str], fill: object, tmp_path: Path) -> None:
     assert plan(tmp_path / "run", *QUIET, "--steps", "1", "--fill", *words) == 0
     assert json.loads((tmp_path / "run" / "config.json").read_text())["planner"]["fill"] == fill
 

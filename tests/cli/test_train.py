@@ -389,7 +389,7 @@ def suggesting(folder: Path, training: str) -> str:
     )
 
 
-def test_flags_override_the_training_that_a_task_suggests(tmp_path: Path) -> None:
+def test_flags_override_the_training_settings_that_a_task_suggests(tmp_path: Path) -> None:
     task = suggesting(tmp_path, 'lw.Training(algorithm="ppo", settings={"lam": 0.5, "gamma": 0.9})')
 
     def chosen(**flags: Any) -> Configuration:
@@ -402,7 +402,7 @@ def test_flags_override_the_training_that_a_task_suggests(tmp_path: Path) -> Non
 
 
 @pytest.mark.long
-def test_a_run_has_the_iterations_that_its_task_suggests(tmp_path: Path) -> None:
+def test_run_has_as_many_iterations_as_its_task_suggests(tmp_path: Path) -> None:
     task, out = suggesting(tmp_path, "lw.Training(iterations=2)"), tmp_path / "run"
     assert (
         cli.main(["train", task, "--nworld", "2", "--samples", "20", "--horizon", "5", "--out", str(out), *QUIET]) == 0
@@ -499,7 +499,9 @@ def test_killed_run_can_be_resumed(trained: Path, tmp_path: Path) -> None:
     assert len(metrics(out)) == total
 
 
-def test_train_prints_the_transfer_verdict_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_train_prints_the_result_of_the_transfer_test_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     options = ["--iterations", "1", "--horizon", "20"]
     assert train(tmp_path / "exact", *options) == 0
     assert "transfer:" not in capsys.readouterr().out

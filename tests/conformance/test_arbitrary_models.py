@@ -1,4 +1,4 @@
-"""Test that tasks with arbitrary models follow the rules on every engine that supports the model."""
+"""Test that tasks with arbitrary models pass ``check_task`` on every engine that supports the model."""
 
 from typing import Any
 
@@ -107,14 +107,14 @@ def sensing(model: str) -> type[lw.Task]:
 )
 @pytest.mark.parametrize("engine", OPTIONS)
 @pytest.mark.parametrize("model", MOVING.values(), ids=MOVING)
-def test_task_with_an_arbitrary_model_follows_the_rules(model: str, engine: str) -> None:
+def test_task_with_an_arbitrary_model_passes_check_task(model: str, engine: str) -> None:
     check_task(moving(model), engine=engine, **OPTIONS[engine])
 
 
 @pytest.mark.quick("delayed sensors-warp", "welds and sensors-mujoco")
 @pytest.mark.parametrize("engine", OPTIONS)
 @pytest.mark.parametrize("model", SENSING.values(), ids=SENSING)
-def test_task_with_sensors_follows_the_rules(model: str, engine: str) -> None:
+def test_task_with_sensors_passes_check_task(model: str, engine: str) -> None:
     check_task(sensing(model), engine=engine, **OPTIONS[engine])
 
 
@@ -123,7 +123,7 @@ def test_task_with_sensors_follows_the_rules(model: str, engine: str) -> None:
 
 @pytest.mark.quick("'mjTRN_SO3'] not supported", "Actuator plugins not supported")
 @pytest.mark.parametrize("model", PLUGINS.values(), ids=PLUGINS)
-def test_task_that_only_the_mujoco_engine_supports_follows_the_rules(model: str) -> None:
+def test_task_that_only_the_mujoco_engine_supports_passes_check_task(model: str) -> None:
     check_task(moving(model), engine="mujoco", nworld=2, steps=20, frame_skip=2, checks=MODEL_CHECKS)
 
 
@@ -247,5 +247,5 @@ class Pushed(lw.Task):
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", OPTIONS)
-def test_task_without_actuators_follows_the_rules(engine: str) -> None:
+def test_task_without_actuators_passes_check_task(engine: str) -> None:
     check_task(Pushed, engine=engine, **OPTIONS[engine])

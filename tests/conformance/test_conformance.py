@@ -1,4 +1,4 @@
-"""Check the rules for every task of the package on both engines, and for some tasks on a toy engine."""
+"""Run ``check_task`` for every task of the package on both engines, and for some tasks on a toy engine."""
 
 import pytest
 from conftest import settle
@@ -35,9 +35,10 @@ def settled_again() -> None:
 
 
 def options(task: str, engine: str) -> dict[str, int]:
-    """Return the number of steps of the long rules; hopper takes enough steps to find a leak of one number per step.
+    """Return how many steps the long rules take.
 
-    On a CPU, a step of the Warp engine takes milliseconds, so other tasks take few steps on this engine.
+    For hopper, the steps suffice to find a leak of one number per step. On a CPU, a step of the Warp engine takes
+    milliseconds, so the rules take only a few steps of other tasks on this engine.
     """
     every = task in EVERY_RULE[engine]
     if engine == "mujoco":
@@ -53,7 +54,7 @@ def options(task: str, engine: str) -> dict[str, int]:
     "warp-go1_velocity", "warp-half_cheetah", "warp-point_mass",
 )  # fmt: skip
 @pytest.mark.parametrize(("engine", "task"), [(engine, task) for engine in EVERY_RULE for task in PACKAGE])
-def test_task_follows_all_rules(task: str, engine: str) -> None:
+def test_task_passes_all_checks_of_check_task(task: str, engine: str) -> None:
     checks = CHECKS if task in EVERY_RULE[engine] else OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
     report = check_task(task, engine=engine, checks=checks, **options(task, engine))
     assert list(report.seconds) == [check.__name__.removeprefix("check_") for check in checks]
@@ -63,16 +64,16 @@ def test_task_follows_all_rules(task: str, engine: str) -> None:
 @pytest.mark.parametrize(
     ("task", "engine"), [(task, engine) for engine in EVERY_RULE for task in PACKAGE if task not in EVERY_RULE[engine]]
 )
-def test_task_follows_the_quick_rules(task: str, engine: str) -> None:
+def test_task_passes_the_quick_checks_of_check_task(task: str, engine: str) -> None:
     done = OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
     checks = [check for check in CHECKS if check not in done]
     if engine == "warp" and "rough" in task:
-        # this rule compares with the C engine, which creates more contacts with a height field than MuJoCo Warp does
+        # this rule compares both engines, but the C engine creates more contacts with a height field than MuJoCo Warp
         checks.remove(check_dynamics)
     check_task(task, engine=engine, checks=checks, **options(task, engine))
 
 
 @pytest.mark.quick("point_mass")
 @pytest.mark.parametrize("task", ["hopper", "point_mass"])
-def test_task_follows_the_rules_on_a_third_engine(task: str) -> None:
+def test_task_passes_check_task_on_a_third_engine(task: str) -> None:
     assert f"{task} on the toy engine" in str(check_task(task, engine=ToyEngine, steps=200))

@@ -1,4 +1,4 @@
-"""Test that every rule fails if an environment is patched to violate it."""
+"""Test that every rule of ``check_task`` fails if an environment is patched to violate it."""
 
 import itertools
 from collections.abc import Callable, Iterable
@@ -185,7 +185,7 @@ FULL_BREAKS: list[Break] = [
 SETTLED_BREAKS: list[Break] = [
     ("settle", MujocoEngine, "settle", at_once),
 ]
-"""Patches that violate each rule, for a variant of the task that settles after a reset."""
+"""Patches that violate each rule, for a variant of this task that takes substeps before each episode."""
 
 ALL_BREAKS = [
     *(("hopper", *broken) for broken in BREAKS),
@@ -209,19 +209,19 @@ def test_violated_rule_is_reported(
 
 @pytest.mark.quick("Full")
 @pytest.mark.parametrize("task", [Full, Settled])
-def test_task_with_every_feature_follows_the_rules(task: type[lw.Task]) -> None:
+def test_task_with_every_feature_passes_check_task(task: type[lw.Task]) -> None:
     check_task(task, engine="mujoco", steps=60)
 
 
 @pytest.mark.quick("Weighed-warp", "Practiced-warp", "Gifted-mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("task", [Weighed, Practiced, Gifted])
-def test_task_that_observes_lasting_memory_follows_the_rules(task: type[lw.Task], engine: str) -> None:
+def test_task_that_observes_lasting_memory_passes_check_task(task: type[lw.Task], engine: str) -> None:
     checks = [check for check in CHECKS if engine == "mujoco" or check.__name__ == "check_reset"]
     check_task(task, engine=engine, nworld=3, steps=60, frame_skip=1, checks=checks)
 
 
-def test_task_with_every_feature_follows_the_task_form_rules_on_the_warp_engine() -> None:
+def test_task_with_every_feature_passes_the_checks_of_these_features_on_the_warp_engine() -> None:
     rules = ("groups", "events", "inputs", "dynamics", "rejection")
     checks = [check for check in CHECKS if check.__name__.removeprefix("check_") in rules]
     check_task(Full, engine="warp", nworld=2, frame_skip=1, checks=checks)

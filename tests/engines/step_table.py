@@ -34,7 +34,7 @@ DRIVE_GROUPS = {
     "filtered": ("integrator", "filter", "filterexact"),
     "special": ("muscle", "dcmotor", "user"),
 }
-"""Groups of actuators; a model applies each actuator of one group to each transmission."""
+"""Groups of actuators; a model combines each actuator of one group with each transmission."""
 
 PLACES = {
     "joint": 'joint="hip"',

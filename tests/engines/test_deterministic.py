@@ -76,7 +76,7 @@ def test_scratch_memory_is_reserved_before_graphs_are_captured(monkeypatch: pyte
 
 @pytest.fixture(scope="module", params=["dense", "sparse"])
 def forwarded(request: pytest.FixtureRequest) -> tuple[WarpEngine, CanonicalOrder]:
-    """Return an engine with humanoids that touch the ground and reach joint limits, and the model's canonical order."""
+    """Return an engine with humanoids that touch the ground and reach joint limits, and a sorter for its contacts."""
     model = copy.copy(lw.make("humanoid").model)
     model.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{request.param.upper()}")
     engine = WarpEngine(model, 3, wp.get_device("cpu"), [describe(model, "qpos")])

@@ -1,4 +1,4 @@
-"""Test per-world model fields, inputs, initial states and settling on every engine."""
+"""Test per-world model fields, inputs, initial states and substeps before an episode on every engine."""
 
 import copy
 from collections.abc import Mapping
@@ -225,12 +225,12 @@ def test_restored_state_restores_its_model_fields(engine: type[Engine]) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_model_with_restored_nominal_values_gives_the_original_steps(engine: type[Engine]) -> None:
+def test_steps_equal_the_original_steps_after_nominal_model_values_are_restored(engine: type[Engine]) -> None:
     made, untouched = make(engine, *DRAWN), make(engine, *DRAWN)
     draw(made)
     for name, nominal in made.nominal.items():
         made.arrays[name].numpy()[:] = nominal.numpy()
-    for _ in range(2):  # in the second pass, the model is nominal
+    for _ in range(2):  # in the second pass, all model fields are already nominal
         made.apply_model(worlds())
     np.testing.assert_array_equal(run(made), run(untouched))
 
@@ -272,13 +272,13 @@ def test_rollout_uses_the_model_fields_of_each_state(
 
 
 class WholeWarpEngine(WarpEngine):
-    """A Warp engine that settles with forward passes of all worlds, as the deterministic engine does."""
+    """A Warp engine whose ``settle`` computes forward passes of all worlds, as the deterministic engine's does."""
 
     partial_refresh = False
 
 
 @pytest.mark.parametrize("engine", [*ENGINES, WholeWarpEngine])
-def test_settling_advances_only_masked_worlds(engine: type[Engine]) -> None:
+def test_settle_advances_only_masked_worlds(engine: type[Engine]) -> None:
     fields = ("xpos", "qfrc_constraint")
     made, alone = make(engine, *DRAWN, fields=fields), make(engine, *DRAWN, fields=fields)
     for either in (made, alone):
@@ -300,7 +300,7 @@ def test_settling_advances_only_masked_worlds(engine: type[Engine]) -> None:
     assert not made.fault.numpy().any()
 
 
-def test_captured_graphs_apply_model_fields_and_settle_worlds() -> None:
+def test_graphs_give_the_same_results_as_direct_calls_of_apply_model_and_settle() -> None:
     captured, direct = (make(WarpEngine, *DRAWN) for _ in range(2))
     mask = worlds(N, 0, 2)
 
@@ -383,7 +383,7 @@ SLIDERS = """<mujoco><worldbody>
 
 
 def test_inverse_weights_of_sliding_or_rotating_bodies_equal_those_of_a_compiled_model() -> None:
-    """In directions in which a body cannot move, MuJoCo's inverse weight is 0; MuJoCo Warp's ``set_const`` differs."""
+    """In directions in which a body cannot move, MuJoCo's inverse weight is 0, unlike MuJoCo Warp's ``set_const``."""
     model = mujoco.MjModel.from_xml_string(SLIDERS)
     engine = make(WarpEngine, "body_mass", nworld=2, model=model)
     for scale in (1.0, 2.0):

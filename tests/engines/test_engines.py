@@ -82,7 +82,7 @@ def file(task_file: TaskFile) -> Path:
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_lagged_fields_belong_to_the_new_state_after_a_reset(file: Path, engine: str) -> None:
+def test_lagged_fields_are_current_after_a_reset(file: Path, engine: str) -> None:
     env = lw.make(file, engine=engine, nworld=2)
     torch.testing.assert_close(env.obs[:, :2], torch.full((2, 2), 0.5))
     for _ in range(6):
@@ -100,7 +100,9 @@ CLEARED = TASK.replace('lagged = ("sensordata",)', 'lagged = cleared = ("sensord
     "fields", [[], ["xpos"], ["qacc"]]
 )  # the listed fields must be computed at the start of an episode
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_cleared_fields_are_zero_when_an_episode_begins(task_file: TaskFile, engine: str, fields: list[str]) -> None:
+def test_fields_listed_as_cleared_are_zero_when_an_episode_begins(
+    task_file: TaskFile, engine: str, fields: list[str]
+) -> None:
     env = lw.make(task_file("cleared.py", CLEARED), engine=engine, nworld=2, fields=fields)
     assert torch.equal(env.obs[:, :2], torch.tensor([[0.5, 0.0]] * 2))
     for _ in range(6):

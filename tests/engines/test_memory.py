@@ -37,8 +37,8 @@ def test_memory_check_first_frees_the_gpu_memory_that_torch_has_cached(monkeypat
 
 
 def test_memory_estimate_of_the_warp_engine_covers_its_arrays() -> None:
-    """The estimate includes MuJoCo Warp's data of all worlds, its data of the few worlds that are refreshed together,
-    and temporary arrays."""
+    """The estimate includes MuJoCo Warp's data for all worlds, its data for the few worlds that one refresh computes
+    together, and temporary arrays."""
     for task in ("hopper", "humanoid"):
         env = lw.make(task, engine="warp", nworld=64)
         engine: Any = env.engine

@@ -1,4 +1,4 @@
-"""Resolve device names and engine="auto", and choose devices for few worlds and for a planner's samples."""
+"""Resolve device names and engine="auto", and choose devices for a few worlds and for a planner's samples."""
 
 import types
 from typing import Any
@@ -47,7 +47,7 @@ def test_find_device_accepts_names_and_torch_devices() -> None:
         find_device("tpu")
 
 
-def test_engine_name_resolves_auto_by_the_device() -> None:
+def test_engine_auto_depends_on_the_device() -> None:
     assert [engine_name("auto", device) for device in ("cpu", None, "cuda", "cuda:1")] == [
         "mujoco", "mujoco", "warp", "warp"
     ]  # fmt: skip
@@ -112,14 +112,14 @@ def test_too_many_worlds_for_the_memory_raise_an_error_before_the_engine_is_made
         open_engine(engine, model, 6, cpu, [], reserved=each)
 
 
-def test_few_worlds_move_from_a_gpu_to_cpu_cores_only_with_engine_auto() -> None:
+def test_small_numbers_of_worlds_run_on_the_cpu_instead_of_a_gpu_only_with_engine_auto() -> None:
     assert options_for_few_worlds("auto", "cuda:0") == ON_CPU
     for engine, device in (("auto", "cpu"), ("auto", None), ("warp", "cuda:0"), ("mujoco", "cpu"), (ToyEngine, "cuda")):
         assert options_for_few_worlds(engine, device) == {}
 
 
-def test_a_plant_moves_from_a_gpu_to_a_cpu_core(gpu: Any) -> None:
-    """On the GPU, the plant's steps would wait for the planner, so a plant with engine="warp" also moves."""
+def test_plant_whose_device_is_a_gpu_runs_on_the_cpu(gpu: Any) -> None:
+    """On the GPU, the plant's steps would wait for the planner, so even with engine="warp", the CPU is used."""
     for engine, device in (("auto", "cuda:0"), ("warp", "cuda:0")):
         assert options_for_plant(engine, device) == ON_CPU
     for engine, device in (("auto", None), ("warp", "cpu"), ("mujoco", "cpu"), (ToyEngine, "cuda:0")):

@@ -220,7 +220,7 @@ def test_acceleration_sensors_keep_their_values_from_the_last_substep(kind: type
     assert np.abs(left[:, late]).max() > 0
     engine.refresh_current(everyone(engine))
     np.testing.assert_array_equal(shown(engine)["sensordata"], left)
-    # push two worlds, as an event does
+    # change the velocities of two worlds, as a push event does
     before, chosen = state_of(engine), only(engine, 0, 2)
     write(engine, "qvel", chosen.numpy(), engine.arrays["qvel"].numpy() + 1.0)
     engine.commit(chosen)
@@ -290,9 +290,9 @@ def test_limit_sensor_is_zero_after_the_joint_leaves_its_limit(kind: type[Engine
         check_current(engine)
 
 
-def test_worlds_that_share_an_mjdata_keep_their_own_fields() -> None:
-    """After a step, a stage of the physics runs for one world after another in the same MjData. Fields that this stage
-    does not compute contain another world's values there."""
+def test_worlds_that_share_an_mjdata_have_separate_fields() -> None:
+    """After a step, a stage of the physics runs for one world after another in the same MjData. Fields outside
+    this stage contain the values of another world in this MjData."""
     model, device = model_of(SENSORS["mixed"]), wp.get_device("cpu")
     for lagged, current in ((), ("xpos",)), (("cvel",), ("xpos",)), (("cvel", "xpos"), ("sensordata",)):
         fields = [describe(model, name, lagged=name in lagged) for name in (*lagged, *current, "qacc", "qvel")]

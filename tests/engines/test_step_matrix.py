@@ -25,7 +25,7 @@ SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 @pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
 def device(request: pytest.FixtureRequest) -> wp.Device:
-    """Return a device on which steps are reproducible bit for bit; on a GPU, the mode is deterministic."""
+    """Return a device on which steps are reproducible bit for bit; on a GPU, the engine is the deterministic one."""
     return wp.get_device(request.param)
 
 
@@ -164,7 +164,7 @@ OF_ANOTHER_MODEL = {
     "tendon_solref_fri": {"tendons": "friction"}, "tendon_solimp_fri": {"tendons": "friction"},
     "pair_solreffriction": {"cone": "elliptic"},
 }  # fmt: skip
-"""Some fields have an effect only with these levels, in addition to the levels in ``DRAWN``."""
+"""Levels without which a field has no effect; the other factors have the levels in ``DRAWN``."""
 
 
 def touching(model: mujoco.MjModel) -> np.ndarray:

@@ -122,7 +122,7 @@ def attack(case: str) -> str:
 
 
 def run(line: list[str]) -> str:
-    """Run a command line in a folder with a run, and check its outcome."""
+    """Run a command line in a folder that contains a training run, and check the outcome."""
     os.chdir(HERE.parent)
     shutil.rmtree(HERE, ignore_errors=True)
     HERE.mkdir()

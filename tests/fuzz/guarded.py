@@ -1,4 +1,4 @@
-"""Run attacks in a subprocess, each with a limited time and memory, and collect the problems.
+"""Run attacks in a subprocess, limit the time and the memory of each attack, and collect the problems.
 
 An attack program calls ``serve``; a test calls ``attacks``. ``python tests/fuzz/PROGRAM.py CASE ...`` repeats single
 cases, prints their tracebacks, and writes files into the current directory.
@@ -73,7 +73,7 @@ def out_of_memory(error: BaseException) -> bool:
 
 
 def serve(attack: Attack, warm_up: Callable[[], None]) -> None:
-    """Run the cases given on the command line. Before memory is limited, ``warm_up`` loads the modules that they
+    """Run the cases given on the command line. Before memory is limited, ``warm_up`` loads the modules that the cases
     need."""
     results = sys.argv[2] if sys.argv[1:2] == ["--results"] else None
     cases = sys.argv[3:] if results else sys.argv[1:]

@@ -144,7 +144,7 @@ def _shown(value: Any) -> str:
 
 
 def warm_up() -> None:
-    """Make a run that calls can load, and make every call once."""
+    """Train a run that the calls can load, and make every call once."""
     torch.set_num_threads(1)
     HERE.mkdir(exist_ok=True)
     os.chdir(HERE)

@@ -38,7 +38,7 @@ MINIMAL: dict[str, Mapping[str, Any]] = {
 
 
 def each(names: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """Return all pairs of a program and one of its names."""
+    """Return all pairs of a program and a name that belongs to this program."""
     return [(program, name) for program in names for name in names[program]]
 
 
@@ -48,7 +48,7 @@ def cases(counts: Mapping[str, int], first: int) -> list[str]:
 
 @pytest.fixture(scope="module")
 def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Return ``outcomes(program, many)``, which runs many cases of a program, or a few cases and all minimal cases.
+    """Return ``outcomes(program, many)``, which runs many random cases, or a few random cases and all minimal cases.
 
     The folder of the cases has the same path in every run of the tests.
     """

@@ -1,4 +1,4 @@
-"""Test on a GPU that no step waits for the host, graphs equal direct launches, and runs are reproducible."""
+"""Test on a GPU that steps do not wait for the device, graphs equal direct launches, and runs are reproducible."""
 
 import contextlib
 import gc
@@ -148,7 +148,7 @@ def test_deterministic_graphs_equal_direct_launches(task: str) -> None:
 
 
 def test_capture_does_not_disturb_running_graphs() -> None:
-    """Graphs share memory that a capture clears, and no other call waits for the device in between."""
+    """Graphs share memory that a capture clears. No other call of this test waits until the running graphs end."""
     replayed, direct = (
         lw.make("humanoid", nworld=1024, device=CUDA, deterministic=True, graphs=graphs) for graphs in (True, False)
     )
@@ -227,8 +227,8 @@ def test_restarting_worlds_get_the_fields_of_a_full_forward_pass(deterministic: 
     assert seen > 0
 
 
-def test_fault_of_one_humanoid_does_not_change_a_few_others() -> None:
-    """The contact buffer has room for a world with excessive contacts even if there are only a few worlds."""
+def test_fault_of_one_humanoid_does_not_change_the_other_worlds() -> None:
+    """Even for only a few worlds, the contact buffer has room for a world with excessive contacts."""
     from lyceum_warp.testing import CHECKS
 
     checks = [check for check in CHECKS if check.__name__ in ("check_bad_state", "check_bad_action")]

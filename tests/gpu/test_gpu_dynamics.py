@@ -45,7 +45,7 @@ def write(engine: Engine, name: str, factors: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("kind", [WarpEngine, DeterministicEngine])
-def test_gpu_graphs_apply_models_and_settle_worlds_like_the_c_engine(kind: type[Engine]) -> None:
+def test_gpu_graphs_agree_with_the_c_engine_if_models_differ_between_worlds(kind: type[Engine]) -> None:
     spec = gymnasium_model("hopper.xml").spec()
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC

@@ -58,7 +58,7 @@ def test_plans_agree_with_plans_on_the_cpu(task: str, horizon: int) -> None:
 
 
 @pytest.mark.parametrize("update", ["mppi with knots", "cem"])
-def test_plans_for_several_plants_equal_single_planners(update: str) -> None:
+def test_planner_for_several_plants_gives_the_plans_of_separate_planners(update: str) -> None:
     settings: dict[str, Any] = dict(task="reach", device=CUDA, engine="warp", samples=40, **UPDATES[update])
     states = lw.make("reach", nworld=5, autoreset=False, seed=3).get_state()
     together = lw.MPPI(**settings, seed=5, plants=5)
@@ -92,7 +92,7 @@ def test_actions_are_on_the_device_of_the_states(of_plants: str, of_plan: str) -
 
 
 @pytest.mark.parametrize("update", UPDATES)
-def test_plan_updates_with_equal_returns_are_equal_on_gpu_and_cpu(update: str) -> None:
+def test_equal_returns_give_equal_plan_updates_on_gpu_and_cpu(update: str) -> None:
     """The returns of the first iteration differ by rounding, which may swap samples that are almost equal."""
     gpu, cpu = (
         lw.MPPI("reach", device=device, engine=engine, samples=200, seed=3, **UPDATES[update])
@@ -112,7 +112,7 @@ def test_plan_updates_with_equal_returns_are_equal_on_gpu_and_cpu(update: str) -
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
-def test_replayed_plans_equal_plans_without_graphs(planner: str) -> None:
+def test_plans_with_graphs_equal_plans_without_graphs(planner: str) -> None:
     env = plant("reach")
     replayed, direct = (
         lw.MPPI("reach", device=CUDA, engine="warp", deterministic=True, graphs=graphs, **PLANNERS[planner])
@@ -175,7 +175,7 @@ def test_a_value_function_moves_to_the_device_of_the_plans(samples: int) -> None
         assert torch.isfinite(plan(plan.state_of())).all()
 
 
-def test_few_samples_are_rolled_out_on_the_cpu() -> None:
+def test_small_numbers_of_samples_are_rolled_out_on_the_cpu() -> None:
     assert lw.MPPI("reach", device=CUDA, samples=8).env.engine.name == "mujoco"
     assert lw.MPPI("reach", device=CUDA, samples=8, nthread=1, nconmax=16).env.device.is_cpu
     assert lw.MPPI("reach", device=CUDA, samples=64, nthread=1).env.engine.name == "warp"

@@ -60,7 +60,7 @@ def test_learner_captures_new_graphs_after_loading_a_state() -> None:
         next(one)
     other = made(learning_rate=2e-3)
     next(other)
-    next(other)  # the old graph contains addresses of the optimizer's moments, which loading replaces
+    next(other)  # the old graph contains addresses of the optimizer's old moments
     other.load_state_dict(one.state_dict())
     for _ in range(3):
         first, second = next(one), next(other)

@@ -63,7 +63,7 @@ def test_learner_captures_new_graphs_after_loading_a_state() -> None:
         next(one)
     other = made()
     next(other)
-    next(other)  # the old graph contains addresses of the optimizer's moments, which loading replaces
+    next(other)  # the old graph contains addresses of the optimizer's old moments
     other.load_state_dict(one.state_dict())
     other.replay.load_state_dict(one.replay.state_dict())
     for _ in range(2):

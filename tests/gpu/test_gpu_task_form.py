@@ -1,5 +1,5 @@
-"""Test on a GPU that a task with every feature follows the rules, agrees with the C engine, and does not
-synchronize."""
+"""Test that a task with every feature passes ``check_task`` on a GPU, agrees with the C engine, and never waits for
+the device."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from lyceum_warp.testing import check_task
 pytestmark = pytest.mark.gpu
 
 
-def test_task_with_every_feature_follows_the_rules_on_a_gpu() -> None:
+def test_task_with_every_feature_passes_check_task_on_a_gpu() -> None:
     check_task(Full, device="cuda", steps=50)
 
 

@@ -28,7 +28,7 @@ def test_steps_and_frames_do_not_wait_for_the_device() -> None:
         session.stage.live.request((4, 5), 4)
 
 
-def test_chosen_world_is_shown_after_one_frame() -> None:
+def test_viewer_shows_the_chosen_world_after_one_frame() -> None:
     env = lw.make("hopper", nworld=4096, device="cuda")
     session = Session(env, controllers={"policy": pushing}, seed=0)
     session.obey(SetWorld(3000))

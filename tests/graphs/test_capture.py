@@ -1,4 +1,4 @@
-"""Test that phases are captured as graphs that compute the same numbers in the same order."""
+"""Test that the phases of a step are captured as graphs that compute the same numbers in the same order."""
 
 import gc
 import threading
@@ -69,7 +69,7 @@ def follow(digit: int, number_inout: wp.array[int], first: int):
     number_inout[w] = 10 * number_inout[w] + digit
 
 
-def test_threads_share_worlds_in_phases_that_allow_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_divide_the_worlds_in_phases_that_allow_it(monkeypatch: pytest.MonkeyPatch) -> None:
     digits, sizes = wp.zeros(5, dtype=int, device="cpu"), []
     launch = wp.launch
 
@@ -92,8 +92,8 @@ def test_threads_share_worlds_in_phases_that_allow_it(monkeypatch: pytest.Monkey
         for call in calls:
             call()
         assert digits.numpy().tolist() == [1234] * 5
-    # the first calls launch for all worlds, the second calls capture them, and later calls capture two parts if
-    # possible
+    # the first calls launch kernels for all worlds, the second calls capture these launches, and later calls capture a
+    # graph for each half of the worlds if the phase allows it
     assert sizes == [5, 5, 5, 5, 5, 5, 5, 5, *(2, 2, 3, 3), *(2, 3)]
 
 
@@ -104,7 +104,7 @@ def count_down(number_inout: wp.array[int], turns_inout: wp.array[int]):
 
 
 def test_graph_contains_only_launches_of_its_own_thread() -> None:
-    """While one thread captures, another thread launches, copies, loops and captures, and gets correct results."""
+    """While one thread captures, another thread launches, copies, captures and runs a loop, with correct results."""
     mine, captured = Digits(), []
     cpu, number, turns, copied = wp.get_device("cpu"), *(wp.full(1, 3, dtype=int, device="cpu") for _ in range(3))
     own = Digits()

@@ -1,4 +1,4 @@
-"""Test which kernels a rehearsal lists for a function, and whether Warp has the names that rehearsals replace."""
+"""Test rehearsals: a rehearsal replaces functions of Warp to list the kernels that a function would launch."""
 
 import inspect
 import subprocess

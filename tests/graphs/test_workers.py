@@ -1,4 +1,4 @@
-"""Test that worker threads run calls in parallel, raise the error of any call, and end with their pool."""
+"""Test that worker threads run calls in parallel and end with their pool, and that errors in calls are raised."""
 
 import gc
 import signal
@@ -28,7 +28,7 @@ def test_calls_run_in_parallel_threads() -> None:
     assert threads.count(threading.current_thread()) == 3 and len(set(threads)) == 3
 
 
-def test_threads_start_on_demand_and_end_with_the_last_reference() -> None:
+def test_threads_start_on_demand_and_end_with_the_last_reference_to_their_pool() -> None:
     before = own_threads()  # threads of other tests' engines may end in the meantime
     workers = Workers(3)
     assert not own_threads() - before

@@ -51,7 +51,7 @@ def look_up(ground: wp.array2d[float], points: wp.array[wp.vec2], out: wp.array2
 
 
 def looked_up(ground: wp.array, points: np.ndarray) -> np.ndarray:
-    """Look up height, normal, coverage, and the distance of a point at height 2 m, (n, 6)."""
+    """Look up the ground's height, normal and presence, and its distance to a point at height 2 m, (n, 6)."""
     out = wp.zeros((len(points), 6), dtype=float, device="cpu")
     wp.launch(look_up, len(points), [ground, wp.array(points, dtype=wp.vec2, device="cpu"), out], device="cpu")
     found: np.ndarray = out.numpy()
@@ -137,7 +137,7 @@ def levels(level: int, walked: float, commanded: float, rng: wp.array2d[wp.uint3
 
 
 def next_levels(level: int, walked: float, commanded: float) -> np.ndarray:
-    """Return the next levels of worlds with different random numbers, for five levels of patches of 8 m."""
+    """Return the next level in worlds with different random numbers; the terrain has five levels of 8 m patches."""
     rng = wp.array(np.arange(2000, dtype=np.uint32).reshape(-1, 1), dtype=wp.uint32, device="cpu")
     out = wp.zeros(len(rng), dtype=int, device="cpu")
     wp.launch(levels, len(rng), [level, walked, commanded, rng, out], device="cpu")

@@ -54,14 +54,14 @@ def test_interpolated_actions_stay_within_the_bounds() -> None:
     np.testing.assert_allclose(bounded, np.minimum(free, 1.0))
 
 
-def test_worlds_of_a_sample_get_the_same_actions_and_are_consecutive() -> None:
+def test_worlds_of_the_same_sample_are_consecutive_and_get_the_same_actions() -> None:
     values = np.arange(10.0).reshape(5, 2, 1)
     found = interpolated(values, 4, 4, "zero", models=3)
     np.testing.assert_array_equal(found[..., 0], np.repeat(values[:4, :, 0], 3, axis=1))
 
 
 @pytest.mark.parametrize("horizon, count", [(12, 4), (13, 4), (7, 5), (5, 5), (9, 1)])
-def test_number_of_passed_knots_follows_the_steps(horizon: int, count: int) -> None:
+def test_number_of_passed_knots_is_proportional_to_the_steps(horizon: int, count: int) -> None:
     phase, passed, steps = (wp.zeros(1, dtype=int, device="cpu") for _ in range(3))
     time = total = 0
     for shift in (0, 1, 1, 3, horizon, 2 * horizon + 1, 1):

@@ -87,7 +87,7 @@ def test_noise_has_the_given_covariance() -> None:
     np.testing.assert_allclose(np.cov(added.T), wanted, atol=3e-5)
 
 
-def test_equal_noise_as_number_vector_or_matrix_gives_equal_samples() -> None:
+def test_equal_noise_gives_equal_samples_as_a_number_a_vector_or_a_matrix() -> None:
     plans = [MPPI("point_mass", horizon=10, noise=noise) for noise in (0.1, [0.1, 0.1], np.diag([0.01, 0.01]))]
     for plan in plans:
         plan(plan.state_of())

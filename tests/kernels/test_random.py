@@ -1,4 +1,4 @@
-"""Test counter-based random streams: draws depend only on (seed, world, episode, step)."""
+"""Test counter-based random numbers, which depend only on (seed, world, episode, step)."""
 
 import itertools
 
@@ -40,7 +40,7 @@ def draw_vectors(rng_inout: wp.array2d[wp.uint32], one_out: wp.array2d[float], m
 
 
 def draws(counters: np.ndarray) -> np.ndarray:
-    """Return four draws for each row (seed, world, episode, step)."""
+    """Return four random numbers for each row (seed, world, episode, step)."""
     columns = [wp.array(column, dtype=int, device="cpu") for column in counters.T]
     rng = wp.zeros((len(counters), 1), dtype=wp.uint32, device="cpu")
     values = wp.zeros((len(counters), 4), dtype=float, device="cpu")
@@ -48,13 +48,13 @@ def draws(counters: np.ndarray) -> np.ndarray:
     return values.numpy()
 
 
-def test_equal_counters_give_equal_draws_in_any_order() -> None:
+def test_equal_counters_give_equal_random_numbers_in_any_order() -> None:
     counters = np.array(list(itertools.product(range(3), range(4), range(3), range(3))))
     order = np.random.default_rng(0).permutation(len(counters))
     np.testing.assert_array_equal(draws(counters)[order], draws(counters[order]))
 
 
-def test_random_vector_equals_separate_draws_of_its_elements() -> None:
+def test_random_vector_equals_its_elements_drawn_one_by_one() -> None:
     rng = wp.array(np.repeat(np.arange(100), 2)[:, None], dtype=wp.uint32, device="cpu")
     one, many = (wp.zeros((100, 5), dtype=float, device="cpu") for _ in range(2))
     wp.launch(draw_vectors, 100, [rng, one, many], device="cpu")
@@ -65,15 +65,15 @@ def test_random_vector_equals_separate_draws_of_its_elements() -> None:
     np.testing.assert_array_equal(ends[::2], ends[1::2])
 
 
-def test_different_counters_give_different_draws() -> None:
-    """Counters with equal sums also give different draws."""
+def test_different_counters_give_different_random_numbers() -> None:
+    """Counters with equal sums also give different random numbers."""
     counters = np.array(list(itertools.product(range(6), range(6), range(6), range(6))))
     found = draws(counters)
     assert len(np.unique(found[:, 0])) > 0.999 * len(counters)
 
 
 @pytest.mark.parametrize("counter", ["seed", "world", "episode", "step"])
-def test_draws_are_independent_along_every_counter(counter: str) -> None:
+def test_random_numbers_are_independent_along_every_counter(counter: str) -> None:
     counters = np.zeros((4000, 4), dtype=int)
     counters[:, ["seed", "world", "episode", "step"].index(counter)] = np.arange(4000)
     values = draws(counters)

@@ -153,8 +153,8 @@ def test_euler_angles_equal_those_of_mujoco(found: dict[str, np.ndarray]) -> Non
 
 
 def test_random_rotations_are_uniform_and_independent() -> None:
-    """As a vector in the plane, any two components of a uniform unit quaternion have a squared length from U(0, 1) and
-    a uniform angle."""
+    """Any two components of a uniform unit quaternion form a vector in the plane. The squared length of this vector is
+    U(0, 1), and the angle is uniform."""
     n = 4000
     rng, quats = (wp.zeros((n, k), dtype=t, device="cpu") for k, t in ((1, wp.uint32), (2, wp.vec4)))
     wp.launch(draw, n, [rng, quats], device="cpu")

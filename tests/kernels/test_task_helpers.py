@@ -107,7 +107,7 @@ def struct(rows: dict[str, np.ndarray]) -> Rows:
     return made
 
 
-def test_numbers_vectors_and_rows_are_written_in_sequence_by_put(rows: dict[str, np.ndarray], struct: Rows) -> None:
+def test_put_writes_numbers_vectors_and_arrays_one_after_another(rows: dict[str, np.ndarray], struct: Rows) -> None:
     out, last = wp.zeros(80, dtype=float, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
     wp.launch(write_rows, 1, [struct, out, last], device="cpu")
     parts = [

@@ -37,7 +37,7 @@ def stored(task: str) -> dict[str, np.ndarray]:
 
 
 def rows(task: str, name: str) -> np.ndarray:
-    """Return the rows of all segments."""
+    """Stack the arrays of all segments."""
     values = stored(task)[name]
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])
 
@@ -221,7 +221,7 @@ def test_margin_of_point_mass_is_the_size_of_its_target() -> None:
     assert env.task.params["margin"] == env.task.params["target_size"] == pytest.approx(0.1)
 
 
-def test_reward_of_acrobot_planners_depends_on_the_energy(shared_env: SharedEnv) -> None:
+def test_reward_of_acrobot_depends_on_the_energy_if_energy_weight_is_set(shared_env: SharedEnv) -> None:
     env = shared_env("dm/acrobot_swingup", nworld=3, autoreset=False, energy_weight=2.0)
     state = env.get_state()
     parts = env.state_space.split(state)
@@ -231,8 +231,8 @@ def test_reward_of_acrobot_planners_depends_on_the_energy(shared_env: SharedEnv)
     np.testing.assert_allclose(rewards, [3.0, 0.0, 1.0], atol=0.1)
 
 
-def test_effort_of_acrobot_planners_is_the_torque_that_balances_the_arms(shared_env: SharedEnv) -> None:
-    """Feedback that minimizes the effort of the linearized task spends the expected effort."""
+def test_balance_effort_of_acrobot_predicts_the_effort_of_optimal_feedback(shared_env: SharedEnv) -> None:
+    """The feedback with the least effort for the linearized task spends the effort that ``balance_effort`` predicts."""
     env = shared_env("dm/acrobot_swingup", nworld=1, autoreset=False)
     effort, dt = np.asarray(env.task.params["balance_effort"]).reshape(4, 4), env.timestep
     state = env.get_state()
@@ -256,7 +256,7 @@ def test_effort_of_acrobot_planners_is_the_torque_that_balances_the_arms(shared_
     assert np.abs(x).max() < 1e-6 and spent == pytest.approx(expected, rel=0.02)
 
 
-def test_planners_of_finger_spin_are_rewarded_below_the_target_velocity(shared_env: SharedEnv) -> None:
+def test_spin_margin_rewards_velocities_below_the_target_velocity(shared_env: SharedEnv) -> None:
     env = shared_env("dm/finger_spin", nworld=3, autoreset=False, spin_margin=30.0)
     state = env.get_state()
     env.state_space.split(state)["qvel"][:, 2] = torch.tensor([-16.0, 0.0, 15.0])

@@ -1,8 +1,8 @@
 """Compare the C engine with the Warp engine for every task of the package.
 
 Both engines run the same task functions on different physics: the C engine uses float64, and the Warp engine uses
-float32. With pyramidal friction cones, MuJoCo Warp uses a different contact frame for a capsule on a plane, so
-trajectories differ. These tests use elliptic cones, which do not depend on the contact frame.
+float32. With pyramidal friction cones, trajectories differ, because MuJoCo and MuJoCo Warp use different contact
+frames for a capsule on a plane. These tests use elliptic cones, which do not depend on the contact frame.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ quick = pytest.mark.quick(
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 FORCE_PARTS = ("contact_force", "touch", "imu", "force_torque")
-"""Observation parts that depend on constraint forces, which are exact only to the solver's tolerance."""
+"""Parts of observations that depend on constraint forces; these forces are exact only to the solver's tolerance."""
 
 
 WALKERS = tuple(name for name in VELOCITY if name != "go1_velocity")
@@ -41,7 +41,7 @@ PARAMS: dict[str, dict[str, Any]] = {
     "go1_velocity": {"fall_angle": 0.5},
     "soft_ball": {"reach": 0.15},
 }
-"""Parameters by task. With these parameters, random field values end some episodes. For some robots, the solver's
+"""Parameters by task. With these parameters, some episodes end under random field values. For some robots, the solver's
 limits are raised, because the engines agree up to rounding only if the solver converges."""
 
 
@@ -227,7 +227,7 @@ def judge(env: lw.Env, before: Outcome, action: torch.Tensor, after: Outcome) ->
 
 
 @quick
-def test_both_engines_have_the_same_spaces(engines: Engines) -> None:
+def test_observation_and_action_spaces_are_the_same_on_both_engines(engines: Engines) -> None:
     """The state of one engine can be set on the other engine."""
     assert engines.c.state_space == engines.warp.state_space
     assert engines.c.obs_space == engines.warp.obs_space
@@ -269,7 +269,7 @@ def test_equal_positions_and_velocities_give_equal_observations_on_both_engines(
         results = []
         for env in (engines.c, engines.warp):
             env.set_state(state.to(env.action.device))
-            # a state includes fields of the last substep; the reset phases recompute these fields on each engine
+            # the state contains fields of the last substep, so the reset phases recompute these fields on each engine
             for phase in env.worlds.reset_phases(randomly=False):
                 if phase.name not in ("restart", "settle"):
                     phase.run()

@@ -1,7 +1,7 @@
 """Compare tasks of dm_control's suite with EnvPool's versions of them, on the C engine.
 
-``store_envpool.py`` stored steps of EnvPool 1.2.5, which has MuJoCo 3.6. The test sets the states that follow from the
-stored observations.
+``store_envpool.py`` stored steps of EnvPool 1.2.5, which has MuJoCo 3.6. The test computes states from the stored
+observations and sets them.
 """
 
 import functools
@@ -76,7 +76,7 @@ used."""
 
 
 def set_states(env: lw.Env, domain: str, observation: np.ndarray) -> None:
-    """Set the states that follow from observations."""
+    """Compute states from observations, and set them."""
     state = env.get_state()
     parts = {name: observation[:, part] for name, part in env.obs_space.parts.items()}
     fields = env.state_space.split(state)
@@ -89,7 +89,7 @@ def set_states(env: lw.Env, domain: str, observation: np.ndarray) -> None:
         fields["mocap_pos"][:, ::2] = torch.from_numpy(parts["target_position"] + hinge[::2])
     if "to_target" in parts:
         fields["mocap_pos"].zero_()
-        finger = -env.get_obs(state)[:, env.obs_space.parts["to_target"]]  # the observation with a target at the origin
+        finger = -env.get_obs(state)[:, env.obs_space.parts["to_target"]]  # the target is at the origin
         fields["mocap_pos"][:, :2] = finger + torch.from_numpy(parts["to_target"])
     env.set_state(state)
 

@@ -47,11 +47,10 @@ WITH_FORCES = [task for task in TASKS if "cfrc_ext" in fields(task)]
 
 
 class SensorStage:
-    """A mixin that makes Gymnasium environments use the Newton solver, and contact forces of the last substep's sensor
-    stage.
+    """A mixin for Gymnasium environments: they use the Newton solver and the contact forces of the last substep.
 
     Gymnasium computes ``cfrc_ext`` again after the last substep. With the mixin, a sensor makes MuJoCo compute this
-    field, as in lyceum_warp.
+    field in the sensor stage of the substep, as in lyceum_warp.
     """
 
     def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -156,7 +155,7 @@ class Pair:
         return np.float32(self.middle + 1.33 * self.reach * self.rng.uniform(-1.0, 1.0, self.middle.shape))
 
     def step(self) -> Step:
-        if self.rng.random() < 0.7:  # otherwise the last action is repeated, so that the robot moves further
+        if self.rng.random() < 0.7:  # with probability 0.3, repeat the last action, so that the robot moves further
             self.held = self.action()
         self.ours.step(torch.from_numpy(self.held[None]))
         obs, reward, terminated, truncated, info = self.theirs.step(self.held.astype(np.float64))
@@ -256,7 +255,7 @@ def test_evaluation_metric_of_a_pendulum_is_its_angle_or_height(
 
 
 def test_force_at_the_end_of_the_rail_equals_that_of_gymnasium() -> None:
-    """The test places the cart at the end of the rail, because the pole falls earlier under random actions."""
+    """The test places the cart at the end of the rail, because under random actions, the pole falls too early."""
     pair = Pair(make_ours("inverted_double_pendulum"), make_theirs("inverted_double_pendulum"))
 
     def drive_to_the_end(data: mujoco.MjData) -> None:
@@ -319,8 +318,8 @@ RANGES = [(task, name) for task in HEALTHY for name in inspect.signature(unchang
 
 @pytest.mark.parametrize(("task", "bounded"), [*((task, None) for task in HEALTHY), *RANGES])
 def test_terminal_states_are_those_of_gymnasium(task: str, bounded: str | None) -> None:
-    """Random states lie on both sides of the bounds of termination. A case checks either all bounds, or one range while
-    the other ranges are too wide to matter."""
+    """Random states lie on both sides of the bounds of termination. A case checks either all bounds, or a single
+    range; the other ranges are then too wide to matter."""
     wide = {name: (-1e6, 1e6) for other, name in RANGES if other == task and bounded not in (None, name)}
     if bounded is not None and math.isinf(max(keywords(task)[bounded])):
         wide[bounded] = (keywords(task)[bounded][0], 2.0)
@@ -435,8 +434,8 @@ def keywords(task: str) -> dict[str, Any]:
 
 
 def variants(default: Any) -> list[Any]:
-    """Return values that differ from the default. If the default is a range, return the sides of the range to move
-    inwards."""
+    """Return values that differ from the default. For a range, the values are names of its sides, which a test
+    moves inwards."""
     if isinstance(default, bool):
         return [not default]
     if isinstance(default, tuple):

@@ -86,7 +86,7 @@ class Pair:
         self.theirs.reset(seed=0)
         self.rng = np.random.default_rng(0)
         self.goals = 0
-        """Number of steps of the current episode in which Gymnasium-Robotics has reported the goal as achieved."""
+        """Number of steps of the current episode after which Gymnasium-Robotics reported the goal as achieved."""
         self._simulate, self.theirs.do_simulation = self.theirs.do_simulation, self._with_our_controls
 
     def _with_our_controls(self, ctrl: np.ndarray, frames: int) -> None:
@@ -222,8 +222,8 @@ MakePair = Callable[..., Pair]
 
 @pytest.fixture
 def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
-    """Return ``make_pair(theirs, sparse=True)``, which pairs an environment of this package with one of
-    Gymnasium-Robotics."""
+    """Return ``make_pair(theirs, **params)``, which pairs an environment of this package with the Gymnasium-Robotics
+    environment ``theirs``."""
 
     def make(theirs: Any = None, **params: Any) -> Pair:
         ours = shared_env(task, autoreset=False, horizon=0, nthread=1, **params)
@@ -350,7 +350,8 @@ def test_fixed_resets_give_the_initial_positions_of_the_model(make_pair: MakePai
 
 @pytest.mark.usefixtures("freed")
 def test_random_resets_have_the_distribution_of_gymnasium_robotics(task: str) -> None:
-    """Compare each number of the first observations by a Kolmogorov-Smirnov test, and their correlations."""
+    """Compare the numbers in the first observations: their distributions by Kolmogorov-Smirnov tests, and their
+    correlations."""
     n, m = 400, 1000
     env, original = lw.make(task, engine="mujoco", nworld=m, nthread=1), registered(task)
     ours = env.obs.numpy().astype(np.float64)

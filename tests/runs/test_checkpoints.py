@@ -109,7 +109,7 @@ def test_missing_checkpoint_raises_an_error_that_names_it(run: Run) -> None:
         load(run)
 
 
-def test_a_policy_of_any_class_is_saved_without_a_value_function(tmp_path: Path) -> None:
+def test_policy_of_a_custom_class_is_loaded_into_a_given_policy_and_has_no_value_function(tmp_path: Path) -> None:
     policy, run = Mine(), Run.create(tmp_path / "run", {})
     torch.nn.init.constant_(policy.gain, 3.0)
     run.save(policy_content(1, policy), {})

@@ -28,7 +28,7 @@ with run_lock(Path(sys.argv[1])):
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[str]:
-    """Lock a folder in another process, yield the process as errors name it, and kill it at the end."""
+    """Lock a folder in another process; yield the description of this process in errors, and kill it at the end."""
     command = [sys.executable, "-c", OTHER, str(folder)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None and other.stdout.readline() == "locked\n"
@@ -47,7 +47,7 @@ def test_second_writer_raises_an_error_until_the_first_writer_ends(tmp_path: Pat
         pass
 
 
-def test_run_that_another_process_writes_is_resumed_only_with_take_over(
+def test_run_that_another_process_writes_is_resumed_only_with_the_flag_take_over(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"
@@ -94,7 +94,7 @@ def test_lock_of_another_host_is_taken_over_only_with_the_flag_take_over(
 
 
 def test_writer_stops_writing_after_its_lock_was_taken_over(tmp_path: Path) -> None:
-    """At its end, the old writer does not remove the lock of the new writer."""
+    """When the old writer ends, it does not remove the lock of the new writer."""
     folder, found = tmp_path / "run", {}
 
     def callback(iteration: lw.Iteration) -> None:

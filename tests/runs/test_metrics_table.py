@@ -62,7 +62,7 @@ def test_file_that_is_not_a_metrics_table_raises_an_error(table: Path) -> None:
         read_metrics(table)
 
 
-@pytest.mark.parametrize("place", [0, 12, 16])  # damage each of the two column names, and a number
+@pytest.mark.parametrize("place", [0, 12, 16])  # a byte in each of the two column names, and one in a number
 def test_metrics_table_with_an_invalid_byte_raises_an_error_and_is_not_changed(place: int, table: Path) -> None:
     damaged = bytearray(b"iteration,value\n1,2\n2,3\n")
     damaged[place] = 0xFF

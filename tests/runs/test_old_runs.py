@@ -28,7 +28,9 @@ def test_policy_and_value_function_of_an_old_run_are_loaded(old_run: Path) -> No
     assert value.discount == 0.995
 
 
-def test_old_run_is_evaluated_with_its_own_physics(old_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_old_run_is_evaluated_with_the_physics_of_its_training(
+    old_run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["eval", str(old_run), "--episodes", "2"]) == 0
     assert "hopper: 2 episodes of the mean policy" in capsys.readouterr().out
 
@@ -42,7 +44,7 @@ def test_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.Cap
 
 
 @pytest.mark.parametrize("gamma", [0.9, 0.995])
-def test_value_function_of_an_old_run_has_the_scale_of_its_release(gamma: float, old_run: Path) -> None:
+def test_value_function_without_a_scale_gets_the_scale_of_its_release(gamma: float, old_run: Path) -> None:
     """The file of the old run lacks the scale, which was 1 / (1 - gamma)."""
     content = torch.load(old_run / "checkpoint.pt", weights_only=True)
     content["value"]["shape"] |= {"scale": 1.0 / (1.0 - gamma), "discount": gamma}
@@ -74,7 +76,7 @@ def test_run_of_release_0_1_is_loaded_and_evaluated(run: Path, capsys: pytest.Ca
     assert "2 episodes of the mean policy" in capsys.readouterr().out
 
 
-def test_run_of_release_0_1_is_resumed_and_starts_another_run(run: Path, tmp_path: Path) -> None:
+def test_run_of_release_0_1_is_resumed_and_new_training_starts_from_it(run: Path, tmp_path: Path) -> None:
     before = Run.open(run)
     assert main(["train", "--resume", str(run), "--trust", "--iterations", "4", *QUIET]) == 0
     after = Run.open(run)

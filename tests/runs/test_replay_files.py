@@ -43,7 +43,7 @@ class Killed(BaseException):
     (replay_files, "write_content", 0), (replay_files, "write_content", 7), (Run, "save", 0),
     (saving, "clean_replay", 0),
 ])  # fmt: skip
-def test_run_continues_identically_after_its_save_was_killed_at_any_file(
+def test_run_continues_identically_after_a_save_was_killed_at_any_point(
     owner: Any, name: str, calls: int, whole: list[dict[str, Any]], tmp_path: Path
 ) -> None:
     """Each iteration overwrites 12 of 20 steps, so a save has begun to replace files of the last checkpoint when the
@@ -82,10 +82,10 @@ def test_an_interrupted_run_continues_identically(whole: list[dict[str, Any]], t
     np.testing.assert_equal(numbers(tmp_path / "run"), whole)
 
 
-def test_save_writes_only_the_parts_of_the_buffer_that_have_grown(
+def test_save_writes_only_those_files_of_the_buffer_that_have_grown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A part of the buffer has 4 of 200 steps, and an iteration fills three parts."""
+    """The buffer of 200 steps is saved in files of 4 steps each, and each iteration fills three files."""
     written: list[str] = []
     write: Callable[..., None] = replay_files.write_content
 

@@ -37,7 +37,7 @@ def test_saving_takes_a_small_fraction_of_the_training_time(
         saver = Saver(run, check, npg)
         saver.save()
     assert saver.saved == 0 and not saver.due()
-    saver._seconds = seconds  # a save with more worlds would take so long
+    saver._seconds = seconds  # simulate the save of a larger run, which takes this long
     saver._when -= 0.9 * wait
     assert not saver.due()
     saver._when -= 0.2 * wait

@@ -93,7 +93,7 @@ def env_of(folder: Path) -> Env:
 
 
 def returns(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Return the line of returns that eval prints."""
+    """Return the line in which eval prints the returns."""
     capsys.readouterr()
     assert cli.main(["eval", *arguments, "--episodes", "2"]) == 0
     output = capsys.readouterr()

@@ -1,4 +1,4 @@
-"""Test that the code and files in another user's run folder are not used until this user trusts the folder."""
+"""Test that the code and files in a run folder of another user are not used until the folder is trusted."""
 
 import json
 import shutil
@@ -166,7 +166,7 @@ def test_run_with_an_edited_path_raises_an_error(
     with pytest.raises(ValueError, match=r"was not made by you .*--trust") as refusal:
         run_env(run, saved.options, saved.params)
     assert str(file) in str(refusal.value) and not witness.exists()
-    if attack in (names_a_table, names_a_model):  # the given task reads a table that the folder names
+    if attack in (names_a_table, names_a_model):  # a given task would also read the file that the run's folder names
         with pytest.raises(ValueError, match=r"was not made by you .*--trust"):
             run_env(run, saved.options, saved.params, task="point_mass")
 
@@ -204,7 +204,9 @@ def test_runs_of_this_user_stay_trusted_after_a_move_and_a_task_edit(made: Path,
         file.write_text(SOURCE)
 
 
-def test_run_of_a_task_of_the_package_needs_no_trust(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_of_a_task_of_the_package_is_used_without_being_trusted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     assert train(tmp_path / "run", "--iterations", "1", "--horizon", "8") == 0
     assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "1"]) == 0

@@ -83,7 +83,7 @@ def test_terminal_initial_state_does_not_end_an_episode(autoreset: bool, engine:
     assert not env.done.any()
 
 
-def test_reset_step_in_next_step_mode_does_not_count_as_an_episode() -> None:
+def test_step_that_only_resets_a_world_does_not_count_as_an_episode() -> None:
     envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(
         GymnasiumVectorEnv(Leave, N, autoreset_mode=AutoresetMode.NEXT_STEP)
     )

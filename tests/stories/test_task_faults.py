@@ -124,7 +124,7 @@ def test_invalid_randomized_model_field_causes_a_fault_in_its_world(engine: str)
     env.set_params(damping=[1.0, -1.0, 1.0])
     env.rand_reset()
     state = env.get_state()
-    assert torch.equal(env.get_obs(state), env.obs)  # scratch worlds have the same states
+    assert torch.equal(env.get_obs(state), env.obs)  # get_obs computes the same observations from the state
     env.step()
     assert [lw.Done(reason) for reason in env.done_reason.tolist()] == [0, lw.Done.MODEL, 0]
     assert env.reward[1] == 0.0
@@ -135,7 +135,7 @@ def test_invalid_randomized_model_field_causes_a_fault_in_its_world(engine: str)
     assert env.fault_counts["model"] == 2
 
 
-def test_state_made_from_parts_has_the_nominal_model_by_default() -> None:
+def test_state_assembled_from_its_parts_has_the_nominal_model_by_default() -> None:
     plan = lw.MPPI(Faulty, samples=2, horizon=2)
     columns = plan.env.state_space.parts["body_mass"]
     assert plan.state_of(qpos=[0.0])[columns].tolist() == [0.0, 1.0]

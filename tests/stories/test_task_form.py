@@ -1,7 +1,6 @@
-"""Test features of the task form through the public interface, such as randomized dynamics, observation groups and
-noise.
+"""Test features of tasks through the public interface, such as randomized dynamics, observation groups and noise.
 
-The rules of ``check_task`` cover each feature for any task; these tests need particular tasks.
+``check_task`` tests each feature for any task; the tests in this file need particular tasks.
 """
 
 from pathlib import Path
@@ -56,7 +55,7 @@ def draw_wind(s: WindyWorld, p: PuckParams, rng: Row[wp.uint32]):
 
 
 class Windy(lw.Task):
-    """A force that is drawn at a reset and stays constant during the episode."""
+    """A random force that is chosen at a reset and stays constant during the episode."""
 
     model = Drawn.model
     obs = {"x": 1, "wind": 1}
@@ -158,7 +157,7 @@ def test_model_fields_can_be_set_in_an_environment_of_any_task(engine: str) -> N
     assert torch.equal(other.field("body_mass"), masses)
 
 
-def test_getters_use_the_dynamics_of_the_given_state() -> None:
+def test_getters_use_the_model_fields_in_the_given_state() -> None:
     env = lw.make(Drawn, nworld=2, horizon=0)
     before = env.get_state()
     action = random_actions(env, 1)[0]
@@ -297,7 +296,7 @@ def test_a_planner_uses_the_model_in_the_state_unless_nominal_model_is_set(task:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_inputs_that_a_reset_draws_affect_steps_and_rollouts(engine: str) -> None:
+def test_inputs_randomized_at_a_reset_affect_steps_and_rollouts(engine: str) -> None:
     env = lw.make(Windy, nworld=2, engine=engine, autoreset=False, horizon=0)
     loop = OpenLoop(lw.make(Windy, nworld=2, engine=engine, autoreset=False, seed=3), 6)
     state = env.get_state()[0].clone()
@@ -523,7 +522,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
 
 
 @pytest.mark.parametrize(("changes", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_error_in_the_task_form_raises_one_line_that_names_it(
+def test_error_in_a_task_definition_raises_one_line_that_names_it(
     changes: list[tuple[str, str]], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=message) as caught:

@@ -1,4 +1,4 @@
-"""Test that an error in a task file raises one line with its fix, and that the corrected file is loaded.
+"""Test that mistakes in a task file raise one-line errors that suggest a fix, and that the corrected file is loaded.
 
 Tests in tests/binding check the same messages, module by module. New users of the package made the mistakes in this
 file.

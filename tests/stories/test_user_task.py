@@ -205,13 +205,13 @@ def random_steps(env: lw.Env, n: int, seed: int = 0) -> None:
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
-def test_user_task_follows_the_rules(module: ModuleType, engine: str) -> None:
+def test_user_task_passes_check_task(module: ModuleType, engine: str) -> None:
     check_task("follow_target", engine=engine, steps=100, frame_skip=2, gain=np.array([0.5, 1.0, 1.5, 2.0]))
 
 
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
-def test_user_task_with_scaled_actions_and_rk4_follows_the_rules(module: ModuleType, path: Path, engine: str) -> None:
+def test_user_task_with_scaled_actions_and_rk4_passes_check_task(module: ModuleType, path: Path, engine: str) -> None:
     spec = mujoco.MjSpec.from_string(module.XML)
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     check_task(f"{path}:ScaledActions", engine=engine, steps=100, model=spec, nworld=3)
@@ -308,7 +308,7 @@ def test_controls_are_computed_by_the_task_or_scaled_to_their_ranges(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_memory_advances_with_random_numbers_and_is_cleared_by_a_reset(module: ModuleType, engine: str) -> None:
+def test_task_memory_changes_in_every_step_and_is_cleared_by_a_reset(module: ModuleType, engine: str) -> None:
     env = lw.make("follow_target", engine=engine, nworld=2, horizon=3, seed=4)
     first = []
     for i in range(2):

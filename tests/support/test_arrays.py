@@ -26,7 +26,7 @@ def test_torch_view_shares_memory_with_the_warp_array() -> None:
     assert array.numpy().tolist() == [[2.0] * 3] * 2
 
 
-def test_launch_over_rows_writes_only_masked_rows() -> None:
+def test_launch_rows_writes_only_masked_rows() -> None:
     source, target = (wp.full((3, 4), value, dtype=float, device="cpu") for value in (1.0, 2.0))
     mask = wp.array([True, False, True], dtype=bool, device="cpu")
     launch_rows(state.copy_rows, mask, source, target)
@@ -40,7 +40,7 @@ def test_launch_over_an_empty_array_does_nothing() -> None:
 
 
 @pytest.mark.parametrize("widths", [[1], [3, 2, 1, 4], [2, 0, 1, 3, 2, 1, 5]])
-def test_several_rows_are_copied_to_separate_targets(widths: list[int]) -> None:
+def test_several_arrays_are_copied_to_separate_targets_in_masked_worlds(widths: list[int]) -> None:
     mask = wp.array([True, False, True], dtype=bool, device="cpu")
     rows = [wp.full((3, width), 0.5 + k, dtype=float, device="cpu") for k, width in enumerate(widths)]
     wide = [wp.zeros((3, width), dtype=wp.float64, device="cpu") for width in widths]

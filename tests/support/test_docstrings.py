@@ -30,7 +30,7 @@ def test_help_shows_every_attribute_docstring(kind: type) -> None:
         assert f"{name}: {' '.join(doc.split())}" in text
 
 
-def test_help_of_done_explains_every_bit() -> None:
+def test_help_of_class_done_explains_every_bit() -> None:
     text = page(lw.Done)
     for bit in lw.Done:
         assert f"{bit.name} ({int(bit)}): " in text

@@ -53,7 +53,7 @@ def test_signal_after_the_end_of_a_postponed_context_raises_interrupted() -> Non
             signal.raise_signal(signal.SIGTERM)
 
 
-def test_second_signal_raises_immediately_if_insist_is_true() -> None:
+def test_postponed_with_insist_raises_interrupted_at_the_second_signal() -> None:
     reached = []
     with signals():
         with pytest.raises(Interrupted) as raised, postponed(insist=True):
@@ -69,7 +69,7 @@ def test_second_signal_raises_immediately_if_insist_is_true() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_second_signal_in_an_obeyed_context_raises_interrupted_and_the_third_is_ignored() -> None:
+def test_obeyed_raises_interrupted_at_the_second_signal_and_ignores_the_third() -> None:
     with signals():
         with pytest.raises(Interrupted):
             signal.raise_signal(signal.SIGINT)
@@ -80,7 +80,7 @@ def test_second_signal_in_an_obeyed_context_raises_interrupted_and_the_third_is_
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
-def test_an_obeyed_context_does_not_replace_ignored_signals_or_other_handlers() -> None:
+def test_obeyed_does_not_replace_ignored_signals_or_other_handlers() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with signals():
         with pytest.raises(Interrupted):

@@ -19,7 +19,7 @@ def test_mean_interval_of_five_values() -> None:
     assert math.isnan(mean_interval([1.0])[1])
 
 
-def test_interval_for_two_paired_shares_covers_their_difference() -> None:
+def test_interval_for_two_paired_proportions_covers_their_difference() -> None:
     random = np.random.default_rng(0)
     for low, high in ((0.05, 0.1), (0.3, 0.6)):
         inside = 0

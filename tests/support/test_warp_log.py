@@ -1,4 +1,4 @@
-"""Test that Warp does not print at its start that a CUDA driver is missing."""
+"""Test that Warp starts without printing that a CUDA driver is missing."""
 
 import subprocess
 import sys

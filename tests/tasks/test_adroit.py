@@ -71,7 +71,7 @@ RANGES: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def test_resets_draw_from_the_ranges_of_the_parameters(shared_env: SharedEnv, task: str) -> None:
+def test_resets_randomize_within_the_ranges_of_the_parameters(shared_env: SharedEnv, task: str) -> None:
     env = shared_env(task, nworld=2, nthread=1, **RANGES[task])
     place = {name: part[1].tolist() for name, part in env.state_space.split(env.get_state()).items()}
     moved = place["mocap_pos"][3:]

@@ -60,8 +60,8 @@ def test_a_scripted_grasp_lifts_the_pot_in_every_world(shared_env: SharedEnv) ->
 
 @pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("place", [None, (0.05, 0.01, 0.1)])
-def test_random_resets_draw_the_position_and_yaw_of_the_pot(place: tuple[float, ...] | None) -> None:
-    """Both handles stay within reach, because the yaw is drawn around 90 degrees."""
+def test_random_resets_change_the_position_and_yaw_of_the_pot(place: tuple[float, ...] | None) -> None:
+    """Both handles stay within reach, because the yaw is a random angle around 90 degrees."""
     env = lw.make("aloha_lift", engine="mujoco", nworld=1000, **({} if place is None else {"place": place}))
     env.rand_reset(0)
     qpos, qvel = positions(env)

@@ -79,7 +79,7 @@ def test_observation_and_reward_equal_the_formulas_of_lyceum(shared_env: SharedE
 
 
 @pytest.mark.usefixtures("freed")
-def test_random_resets_draw_the_position_of_the_ball() -> None:
+def test_random_resets_change_the_position_of_the_ball() -> None:
     env = lw.make("arm_hand_pickup", engine="mujoco", nworld=2000)
     qpos, qvel = positions(env)
     check_uniform(qpos[:, 9:11] / np.float32([0.15, 0.1]))

@@ -17,7 +17,7 @@ def clock(env: lw.Env) -> torch.Tensor:
     return env.obs_space.split(env.obs)["clock"].clone()
 
 
-def test_the_clock_turns_at_the_gait_frequency(g1: lw.Env) -> None:
+def test_gait_clock_turns_at_the_gait_frequency(g1: lw.Env) -> None:
     g1.rand_reset(seed=0)
     begin = clock(g1)
     angle = 2.0 * np.pi * g1.task.params["gait_frequency"] * g1.timestep
@@ -46,7 +46,7 @@ def test_gait_clock_reward_is_the_share_of_feet_that_follow_the_clock(g1: lw.Env
     assert seen == {0.0, 1.0, 2.0}
 
 
-def test_costs_of_fast_motion_grow_with_the_steps_of_a_world(g1: lw.Env) -> None:
+def test_costs_of_fast_motion_grow_with_the_number_of_steps_of_a_world(g1: lw.Env) -> None:
     action = torch.linspace(-0.2, 0.2, 12).repeat(8, 1)
     costs = []
     for steps in (0.0, 1000.0, 4000.0, 9000.0):

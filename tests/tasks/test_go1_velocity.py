@@ -157,7 +157,7 @@ def test_commands_have_the_distribution_of_mjlab() -> None:
 
 
 def command_of(env: lw.Env) -> torch.Tensor:
-    """Return the drawn velocity, the heading and the timer of each world's command, (nworld, 5)."""
+    """Return the random velocity, the heading and the timer of each world's command, (nworld, 5)."""
     parts = env.state_space.split(env.get_state())
     return torch.cat([parts[name] for name in ("drawn_velocity", "heading_target", "command_timer")], dim=1)
 

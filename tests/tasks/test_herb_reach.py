@@ -197,7 +197,7 @@ def test_reward_evaluation_and_observation_equal_their_formulas(shared_env: Shar
 
 
 @pytest.mark.usefixtures("freed")
-def test_random_resets_draw_targets_in_front_of_each_shoulder_and_arms_near_home() -> None:
+def test_random_resets_place_targets_in_front_of_each_shoulder_and_arms_near_home() -> None:
     env = lw.make("herb_reach", engine="mujoco", nworld=2000)
     env.rand_reset(0)
     low, high = np.float32([0.6, 0.1, 0.7]), np.float32([0.95, 0.6, 1.3])

@@ -118,7 +118,7 @@ def test_task_succeeds_after_ten_consecutive_steps_above_the_goal() -> None:
 
 @pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("area", [None, (0.4, 0.5, 0.0, 0.3)])
-def test_random_resets_draw_the_position_and_yaw_of_the_cube(area: tuple[float, ...] | None) -> None:
+def test_random_resets_change_the_position_and_yaw_of_the_cube(area: tuple[float, ...] | None) -> None:
     env = lw.make("panda_lift", engine="mujoco", nworld=2000, **({} if area is None else {"area": area}))
     env.rand_reset(0)
     found = cube(env)

@@ -53,7 +53,7 @@ def test_action_accelerates_only_the_agent(shared_env: SharedEnv) -> None:
     np.testing.assert_allclose(qpos, [[0.02 * speed, 0, 1, 0], [0, -0.02 * speed, 1, 0]], rtol=1e-6, atol=1e-9)
 
 
-def test_random_resets_draw_agent_and_target_from_the_square() -> None:
+def test_random_resets_place_agent_and_target_within_the_square() -> None:
     """The fixed reset puts the agent at the origin and the target at (1, 0)."""
     env = lw.make("point_mass", engine="mujoco", nworld=2000)
     env.rand_reset(0)

@@ -125,8 +125,8 @@ def targets(env: lw.Env) -> np.ndarray:
 
 @pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("scale", [None, (0.1, 0.5, 0.0)])
-def test_random_resets_draw_the_target_from_its_box(scale: tuple[float, float, float] | None) -> None:
-    """The arm starts at rest with all joints at zero, and each world draws its own target."""
+def test_random_resets_place_the_target_within_its_box(scale: tuple[float, float, float] | None) -> None:
+    """The arm starts at rest with all joints at zero, and each world has another random target."""
     env = lw.make("reach", engine="mujoco", nworld=2000, **({} if scale is None else {"target_range": scale}))
     env.rand_reset(0)
     size = np.array(scale or (0.3, 0.2, 0.25))
@@ -141,7 +141,7 @@ def test_random_resets_draw_the_target_from_its_box(scale: tuple[float, float, f
 
 
 @pytest.mark.usefixtures("freed")
-def test_random_start_draws_every_joint_from_its_range() -> None:
+def test_random_start_places_every_joint_within_its_range() -> None:
     """The arm starts at rest."""
     env = lw.make("reach", engine="mujoco", nworld=2000, random_start=True)
     qpos, qvel = positions(env)

@@ -100,7 +100,7 @@ def test_random_resets_place_ball_and_target(shared_env: SharedEnv) -> None:
 
 
 def test_constraint_buffers_of_a_flex_model_hold_bursts_of_contacts(shared_env: SharedEnv) -> None:
-    """Fingers that press into the ball need more than twice as many constraints as the probe's peak."""
+    """Fingers that press into the ball cause more than twice as many constraints as the states that the probe tries."""
     model = shared_env("soft_ball").model
     assert probe_sizes(model) >= (256, 512)
     env = shared_env("soft_ball", engine="warp", nworld=4, autoreset=False)

@@ -1,4 +1,4 @@
-"""Check the distributions of drawn numbers and model fields."""
+"""Check the distributions of random numbers and of randomized model fields."""
 
 import numpy as np
 from checks import check_uniform
@@ -14,7 +14,7 @@ def centred(x: np.ndarray, low: float, high: float) -> np.ndarray:
     return np.clip(scaled, -1.0, 1.0)
 
 
-def test_random_numbers_have_their_distributions() -> None:
+def test_random_numbers_have_the_expected_distributions() -> None:
     check_uniform(centred(np.log(call("log_uniform", low=1e-4, high=2.0).result[:, None]), np.log(1e-4), np.log(2.0)))
     counts = np.bincount(call("uniform_int", least=2, most=5).result)
     assert counts[:2].sum() == 0 and len(counts) == 6 and np.abs(counts[2:] - N / 4).max() < 5 * np.sqrt(N * 3 / 16)

@@ -6,7 +6,7 @@ from term_calls import N, call
 DT, SUBSTEP, SKIP = 0.02, 0.005, 4
 
 
-def test_foot_timers_and_swings_follow_a_contact_sequence() -> None:
+def test_contact_sequences_determine_foot_timers_and_swings() -> None:
     """Each world has its own contact sequence, and the test compares the timers with counts of substeps."""
     rng = np.random.default_rng(1)
     touching = rng.random((N, 200)) < 0.5

@@ -11,7 +11,7 @@ def near(share: np.ndarray, wanted: float) -> bool:
     return bool(abs(share.mean() - wanted) < 5.0 * np.sqrt(wanted * (1.0 - wanted) / len(share)))
 
 
-def test_velocity_command_is_drawn_from_its_ranges() -> None:
+def test_velocity_commands_are_uniform_within_their_ranges() -> None:
     low, high = np.array([-1.0, -0.5, -2.0]), np.array([3.0, 0.5, 0.0])
     velocity = call("draw_velocity", drawn_velocity=np.zeros((1, 3)), command_low=low, command_high=high)
     check_uniform((velocity.after["drawn_velocity"][:, 0] - (low + high) / 2) / ((high - low) / 2))
@@ -34,7 +34,7 @@ def test_the_given_share_of_commands_has_only_a_forward_velocity() -> None:
     np.testing.assert_allclose(after[~forward], before[~forward, 0], rtol=1e-6)
 
 
-def test_timer_expires_after_its_seconds() -> None:
+def test_timer_expires_after_the_given_seconds() -> None:
     timer, due = np.array([0.1]), []
     for _ in range(6):
         due.append(bool(call("is_due", timer=timer).result[0]))

@@ -29,7 +29,7 @@ def test_settings_to_try_for_hopper_have_lower_limits_and_the_same_control_time_
     assert not {"noslip", "impratio", "room"} & {setting.group for setting in settings}
 
 
-def test_elliptic_cone_and_noslip_add_settings_to_try(shared_env: SharedEnv) -> None:
+def test_settings_to_try_include_those_for_an_elliptic_cone_and_for_noslip(shared_env: SharedEnv) -> None:
     spec = lw.gymnasium_model("hopper.xml").spec()
     spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10
     spec.option.noslip_iterations = 5

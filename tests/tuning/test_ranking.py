@@ -16,7 +16,9 @@ def test_rank_correlations_are_spearman_correlations_with_mean_ranks_for_ties() 
     first = torch.tensor([order, [1.0, 2.0, 2.0, 3.0], [0.0, 1.0, 5.0, FAILED], [7.0] * 4, order])
     second = torch.tensor([[1.0, 3.0, 2.0, 4.0], order, [9.0, 4.0, 1.0, 90.0], order, [2.0] * 4])
     found = rank_correlations(first, second)
-    assert found.tolist() == pytest.approx([0.8, 0.9487, -1.0, 0.0], abs=1e-4)  # a row of equal numbers is omitted
+    assert found.tolist() == pytest.approx(
+        [0.8, 0.9487, -1.0, 0.0], abs=1e-4
+    )  # states in which all samples have equal returns are omitted
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +41,7 @@ def test_sparse_jacobian_keeps_the_ranks_of_samples_but_coarse_physics_change_th
     assert verdict(crude, "strict") in ("ranks badly", "not shown") and verdict(crude, "any") in ("same", "no gain")
 
 
-def test_standing_moving_and_fallen_states_are_from_different_steps(rankings: Rankings) -> None:
+def test_standing_moving_and_fallen_start_states_have_the_expected_step_counts(rankings: Rankings) -> None:
     columns = rankings.reference.state_space.parts["step"]
     steps = {kind: start[:, columns] for kind, start in rankings.starts.items()}
     assert (steps["standing"] == 0).all() and (steps["moving"] == 30).all() and (steps["fallen"] > 100).all()

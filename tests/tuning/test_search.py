@@ -1,4 +1,4 @@
-"""Test the results of lw.tune, its resumption from their file, and its errors."""
+"""Test the results of lw.tune, resumption from the file of results, and errors."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -92,7 +92,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_policy_of_a_run_plays_with_the_parameters_of_the_run(run: Path, tmp_path: Path) -> None:
+def test_tune_evaluates_the_policy_of_a_run_with_the_parameters_of_the_run(run: Path, tmp_path: Path) -> None:
     rows: list[dict[str, Any]] = []
 
     def stop(row: dict[str, Any]) -> None:

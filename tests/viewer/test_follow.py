@@ -106,7 +106,7 @@ def runs(process: int) -> bool:
 
 
 @pytest.mark.long
-def test_viewer_that_still_waits_for_a_run_ends_when_its_program_ends(tmp_path: Path) -> None:
+def test_viewer_that_waits_for_a_run_ends_with_the_program_that_opened_it(tmp_path: Path) -> None:
     command = [sys.executable, "-c", PROGRAM, str(tmp_path / "run")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None
@@ -136,7 +136,9 @@ def test_train_with_view_opens_a_viewer(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.long
-def test_viewer_of_a_missing_task_ends_with_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_viewer_of_a_run_whose_task_is_missing_prints_one_line_and_ends(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     assert train(tmp_path / "run", "--iterations", "1") == 0
     run = Run.open(tmp_path / "run")
     run.amend(task="missing_task")

@@ -21,7 +21,7 @@ def episode(env: lw.Env) -> Trajectory:
 
 
 @pytest.mark.parametrize("case", ["one episode", "two episodes", "async", "one step"])
-def test_episodes_are_drawn_as_png(case: str, episode: Trajectory, env: lw.Env, tmp_path: Path) -> None:
+def test_episodes_are_plotted_as_png(case: str, episode: Trajectory, env: lw.Env, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     match case:
         case "one episode":
@@ -36,7 +36,7 @@ def test_episodes_are_drawn_as_png(case: str, episode: Trajectory, env: lw.Env, 
     assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 10_000
 
 
-def test_error_without_matplotlib_names_the_extra(
+def test_error_names_the_extra_if_matplotlib_is_missing(
     episode: Trajectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)

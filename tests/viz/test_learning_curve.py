@@ -42,14 +42,14 @@ def test_learning_curve_of_a_task_with_metrics_has_a_panel_for_them(tmp_path: Pa
     assert sizes[1] > sizes[0]
 
 
-def test_learning_curve_of_a_run_without_rows_raises_an_error(run: Run) -> None:
+def test_learning_curve_of_a_run_without_complete_iterations_raises_an_error(run: Run) -> None:
     pytest.importorskip("matplotlib")
     cut_rows(run.metrics, 0)
     with pytest.raises(ValueError, match="has no complete iteration to plot: continue its training"):
         learning_curve(run)
 
 
-def test_rewards_are_drawn_if_no_episode_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_learning_curve_shows_rewards_if_no_episode_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
     figures = []
     monkeypatch.setattr(module, "save_png", lambda figure, out: figures.append(figure))

@@ -153,7 +153,7 @@ def video_of(model: mujoco.MjModel, out: Path, *, fps: float = 30.0, most_waitin
     return video.Recorder(model, out, size=SMALL, fps=fps, most_waiting=most_waiting)
 
 
-def test_single_shots_show_their_model_ghosts_and_lines(model: mujoco.MjModel, tmp_path: Path) -> None:
+def test_video_of_single_shots_shows_model_fields_ghosts_and_lines(model: mujoco.MjModel, tmp_path: Path) -> None:
     small, red = {"geom_size": np.array([[0.1, 0, 0], [0.1, 0, 0]])}, (1.0, 0.0, 0.0, 1.0)
 
     def write() -> Path:
@@ -164,7 +164,7 @@ def test_single_shots_show_their_model_ghosts_and_lines(model: mujoco.MjModel, t
             shot(0.0, lines=[(np.array([[-1.5, 0, -1], [1.5, 0, -1]]), red, 2.0)]),
         ):  # fmt: skip
             mp4.add(each)
-        assert mp4.added == 6 and not mp4.finished  # no shot has waited for the process
+        assert mp4.added == 6 and not mp4.finished  # adding a shot does not wait for the render process
         return mp4.close()
 
     result = video_frames.read(drawable(write))
@@ -182,7 +182,7 @@ def test_shots_are_dropped_if_rendering_is_too_slow_and_the_video_keeps_its_leng
         mp4 = video_of(model, tmp_path / "video.mp4", most_waiting=2)
         for i in range(10):
             mp4.add(shot(0.1 * i))
-        assert mp4.added == 10 and mp4.dropped in (7, 8)  # the process may have taken one shot
+        assert mp4.added == 10 and mp4.dropped in (7, 8)  # the render process may already have taken a shot
         return mp4.close()
 
     result = video_frames.read(drawable(write))

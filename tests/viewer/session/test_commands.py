@@ -22,7 +22,7 @@ def pushed(env: lw.Env, world: int) -> bool:
     return bool(env.get_state()[world, env.state_space.parts["xfrc_applied"]].any())
 
 
-def test_a_push_ends_when_another_world_is_shown(shared_env: SharedEnv) -> None:
+def test_push_ends_when_the_viewer_shows_another_world(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True)
     for command, pushes in ((PUSH, (True, False)), (protocol.SetWorld(1), (False, False)),
@@ -33,7 +33,9 @@ def test_a_push_ends_when_another_world_is_shown(shared_env: SharedEnv) -> None:
 
 @pytest.mark.parametrize("branch", [Perturb(0 * FORCES, qpos=np.full(6, 0.1)), SetMode("passive"),
                                     SetMode("controller", "other"), protocol.SetWorld(1), StepBy(3)])  # fmt: skip
-def test_a_restored_push_ends_when_the_world_continues(shared_env: SharedEnv, branch: protocol.Command) -> None:
+def test_push_that_stepping_back_restored_ends_at_the_next_change_of_the_world(
+    shared_env: SharedEnv, branch: protocol.Command
+) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, controllers={"policy": pushing, "other": pushing}, paused=True)
     for command in (PUSH, StepBy(4), RELEASE, StepBy(2), StepBy(-4)):
@@ -43,7 +45,7 @@ def test_a_restored_push_ends_when_the_world_continues(shared_env: SharedEnv, br
     assert not pushed(env, 0)
 
 
-def test_push_that_ended_in_a_past_step_does_not_act_in_the_present(shared_env: SharedEnv) -> None:
+def test_push_that_is_released_in_a_past_step_does_not_act_in_the_newest_state(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True)
     for command in (StepBy(2), PUSH, StepBy(2), StepBy(-4), RELEASE, StepBy(2)):

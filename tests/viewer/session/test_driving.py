@@ -1,4 +1,4 @@
-"""Test that a user's velocity command replaces the command that the task draws."""
+"""Test that a user's velocity command replaces the random command of the task."""
 
 import numpy as np
 import torch
@@ -21,7 +21,9 @@ def test_command_of_the_user_is_observed_until_it_is_released(shared_env: Shared
         status = stage.frame().status
         assert status.driven and np.allclose(status.command, command)
         np.testing.assert_allclose(env.obs[0, 45:], command)
-        session.obey(protocol.Reset(random=True))  # the task draws a command, which the next frame replaces
+        session.obey(
+            protocol.Reset(random=True)
+        )  # the task chooses a random command, and the next frame replaces it by the user's command
         stage.frame()
     for end in (protocol.Drive(None), protocol.SetWorld(1)):
         session.obey(protocol.Drive(command))
@@ -45,7 +47,7 @@ def test_arrows_show_the_commanded_and_the_measured_velocity(shared_env: SharedE
     np.testing.assert_allclose(ways, expected, atol=1e-6)
 
 
-def test_task_without_velocity_commands_cannot_be_driven(shared_env: SharedEnv) -> None:
+def test_driving_a_task_without_velocity_commands_shows_a_message(shared_env: SharedEnv) -> None:
     session = Session(shared_env("hopper", nworld=2), paused=True)
     session.obey(protocol.Drive((1.0, 0.0, 0.0)))
     frame = session.stage.frame()

@@ -56,7 +56,7 @@ def test_the_history_is_bounded_and_its_end_is_reported(shared_env: SharedEnv) -
     assert plant.env is not worlds and plant.past.states.nbytes <= PLANT_HISTORY_BYTES
 
 
-def test_return_stops_at_the_end_of_the_episode_without_autoreset() -> None:
+def test_return_of_a_world_without_autoreset_stays_constant_after_its_episode() -> None:
     env = lw.make("hopper", nworld=3, autoreset=False)
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=0)
     total, over = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.bool)

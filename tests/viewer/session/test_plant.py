@@ -18,7 +18,7 @@ from lyceum_warp.viewer.session.clock import Session
 PLANNER = dict(horizon=8, samples=6, temperature=0.01, noise=0.3)
 
 
-def test_plant_keeps_its_rate_and_the_plan_is_shown() -> None:
+def test_plant_runs_in_real_time_and_the_viewer_draws_the_plan() -> None:
     env = lw.make("point_mass", autoreset=False, horizon=0)
     session = Session(env, controllers={"mppi": lw.MPPI("point_mass", **PLANNER)}, seed=0)
     begun = time.monotonic()
@@ -38,7 +38,7 @@ def test_plant_keeps_its_rate_and_the_plan_is_shown() -> None:
     assert np.isfinite(np.concatenate([frame.samples for frame in window.frames])).all()
 
 
-def test_a_planner_controls_a_copy_of_the_shown_world(shared_env: SharedEnv) -> None:
+def test_planner_controls_a_copy_of_the_world_in_view(shared_env: SharedEnv) -> None:
     env = shared_env("point_mass", nworld=3)
     mppi = lw.MPPI("point_mass", **PLANNER)
     session = Session(env, controllers={"mppi": mppi, "own": towards}, paused=True, seed=0)
@@ -147,7 +147,7 @@ def test_failing_controller_is_reported_and_stopped(
 
 
 @pytest.mark.parametrize("speed", [4.0, 16.0])
-def test_frames_are_shown_even_if_the_plant_never_waits(shared_env: SharedEnv, speed: float) -> None:
+def test_viewer_shows_frames_even_if_the_plant_never_waits(shared_env: SharedEnv, speed: float) -> None:
     env = shared_env("point_mass", autoreset=False, horizon=0)
     session = Session(env, controllers={"none": lambda state, obs: torch.zeros(2)}, seed=0)
     session.obey(protocol.SetSpeed(speed))

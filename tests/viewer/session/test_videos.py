@@ -73,7 +73,7 @@ def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> No
         time.sleep(0.5)
 
     monkeypatch.setattr(drawing.Drawing, "draw", slow)
-    monkeypatch.setattr(videos, "FPS", 5)  # the video has few poses, because they are drawn without a GPU
+    monkeypatch.setattr(videos, "FPS", 5)  # the video has only some poses, because rendering without a GPU is slow
     try:
         taker.begin(CAMERA)
         while not drawn.is_set():

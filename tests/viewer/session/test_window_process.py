@@ -116,7 +116,7 @@ def test_show_does_not_wait_for_a_window_that_hangs(shared_window: Window) -> No
         os.kill(process_of(shared_window), signal.SIGCONT)
 
 
-def test_skipped_frames_keep_their_points_and_messages_up_to_a_limit() -> None:
+def test_points_and_messages_of_skipped_frames_are_merged_up_to_a_limit() -> None:
     merged = None
     for frame in (
         frame_of(MODEL, DATA, samples=np.array([[0.0, 1, 2]]), messages=("one",)),

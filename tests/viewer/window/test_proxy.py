@@ -344,7 +344,7 @@ def test_connection_of_a_client_that_does_not_read_is_closed(monkeypatch: pytest
             client.connect(("127.0.0.1", proxy.port))
             client.sendall(f"GET {path}/ HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: {key}\r\n\r\n".encode())
             wait_until(lambda: upstream.ended == 1)
-            with pytest.raises(ConnectionError):  # a connection that waits for the client would accept these bytes
+            with pytest.raises(ConnectionError):  # an open connection would accept these bytes
                 for _ in range(1000):
                     client.send(b"x")
                     time.sleep(0.01)
@@ -386,7 +386,7 @@ def open_tab(proxy: Proxy, path: str = "/ui") -> ClientConnection:
                    additional_headers={"Cookie": cookie})  # fmt: skip
 
 
-def test_two_tabs_communicate_at_the_same_time_and_one_may_close(echo: Echo) -> None:
+def test_proxy_serves_two_tabs_at_the_same_time_and_one_may_close(echo: Echo) -> None:
     proxy, opened, _ = echo
     with open_tab(proxy) as one:
         with open_tab(proxy, "/state?sid=b") as two:

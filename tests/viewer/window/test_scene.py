@@ -33,7 +33,7 @@ def test_geom_groups_that_are_hidden_have_no_ghosts() -> None:
     assert ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(2.0)], groups=groups) == []
 
 
-def test_ghost_omits_geoms_that_coincide_with_those_of_the_shown_world() -> None:
+def test_ghost_omits_geoms_that_coincide_with_those_of_the_world_in_view() -> None:
     geoms = ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(0.0), ghost(0.5)])
     np.testing.assert_allclose([geom.pos[0] for geom in geoms], [0.5])
 
@@ -44,12 +44,14 @@ def test_traces_are_thinned_before_some_are_omitted(limit: int, number: int, bes
     traces = np.random.default_rng(0).normal(size=(number, 33, 3))
     scene = ExtraGeoms(MODEL, limit)
     geoms = scene.draw(pose(0), traces=traces, best=best)
-    assert len(geoms) <= min(limit, 160)  # traces take few of the geoms, so that ghosts can take the others
+    assert len(geoms) <= min(
+        limit, 160
+    )  # traces use only some of the available geoms, so that the others remain for ghosts
     assert (len(geoms) >= 4 * number) == (limit >= 100 and number == 10)  # a trace has at least 4 lines
     assert len(scene.draw(pose(0), [ghost(i) for i in range(20)], traces, best)) <= limit
 
 
-# the tests below check the model of the shown world
+# the tests below check the model of the world in view
 
 
 def test_model_values_of_a_world_are_set_and_reset() -> None:
