@@ -4,8 +4,9 @@
     lyceum-warp bench humanoid --tasks humanoid_stand --contestants real_time --repeats 20
 
 Starts and pushes are constants of this program. An episode lasts 20 s. ``real_time``: the plant keeps its rate, and
-the planner plans as often as it can (``lw.control_async``). ``in_turn``: the plant waits until each plan is ready. Run
-the real-time episodes on idle cores, because other processes delay plans.
+the planner plans as often as it can (``lw.control_async``). ``predicted``: in addition, the planner plans from
+predicted states (``predict=True``). ``in_turn``: the plant waits until each plan is ready. Run the real-time episodes
+on idle cores, because other processes delay plans.
 """
 
 import dataclasses
@@ -37,7 +38,9 @@ FIRST_SEED = 1000
 """Seed of the first episode's start, pushes and planner noise."""
 WALKS, UP = {"humanoid_walk": 0.5, "g1_walk": 0.3}, 1.1
 """Minimum mean speed of a walk, m/s, and minimum height of the humanoid's standing torso, m."""
-CONTESTANTS = {"real_time": "in real time", "in_turn": "the plant waits"}
+CONTESTANTS = {
+    "real_time": "in real time", "predicted": "in real time, from predicted states", "in_turn": "the plant waits",
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,8 +91,12 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     params = STARTS | TASKS[case.task]
     with experiment.cores(case.threads):
         plant = lw.make(case.task, autoreset=False, nthread=1, **params)
-        run = lw.control_async if case.contestant == "real_time" else lw.control
-        done = run(plant, planner(case.task, case.threads), steps=round(case.seconds / plant.timestep), seed=case.seed)
+        words: dict[str, Any] = dict(steps=round(case.seconds / plant.timestep), seed=case.seed)
+        if case.contestant == "in_turn":
+            done = lw.control(plant, planner(case.task, case.threads), **words)
+        else:
+            predict = case.contestant == "predicted"
+            done = lw.control_async(plant, planner(case.task, case.threads), predict=predict, **words)
     report = lw.control_report([done])
     positions = done.states[:, slice(*done.state_parts["qpos"])]
     up = positions[:, 2] > UP

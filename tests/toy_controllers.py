@@ -107,8 +107,9 @@ class SimulatedPlans:
                 self.waiting = None
         return self.plans[-1]
 
-    def publish(self, *published: Any) -> None:
-        self.waiting = published  # type: ignore[assignment]
+    def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor, action: torch.Tensor) -> None:
+        published = step, state, obs
+        self.waiting = published
         if self.running is None:
             self.begin(self.clock.time, *published)
             self.waiting = None

@@ -122,6 +122,9 @@ class Plan:
     """Seed of the first episode's initial state and noise; each further episode increases it by one."""
     real_time: bool = False
     """Step the world in real time while the planner plans, instead of waiting for each plan."""
+    predict: bool = False
+    """With --real-time, plan from the state that is predicted for the end of the current step, when the plan can first
+    apply."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder; by default runs/plan-TASK-DATE."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
@@ -151,6 +154,10 @@ class Plan:
         whole_number("seed", self.seed, low=0)
         whole_number("seed of the last episode", self.seed + self.episodes - 1, low=0)
         every = whole_number("replan_every", self.replan_every, low=1)
+        if self.predict and not self.real_time:
+            raise ValueError(
+                "--predict has no effect without --real-time, where the world waits for each plan: omit it"
+            )
         if every > 1 and self.real_time:
             raise ValueError(
                 f"--replan-every {every} has no effect with --real-time, where plans follow one another without a "
@@ -183,7 +190,7 @@ class Plan:
             "planner_model": self.planner_model and str(_model(self.planner_model)),
             "value": self.value and str(self.value.resolve()), **vars(self.planner),
             "engine": planner.env.engine.name, "episodes": self.episodes, "steps": self.steps,
-            "replan_every": every, "seed": self.seed, "real_time": self.real_time,
+            "replan_every": every, "seed": self.seed, "real_time": self.real_time, "predict": self.predict,
         }  # fmt: skip
         run = Run.create(out, config, device=self.planner.device)
         return _run(run, plant, planner, dataclasses.replace(self, replan_every=every))
@@ -308,7 +315,9 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
     )  # fmt: skip
     done: list[Trajectory] = []
     aborted: list[Trajectory] = []
-    method: Any = control_async if options.real_time else functools.partial(control, replan_every=options.replan_every)
+    method: Any = functools.partial(control, replan_every=options.replan_every)
+    if options.real_time:
+        method = functools.partial(control_async, predict=options.predict)
     shown: dict[str, Any] = dict(steps=plant.horizon, timestep=plant.timestep, real_time=options.real_time)
     end = math.inf if options.minutes is None else time.monotonic() + 60 * options.minutes
     try:

@@ -49,6 +49,12 @@ class TimedPlan:
     begun: float  # start time, in seconds on the run's clock
     seconds: float
     actions: torch.Tensor  # (horizon, nact)
+    ahead: int = 0  # number of steps by which the initial state was predicted
+
+    @property
+    def seen(self) -> int:
+        """Index of the measured state from which the plan's initial state was predicted."""
+        return self.step - self.ahead
 
 
 def check_arguments(env: Env, *, reset: bool, on_step: OnStep | None, on_abort: OnAbort | None) -> None:
@@ -130,7 +136,7 @@ class EpisodeCollector:
 
     def add_plan(self, plan: TimedPlan, quality: tuple[float, float]) -> None:
         """Add a finished plan; ``quality`` is its number of failed samples and its effective sample size."""
-        self._plans.append((plan.step, plan.begun - self.start, plan.seconds, *quality))
+        self._plans.append((plan.seen, plan.begun - self.start, plan.seconds, *quality))
 
     def before_step(self, plan: TimedPlan, now: float, age: float, *, late: bool) -> None:
         """Record ``env.action`` just before the plant applies it.

@@ -10,6 +10,7 @@ import threading
 import time
 import weakref
 from collections.abc import Iterator
+from typing import TypeAlias
 
 import torch
 
@@ -25,7 +26,7 @@ from lyceum_warp.controllers.episode_collector import (
 )
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
-from lyceum_warp.support.validate import check_kind, positive_number
+from lyceum_warp.support.validate import check_flag, check_kind, positive_number
 
 # all in seconds
 _SPIN = 0.0005  # at the end of a wait, poll the clock for this time instead of sleeping
@@ -45,6 +46,7 @@ def control_async(
     reset: bool = True,
     on_step: OnStep | None = None,
     on_abort: OnAbort | None = None,
+    predict: bool = False,
     clock: "Clock | None" = None,
 ) -> Trajectory:
     """Control one world, the plant, in real time: it steps at a fixed rate and does not wait for plans.
@@ -56,6 +58,12 @@ def control_async(
     its last action is held. This choice by time compensates for planning delays up to the length of the plan. The plant
     waits for the first plan, so the first action has age 0. Later actions are at least one step old, and exactly one
     step old if every plan takes less than a period.
+
+    With ``predict``, the controller plans from the state that is expected one step later, when the plan can first
+    apply. A copy of the plant predicts this state with the action that the plant is applying. The first action of a
+    plan that takes less than a period is then applied to the state for which it was planned. Without ``predict``, this
+    action comes too late, and only the rest of the plan applies. If the copy's episode ends in the predicted step, the
+    controller plans from the measured state.
 
     Before the clock starts, a warm-up calls the controller three times with the first state, steps the plant three
     times, and restores the plant's state. The warm-up loads kernels and captures graphs, because Warp cannot capture a
@@ -85,6 +93,7 @@ def control_async(
         on_abort: Called with the trajectory of the complete steps if an exception, such as Ctrl-C, ends the run after
             the first step. The trajectory's ``done_reason`` is 0. The loop raises the exception after calling
             ``on_abort``.
+        predict: Whether to plan from predicted states.
         clock: Replacement for the wall clock, for example to do other work while the plant waits.
 
     Returns:
@@ -97,18 +106,23 @@ def control_async(
     """
     check_arguments(env, reset=reset, on_step=on_step, on_abort=on_abort)
     check_kind("clock", clock, Clock | None, "which has now, wait_until and wait_for")
+    check_flag("predict", predict)
     period = positive_number("period", env.timestep if period is None else period, "seconds")
     if period > threading.TIMEOUT_MAX:
         raise ValueError(f"period must be at most {threading.TIMEOUT_MAX:g} seconds, not {period!r}")
     checked = CheckedController(controller, env)
     limit, first = begin_episode(env, checked, steps, seed, reset=reset)
     _capture_graphs(env)
+    copy = env.replicate() if predict else None
+    if copy is not None:
+        copy.set_state(env.get_state())
+        _capture_graphs(copy)
     clock = Clock() if clock is None else clock
     episode = EpisodeCollector(env, checked, mode="async", period=period, seed=seed, now=clock.now)
-    planner = PlannerThread(checked, clock, seed, first, reset=reset)
+    planner = PlannerThread(checked, clock, seed, first, reset=reset, copy=copy)
     with _frequent_thread_switches():
         try:
-            planner.publish(0, episode.states[0], episode.obs[0])
+            planner.publish(0, episode.states[0], episode.obs[0], None)
             planner.wait()
             episode.restart_clock()
             wall = run_plant(env, checked, planner, clock, episode, limit, on_step)
@@ -162,10 +176,10 @@ def run_plant(
         env.action[0] = controller.action(plan.actions, k - plan.step)
         now = episode.elapsed()
         # the first action has age 0, because the clock starts after the first plan
-        planned_from = episode.times[plan.step] if plan.step < k else now
+        planned_from = episode.times[plan.seen] if plan.seen < k else now
         episode.before_step(plan, now, now - planned_from, late=late)
         if k > 0:
-            plans.publish(k, episode.states[k], episode.obs[k])
+            plans.publish(k, episode.states[k], episode.obs[k], env.action[0].clone())
         env.step()
         episode.after_step(on_step)
         if env.done.item():
@@ -202,27 +216,31 @@ class PlannerThread:
         seed: Seed of the run.
         first: Number of steps between the reset and the start of the run.
         reset: Whether the run started with a reset.
+        copy: A copy of the plant that predicts the initial states of plans, or None to plan from measured states.
     """
 
     def __init__(
-        self, controller: CheckedController, clock: Clock, seed: int | None, first: int, *, reset: bool
+        self, controller: CheckedController, clock: Clock, seed: int | None, first: int, *, reset: bool,
+        copy: Env | None = None,
     ) -> None:  # fmt: skip
+        self._copy = copy
         self._controller, self._clock, self._seed, self._first, self._reset = controller, clock, seed, first, reset
         self._plans: list[TimedPlan] = []
         self._qualities: list[tuple[float, float]] = []  # quality of each plan, appended after the plan itself
         self._error: BaseException | None = None
         self._begun = threading.Event()  # set after the first plan or after an error
         # use SimpleQueue, which is implemented in C, so that no thread loses the GIL while it holds the queue's lock
-        self._states: queue.SimpleQueue[tuple[int, torch.Tensor, torch.Tensor] | None] = queue.SimpleQueue()
+        self._states: queue.SimpleQueue[Published | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="lyceum_warp planner", daemon=True)
         self._thread.start()
 
-    def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor) -> None:
-        """Pass a state to the thread. Its next plan starts from the newest state.
+    def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor, action: torch.Tensor | None) -> None:
+        """Pass a measured state to the thread, and the action that the plant applies in this state.
 
-        The caller must not change the tensors.
+        The thread plans next from the newest state. The action is None if the plant waits for the plan. The caller must
+        not change the tensors.
         """
-        self._states.put((step, state, obs))
+        self._states.put((step, state, obs, action))
 
     def wait(self) -> None:
         """Wait for the first plan."""
@@ -269,33 +287,46 @@ class PlannerThread:
             with torch.no_grad():  # the calling thread's no_grad has no effect in this thread
                 last = 0
                 while (published := self._newest_state()) is not None:
-                    self._plan(*published, last)
-                    last = published[0]
+                    last = self._plan(*published, last)
                     self._begun.set()
         except BaseException as error:
             self._error = error
         finally:
             self._begun.set()
 
-    def _newest_state(self) -> tuple[int, torch.Tensor, torch.Tensor] | None:
+    def _newest_state(self) -> "Published | None":
         published = self._states.get()
         while not self._states.empty():
             published = self._states.get()
         return published
 
-    def _plan(self, step: int, state: torch.Tensor, obs: torch.Tensor, last: int) -> None:
+    def _plan(
+        self, step: int, state: torch.Tensor, obs: torch.Tensor, action: torch.Tensor | None, last: int
+    ) -> int:  # fmt: skip
+        """Plan from a state, or from the predicted next state, and return the step of the plan's initial state."""
         controller = self._controller
         if not self._plans:
             controller(state, obs, controller.passed(max(self._first - 1, 0), self._first), step)
             controller(state, obs, 0, step)
             if self._reset:
                 controller.reset(self._seed)
-        begun = self._clock.now()
-        shift = controller.passed(self._first + last, self._first + step)
-        actions = controller(state, obs, shift, step)
-        self._plans.append(TimedPlan(len(self._plans), step, begun, self._clock.now() - begun, actions))
+        begun, ahead, copy = self._clock.now(), 0, self._copy
+        if copy is not None and action is not None:
+            copy.set_state(state[None])
+            copy.action[0] = action
+            copy.step()
+            if not copy.done.item():
+                state, obs, ahead = copy.get_state()[0], copy.obs[0].clone(), 1
+        start = step + ahead
+        actions = controller(state, obs, controller.passed(self._first + last, self._first + start), step)
+        self._plans.append(TimedPlan(len(self._plans), start, begun, self._clock.now() - begun, actions, ahead))
         # append the quality only after the plan, because the plant may be waiting for the plan
         self._qualities.append(controller.quality())
+        return start
+
+
+Published: TypeAlias = tuple[int, torch.Tensor, torch.Tensor, torch.Tensor | None]
+"""A step, with the state, the observation and the action before the step."""
 
 
 _unfinished: "weakref.WeakSet[threading.Thread]" = weakref.WeakSet()

@@ -241,6 +241,7 @@ def test_chosen_plan_update_is_saved_and_printed(tmp_path: Path, capsys: pytest.
     (["--replan-every", "0"], ["replan_every", "0"]),
     (["--replan-every", "11"], ["replan_every=11", "a plan of 10 actions"]),
     (["--replan-every", "2", "--real-time"], ["--replan-every 2", "--real-time"]),
+    (["--predict"], ["--predict", "--real-time"]),
     (["--episodes", "0"], ["episodes", "0"]),
     (["--steps", "0"], ["steps", "0"]),
     (["--param", "mass=2"], ["mass"]),

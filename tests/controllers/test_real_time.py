@@ -64,6 +64,22 @@ def test_slow_step_does_not_delay_later_steps(env: lw.Env) -> None:
     assert report.tick_jitter_ms == pytest.approx(np.std([0, 0, 1250, 250, 0, 0], ddof=1))
 
 
+def test_predicted_states_equal_the_next_states_of_the_plant(env: lw.Env) -> None:
+    planned = []
+
+    def controller(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        planned.append(torch.cat([state, obs.double()]))
+        return towards(state, obs)
+
+    episode = control_async(env, controller, period=0.01, steps=12, seed=3, predict=True)
+    measured = torch.cat([episode.states, episode.obs.double()], dim=1)
+    first, *others = planned[2:]  # the warm-up makes two plans
+    assert len(others) == len(episode.plan_steps) - 1 > 0
+    torch.testing.assert_close(first, measured[0])
+    torch.testing.assert_close(torch.stack(others), measured[episode.plan_steps[1:] + 1])
+    assert episode.age_steps[0] == 0 and (episode.age_steps[1:] >= 1).all()
+
+
 def planner_threads() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if thread.name == "lyceum_warp planner"]
 
