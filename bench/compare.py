@@ -277,7 +277,7 @@ class Side:
         return {"failure": {"text": f"the process ended with {code}", "trace": trace, "missing": False}}
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return the arrays of the last unit."""
+        """Return the arrays of the last compared unit of work."""
         if not self._file.exists():
             return {}
         with np.load(self._file) as file:

@@ -42,7 +42,7 @@ GPU_WORLDS = 16_384
 
 
 def worlds(contestant: str, threads: int, device: str) -> int:
-    """Return a contestant's default number of worlds."""
+    """Return the default number of worlds of a library or engine."""
     if contestant == "warp" and device.startswith("cuda"):
         return GPU_WORLDS
     return WORLDS[contestant] * (1 if contestant == "gym-sync" else threads)

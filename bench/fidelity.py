@@ -8,7 +8,7 @@ itself from an initial state perturbed by float32 rounding. Chaos separates any 
 comparisons set the scale: if the Warp engine does not diverge earlier than they do, it is as accurate as float32
 allows. Two states of a world are compared by their observations: each difference is divided by max(1, |value|), and the
 largest quotient counts. Contact forces are excluded, because a solver is accurate only to its tolerance. Worlds
-continue after the end of an episode, and are dropped at a fault.
+continue after the end of an episode, and are excluded after a fault.
 """
 
 import dataclasses

@@ -66,7 +66,7 @@ class Options(experiment.Options):
     """Number of worlds of lyceum_warp and of native C; by default 64 per thread, and 16,384 on a GPU. In the part
     "suite", number of worlds of every contestant; by default 2, 16 and 128."""
     policy: str | None = None
-    """Folder of the run whose policy acts in the part "kept"; by default actions are random."""
+    """Folder of the run whose policy acts in the part "kept" (``--parts kept``); by default, actions are random."""
 
 
 @dataclasses.dataclass(frozen=True)

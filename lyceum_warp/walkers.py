@@ -83,7 +83,7 @@ def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def force_limits(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the largest force of each joint's servo, in N m, (joints,); 0 without a limit."""
+    """Get the largest force of each joint's servo, in N m, (joints,). Joints without a limit get 0."""
     actuators = servos(model, p)
     return np.where(
         model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators, 1],

@@ -36,8 +36,8 @@ class Rollout:
         env: The environment.
         steps: Number of steps.
         groups: Groups of observations to store in addition to "policy", such as ``("critic",)``.
-        first_only: Whether to count only each world's first episode since ``restart``. If all worlds start together and
-            all finished episodes count, the statistics are biased towards short episodes.
+        first_only: Whether to count only each world's first episode since ``restart``. Statistics of all finished
+            episodes are biased towards short episodes if all worlds start together.
 
     Raises:
         ValueError: The task has no group of observations of this name.

@@ -57,18 +57,18 @@ def one_thread() -> Iterator[None]:
 
 @contextlib.contextmanager
 def beside(function: Callable[[], Result], *, allowed: bool) -> Iterator[Callable[[], Result]]:
-    """Run a function and the with block in parallel if torch has exactly two threads.
+    """Run a function and the ``with`` block in parallel if torch has exactly two threads.
 
-    The function and the with block then use one thread each. This is faster than running them one after the other on
-    two threads, because mini-batches do not benefit from a second thread, and large products speed up by less than a
+    The function and the ``with`` block then use one thread each. This is faster than running them one after the other
+    on two threads, because mini-batches do not benefit from a second thread, and large products speed up by less than a
     factor of two.
 
-    With any other number of threads, or if ``allowed`` is False, the function runs when the with block asks for its
+    With any other number of threads, or if ``allowed`` is False, the function runs when the ``with`` block asks for its
     result.
 
     Args:
         function: The function, which must not share state with the with block.
-        allowed: Whether the function and the with block may run at the same time.
+        allowed: Whether the function may run in parallel with the ``with`` block.
 
     Yields:
         A function that waits for the result and returns the result.

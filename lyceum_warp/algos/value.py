@@ -156,7 +156,7 @@ BOUND = 10.0
 
 
 def value_group(env: Env, given: str | None) -> str:
-    """Select a new value function's observation group, by default "critic" if the task has such a group, else "policy".
+    """Select the observations of a new value function: by default the group "critic" if it exists, else "policy".
 
     Raises:
         ValueError: The task has no observation group of this name.

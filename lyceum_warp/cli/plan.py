@@ -251,7 +251,7 @@ _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 
 
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
-    """Measure planning times to choose the settings that no flag gives; return None if flags give all.
+    """Choose the settings that flags leave open by measuring planning times; return None if flags set all of them.
 
     A plan must be ready within a step of the plant. If no setting is fast enough, a plan may take as long as a step of
     the planner.

@@ -1,4 +1,4 @@
-"""Check array indices in the instrumented copies of a task's functions that ``check_task`` runs.
+"""Check array indices while ``check_task`` runs instrumented copies of a task's functions.
 
 ``report`` is (places, 3). Each of its rows belongs to one place in the source at which an array is indexed, and holds
 the number of bad indices, the first bad index, and the size of the array. Functions are not inlined, because inlining

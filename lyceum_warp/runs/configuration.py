@@ -38,7 +38,7 @@ def describe(learner: Learner) -> dict[str, Any]:
     """Make the content of config.json, from which ``Configuration`` makes the same learner."""
     env, options = learner.env, learner.env.options
     others = options.given()
-    if learner.team.neighbours > 1:  # omit nthread, because a different number of processes may resume the run
+    if learner.team.neighbours > 1:  # omit nthread: the run may be resumed with another number of processes
         others.pop("nthread", None)
     for name in others.keys() - {"nthread", "horizon", "graphs", "fields", "dynamics"}:
         del others[name]

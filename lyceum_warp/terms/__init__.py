@@ -1,4 +1,4 @@
-"""Offer reward terms, commands, contact clocks, noise, random draws and motors as functions of values and rows.
+"""Offer reward terms, commands, contact clocks, noise, random draws and motors as functions of numbers and arrays.
 
 Every function is a ``wp.func`` of numbers, vectors, rows of ``World`` and tables of ``Params``, so it works in any
 task. An argument's name has the same meaning in all functions; ``ARGUMENTS`` explains the names.

@@ -79,7 +79,7 @@ def tune(
     """Measure how physics options change a task's speed and returns, and find the fastest that keep the returns.
 
     Every setting is compared with the unchanged task in the same process: steps per second, memory, faults, divergence,
-    and the returns of equal episodes under random actions and under a policy. Settings are first tried alone.
+    and the returns of the same episodes under random actions and under a policy. Settings are first tried alone.
     Afterwards, the best settings of all groups are combined, and as long as the combination changes the returns, its
     least useful setting is removed.
 

@@ -84,7 +84,7 @@ def test_value_function_receives_the_samples_of_every_plant(kind: str) -> None:
         torch.testing.assert_close(together.returns[i], alone.returns)
 
 
-def test_a_masked_reset_restarts_only_some_plants() -> None:
+def test_reset_with_a_mask_restarts_only_the_selected_plants() -> None:
     plan = lw.MPPI("point_mass", horizon=5, samples=6, update="cem", elites=2, knots=2, plants=3, seed=1)
     states = states_of("point_mass", 3)
     first = plan(states)

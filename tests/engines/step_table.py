@@ -1,4 +1,4 @@
-"""Generate models with every element that both engines support, and tables of their combinations."""
+"""Generate models with every element that both engines support, and list the combinations that they cover."""
 
 import functools
 import itertools

@@ -38,7 +38,7 @@ MINIMAL: dict[str, Mapping[str, Any]] = {
 
 
 def each(names: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """Return all pairs of a program and a name that belongs to this program."""
+    """Pair each program with each of the program's names."""
     return [(program, name) for program in names for name in names[program]]
 
 

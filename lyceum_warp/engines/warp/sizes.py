@@ -23,7 +23,7 @@ _WORLDS, _HOLDS, _SUBSTEPS = 32, 25, 20
 
 _LEAST, _LEAST_WITH_FLEX = (8, 8), (256, 512)
 """The smallest capacities, for a model without and with a flex. A probe may miss many contacts, because a geom that is
-pressed into a flex touches up to 50 of its elements. The capacities with a flex are MuJoCo Warp's defaults."""
+pressed into a flex touches up to 50 of its elements. The second pair is MuJoCo Warp's default."""
 
 _FIRST = 32
 """The maximum number of worlds whose initial states are checked."""
@@ -113,7 +113,7 @@ def warn_of_little_room(
 
 
 def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> mujoco.MjModel:
-    """Copy a model, and turn on every friction loss that any world may have."""
+    """Copy a model, and give each joint and tendon friction loss if it has friction loss in any world."""
     if names := _FRICTION.intersection(varied):
         model = copy.copy(model)
         for name in names:

@@ -45,7 +45,7 @@ class WarpEngine(Engine):
         dynamics: The model fields that differ between worlds. Contact and constraint capacities are probed with the
             model's own values; see ``sizes.probe_sizes``.
         initial: The initial state for ``reset``, rounded to float32; None for the model's own.
-        nconmax: Contact capacity per world, as an average over the worlds. By default, the model is probed, and
+        nconmax: Contact capacity of all worlds, divided by the number of worlds. By default, the model is probed, and
             capacity is added for one world in which all geoms touch.
         njmax: Constraint capacity of each world; by default the model is probed.
 

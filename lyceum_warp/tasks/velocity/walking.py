@@ -342,7 +342,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     draw_command(s, p, rng)
 
 
-# arguments of the reward terms are found by name; the command belongs to the state before the step
+# the reward terms get their arguments by name; their command is the one in the state before the step
 
 
 @wp.func

@@ -42,7 +42,7 @@ class ExtraGeoms:
         self.model, self.limit = model, limit
         self._data = mujoco.MjData(model)
         self._options, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
-        # leave room for one more ghost beyond the limit
+        # allocate twice the model's geoms and sites: for the shown world, and for a last ghost that exceeds the limit
         self._scene = mujoco.MjvScene(model, limit + 2 * (model.ngeom + model.nsite) + 10)
 
     def draw(
