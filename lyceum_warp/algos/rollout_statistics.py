@@ -30,7 +30,7 @@ class SampledIteration(Iteration):
     time_mean: float
     """Seconds for evaluating the mean policy."""
     samples_per_second: float
-    """Samples divided by ``time_sample``."""
+    """Samples per second of sampling; with SAC, per second of sampling and updates."""
 
     def row(self) -> dict[str, Any]:
         """Convert the statistics to a row of metrics.csv, including columns whose value is None."""

@@ -53,7 +53,9 @@ def test_capture_metric_is_the_distance_between_capture_point_and_feet(shared_en
     assert moving - still == pytest.approx(np.sqrt(height / 9.81), rel=0.15)
 
 
-@pytest.mark.parametrize(("task", "least"), [("humanoid_stand", 1.1), ("g1_stand", 0.65)])
+@pytest.mark.parametrize(
+    ("task", "least"), [("humanoid_stand", 1.1), pytest.param("g1_stand", 0.65, marks=pytest.mark.long)]
+)
 def test_robot_stands_with_a_planner_and_falls_without_one(shared_env: SharedEnv, task: str, least: float) -> None:
     env = shared_env(task, autoreset=False)
     plan = lw.MPPI(task, samples=16, nthread=1)
