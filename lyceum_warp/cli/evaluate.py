@@ -188,8 +188,7 @@ def run_worlds(
     try:
         env = run_env(run, known, own | params, note=note, task=task, trust=trust)
     except (ValueError, FileNotFoundError) as error:
-        if str(run.folder) not in str(error):
-            error.add_note(f"with the settings in {run.folder / 'config.json'}")
+        run.note_settings(error)
         raise
     if task is None:
         note_changes(run, env, note=note, model=env.options.physics == saved.options.physics)

@@ -58,9 +58,9 @@ _KEPT = {
 class Train:
     """Train a policy on a task, with the natural policy gradient, PPO or SAC.
 
-    The command writes config.json, metrics.csv (one row per iteration), policy.pt, best.pt,
-    checkpoint.pt, curve.png and video.mp4 into the run's folder. Ctrl-C saves and ends the run after the current
-    iteration; a second Ctrl-C ends it immediately.
+    The command writes config.json, metrics.csv (one row per iteration), policy.pt, best.pt, checkpoint.pt, curve.png
+    and video.mp4 into the run's folder. Ctrl-C saves and ends the run after the current iteration; a second Ctrl-C ends
+    it immediately.
 
     $ lyceum-warp train hopper --iterations 100 --seed 1
     $ lyceum-warp train half_cheetah --param ctrl_cost_weight=0.05 --param reset_noise_scale=0 --hidden 32 32

@@ -34,6 +34,9 @@ _PATIENCE = 0.2  # timeout for an unfinished plan after an exception
 _EXIT_PATIENCE = 5.0  # timeout for an unfinished plan when the program exits
 _SWITCH_INTERVAL = 0.0005  # shorter than Python's default of 5 ms, which is most of a fast plant's period
 
+Published: TypeAlias = tuple[int, torch.Tensor, torch.Tensor, torch.Tensor | None]
+"""A step's index, the state and the observation before the step, and its action."""
+
 
 @torch.no_grad()
 def control_async(
@@ -63,7 +66,8 @@ def control_async(
     apply. A copy of the plant predicts this state with the action that the plant is applying. The first action of a
     plan that takes less than a period is then applied to the state for which it was planned. Without ``predict``, this
     action comes too late, and only the rest of the plan applies. If the copy's episode ends in the predicted step, the
-    controller plans from the measured state.
+    controller plans from the measured state. The copy has the plant's random stream, so it foresees an event of the
+    task, such as a push, by one step.
 
     Before the clock starts, a warm-up calls the controller three times with the first state, steps the plant three
     times, and restores the plant's state. The warm-up loads kernels and captures graphs, because Warp cannot capture a
@@ -294,7 +298,7 @@ class PlannerThread:
         finally:
             self._begun.set()
 
-    def _newest_state(self) -> "Published | None":
+    def _newest_state(self) -> Published | None:
         published = self._states.get()
         while not self._states.empty():
             published = self._states.get()
@@ -323,10 +327,6 @@ class PlannerThread:
         # append the quality only after the plan, because the plant may be waiting for the plan
         self._qualities.append(controller.quality())
         return start
-
-
-Published: TypeAlias = tuple[int, torch.Tensor, torch.Tensor, torch.Tensor | None]
-"""A step, with the state, the observation and the action before the step."""
 
 
 _unfinished: "weakref.WeakSet[threading.Thread]" = weakref.WeakSet()

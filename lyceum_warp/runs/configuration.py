@@ -155,8 +155,8 @@ class Configuration:
             learner: Learner = ALGORITHMS[self.algorithm][0](env, *networks, self.hyperparameters, seed=seed, team=team)
             return learner
         except (ValueError, FileNotFoundError) as error:
-            if run is not None and str(run.folder) not in str(error):
-                error.add_note(f"with the settings in {run.folder / 'config.json'}")
+            if run is not None:
+                run.note_settings(error)
             raise
 
 

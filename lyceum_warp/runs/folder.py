@@ -171,6 +171,11 @@ class Run:
         with replaced(self.folder / _CONFIG) as temporary:
             temporary.write_text(json.dumps(self.config, indent=2))
 
+    def note_settings(self, error: Exception) -> None:
+        """Add the path of ``config.json`` to an error that the settings may have caused."""
+        if str(self.folder) not in str(error):
+            error.add_note(f"with the settings in {self.folder / _CONFIG}")
+
     def rows(self) -> list[dict[str, float | None]]:
         """Read the rows of the metrics table. Empty cells become None.
 

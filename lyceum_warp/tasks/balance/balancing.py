@@ -111,6 +111,11 @@ def evaluate(s: World, p: Params) -> float:
 
 
 @wp.func
+def evaluate_distance(s: World, p: Params) -> float:
+    return s.qpos[0]
+
+
+@wp.func
 def initialize(s: World, p: Params):
     lw.put_upright(s.qpos, 0, wp.vec3(0.0, 0.0, p.start_height), 0.0)
     for j in range(p.joint_qpos.shape[0]):

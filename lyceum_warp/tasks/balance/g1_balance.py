@@ -105,13 +105,8 @@ class WalkParams(Params):
     forward_speed: float = 0.6
 
 
-@wp.func
-def evaluate_distance(s: World, p: Params) -> float:
-    return s.qpos[0]
-
-
 @lw.register
 class G1Walk(G1Stand):
     """A Unitree G1 with a rigid upper body walks forward, and keeps its balance when it is pushed."""
 
-    Params, evaluate = WalkParams, evaluate_distance
+    Params, evaluate = WalkParams, balancing.evaluate_distance

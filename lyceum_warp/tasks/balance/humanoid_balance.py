@@ -58,16 +58,11 @@ class WalkParams(Params):
     forward_speed: float = 0.8
 
 
-@wp.func
-def evaluate_distance(s: World, p: Params) -> float:
-    return s.qpos[0]
-
-
 @lw.register
 class HumanoidWalk(HumanoidStand):
     """Gymnasium's humanoid walks forward, and keeps its balance when it is pushed."""
 
-    Params, evaluate = WalkParams, evaluate_distance
+    Params, evaluate = WalkParams, balancing.evaluate_distance
 
 
 @wp.struct
