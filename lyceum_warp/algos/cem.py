@@ -7,9 +7,9 @@ samples (the elites) u_t^1, ..., u_t^n determine the next plan and its noise:
 
 CEM was proposed by Rubinstein (1999, "The cross-entropy method for combinatorial and continuous optimization"). Here,
 as in hydrax, judo and MuJoCo MPC, the covariance is diagonal. When the planner shifts the plan in time, it also shifts
-the standard deviations, and appends initial values at the end. If the noise is smoothed over time, s_t is the standard
-deviation before smoothing. To find this s_t, the elites' standard deviation is divided by the factor by which the
-smoothing scales a standard deviation.
+the standard deviations, and appends initial values at the end. If the noise is smoothed over time, s_t is its standard
+deviation before smoothing. To compute s_t, CEM divides the elites' standard deviation by the standard deviation of
+smoothed unit noise (``spread``).
 """
 
 from collections.abc import Sequence
@@ -91,7 +91,7 @@ class CrossEntropy(EliteWeights):
 
 
 def spread(smoothing: tuple[float, float, float], count: int) -> np.ndarray:
-    """Compute the standard deviations of smoothed standard normal noise, (count,).
+    """Compute the standard deviation that smoothing gives to standard normal noise in each step, (count,).
 
     For e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2), the variance v_t and the covariance c_t of e_t and e_(t-1) satisfy v_t =
     b0^2 + b1^2 v_(t-1) + b2^2 v_(t-2) + 2 b1 b2 c_(t-1) and c_t = b1 v_(t-1) + b2 c_(t-1).

@@ -33,8 +33,8 @@ _ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[[tor
     nn.ReLU: (lambda x: np.maximum(x, 0.0, out=x), lambda d, y: _relu_slope(d, y, 0.0, grad_input=d)),
     nn.ELU: (_elu_, lambda d, y: _elu_slope(d, 1.0, 1.0, 1.0, True, y, grad_input=d)),
 }
-"""Map each supported activation to two in-place functions: f(x) applies the activation, and g(d, y) multiplies the
-derivative d by the activation's slope, computed from the activation's output y."""
+"""Two in-place functions for each supported activation: f(x) applies the activation, and g(d, y) multiplies d by the
+activation's derivative, which it computes from the activation's output y."""
 
 _FEW = 2**18
 """Use NumPy if batch size times number of weights in the largest layer is at most this number, and torch otherwise. A
@@ -89,7 +89,7 @@ class DensePasses:
         self._buffers = [[torch.empty(rows, n) for n in widths] for _ in range(2)]
 
     def _resize(self, rows: int) -> None:
-        """Use the first ``rows`` rows of the buffers; allocate larger buffers if they are too small."""
+        """Make views of the buffers for a batch of ``rows`` inputs; allocate larger buffers if necessary."""
         if rows > len(self._buffers[0][0]):
             self._allocate(rows)
         self._rows, self._few = rows, rows * max(weight.numel() for weight in self.weights) <= _FEW
@@ -115,7 +115,7 @@ class DensePasses:
         return self.results[-1]
 
     def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Compute J v (rows, outputs) at the last inputs; v has one tensor in the shape of each parameter."""
+        """Compute J v (rows, outputs) at the last inputs; v consists of one tensor per parameter, of the same shape."""
         last = len(self.weights) - 1
         for i, derivative in enumerate(self.derivatives):
             torch.addmm(parts[2 * i + 1], self._inputs[i], parts[2 * i].t(), out=derivative)
@@ -126,10 +126,10 @@ class DensePasses:
         return self.derivatives[-1]
 
     def pull(self, u: torch.Tensor, out: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
-        """Compute J^T u at the last inputs, for u (rows, outputs), into tensors ``out`` shaped like the parameters."""
+        """Compute J^T u at the last inputs for u (rows, outputs); write it into ``out``, shaped like the parameters."""
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
-            # with more outputs than inputs, x^T u is faster than u^T x, because its rows are longer
+            # with more outputs than inputs, x^T u is faster than u^T x, because the rows of x^T u are longer
             if x.shape[1] < u.shape[1]:
                 out[2 * i].copy_((x.t() @ u).t())
             else:
@@ -142,7 +142,7 @@ class DensePasses:
 
 
 class DensePolicy:
-    """Evaluates a ``GaussianPolicy`` without autograd, by ``DensePasses`` on the policy's parameters."""
+    """Evaluates a ``GaussianPolicy`` without autograd, using ``DensePasses``."""
 
     def __init__(self, policy: GaussianPolicy, passes: DensePasses) -> None:
         self.policy, self.passes = policy, passes
@@ -151,7 +151,7 @@ class DensePolicy:
 
     @staticmethod
     def of(policy: GaussianPolicy) -> "DensePolicy | None":
-        """Wrap a policy; return None for a subclass, a symmetric policy, or an unsupported or partly frozen network."""
+        """Wrap a policy; return None for subclasses, symmetric policies, and unsupported or partly frozen networks."""
         plain = (
             type(policy) is GaussianPolicy
             and policy.mirror is None
@@ -196,14 +196,14 @@ class DensePolicy:
 
 
 class DenseValue:
-    """Evaluates a ``ValueFunction`` without autograd, by ``DensePasses`` on the value function's parameters."""
+    """Evaluates a ``ValueFunction`` without autograd, using ``DensePasses``."""
 
     def __init__(self, value: ValueFunction, passes: DensePasses) -> None:
         self.value, self.passes = value, passes
 
     @staticmethod
     def of(value: ValueFunction) -> "DenseValue | None":
-        """Wrap a value function; return None for a subclass or an unsupported network."""
+        """Wrap a value function; return None for subclasses of ``ValueFunction`` and for unsupported networks."""
         if type(value) is not ValueFunction or _hooked(value):
             return None
         passes = DensePasses.of(value.network)

@@ -17,9 +17,9 @@ from lyceum_warp.graphs.capture import capturing
 
 
 class Team:
-    """Sums and copies tensors between the processes that learn together; a single process does not communicate.
+    """Sums and copies tensors across the processes that learn together; a single process does not communicate.
 
-    All processes must call the methods in the same order; only ``share`` and ``locate`` are exceptions.
+    All processes must call the methods in the same order, except ``share`` and ``locate``, which do not communicate.
 
     Args:
         rank: Rank of this process.
@@ -73,15 +73,15 @@ class Team:
         return nworld // self.size
 
     def locate(self, index: torch.Tensor, nworld: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Convert sample indices over all worlds to sample indices of this process.
+        """Convert indices of samples in the worlds of all processes to indices of this process's samples.
 
         Args:
             index: Indices into a flattened array (steps, worlds of all processes).
             nworld: Number of this process's worlds.
 
         Returns:
-            Indices into a flattened array (steps, nworld), and a mask of this process's samples. The index of another
-            process's sample is 0.
+            Indices into a flattened array (steps, nworld), and a mask of this process's samples. Samples of other
+            processes get the index 0.
         """
         step, world = index // (nworld * self.size), index % (nworld * self.size) - self.rank * nworld
         own = (world >= 0) & (world < nworld)
@@ -94,7 +94,7 @@ class Team:
         return tensor
 
     def largest(self, *numbers: int) -> tuple[int, ...]:
-        """Compute the elementwise maximum over the processes; if there are several, the host waits for the device."""
+        """Compute the elementwise maximum over the processes; with several processes, the host waits for the device."""
         if self.size == 1:
             return numbers
         whole = torch.tensor(numbers, device=self.device)
@@ -146,7 +146,7 @@ class Team:
 
 
 class Captured:
-    """Calls a function that runs torch operations and communication; on a GPU, replays it as a CUDA graph.
+    """Calls a function of torch operations and communication; on a GPU, replays the function as a CUDA graph.
 
     The first call runs the function directly, so that it allocates its buffers. The second call captures and replays a
     graph; all later calls replay it. A graph stores addresses, so the function must update tensors in place.

@@ -20,7 +20,7 @@ MEAN_SEED = 2**31 - 1
 
 
 def evaluation_seed(seed: int) -> int:
-    """Derive another seed for an evaluation, so that its initial states differ from those of training."""
+    """Derive an evaluation's seed from the seed of training, so that the two have different initial states."""
     return whole_number("seed", seed, low=0) ^ 0x5A17C3E9
 
 
@@ -70,8 +70,8 @@ def evaluate(
         policy: A module with a method ``act``, or a function, that maps observations (nworld, nobs) to actions (nworld,
             nact).
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
-        seed: Seed of the initial states; an environment made with the same seed draws different initial states. Without
-            a seed, initial states depend on the random numbers that the worlds have used before.
+        seed: Seed of the initial states, which differ from those of an environment made with the same seed. Without a
+            seed, the worlds continue their random streams.
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:
@@ -136,7 +136,7 @@ ENDLESS_STEPS = 1000
 
 
 def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
-    """Make a small environment of the same task; if the task has no horizon, the horizon is 1,000 steps.
+    """Copy an environment with another number of worlds; if it has no horizon, the copy's is 1,000 steps.
 
     Args:
         env: The environment.
@@ -148,7 +148,7 @@ def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
 
 
 class MeanPolicyEvaluation:
-    """Evaluates the mean policy during training in a separate environment with few worlds.
+    """Evaluates the mean policy (the policy without noise) during training, in a separate, small environment.
 
     All evaluations start from the same initial states, so that they differ only in the policy. Training uses different
     initial states. Rank 0 evaluates; all processes get its results.
@@ -164,7 +164,7 @@ class MeanPolicyEvaluation:
         self._few: Env | None = None
 
     def __call__(self, policy: torch.nn.Module) -> dict[str, float]:
-        """Evaluate the policy, and return the means over the episodes, by the names of the fields of ``Iteration``."""
+        """Evaluate the policy, and return means over the episodes, with the names of the fields of ``Iteration``."""
         means = torch.zeros(len(MEAN_STATISTICS), dtype=torch.float64, device=self.env.obs.device)
         if self.team.leads:
             if self._few is None:
@@ -177,11 +177,11 @@ class MeanPolicyEvaluation:
         return dict(zip(MEAN_STATISTICS, means.tolist(), strict=True))
 
     def added(self, statistics: Mapping[str, Any], policy: torch.nn.Module, *, due: bool) -> dict[str, Any]:
-        """Evaluate the policy if due, and add the results to the statistics; add None for each result if not due."""
+        """Add the results of an evaluation to the statistics; if no evaluation is due, add None for each result."""
         mean: dict[str, Any] = self(policy) if due else dict.fromkeys(MEAN_STATISTICS)
         success = self.env.task.functions["success"] is not None
         return {**statistics, **mean} | ({} if success else {"success": math.nan, "mean_success": None})
 
 
 MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")
-"""Fields of ``Iteration`` for the results of an evaluation of the mean policy."""
+"""The fields of ``Iteration`` that hold the results of evaluating the mean policy."""

@@ -1,4 +1,4 @@
-"""Define the interface of learning algorithms, for training, run folders and export."""
+"""Define the interface of learning algorithms that training, run folders and export use."""
 
 import abc
 import copy
@@ -15,7 +15,7 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
 
 METRIC_COLUMN, STEP_METRIC_COLUMN = "metrics/", "step_metrics/"
-"""Prefixes of a task metric's two columns: the sum over an episode, and the mean over steps."""
+"""Prefixes of the two columns of a task's metric in metrics.csv: its sum over an episode, and its mean over steps."""
 
 NESTED = ("metrics", "step_metrics", "numbers")
 """Fields of ``Iteration`` that are dicts."""
@@ -50,7 +50,7 @@ class Iteration:
     eval_mean: float | None = None
     """Mean evaluation metric at the end of an episode."""
     success: float | None = None
-    """Fraction of episodes that ended with the goal met; NaN for tasks without ``success``."""
+    """Fraction of episodes that ended with the goal met; NaN if the task does not define ``success``."""
     mean_return: float | None = None
     """Mean return of the policy without noise, evaluated after the iteration; None without an evaluation."""
     mean_length: float | None = None
@@ -60,7 +60,7 @@ class Iteration:
     mean_eval: float | None = None
     """Mean evaluation metric at the end of the evaluated episodes."""
     mean_success: float | None = None
-    """Fraction of the evaluated episodes that ended with the goal met; None for tasks without ``success``."""
+    """Fraction of the evaluated episodes that ended with the goal met; None if the task does not define ``success``."""
     metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """The task's metrics by name, summed over each episode and averaged over episodes."""
     step_metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
@@ -102,8 +102,8 @@ class Learner(abc.ABC):
     env: Env
     """The environment that provides the samples."""
     policy: torch.nn.Module
-    """The policy after the last iteration. Its method ``act`` normalises the observations (..., nobs) itself, and maps
-    them to actions without noise (..., nact). The policy has the attributes ``nobs`` and ``nact``."""
+    """The policy after the last iteration. Its method ``act`` maps observations (..., nobs), which it normalises
+    itself, to actions without noise (..., nact). The policy has the attributes ``nobs`` and ``nact``."""
     value: torch.nn.Module | None = None
     """The value function after the last iteration; None for algorithms without one."""
     config: Any
@@ -154,10 +154,11 @@ class Learner(abc.ABC):
 
     @property
     def best_by(self) -> str:
-        """Name of the field of ``Iteration`` by which the best policy is selected and a target return is checked.
+        """The field of ``Iteration`` that selects the best policy and is compared with a run's target return.
 
-        "mean_return" is the return of the policy after the iteration, "return_mean" the return of the policy before it.
-        The default is "mean_return", or "return_mean" if the configuration has ``mean_every=0``.
+        "mean_return" is the return of the policy after the iteration's update, without noise; "return_mean" is the
+        return of the policy before the update, with noise. The default is "mean_return", or "return_mean" if the
+        configuration has ``mean_every=0``.
         """
         return "return_mean" if getattr(self.config, "mean_every", None) == 0 else "mean_return"
 
@@ -171,7 +172,7 @@ class Learner(abc.ABC):
         return dataclasses.asdict(self.config)
 
     def state_dict(self) -> dict[str, Any]:
-        """Copy the complete state, including the worlds of all processes but not ``replay``.
+        """Copy the complete state except ``replay``; the state includes the worlds of all processes.
 
         The state consists of tensors, numbers, strings, dicts and lists. All processes must call this method. Any
         number of processes can resume from the state.
@@ -192,7 +193,7 @@ class Learner(abc.ABC):
         return copy.deepcopy(state)  # copy, because a module's state_dict shares memory with the parameters
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from a state of ``state_dict``; later iterations equal those of an uninterrupted run bit for bit.
+        """Resume from a result of ``state_dict``; later iterations equal those of an uninterrupted run bit for bit.
 
         Raises:
             ValueError: The state has a different number of worlds, or a counter is not a whole number.

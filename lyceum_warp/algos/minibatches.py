@@ -9,14 +9,14 @@ import torch
 from lyceum_warp.algos.distributed import Captured, Team
 
 Samples = Mapping[str, torch.Tensor]
-"""Map names to tensors with one row per sample."""
+"""Tensors by name, each with one row per sample."""
 
 _SURE = 6.0
-"""Number of standard deviations between the mean number of a process's samples and the size of its buffer."""
+"""A process's buffer is larger than the mean number of its samples by this number of standard deviations."""
 
 
 def room(batch: int, team: Team) -> int:
-    """Compute the size of a process's buffer for a mini-batch of ``batch`` samples over all processes."""
+    """Compute the size of each process's buffer if all processes together learn from ``batch`` samples at once."""
     share = batch / team.size
     return min(batch, math.ceil(share + _SURE * math.sqrt(share)))
 
@@ -24,9 +24,10 @@ def room(batch: int, team: Team) -> int:
 class Minibatches:
     """Shuffles a rollout's samples once, and learns from the same mini-batches in every epoch.
 
-    The mini-batches do not depend on the number of processes. The number of samples that come from a process's own
-    worlds varies between mini-batches. Each process therefore uses a buffer of fixed size, padded with samples of
-    weight 0. The buffer's size is the mean of this number plus six standard deviations; further samples are dropped.
+    The mini-batches do not depend on the number of processes. In a random mini-batch, the number of samples from one
+    process's worlds varies. Each process therefore copies its samples into a buffer of fixed size, padded with samples
+    of weight 0. The buffer has room for six standard deviations more than the mean number of samples; samples beyond
+    that are dropped.
 
     On a GPU, an epoch runs as a CUDA graph, so ``learn`` must update tensors in place.
 
@@ -62,7 +63,7 @@ class Minibatches:
             generator: Random generator for the permutation of the samples of all processes.
 
         Returns:
-            The mini-batches, each (mini-batches, samples, ...).
+            The mini-batches by name, each tensor (mini-batches, samples, ...).
         """
         order = torch.randperm(self.samples, generator=generator, device=self.weight.device)
         places, own = self.team.locate(order[: self.count * self.batch].view(self.count, self.batch), self.nworld)

@@ -24,7 +24,7 @@ def score_gradient(
         obs: Observations, (samples, nobs).
         action: Actions, (samples, nact).
         weight: Weights, (samples,).
-        dense: The policy's evaluation without autograd, if available.
+        dense: Evaluates the policy without autograd; None to use autograd.
     """
     parameters = [p for p in policy.parameters() if p.requires_grad]
     if dense is None:
@@ -50,7 +50,7 @@ class FisherProduct:
         count: Total number of observations over all processes; ``len(obs)`` by default.
         weight: Weights of the observations, (samples,): 0 for observations of other processes, otherwise 1.
         team: The processes.
-        dense: The policy's evaluation without autograd, if available.
+        dense: Evaluates the policy without autograd; None to use autograd.
     """
 
     def __init__(
@@ -82,9 +82,8 @@ class FisherProduct:
         ]
         log_std_part = vector if self.log_std_at is None else parts.pop(self.log_std_at)
         pulled = self.jacobian.pull(self.jacobian.push(parts) * self.precision)
-        if (
-            self.log_std_at is not None
-        ):  # log_std's term is not a sum over samples: divide it by the number of processes
+        if self.log_std_at is not None:
+            # log_std's term is not a sum over samples, so each process adds an equal share of it
             pulled.insert(self.log_std_at, 2.0 / self.team.size * log_std_part)
         return self.team.sum(flatten(pulled)) + self.damping * vector
 
@@ -92,8 +91,8 @@ class FisherProduct:
 class AutogradJacobian:
     """Compute products with any network's Jacobian J = d mean / d parameters by autograd.
 
-    u^T J is a backward pass through the network. J v is the derivative of u^T J v with respect to u, hence a backward
-    pass through the graph of the first pass. Both graphs are built only once.
+    A backward pass through the network computes u^T J. Since J v is the derivative of u^T J v with respect to u, a
+    backward pass through the first backward pass computes J v. Both graphs are built only once.
 
     Args:
         mean: The network's outputs, (samples, nact).
@@ -106,11 +105,11 @@ class AutogradJacobian:
         self.pulled = torch.autograd.grad(mean, parameters, self.probe, create_graph=True)
 
     def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Compute J v (samples, nact); v has one tensor in the shape of each parameter."""
+        """Compute J v (samples, nact); v consists of one tensor per parameter, of the same shape."""
         return torch.autograd.grad(self.pulled, self.probe, parts, retain_graph=True)[0]
 
     def pull(self, u: torch.Tensor) -> list[torch.Tensor]:
-        """Compute J^T u for u (samples, nact); the result has one tensor in the shape of each parameter."""
+        """Compute J^T u for u (samples, nact); the result is one tensor per parameter, of the same shape."""
         return list(torch.autograd.grad(self.mean, self.parameters, u, retain_graph=True))
 
 
@@ -119,8 +118,8 @@ def conjugate_gradient(
 ) -> torch.Tensor:
     """Solve A x = target for a symmetric positive definite matrix A, starting from x = 0; ``product`` computes A x.
 
-    The number of iterations is fixed and no branch depends on values, so the host never waits for the device. After the
-    residual has become zero, all steps are zero.
+    The number of iterations is fixed and no branch depends on values, so the host never waits for the device. Once the
+    residual is zero, further iterations change nothing.
     """
     x = torch.zeros_like(target)
     residual = target.clone()

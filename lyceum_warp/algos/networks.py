@@ -94,7 +94,7 @@ _Applied: TypeAlias = tuple[torch.Tensor, torch.Tensor]
 
 
 class Normalizer(nn.Module):
-    """Normalises observations by their running mean and variance; before the first update, it changes nothing.
+    """Normalises observations by their running mean and variance; observations do not change before the first update.
 
     Args:
         size: Length of an observation.
@@ -139,7 +139,7 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def interpolate(self, before: _Applied, after: _Applied, part: torch.Tensor) -> None:
-        """Apply only a fraction of an update to ``shift`` and ``scale``; mean and variance are not changed.
+        """Apply a fraction of an update to ``shift`` and ``scale``; mean and variance keep the whole update.
 
         Args:
             before: ``shift`` and ``scale`` before the update.
@@ -188,7 +188,7 @@ def moved(module: Module, env: Env) -> Module:
 
 
 def trainable(module: Module) -> Module:
-    """Return a module; first unfreeze its parameters if all are frozen, as in a module from ``lw.load``."""
+    """Return the module; if all its parameters are frozen, as in a module from ``lw.load``, unfreeze them."""
     if isinstance(module, nn.Module) and not any(parameter.requires_grad for parameter in module.parameters()):
         module.requires_grad_(True)
     return module

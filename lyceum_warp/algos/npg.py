@@ -37,7 +37,7 @@ from lyceum_warp.support.docstrings import document_attributes
 log = logging.getLogger(__name__)
 
 _SHORTER = 4
-"""Maximum number of times that NPG shortens a step or a change of the normaliser."""
+"""Maximum number of times that NPG shortens a step of the policy or an update of the normaliser."""
 
 _LARGEST = 1e30
 """Rewards are clipped to this absolute value, so that an episode's sum does not overflow float32."""
@@ -64,7 +64,7 @@ class NPG(OnPolicyLearner):
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
         team: The processes that learn together, each with some of the worlds. All processes must make the same calls
-            with the same arguments, and get the same statistics.
+            with the same arguments; all get the same statistics.
 
     Raises:
         ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy is not
@@ -97,7 +97,7 @@ class NPG(OnPolicyLearner):
         scale = 1.0 / max(1.0 - config.gamma, 1e-3)
         self._make_networks(policy, value, scale=scale, time_orders=config.time_orders)
 
-        # only with one process on the CPU, branching on a tensor needs no synchronisation
+        # one process on the CPU can branch on the value of a tensor without waiting for a device or another process
         self._reads_numbers = device.type == "cpu" and team.size == 1
 
         # samples
@@ -205,12 +205,12 @@ class NPG(OnPolicyLearner):
             last, self._skipping = self.iteration + 1, 0
             raise FloatingPointError(
                 f"{' and '.join(skipped)} in iteration {last} {'are' if len(skipped) > 1 else 'is'} not finite, as "
-                f"in the {_PATIENCE - 1} iterations before, and non-finite updates are skipped. "
+                f"in the {_PATIENCE - 1} iterations before; all these updates were skipped. "
                 f"{self.rollout.explain_not_finite()}"
             )
 
     def sample(self) -> None:
-        """Fill the rollout buffer with the current policy and new noise."""
+        """Fill the rollout buffer with samples of the current policy, drawn with new noise."""
         with one_thread():
             self.noise.normal_(generator=self.generator)
             self._dense = DensePolicy.of(self.policy)
@@ -222,13 +222,13 @@ class NPG(OnPolicyLearner):
         """Compute generalised advantages and discounted returns of the rollout.
 
         The returns bootstrap from the value function at time limits and at the end of the rollout. Terminal states have
-        the value 0, as in mjrl; Lyceum bootstraps at terminal states too. The returns determine the value function's
-        scale. Clipping advantages to ten times this scale keeps a single extreme reward from dominating the gradient or
-        the fit.
+        the value 0, as in mjrl; Lyceum bootstraps at terminal states too. The standard deviation of the returns becomes
+        the value function's scale. Advantages are clipped to ten times this scale, so that a single extreme reward does
+        not dominate the gradient or the fit.
 
         Returns:
-            Advantages, (steps, nworld), divided by a power of two close to the value function's scale; returns, (steps,
-            nworld); statistics of the value function's errors; and the number of clipped advantages.
+            Advantages and returns, each (steps, nworld); statistics of the value function's errors; and the number of
+            clipped advantages. The advantages are divided by a power of two close to the value function's scale.
         """
         rollout, config, team = self.rollout, self.config, self.team
         value = self.predict(rollout.obs_groups[self.value.group], rollout.step)
@@ -237,7 +237,7 @@ class NPG(OnPolicyLearner):
         advantage, target = self._estimate(reward, value, next_value)
         prediction = prediction_sums(target, value)
         self.value.rescale(target, first=self._value_is_new and self.iteration == 0, team=team)
-        # the step does not depend on the scale of the advantages, and dividing by a power of two rounds nothing
+        # a factor on the advantages does not change the step, and division by a power of two causes no rounding
         unit = torch.exp2(torch.floor(torch.log2(self.value.scale)))
         advantage, scale = advantage / unit.float(), (self.value.scale / unit).float()
         bound = BOUND * scale
@@ -285,7 +285,7 @@ class NPG(OnPolicyLearner):
                 square = (old_mean - mean(obs)).square()
                 kl = 0.5 * (square * torch.exp(-2 * self.policy.log_std)).sum(-1).mean()
                 kl = self.team.sum(kl) / self.team.size
-                if self._reads_numbers and kl <= limit:  # more iterations would change nothing
+                if self._reads_numbers and kl <= limit:  # the limit is met, so stop early
                     break
                 part = torch.where(kl <= limit, part, part * (limit / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5))
             normalizer.interpolate(before, after, part)
@@ -302,7 +302,7 @@ class NPG(OnPolicyLearner):
             subset = torch.randperm(self.count, generator=self.generator, device=obs.device)[: self._fisher_count]
             if self.team.size == 1:
                 obs = obs[subset]
-            else:  # exclude other processes' samples by the weight 0, because a selection would synchronise
+            else:  # give other processes' samples the weight 0: selection by a mask would synchronise
                 places, own = self.team.locate(subset, self.env.nworld)
                 obs, weight = obs[places], own.float()
         return FisherProduct(
@@ -318,9 +318,9 @@ class NPG(OnPolicyLearner):
 
         The step's length was computed from the Fisher information, which approximates the KL divergence only to second
         order and on a subset of the samples. If the measured divergence exceeds its limit, the step is shortened, up to
-        four times. Each time, the new length follows from a second-order estimate, but is at most half of the old
-        length. If the divergence still exceeds the limit, or if the step is not finite, the policy does not change. The
-        host does not wait for the device.
+        four times. Each time, a second-order estimate gives the new length, which is at most half of the old length. If
+        the divergence still exceeds the limit, or if the step is not finite, the policy does not change. The host does
+        not wait for the device.
 
         Args:
             step: The step, (parameters,).
@@ -353,7 +353,7 @@ class NPG(OnPolicyLearner):
         fraction = finite.float()
         for _ in range(_SHORTER):
             kl = measured(fraction)
-            if self._reads_numbers and kl <= limit:  # more iterations would change nothing
+            if self._reads_numbers and kl <= limit:  # the limit is met, so stop early
                 break
             factor = (wanted / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5)
             fraction = torch.where(kl <= limit, fraction, fraction * factor)
@@ -374,6 +374,6 @@ class NPG(OnPolicyLearner):
         return super().state_dict() | {"optimizer": copy.deepcopy(self.fit.state_dict())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from a state of ``state_dict``; see ``Learner``."""
+        """Resume from a result of ``state_dict``; see ``Learner``."""
         super().load_state_dict(state)
         self.fit.load_state_dict(state["optimizer"])

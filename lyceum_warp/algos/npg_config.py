@@ -15,9 +15,9 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 _LONG_EPISODE = 20
-"""If an episode lasts longer than this number of iterations, NPG restarts worlds by default (``min_restarts``). On
-hopper with some seeds, NPG's return stayed low for a long time with 63 and 31 iterations per episode, but not with 16
-(bench/README.md, "NPG's learning curves")."""
+"""If an episode lasts longer than this number of iterations, NPG restarts worlds by default (``min_restarts``). If an
+episode of hopper lasted 63 or 31 iterations, NPG's return stayed low for a long time with some seeds; with 16
+iterations, it did not (bench/README.md, "NPG's learning curves")."""
 
 
 @document_attributes
@@ -33,17 +33,18 @@ class NPGConfig:
     """Samples per iteration, rounded up to a multiple of the number of worlds. The default is the paper's 10,000, or 16
     steps of every world if that is more."""
     rollout: Literal["auto", "episodes", "segments"] = "auto"
-    """"episodes" starts new episodes in every iteration, as in the paper; "segments" continues the last iteration's
-    episodes, which suits many worlds with few steps each; "auto" selects "episodes" if samples / worlds >= horizon, and
+    """"episodes" starts new episodes in every iteration, as in the paper. "segments" continues the last iteration's
+    episodes; this suits many worlds with few steps each. "auto" selects "episodes" if samples / worlds >= horizon, and
     otherwise "segments"."""
     min_restarts: float | None = None
-    """Minimum number of worlds that start an episode in each iteration, as a multiple of samples / horizon. If fewer
-    worlds started an episode in the last iteration, random worlds are restarted. Worlds are restarted only if the
-    rollout is "segments" and episodes have a time limit. Without restarts, worlds that started together also reach the
-    time limit together, and few samples in between come from the start of an episode. The statistics exclude
-    interrupted episodes, so values well above 1 bias ``return_mean`` towards short episodes. 0 turns restarts off. The
-    default is 0.5 if an episode lasts longer than 20 iterations, and 0 otherwise. For example, episodes of 1,000 steps
-    last longer than 20 iterations with 205 or more worlds and the default number of samples."""
+    """Minimum number of worlds that start an episode in each iteration, as a multiple of samples / horizon; 0 turns
+    restarts off. If fewer worlds started an episode in the last iteration, random worlds are restarted. Worlds are
+    restarted only if the rollout is "segments" and episodes have a time limit. Without restarts, worlds that started
+    together also reach the time limit together; in the iterations in between, few samples come from the start of an
+    episode. The statistics exclude interrupted episodes, so a ``min_restarts`` well above 1 biases ``return_mean``
+    towards short episodes. The default is 0.5 if an episode lasts longer than 20 iterations, and 0 otherwise. For
+    example, episodes of 1,000 steps last longer than 20 iterations with 205 or more worlds and the default number of
+    samples."""
     gamma: float = 0.995
     """Discount factor."""
     lam: float = 0.97
@@ -60,8 +61,8 @@ class NPGConfig:
     fisher_fraction: float = 1.0
     """Fraction of the samples used for the Fisher information, drawn at random in each iteration."""
     kl_limit: float = 1.5
-    """Maximum KL divergence of a step, as a multiple of delta / 2 (the KL divergence to second order). NPG shortens
-    steps that exceed this limit."""
+    """Maximum KL divergence of a step, as a multiple of delta / 2, the second-order estimate of the divergence. NPG
+    shortens steps that exceed this limit."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the policy's hidden layers."""
     activation: Activation = "tanh"

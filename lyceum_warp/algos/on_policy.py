@@ -76,7 +76,7 @@ class OnPolicyLearner(Learner):
         limit: float = LIMIT,
         as_torch: bool = False,
     ) -> None:
-        """Set the given networks, or make new networks, and seed the generator."""
+        """Use the given networks, or make new ones, and seed the generator."""
         env, config, device = self.env, self.config, self.env.obs.device
         nobs, nact = env.obs_space.size, env.action_space.size
         group = value_group(env, config.value_group) if value is None else value.group
@@ -136,6 +136,6 @@ class OnPolicyLearner(Learner):
         return super().state_dict() | {"returns": self.team.gather(self.rollout.running_return).clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from a state of ``state_dict``; see ``Learner``."""
+        """Resume from a result of ``state_dict``; see ``Learner``."""
         super().load_state_dict(state)
         self.rollout.running_return.copy_(state["returns"][self.own_worlds])

@@ -1,4 +1,4 @@
-"""Define the interface of plan updates: they weight the samples, and may fit the noise or the plan to them.
+"""Define the interface of plan updates, which weight the samples, and may fit the plan and its noise to them.
 
 The planner (``planner.py``) rolls out the samples and computes their weighted mean. The modules ``mppi.py``, ``cem.py``
 and ``predictive_sampling.py`` implement three updates.
@@ -31,11 +31,12 @@ class PlanSamples:
     """The samples' weights, (plants, samples). The method ``weigh`` writes the weights; the weights for each plant sum
     to 1."""
     actions: torch.Tensor
-    """The samples, (rows, plants, samples, nact)."""
+    """The samples' actions, (rows, plants, samples, nact)."""
     nominal: torch.Tensor
     """The plans around which the planner drew the samples, (rows, plants, nact)."""
     plan: torch.Tensor
-    """The new plans, (rows, plants, nact): before ``fit``, the weighted means of the samples."""
+    """The new plans, (rows, plants, nact). The planner writes the weighted means of the samples, which ``fit`` may
+    change."""
     nominal_deviation: torch.Tensor | None
     """Standard deviations of the samples' noise before smoothing, (rows, plants, nact); None if ``adapts_noise`` is
     False."""
@@ -51,13 +52,14 @@ class PlanUpdate(abc.ABC):
     """Base class of updates that turn samples into the next plan, as in ``lw.Planner(task, update=MyUpdate(...))``.
 
     A subclass implements ``weigh``; the new plan is the weighted mean of the samples. A subclass may also implement
-    ``fit``, for example to adapt the noise. Each planner makes a shallow copy of the given object, so ``prepare`` may
-    store buffers in its attributes.
+    ``fit``, for example to adapt the noise. Each planner uses a shallow copy of the given object, so ``prepare`` may
+    store buffers as attributes.
     """
 
     capturable: ClassVar[bool] = False
-    """Whether a CUDA graph can capture ``weigh`` and ``fit``, because they consist of Warp launches on arrays at fixed
-    addresses. If False, ``weigh`` and ``fit`` may use torch, and the planner calls them between two graphs."""
+    """Whether a CUDA graph can capture ``weigh`` and ``fit``. This requires that both consist of Warp launches on
+    arrays at fixed addresses. If False, ``weigh`` and ``fit`` may use torch, and the planner calls them between two
+    graphs."""
     adapts_noise: ClassVar[bool] = False
     """Whether the noise has a separate standard deviation for each element of a plan. ``fit`` adapts these standard
     deviations, and the planner shifts them in time. If False, the standard deviations are those of the planner's
@@ -82,7 +84,7 @@ class PlanUpdate(abc.ABC):
 
 
 def by_sample(tensor: torch.Tensor) -> Any:
-    """Convert a tensor of ``PlanSamples`` to a Warp array with one merged axis for plants and samples."""
+    """Convert a tensor of ``PlanSamples`` to a Warp array, with the axes of plants and samples merged."""
     plants = 0 if tensor.ndim == 2 else 1
     return wp.from_torch(tensor.flatten(plants, plants + 1))
 

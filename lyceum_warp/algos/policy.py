@@ -83,7 +83,7 @@ class GaussianPolicy(Normalized):
         self.mirror: PolicyMirror | None = None
 
     def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:
-        """Make the policy symmetric: average its actions with the mirrored actions for mirrored observations.
+        """Make the policy symmetric: average its actions with those for mirrored observations, mirrored back.
 
         Args:
             reflections: The reflections of ``obs`` and ``action`` (``algos.symmetry.reflections``).
@@ -96,7 +96,7 @@ class GaussianPolicy(Normalized):
         """Make a new policy with the given ``shape``.
 
         Raises:
-            ValueError: The shape belongs to a custom policy class or a custom network.
+            ValueError: The shape is that of a custom policy class or of a policy with a custom network.
         """
         if (own := shape.get("own")) is not None:
             normalize = ", normalize=True" if shape["normalize"] else ""

@@ -27,7 +27,7 @@ _SUFFIXES = (".onnx", ".pt2")
 def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None = None) -> Path:
     """Export a policy's ``act`` to a file that runs without this package.
 
-    The exported file includes the normaliser, and maps observations, (n, nobs) float32 for any n, to actions without
+    The exported file includes the normaliser. It maps float32 observations (n, nobs), with any n, to actions without
     noise. The exported file does not clip controls to the actuators' ranges, as environments do.
 
     ===========  ======================================================================================
@@ -53,7 +53,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
         ValueError: The file has an unsupported suffix, or the policy's network cannot be exported.
     """
     if not (isinstance(policy, torch.nn.Module) and hasattr(policy, "act") and hasattr(policy, "nobs")):
-        raise ValueError(f"policy must be a policy, as lw.load(run) returns one, not {described(policy)}")
+        raise ValueError(f"policy must be a module with act and nobs, as lw.load(run) returns, not {described(policy)}")
     path = Path(path)
     check_export(path)
     nobs: Any = policy.nobs

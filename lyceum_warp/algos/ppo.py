@@ -43,7 +43,7 @@ _EPS = 1e-2
 _SMALLEST_STD = 1e-6
 
 _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
-"""Lower limit and upper limit of the adaptive learning rate, and the factor of one change."""
+"""The lower and upper limit of the adaptive learning rate, and the factor by which a change raises or lowers it."""
 
 
 @document_attributes
@@ -84,7 +84,7 @@ class PPO(OnPolicyLearner):
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
         team: The processes that learn together, each with some of the worlds. All processes must make the same calls
-            with the same arguments, and get the same statistics.
+            with the same arguments; all get the same statistics.
 
     Raises:
         ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy is not
@@ -114,11 +114,11 @@ class PPO(OnPolicyLearner):
         config, team, device, steps = self.config, self.team, env.obs.device, self.config.num_steps
         if config.minibatches > (count := steps * env.nworld * team.size):
             raise ValueError(
-                f"{config.minibatches} mini-batches need at least as many samples, not {count}: use more worlds, or "
-                "make "
-                "minibatches smaller"
+                f"{config.minibatches} mini-batches need at least {config.minibatches} samples, not {count}: use more "
+                "worlds or fewer mini-batches"
             )
-        # NPG's initial last layer near zero would make the adaptive learning rate much too high at first
+        # use torch's initial weights: with NPG's last layer near zero, the adaptive learning rate would be much too
+        # high at first
         limit = math.inf if config.normalize else LIMIT
         self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)
         self._make_mirror()
@@ -180,8 +180,8 @@ class PPO(OnPolicyLearner):
             samples = self.evaluated_samples()
             timer.mark()
 
-            # 3. Run epochs of gradient steps on the clipped surrogate, the value loss and the entropy, one per
-            # mini-batch.
+            # 3. Run epochs of mini-batches, each for one gradient step on the clipped surrogate, the value loss and the
+            # entropy.
             self.update(samples)
             kl = self.divergence()
 
@@ -235,7 +235,7 @@ class PPO(OnPolicyLearner):
 
     @torch.no_grad()
     def sample(self) -> None:
-        """Fill the rollout buffer with the current policy and new noise.
+        """Fill the rollout buffer with samples of the current policy, drawn with new noise.
 
         After each step, the normalisers are updated with the step's observations. Values and densities are computed
         later, by ``evaluated_samples`` for all steps at once.
@@ -256,7 +256,7 @@ class PPO(OnPolicyLearner):
 
     @torch.no_grad()
     def evaluated_samples(self) -> dict[str, torch.Tensor]:
-        """Compute the inputs of the update, each (steps, nworld, ...), from the samples and the old networks.
+        """Compute the update's inputs, each (steps, nworld, ...), with the networks from before the update.
 
         Advantages bootstrap from the observation after each step but before the task's events, such as a push or a new
         command. An event changes the value of the state, but no action caused this change, so advantages and targets
@@ -338,7 +338,7 @@ class PPO(OnPolicyLearner):
     def _with_images(self, samples: Samples) -> dict[str, torch.Tensor]:
         """Append the mirror images of samples.
 
-        A mirrored sample has the same density as the original sample, because the mirrored policy has drawn it.
+        A mirrored sample keeps the density of the original sample: the mirrored policy would draw it with this density.
         """
         assert self._mirror is not None
         images = dict(samples)
@@ -375,7 +375,7 @@ class PPO(OnPolicyLearner):
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
-        """Get the returns of all processes' counted episodes that ended in the iteration, ordered by step."""
+        """Get the returns of the counted episodes that ended in any process's worlds, ordered by step."""
         ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
         ended = self.team.gather(ended.T).T
         found: list[float] = ended[~ended.isnan()].tolist()
@@ -391,7 +391,7 @@ class PPO(OnPolicyLearner):
         return super().state_dict() | copy.deepcopy(own)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from a state of ``state_dict``; see ``Learner``."""
+        """Resume from a result of ``state_dict``; see ``Learner``."""
         super().load_state_dict(state)
         self.optimizer.load_state_dict(state["optimizer"])
         for group in self.optimizer.param_groups:

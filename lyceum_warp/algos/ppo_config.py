@@ -39,7 +39,8 @@ class PPOConfig:
     """Clipping range of the probability ratio around 1. If clip_value_loss is set, values are clipped to the same
     distance from the old values."""
     clip_value_loss: bool = True
-    """Whether to use a clipped value loss: the larger of the errors of the prediction and of the clipped prediction."""
+    """Whether to clip the value loss: it is then the larger of the errors of the prediction and the clipped
+    prediction."""
     value_coef: float = 1.0
     """Coefficient of the value loss."""
     entropy_coef: float = 0.01
@@ -77,16 +78,16 @@ class PPOConfig:
     value_group: str | None = None
     """Group of observations for the value function; by default "critic" if the task has such a group, else "policy"."""
     symmetry: Literal["none", "exact", "loss", "augment"] = "none"
-    """How to use the mirror symmetry that a task declares (``lw.Mirror``): "exact" averages the policy with its mirror
-    image; "loss" adds symmetry_coef times the squared difference between the policy and its mirror image; "augment"
-    also learns from the mirror images of all samples; "none" ignores the symmetry."""
+    """How to use the mirror symmetry that a task declares (``lw.Mirror``). "exact" averages the policy with its mirror
+    image. "loss" adds symmetry_coef times the squared difference between the policy and its mirror image to the loss.
+    "augment" also learns from the mirror images of all samples. "none" ignores the symmetry."""
     symmetry_coef: float = 1.0
     """Coefficient of the symmetry loss, if symmetry is "loss"."""
     normalize: bool = True
     """Whether to normalise observations by their running mean and variance, updated in every step."""
     stagger: bool = True
-    """Whether the first episodes start at random steps, so that time limits are spread over time. On the Warp engine,
-    all worlds start together nevertheless if the task sets ``lw.Task.settle``."""
+    """Whether the first episodes start at random steps, so that time limits are spread over time. The Warp engine
+    starts all worlds together nevertheless if the task sets ``lw.Task.settle``."""
     tf32: bool = True
     """Whether matrix products on a GPU use TensorFloat-32."""
     mean_every: int = 20

@@ -11,10 +11,11 @@ from lyceum_warp.support.machine import free_memory
 from lyceum_warp.support.validate import check_kind, finite_number, whole_number
 
 Rows: TypeAlias = dict[str, torch.Tensor]
-"""The buffer's contents for consecutive steps, such as rewards, by name; each tensor is (steps, nworld, ...)."""
+"""The contents of consecutive steps (rewards, actions, ...) by name; each tensor is (steps, nworld, ...)."""
 
 _TRANSITIONS, _STEPS = 1_000_000, 1_024
-"""The default capacity is the larger of a number of transitions and a number of steps of every world."""
+"""The default capacity is the first number of transitions, or the second number of steps of every world if that is
+more."""
 
 _SHARE = 0.3
 """Largest fraction of the device's free memory that the default capacity takes."""
@@ -41,9 +42,9 @@ class Replay:
     """Ring buffer of the transitions of every world, on the device of the environment's observations.
 
     ``step`` steps the environment and stores its transitions; ``sample`` draws some of the stored transitions. Sampling
-    retains no memory, and the host does not wait for the device. A fault truncates an episode: the transition has the
-    reward 0 and the last valid observations as ``next_obs``. Non-finite actions are stored as 0, so all contents are
-    finite.
+    frees all memory that it allocates except the batch, and the host does not wait for the device. A fault truncates an
+    episode: the transition has the reward 0 and the last valid observations as ``next_obs``. Non-finite actions are
+    stored as 0, so all contents are finite.
 
     Example:
         >>> replay = Replay(env)
@@ -185,7 +186,7 @@ class Replay:
         )  # fmt: skip
 
     def _groups(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Get a view of each observation group, stored in the first columns."""
+        """Get a view of each observation group; the groups are stored one after another in the first columns."""
         parts = rows[..., : sum(self._sizes)].split(self._sizes, dim=-1)
         return dict(zip(self.env.obs_groups, parts, strict=True))
 
@@ -203,7 +204,7 @@ class Replay:
             array[place] = rows[name].to(array.device)
 
     def restore(self, stored: int) -> None:
-        """Set the number of steps stored so far, after calls of ``set_rows``."""
+        """Set the number of steps stored so far; call this after the last ``set_rows``."""
         self._set_stored(whole_number("stored", stored, low=0, high=2**62))
 
     def state_dict(self) -> dict[str, Any]:
@@ -211,7 +212,7 @@ class Replay:
         return {"stored": self.stored, "rows": self.rows(self.stored - self.count, self.stored)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of ``state_dict``. Sampling with equal random numbers then gives equal transitions.
+        """Restore a result of ``state_dict``. Sampling with equal random numbers then gives equal transitions.
 
         Raises:
             ValueError: The state belongs to a buffer of a different size.
@@ -242,7 +243,7 @@ def default_capacity(env: Env, processes: int = 1) -> int:
 
     Args:
         env: The environment.
-        processes: Number of processes that share the default number of transitions; each has its own environment.
+        processes: Number of processes; each stores an equal part of the default number of transitions.
     """
     wanted, free = max(-(-_TRANSITIONS // processes), _STEPS * env.nworld), free_memory(env.device)
     return wanted if free is None else max(min(wanted, int(_SHARE * free) // _transition_bytes(env)), env.nworld)

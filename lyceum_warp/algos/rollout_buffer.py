@@ -36,8 +36,8 @@ class Rollout:
         env: The environment.
         steps: Number of steps.
         groups: Groups of observations to store in addition to "policy", such as ``("critic",)``.
-        first_only: Whether to count only each world's first episode since ``restart``. Statistics of all finished
-            episodes are biased towards short episodes if all worlds start together.
+        first_only: Whether to count only each world's first episode since ``restart``. If all worlds start together,
+            statistics of all finished episodes would be biased towards short episodes.
 
     Raises:
         ValueError: The task has no group of observations of this name.
@@ -67,7 +67,7 @@ class Rollout:
     success: torch.Tensor
     """Whether the goal is met after each step, (steps, nworld) bool."""
     episode_return: torch.Tensor
-    """Sum of the episode's rewards so far, (steps, nworld); NaN in episodes that are not counted."""
+    """Sum of the episode's rewards so far, (steps, nworld); NaN in episodes that the statistics exclude."""
     episode_length: torch.Tensor
     """Number of the episode's steps so far, (steps, nworld)."""
     episode_metrics: dict[str, torch.Tensor]
@@ -76,7 +76,7 @@ class Rollout:
     """The task's metrics at each step, by name, each (steps, nworld)."""
 
     running_return: torch.Tensor
-    """Sum of the rewards of each world's current episode, (nworld,); NaN in episodes that are not counted."""
+    """Sum of the rewards of each world's current episode, (nworld,); NaN in episodes that the statistics exclude."""
     faults: torch.Tensor
     """Number of faults of each world within the buffer's steps, (nworld,) int32."""
 
@@ -127,7 +127,7 @@ class Rollout:
         self._after_step = graphs.sequence([Phase("store outputs", self._launch_outputs)])
 
     def _stored(self, source: torch.Tensor, into: list["_Rows"]) -> torch.Tensor:
-        """Allocate a tensor (steps, nworld, size) in which to store ``source`` at each step."""
+        """Allocate a tensor (steps, nworld, size) for a copy of ``source`` at each step."""
         into.append(_Rows(source, self.steps, self.env.device))
         return into[-1].stored
 
@@ -148,7 +148,7 @@ class Rollout:
             self.store_outputs()
 
     def begin(self) -> None:
-        """Start to fill the buffer; for callers that step the environment themselves instead of by ``collect``."""
+        """Start to fill the buffer, if the caller steps the environment itself instead of calling ``collect``."""
         self._index.zero_()
         self._fault.zero_()
 
@@ -172,10 +172,11 @@ class Rollout:
 
         Worlds that start together and never terminate would otherwise all reach their time limits in the same rollout.
         The returns of the shortened episodes are not counted. If ``lw.Task.settle`` is set and the engine is Warp, this
-        method does nothing: while one world settles, all others wait, so all should reset at the same time.
+        method does nothing: while one world settles after a reset, all others wait, so all worlds should reset at the
+        same time.
 
         Args:
-            generator: Random generator for the values, in the same state in every process.
+            generator: Random generator for the values; its state must be the same in every process.
             team: The processes.
         """
         env, team = self.env, team or Team()
@@ -191,12 +192,12 @@ class Rollout:
     def restart_some(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
         """Restart random worlds so that at least ``least`` worlds started an episode within the last ``steps`` steps.
 
-        Interrupted episodes are not counted. Do not restart worlds if ``first_only`` is set, because the first episodes
-        of restarted worlds would count twice. The host does not wait for the device.
+        The statistics exclude interrupted episodes. Do not call this if ``first_only`` is set, because two episodes of
+        a restarted world would count as its first. The host does not wait for the device.
 
         Args:
             least: Minimum number of worlds in all processes.
-            generator: Random generator for the choice of worlds, in the same state in every process.
+            generator: Random generator for the choice of worlds; its state must be the same in every process.
             team: The processes.
         """
         env, team = self.env, team or Team()
@@ -209,7 +210,7 @@ class Rollout:
         self.running_return.masked_fill_(mask, 0.0)
 
     def explain_not_finite(self) -> str:
-        """Describe the first number that is infinite, NaN or too large for float32, and its fix, in one sentence.
+        """Describe in one sentence the first number that is infinite, NaN or too large for float32, and a remedy.
 
         The host waits for the device. A task's rewards and observations can be too large, but never infinite or NaN,
         because the environment treats such values as faults.

@@ -116,7 +116,7 @@ def metric_sums(rollout: Rollout) -> tuple[torch.Tensor, ...]:
 
 
 def _ended(rollout: Rollout) -> torch.Tensor:
-    """Compute a mask, (steps, nworld) bool: whether a counted episode ended in the step."""
+    """Compute a mask of the steps in which a counted episode ended, (steps, nworld) bool."""
     return rollout.done & ~rollout.episode_return.isnan()
 
 

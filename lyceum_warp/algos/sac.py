@@ -72,8 +72,8 @@ class SACIteration(SampledIteration):
 class SAC(Learner):
     """Learns a policy by SAC, as an infinite iterator of ``SACIteration``.
 
-    In an iteration, every world makes ``num_steps`` steps, each followed by ``updates`` updates. On a GPU, all updates
-    after a step run as one CUDA graph, including the sampling of their batches.
+    In an iteration, every world makes ``num_steps`` steps. Each step is followed by as many updates as the setting
+    ``updates`` says; on a GPU, they run as one CUDA graph, including the sampling of their batches.
 
     Example:
         >>> for it in SAC(env):
@@ -86,7 +86,7 @@ class SAC(Learner):
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
         team: The processes that learn together. Each has some of the worlds, and a replay buffer for them. All
-            processes must make the same calls with the same arguments, and get the same statistics.
+            processes must make the same calls with the same arguments; all get the same statistics.
 
     Raises:
         ValueError: The environment does not reset automatically, or an argument does not fit the environment.
@@ -295,7 +295,7 @@ class SAC(Learner):
         random: dict[str, Any] = dict(generator=self.generator, device=self._index.device)
         index = torch.randint(self.replay.count * nworld * team.size, shape, **random)
         noise = torch.randn((*shape, self._noise.shape[-1]), **random)
-        # move this process's samples to the front, and drop samples beyond the capacity, as Minibatches does
+        # as in Minibatches, move this process's samples to the front, and drop those that do not fit into the buffer
         if team.size > 1:
             index, own = team.locate(index, nworld)
             first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self._index.shape[1]]
@@ -399,7 +399,7 @@ class SAC(Learner):
         return super().state_dict() | copy.deepcopy(own)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from a state of ``state_dict``; see ``Learner``."""
+        """Resume from a result of ``state_dict``; see ``Learner``."""
         super().load_state_dict(state)
         self.target.load_state_dict(state["target"])
         with torch.no_grad():
@@ -429,7 +429,7 @@ class GradientStep:
         self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=cuda)
 
     def __call__(self, loss: torch.Tensor, *numbers: torch.Tensor) -> torch.Tensor:
-        """Make a gradient step; return the sums of the loss and the numbers over all processes, (1 + len(numbers),)."""
+        """Make a gradient step; return the loss and the numbers, summed over all processes, (1 + len(numbers),)."""
         # do not use backward(): it accumulates gradients on the CUDA stream of its first call
         gradients = torch.autograd.grad(loss, self.parameters)
         parts = [*gradients, *(number.detach() for number in (loss, *numbers))]

@@ -74,8 +74,8 @@ class SACConfig:
     """Initial temperature, the learned weight of the entropy. The default is 0.001 with 256 or more worlds, and
     otherwise 1."""
     target_entropy: float | None = None
-    """Target entropy of the policy, per element of the action scaled to [-1, 1]. SAC adapts the temperature to the
-    target entropy. The default is 0 with 256 or more worlds, and otherwise -1."""
+    """Target entropy of the policy, per element of the action scaled to [-1, 1]. SAC adapts the temperature so that the
+    policy's entropy reaches the target. The default is 0 with 256 or more worlds, and otherwise -1."""
     action_limit: float = 1.0
     """Absolute limit of actions for which the task gives no bounds."""
     hidden: tuple[int, ...] | None = None
@@ -93,9 +93,9 @@ class SACConfig:
     layer_norm: bool = True
     """Whether to apply layer normalisation to the critics' hidden layers."""
     symmetry: Literal["none", "exact", "loss", "augment"] = "none"
-    """How to use the mirror symmetry that a task declares (``lw.Mirror``): "exact" averages the policy with its mirror
-    image; "loss" adds symmetry_coef times the squared difference between the policy and its mirror image; "augment"
-    also learns from the mirror images of all samples; "none" ignores the symmetry."""
+    """How to use the mirror symmetry that a task declares (``lw.Mirror``). "exact" averages the policy with its mirror
+    image. "loss" adds symmetry_coef times the squared difference between the policy and its mirror image to the loss.
+    "augment" also learns from the mirror images of all samples. "none" ignores the symmetry."""
     symmetry_coef: float = 1.0
     """Coefficient of the symmetry loss, if symmetry is "loss"."""
     normalize: bool = True

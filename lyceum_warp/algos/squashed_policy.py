@@ -36,7 +36,7 @@ class SquashedPolicy(Normalized):
         generator: Draws the initial weights.
 
     Raises:
-        ValueError: The mirror image of an action has different bounds.
+        ValueError: The bounds of an action differ from those of its mirror image.
     """
 
     shape: dict[str, Any]
@@ -78,13 +78,13 @@ class SquashedPolicy(Normalized):
             self.use_mirror(mirror)
 
     def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:
-        """Make the policy symmetric: average mean and standard deviation with those of its mirror image.
+        """Make the policy symmetric: average its mean and standard deviation with those of its mirror image.
 
         Args:
             reflections: The reflections of ``obs`` and ``action`` (``algos.symmetry.reflections``).
 
         Raises:
-            ValueError: The mirror image of an action has different bounds.
+            ValueError: The bounds of an action differ from those of its mirror image.
         """
         low, high = self.shape["low"], self.shape["high"]
         bounds = list(zip(low, high, strict=True))

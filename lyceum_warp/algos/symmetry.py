@@ -45,9 +45,9 @@ class PolicyMirror(nn.Module):
         self.obs, self.action = Reflected(reflections["obs"]), Reflected(reflections["action"])
 
     def average(self, function: Callable[[torch.Tensor], torch.Tensor], obs: torch.Tensor) -> torch.Tensor:
-        """Compute symmetric actions: average a function's actions with their mirrored counterparts.
+        """Compute symmetric actions: average actions with those for mirrored observations, mirrored back.
 
-        For mirrored observations, the result is exactly the mirror image, bit for bit.
+        Mirrored observations then give exactly the mirror images of the actions, bit for bit.
         """
         return 0.5 * (function(obs) + self.action(function(self.obs(obs))))
 

@@ -14,7 +14,7 @@ Result = TypeVar("Result")
 class PhaseTimer:
     """Measures the seconds between calls of ``mark``, starting at construction.
 
-    On a GPU, ``mark`` records a CUDA event, so that only ``seconds`` waits for the device.
+    On a GPU, ``mark`` only records a CUDA event; the host waits for the device in ``seconds``.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -71,7 +71,7 @@ def beside(function: Callable[[], Result], *, allowed: bool) -> Iterator[Callabl
         allowed: Whether the function may run in parallel with the ``with`` block.
 
     Yields:
-        A function that waits for the result and returns the result.
+        A function that waits until ``function`` has returned, and returns its result.
     """
     if not allowed or torch.get_num_threads() != 2:
         yield function

@@ -40,11 +40,11 @@ class Difference:
     high: float
     """Upper end of the confidence interval of the difference (second mean minus first mean)."""
     margin: float
-    """The largest difference that counts as equal."""
+    """The largest difference at which the two means count as equal."""
 
     @property
     def verdict(self) -> str:
-        """Compare the interval with the margin: "same" if inside, "different" if outside, "not shown" otherwise."""
+        """Return "same" if the interval is within the margin, "different" if outside, and otherwise "not shown"."""
         if -self.margin <= self.low and self.high <= self.margin:
             return "same"
         return "different" if self.low > self.margin or self.high < -self.margin else "not shown"
@@ -71,7 +71,7 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """Combine the verdicts: "different" if any is "different", "same" if all are "same", else "not shown"."""
+        """Return "different" if any quantity's verdict is, "same" if all verdicts are, and otherwise "not shown"."""
         verdicts = {difference.verdict for difference in self.differences}
         return "different" if "different" in verdicts else "same" if verdicts == {"same"} else "not shown"
 
@@ -125,19 +125,19 @@ def transfer(
     """Play and compare pairs of episodes, on both engines and with each of the task's physics options.
 
     There are two kinds of comparisons. The Warp engine is compared with the C engine, both with the environment's
-    physics options. On the C engine, each set of physics options of the task, and the environment's set, is compared
-    with the task's exact physics. Both episodes of a pair have equal initial states, randomized model fields, pushes
-    and commands. The intervals of returns and lengths use Student's t over the pairs; the interval of the terminated
-    fraction uses Agresti and Min's method.
+    physics options. On the C engine, the task's exact physics is compared with each other set of physics options of the
+    task, and with the environment's set. Both episodes of a pair have equal initial states, randomized model fields,
+    pushes and commands. The intervals of returns and lengths use Student's t over the pairs; the interval of the
+    terminated fraction uses Agresti and Min's method.
 
     Args:
         env: An environment of the task; its worlds do not change.
         policy: A module with a method ``act``, or a function from observations to actions, without noise.
         episodes: Number of pairs of episodes, each in a separate world.
         seed: Seed of the initial states.
-        margin: Largest difference that counts as equal. For returns and lengths, the margin is a fraction of the mean
-            absolute return or mean length in the first simulation; for terminations, it is an absolute difference of
-            fractions.
+        margin: Largest difference at which two means count as equal. For returns and lengths, the margin is a fraction
+            of the mean absolute return or mean length in the first simulation; for terminations, it is an absolute
+            difference of fractions.
         device: Device of the Warp engine; by default the environment's GPU, or else another GPU, or else the CPU, on
             which Warp's kernels may take minutes to compile.
         warp: Whether to play episodes on the Warp engine, too.
@@ -182,7 +182,7 @@ def _show(progress: Callable[[int, int], object] | None, play: int, plays: int, 
 
 
 def task_physics(env: Env) -> tuple[dict[str, PhysicsOptions], str]:
-    """Get a task's sets of physics options by name, including the environment's set, and the name of this set.
+    """Get the task's and the environment's physics options by name, and the name of the environment's options.
 
     Options that only the Warp engine has are ignored.
     """

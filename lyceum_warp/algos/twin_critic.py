@@ -15,7 +15,7 @@ from lyceum_warp.support.validate import layer_sizes, whole_number
 
 @document_attributes
 class TwinCritic(Normalized):
-    """Two independent networks of the same shape, evaluated together, one layer after the other.
+    """Two independent networks of the same shape, evaluated together, layer by layer.
 
     Args:
         nobs: Length of an observation.
@@ -94,7 +94,7 @@ class TwinLinear(nn.Module):
 
 
 class TwinLayerNorm(nn.Module):
-    """Two layer normalisations for the two halves of an input (2, rows, m)."""
+    """Two layer normalisations, one for each half of an input (2, rows, m)."""
 
     def __init__(self, m: int) -> None:
         super().__init__()

@@ -25,7 +25,7 @@ class ValueFit:
         rate: Learning rate.
         epochs: Number of passes over the samples.
         batch: Number of samples in a mini-batch.
-        team: The processes that fit together.
+        team: The processes that fit the value function together.
     """
 
     def __init__(
@@ -110,11 +110,11 @@ class ValueFit:
             tensor.copy_(part.view_as(tensor))
 
     def _own(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | float]:
-        """Select this process's samples of a mini-batch, and compute their weights in the mean over the mini-batch."""
+        """Select this process's samples of a mini-batch, and compute their weights in the mini-batch's mean."""
         if self.team.size == 1:
             return index, 1.0 / len(index)
         places, own = self.team.locate(index, self.nworld)
-        # on a GPU, exclude other processes' samples by the weight 0, because a selection would synchronise
+        # on a GPU, give other processes' samples the weight 0, because selection by a mask would synchronise
         if self.cuda:
             return places, own.unsqueeze(-1) / len(index)
         return places[own], 1.0 / len(index)
@@ -252,7 +252,7 @@ class CapturedStep:
         self.at.zero_()
 
     def _capture(self, times: int) -> None:
-        """Run ``times`` steps directly, so that Adam allocates its moments, and then capture the graph."""
+        """Run ``times`` steps without a graph, so that Adam allocates its moments; then capture the graph."""
         with side_stream():
             for _ in range(times):
                 self.learn()

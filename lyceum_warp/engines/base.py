@@ -35,10 +35,10 @@ class Engine(abc.ABC):
         device: The device of the arrays.
         fields: The fields to provide, from ``fields.describe``. The engine provides no other fields.
         dynamics: The model fields that differ between worlds, from ``model_fields.describe_model_field``.
-        initial: The initial state for ``reset``, (integration_size,); None for the model's own.
+        initial: The initial state for ``reset``, (integration_size,); None for the model's initial state.
 
     Raises:
-        ValueError: A field is described as both lagged and current, the initial state has the wrong shape, or a model
+        ValueError: A field is listed twice, as lagged and as current, the initial state has the wrong shape, or a model
             field cannot differ between worlds of this model.
     """
 
@@ -156,7 +156,7 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def find_faults(self, mask: wp.array) -> None:
-        """Set ``fault`` in the masked worlds, from their states, and from overflows and warnings since the last call.
+        """Set ``fault`` in the masked worlds from their states, and from overflows and warnings since the last call.
 
         The method consists of Warp launches on every engine.
         """
@@ -168,7 +168,7 @@ class Engine(abc.ABC):
     def reset(self, mask: wp.array) -> None:
         """Put the masked worlds and their state fields into the initial state.
 
-        The method consists of Warp launches on every engine. The caller then updates derived fields by ``refresh``.
+        The method consists of Warp launches on every engine. The caller must then update derived fields by ``refresh``.
         """
 
     @abc.abstractmethod
@@ -181,7 +181,7 @@ class Engine(abc.ABC):
     def apply_model(self, mask: wp.array) -> None:
         """Apply the masked worlds' model fields, and recompute the constants derived from them.
 
-        The cost is negligible for unchanged values. The caller then updates derived fields by ``refresh`` or
+        The cost is negligible for unchanged values. The caller must then update derived fields by ``refresh`` or
         ``refresh_current``. An engine that accepts ``dynamics`` must implement this method.
         """
         if self.dynamics:
@@ -190,8 +190,8 @@ class Engine(abc.ABC):
     def settle(self, mask: wp.array, nstep: int) -> None:
         """Advance only the masked worlds by ``nstep`` substeps from their committed states, and update state fields.
 
-        The time of the masked worlds is then 0, and the caller updates derived fields by ``refresh``. No bit of any
-        other world changes.
+        Afterwards, the time of the masked worlds is 0, and the caller must update derived fields by ``refresh``. No bit
+        of any other world changes.
         """
         raise NotImplementedError(f"the {self.name} engine cannot settle individual worlds")
 
@@ -225,7 +225,7 @@ class Engine(abc.ABC):
             buffers: Destinations of fields and model fields, by name, (steps + 1, nworld, ...); row 0 is the initial
                 state.
         """
-        self.reset(self._everyone)  # find_faults also clears the last rollout's warnings and warm starts
+        self.reset(self._everyone)  # clear what the last rollout left, such as warm starts
         self.set_state(state, self._everyone)
         self._copy_fields(buffers, 0)
         for t in range(len(controls)):
@@ -299,8 +299,8 @@ class Engine(abc.ABC):
 EngineFactory = Callable[..., Engine]
 """A function that makes an engine from (model, nworld, device, fields, dynamics, initial, **options).
 
-Engine classes are factories. Available memory is checked first if a factory has ``bytes_per_world``, as engine classes
-do.
+Engine classes are factories. If a factory has ``bytes_per_world``, as engine classes do, the free memory is checked
+before the factory is called.
 """
 
 

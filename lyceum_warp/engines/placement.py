@@ -31,11 +31,11 @@ break-even points are 27 samples per core on adroit_pen without noslip, 41 on re
 (bench/README.md)."""
 
 _MOST_CORES = 16
-"""The maximum number of CPU cores that the choice takes into account. More cores were not measured, and the rest of a
-plan's work runs on one core."""
+"""The maximum number of CPU cores that the choice takes into account. More cores were not measured, and only the
+rollouts of a plan run on several cores."""
 
 _NOSLIP = 6
-"""The factor on the break-even point if the model uses the noslip solver, which is slow on a GPU."""
+"""The factor by which the noslip solver, which is slow on a GPU, raises the break-even point."""
 
 
 def find_device(device: str | None) -> wp.Device:
@@ -92,7 +92,7 @@ def open_engine(
         device: The device of the worlds.
         fields: The fields to provide, from ``fields.describe``.
         dynamics: The model fields that differ between worlds, from ``model_fields.describe_model_field``.
-        initial: The initial state for resets; None for the model's own.
+        initial: The initial state for resets; None for the model's initial state.
         reserved: The bytes per world that the caller allocates.
         options: Keyword-only arguments of the engine's constructor. None stands for the engine's default. An unknown
             option is ignored if its value is True or False.

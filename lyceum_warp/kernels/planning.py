@@ -1,4 +1,4 @@
-"""Plan by sampling: controls of open-loop rollouts, noise around a plan, weights, and the weighted mean.
+"""Plan by sampling: compute controls of open-loop rollouts, add noise to plans, weigh and average samples.
 
 Plans have the shape (horizon, nplant, nact). Actions of samples have the shape (horizon, nsample, nact), with the
 samples of a plant in consecutive rows. With spline knots, the first axis has one entry per knot.

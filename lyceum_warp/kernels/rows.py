@@ -1,4 +1,4 @@
-"""Divide a world's rows among threads: thread ``lane`` of ``lanes`` gets the indices i with i % lanes == lane."""
+"""Divide a world's rows among ``lanes`` threads: thread ``lane`` gets the indices i with i % lanes == lane."""
 
 import warp as wp
 

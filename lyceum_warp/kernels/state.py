@@ -1,4 +1,4 @@
-"""Cast and copy masked rows between the arrays of an environment and an engine.
+"""Copy rows of masked worlds between the arrays of an environment and an engine, and cast them.
 
 The float64 arrays are often views of the engine's states. Writes are masked, because copying back a float32 value would
 round the state of a world that should not change. Most masks are nearly empty and most rows are short, so

@@ -82,7 +82,7 @@ def test_policy_that_is_not_gaussian_is_saved_and_exported(env: lw.Env, tmp_path
     path = lw.export_policy(drift.policy, tmp_path / "policy.pt2")
     exported = torch.export.load(path).module()(torch.zeros(3, 6))
     torch.testing.assert_close(exported, drift.policy.act(torch.zeros(3, 6)))
-    with pytest.raises(ValueError, match="policy must be a policy, as lw.load"):
+    with pytest.raises(ValueError, match="policy must be a module with act and nobs, as lw.load"):
         lw.export_policy(nn.Linear(6, 2), tmp_path / "policy.pt2")
 
 

@@ -328,7 +328,7 @@ def test_many_consecutive_non_finite_updates_end_a_run(task_file: TaskFile, tmp_
     message = str(raised.value)
     assert message.startswith(
         "the step of the policy and the fit of the value function in iteration 10 are not finite, as in the 9 "
-        "iterations before, and non-finite updates are skipped. The observation of the task 'wild' is 1e+30 in 'rate' "
+        "iterations before; all these updates were skipped. The observation of the task 'wild' is 1e+30 in 'rate' "
     )
     assert message.endswith("of 320 samples: scale it in observe, or normalise observations (normalize)")
     assert raised.value.__notes__[0].startswith(f"the run in {tmp_path / 'run'} is saved up to iteration ")

@@ -114,7 +114,7 @@ def test_invalid_export_arguments_and_a_missing_package_raise_one_line_errors(
     policy = lw.GaussianPolicy(5, 2)
     with pytest.raises(ValueError, match=r"policy\.jit must end with \.onnx or \.pt2$"):
         lw.export_policy(policy, tmp_path / "policy.jit")
-    with pytest.raises(ValueError, match="policy must be a policy, as lw.load"):
+    with pytest.raises(ValueError, match="policy must be a module with act and nobs, as lw.load"):
         lw.export_policy("runs/mine", tmp_path / "policy.onnx")  # type: ignore[arg-type]
     monkeypatch.setattr(policy_export.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"needs onnx and onnxscript: pip install 'lyceum-warp\[export\]'$"):

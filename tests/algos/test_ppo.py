@@ -220,7 +220,7 @@ def test_invalid_hyperparameters_raise_an_error(words: dict[str, Any], message: 
 
 def test_invalid_ppo_arguments_raise_an_error(env: lw.Env) -> None:
     with pytest.raises(
-        ValueError, match="200 mini-batches need at least as many samples, not 48: use more worlds, or make"
+        ValueError, match="200 mini-batches need at least 200 samples, not 48: use more worlds or fewer mini-batches"
     ):
         made(env, minibatches=200)
     with pytest.raises(ValueError, match="'metered' has no group 'actor' of observations: it has policy, critic"):

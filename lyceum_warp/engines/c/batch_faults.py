@@ -8,7 +8,7 @@ from mujoco.batch import Batch, SimulationError
 log = logging.getLogger(__name__)
 
 _COUNTED_AS = mujoco.mjtWarning.mjWARN_INERTIA.value
-"""The type of warning under which errors are counted."""
+"""Errors are counted as warnings of this type."""
 
 
 class ErrorsAsWarnings:

@@ -45,7 +45,7 @@ _BATCH_BYTES = 150
 """The bytes that ``Batch`` stores per world for warnings, a status and an error message."""
 
 _MOST_MASKS = 16
-"""The maximum number of cached views of masks; an environment has fewer masks."""
+"""The maximum number of masks whose NumPy views are cached; an environment has fewer masks."""
 
 
 class MujocoEngine(Engine):
@@ -54,7 +54,7 @@ class MujocoEngine(Engine):
     Args:
         model, nworld, fields, dynamics: See ``Engine``.
         device: Must be the CPU.
-        initial: The initial state for ``reset``; None for the model's own. The engine rounds it to float32.
+        initial: The initial state for ``reset``; None for the model's initial state. The engine rounds it to float32.
         nthread: Threads of the pool; 0 for all cores.
 
     Raises:
@@ -82,15 +82,15 @@ class MujocoEngine(Engine):
         super().__init__(model, nworld, device, fields, dynamics, initial)
         quiet()
         self.nthread = whole_number("nthread", nthread, low=0)
-        # use one thread: if a subclass launches kernels over all worlds, every thread would repeat these launches
+        # subclasses use one thread: if they launch kernels over all worlds, every thread would repeat these launches
         self.launch_threads = (self.nthread or cpu_cores()) if type(self) is MujocoEngine else 1
         self.native_model = copy.copy(model)
         """The model that the batch steps."""
         # autoreset would hide a fault, because MuJoCo would silently reset the world within a step
         self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         # The batch is not persistent (it has no MjData for each world). A persistent batch could reuse the stages
-        # computed after the last step, but one MjData per world does not fit into the CPU's caches: with a persistent
-        # batch, the six tasks that need such stages were 4 to 33 % slower (128 and 1,024 worlds on two cores).
+        # computed after the last step. However, one MjData per world does not fit into the CPU's caches: the six tasks
+        # that need such stages were 4 to 33 % slower with a persistent batch (128 and 1,024 worlds on two cores).
         self.batch = Batch(self.native_model, nworld, self.nthread)
         self._errors_as_warnings = ErrorsAsWarnings(self.batch)
         self._rows = self._alias(self.batch.state)
@@ -107,13 +107,13 @@ class MujocoEngine(Engine):
         computed = [field for field in self._derived if field.refresh > Stage.NONE]
         positions = all(DERIVED_FIELDS.get(field.name) == Stage.POSITION for field in computed)
         self._apart = bool(computed) and (positions or any(field.lagged for field in kept))
-        """Whether a separate call must compute the last stage after the substeps."""
+        """Whether a separate call of ``forward`` must compute derived fields after the substeps."""
         shown = [field for field in kept if field.name != "ctrl"]  # an input
         late = [field for field in shown if field not in computed or field.snapshot] if self._apart else []
         self._before_stage = [field for field in late if field.name not in STATE_FIELDS]
-        """The fields to copy before the separate call, because the call may run in the MjData of another world."""
+        """The fields to copy before the call of ``forward``, because the call may use the MjData of another world."""
         self._after_stage = [field for field in self._before_stage if field in computed]
-        """The fields that the separate call computes only in part, such as sensors up to a stage."""
+        """Those of ``_before_stage`` that ``forward`` computes in part, such as the sensors of early stages."""
         self._last = [field for field in shown if field not in self._before_stage]
         """The fields that kernel launches copy at the end of a step."""
         # skip collision detection, the slowest part of the position stage: positions do not depend on contacts
@@ -313,7 +313,7 @@ class MujocoEngine(Engine):
         launch_several_rows(widen_four, mask, numbers)
 
     def refresh(self, mask: wp.array) -> None:
-        computed = [field for field in self._derived if field.reset > Stage.NONE]  # clear all other bits
+        computed = [field for field in self._derived if field.reset > Stage.NONE]
         self._forward(mask, self.reset_stage, computed)
 
     def refresh_current(self, mask: wp.array) -> None:

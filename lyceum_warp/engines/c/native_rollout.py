@@ -14,12 +14,12 @@ from lyceum_warp.model_fields import ModelField
 
 
 def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
-    """Whether ``Batch.rollout`` returns exactly the same values as one ``Batch.step`` for each step.
+    """Whether ``Batch.rollout`` returns exactly the same values as a loop of ``Batch.step``.
 
     Each row of a native rollout holds the values in MjData after an ``mj_step``. The state in a row is the state after
-    the substep. Quantities of the position and velocity stages belong to the state before the last substep, and their
-    new values are in the next row. With RK4, quantities of the position and velocity stages belong to an intermediate
-    stage. Sensor data come from several stages, so a native rollout cannot return them exactly.
+    the substep. Quantities of the position and velocity stages belong to the state before that substep; their values
+    for the new state are in the next row. With RK4, quantities of the position and velocity stages belong to an
+    intermediate stage. Sensor data come from several stages, so a native rollout cannot return them exactly.
     """
     current = [field for field in fields if field.refresh > Stage.NONE]
     if any(field.snapshot for field in current):

@@ -13,8 +13,8 @@ from lyceum_warp.model_fields import ModelField
 class WorldModels:
     """Writes values of model fields into a batch, and recomputes the constants derived from them.
 
-    A value that equals the model's own value in float32 becomes the model's float64 value. All other values are written
-    unchanged.
+    A value that equals the model's value, rounded to float32, is replaced by the model's float64 value. All other
+    values are written unchanged.
 
     Args:
         batch: The worlds.
@@ -36,7 +36,7 @@ class WorldModels:
             self._rounded[field.name] = self._own[field.name].astype(np.float32)
             if field.name in self._follows:
                 self._applied[field.name] = self._rows[field.name].astype(np.float32)
-        # call set_const even for the model's own values, so that equal values give equal constants
+        # call set_const at first even in worlds with the model's own values, so that equal values give equal constants
         self._stale = np.full(batch.nsim, bool(self._follows))
 
     def apply(self, values: Mapping[str, np.ndarray], mask: np.ndarray | None = None) -> None:

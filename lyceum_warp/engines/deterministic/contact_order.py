@@ -16,8 +16,8 @@ class CanonicalOrder:
     """Sorts a Data's contacts and constraint rows in every forward pass, through MuJoCo Warp's callbacks.
 
     MuJoCo Warp's own deterministic mode makes sums of atomic additions reproducible, but does not sort contacts and
-    rows. The callbacks run after collision detection, and after the constraint rows are made but before they are
-    solved. ``order_kernels`` describes the order.
+    rows. One callback runs after collision detection. The other runs after the constraint rows are made, before they
+    are solved. ``order_kernels`` describes the order.
 
     Args:
         model: MuJoCo Warp's model; its callbacks are set.

@@ -52,8 +52,8 @@ class DeterministicEngine(WarpEngine):
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
         """Make another Model and Data with the same options and sizes, to benchmark MuJoCo Warp alone.
 
-        All launches of this engine share scratch memory. Launches on the returned Model and Data do not, so a graph of
-        their step takes about a hundred times as much memory.
+        All launches of this engine share scratch memory. Launches on the returned Model and Data allocate separate
+        memory, so a graph of their step takes about a hundred times as much.
         """
         model, data = super().bare()
         with wp.ScopedDevice(self.device):
@@ -68,7 +68,7 @@ class DeterministicEngine(WarpEngine):
         if self.nworld > sizes.most:
             raise ValueError(
                 f"{self.nworld} worlds need buffers of more than the {LARGEST_BUFFER / 1e9:.3g} GB in which Warp can "
-                f"sort with deterministic=True: use nworld={sizes.most} at most, or omit it"
+                f"sort with deterministic=True: use nworld={sizes.most} at most, or omit deterministic"
             )
         fields, dynamics = self.fields.values(), self.dynamics.values()
         plain = super().bytes_per_world(self.model, fields, dynamics, nconmax=self.nconmax, njmax=self.njmax)

@@ -65,7 +65,7 @@ class Scratch(Reserve):
 
 @dataclasses.dataclass(frozen=True)
 class ScratchSizes:
-    """Holds two results: the scratch memory that worlds need, and the largest possible number of worlds."""
+    """The scratch memory that worlds need, and the largest possible number of worlds."""
 
     fixed: int
     """The bytes that do not depend on the number of worlds."""

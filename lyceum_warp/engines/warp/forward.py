@@ -22,7 +22,7 @@ Part = Callable[[mjw.Model, mjw.Data], None]
 """A part of a forward pass, for every world of a Data."""
 
 POSITION: tuple[Part, ...] = (mjw.kinematics, mjw.com_pos, mjw.camlight, mjw.flex, mjw.tendon)
-"""The first parts of substeps and forward passes. These parts depend only on positions."""
+"""The parts with which substeps and forward passes begin; they depend only on positions."""
 
 
 def step(model: mjw.Model, data: mjw.Data, done: Collection[Part] = ()) -> None:
@@ -49,7 +49,7 @@ def inertia(model: mjw.Model, data: mjw.Data) -> None:
 
 @functools.cache
 def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
-    """Make versions of MuJoCo Warp's functions whose first forward pass skips the parts in ``done``.
+    """Make versions of MuJoCo Warp's functions that skip the parts in ``done`` in their first forward pass.
 
     The functions are copies in which some global names are replaced, so MuJoCo Warp itself does not change. The copy of
     ``step`` computes the same results as MuJoCo Warp's ``step``.
@@ -214,7 +214,7 @@ class PartialForward:
     are therefore copied into the group, in as many batches as necessary.
 
     Args:
-        rows: Makes MuJoCo Warp's model for the group, and copies the model fields of the group's worlds into it.
+        rows: Holds MuJoCo Warp's model of the group, and copies the model fields of the group's worlds into it.
         data: MuJoCo Warp's data of all worlds.
         group: MuJoCo Warp's data of the group.
         states: A buffer for the integration states of all worlds, (nworld, integration size), float32.
@@ -266,7 +266,7 @@ class PartialForward:
             mjw.set_state(self._rows.whole, self._data, self._states, _SPEC, mask)
 
     def _run(self, mask: wp.array, work: Callable[[], None]) -> None:
-        """Copy masked worlds' states and model fields into the group, one group at a time, and call ``work``."""
+        """For each group of masked worlds, copy states and model fields into the scratch worlds, and call ``work``."""
         model, group = self._rows.model, self._group
 
         def turn() -> None:

@@ -12,7 +12,7 @@ _ALIGNED = 512
 
 
 class Reserve:
-    """Holds blocks of memory for graphs, which store the blocks' addresses; the blocks live as long as this object.
+    """Holds blocks of memory to which graphs refer by address; the blocks live as long as this object.
 
     Subclasses implement ``allocate`` and can then serve as Warp allocators.
 

@@ -22,8 +22,9 @@ log = logging.getLogger(__name__)
 _WORLDS, _HOLDS, _SUBSTEPS = 32, 25, 20
 
 _LEAST, _LEAST_WITH_FLEX = (8, 8), (256, 512)
-"""The smallest capacities, for a model without and with a flex. A probe may miss many contacts, because a geom that is
-pressed into a flex touches up to 50 of its elements. The second pair is MuJoCo Warp's default."""
+"""The smallest (nconmax, njmax) for a model without a flex, and for a model with a flex. In a model with a flex, a
+probe may miss many contacts, because a geom that is pressed into the flex touches up to 50 of its elements. The second
+pair is MuJoCo Warp's default."""
 
 _FIRST = 32
 """The maximum number of worlds whose initial states are checked."""
@@ -113,7 +114,7 @@ def warn_of_little_room(
 
 
 def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> mujoco.MjModel:
-    """Copy a model, and give each joint and tendon friction loss if it has friction loss in any world."""
+    """Copy a model, and give every joint and tendon friction loss if the task randomizes friction losses."""
     if names := _FRICTION.intersection(varied):
         model = copy.copy(model)
         for name in names:
@@ -175,9 +176,9 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 _TEMPORARIES = 1.25
-"""The memory of a world, divided by the memory of MuJoCo Warp's Data. In measurements, a step's temporary arrays
-took 1 to 9 %; the rest is for graphs and for the group of a partial forward pass. CPU graphs keep all temporary arrays
-alive and take up to three times as much."""
+"""The memory of a world, divided by the memory of a world in MuJoCo Warp's Data. In measurements, a step's temporary
+arrays took 1 to 9 %; the rest of the excess is for graphs and for the group of a partial forward pass. CPU graphs keep
+all temporary arrays alive and take up to three times as much."""
 
 _TEMPORARIES_CONVEX = 3.5
 """The factor for models with convex collisions or the noslip solver. On adroit_pen, the temporary arrays take 1.5 to

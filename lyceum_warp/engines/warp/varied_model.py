@@ -114,15 +114,15 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
 class ModelRows:
     """Make the model of a group of worlds.
 
-    The group's model has its own rows of the fields that differ, and shares all other fields. The group needs a model
-    of its own, because for world w of the group MuJoCo Warp would read row w of the model of all worlds, which belongs
-    to another world.
+    The group's model has its own rows of the fields that differ between worlds, and shares all other fields. In the
+    model of all worlds, row w belongs to world w; for world w of the group, MuJoCo Warp would read the row of a wrong
+    world.
 
     Args:
         whole: The model of all worlds.
         names: The fields with one row per world.
         size: Number of worlds in the group.
-        own: Additional fields that the group writes and that are therefore copied.
+        own: Additional fields to copy, because the group writes them.
     """
 
     def __init__(self, whole: mjw.Model, names: Iterable[str], size: int, own: Iterable[str] = ()) -> None:
@@ -144,7 +144,7 @@ class ModelRows:
             setattr(self.model, name, wp.clone(getattr(whole, name)))
 
     def take(self, turns: Turns) -> None:
-        """Copy into the group the rows of its worlds, from the rows of all worlds."""
+        """Copy the rows of the group's worlds from the model of all worlds into the group's model."""
         if self.model is not self.whole:
             for source, group in self._pairs.values():
                 turns.take(source, group)
@@ -202,7 +202,7 @@ class ModelConstants:
             self._rows = ModelRows(put, [*names, *self._outputs], size, written - set(self._outputs))
             self._scratch = mjw.make_data(model, nworld=size, nconmax=1, njmax=1)
             self._given = [flat(getattr(owner(put, name), name)).view(wp.int32) for name in names]
-            # start with the bits of a NaN that no computation produces
+            # start with the bits of a NaN that no computation produces, so that all worlds count as changed
             self._applied = [wp.full_like(given, -1) for given in self._given]
             self._changed = wp.zeros(nworld, dtype=bool)
             self._everyone = wp.full(size, True, dtype=bool)

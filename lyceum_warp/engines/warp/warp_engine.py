@@ -44,7 +44,7 @@ class WarpEngine(Engine):
         device: A CUDA device, or the CPU, which uses a single thread and is for tests.
         dynamics: The model fields that differ between worlds. Contact and constraint capacities are probed with the
             model's own values; see ``sizes.probe_sizes``.
-        initial: The initial state for ``reset``, rounded to float32; None for the model's own.
+        initial: The initial state for ``reset``, rounded to float32; None for the model's initial state.
         nconmax: Contact capacity of all worlds, divided by the number of worlds. By default, the model is probed, and
             capacity is added for one world in which all geoms touch.
         njmax: Constraint capacity of each world; by default the model is probed.
@@ -103,7 +103,7 @@ class WarpEngine(Engine):
         if self.reset_stage < Stage.ACCELERATION:
             self._reset_parts = forward_parts(model, self._reset)
         self._columns: wp.array = wp.array(early_sensor_columns(model), dtype=int, device=device)
-        # the parts that the last step or restart has already computed for the next step's initial state
+        # the parts of the next step's first forward pass that the last step or restart has already computed
         moved = any(field.written for name, field in self.fields.items() if name in ("mocap_pos", "mocap_quat"))
         current_parts = () if moved else self._current_parts or ()
         self._shared = tuple(part for part in current_parts if part in forward.POSITION)
@@ -310,7 +310,7 @@ class WarpEngine(Engine):
         return self.partial_refresh and self.m.opt.broadphase == mjw.BroadphaseType.NXN
 
     def _partial_forward(self) -> PartialForward | None:
-        """Make a forward pass for only the restarting worlds, or return None if this is impossible or saves nothing."""
+        """Make a forward pass of the restarting worlds alone; return None if this is impossible or saves nothing."""
         return self._group_of_worlds() if self._is_partial() and self._reset_parts is None else None
 
     def _group_of_worlds(self) -> PartialForward:
@@ -323,7 +323,7 @@ class WarpEngine(Engine):
 
     @contextlib.contextmanager
     def _histories_kept(self) -> Iterator[None]:
-        """Return a context that restores sensor histories, because the next step adds the same samples again."""
+        """Return a context that restores sensor histories at its end, because the next step adds the same samples."""
         if self.d.history.size:
             wp.copy(self._history, self.d.history)
         yield

@@ -1,6 +1,6 @@
 """Define kernels that copy masked worlds into a small group and back, place static geoms, and correct constants.
 
-Each masked world has a rank; a group holds consecutive ranks from ``first``.
+Each masked world has a rank. A group holds the worlds with consecutive ranks, beginning with rank ``first``.
 """
 
 import warp as wp
