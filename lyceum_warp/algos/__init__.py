@@ -1,1 +1,1 @@
-"""Learn by NPG, PPO or SAC, and plan by sampling: one file for each algorithm, and their common modules."""
+"""Learn by NPG, PPO or SAC, and plan by sampling: one module for each algorithm, and modules that they share."""

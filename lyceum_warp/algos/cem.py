@@ -52,7 +52,7 @@ class CrossEntropy(EliteWeights):
 
     Args:
         elites: Number of best samples, which determine the new plan and the new noise.
-        min_noise: Lower limit of the standard deviations, one number or one for each action.
+        min_noise: Lower limit of the standard deviations: one number, or one number for each action.
         smoothing: Weights (b0, b1, b2) that smooth the noise over time.
     """
 

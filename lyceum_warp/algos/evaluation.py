@@ -136,7 +136,7 @@ ENDLESS_STEPS = 1000
 
 
 def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
-    """Copy an environment with another number of worlds; if it has no horizon, the copy's is 1,000 steps.
+    """Copy an environment with another number of worlds, and with a horizon of 1,000 steps if it has none.
 
     Args:
         env: The environment.
@@ -164,7 +164,7 @@ class MeanPolicyEvaluation:
         self._few: Env | None = None
 
     def __call__(self, policy: torch.nn.Module) -> dict[str, float]:
-        """Evaluate the policy, and return means over the episodes, with the names of the fields of ``Iteration``."""
+        """Evaluate the policy, and return the fields of ``Iteration`` that hold means over the episodes."""
         means = torch.zeros(len(MEAN_STATISTICS), dtype=torch.float64, device=self.env.obs.device)
         if self.team.leads:
             if self._few is None:

@@ -94,7 +94,7 @@ _Applied: TypeAlias = tuple[torch.Tensor, torch.Tensor]
 
 
 class Normalizer(nn.Module):
-    """Normalises observations by their running mean and variance; observations do not change before the first update.
+    """Normalises observations by their running mean and variance; until the first update, observations stay unchanged.
 
     Args:
         size: Length of an observation.

@@ -292,7 +292,7 @@ class NPG(OnPolicyLearner):
         return old_mean
 
     def fisher(self, obs: torch.Tensor) -> FisherProduct:
-        """Make a function that multiplies by the Fisher information, estimated on a random subset of the samples.
+        """Make a function that multiplies a vector by the Fisher information of a random subset of the samples.
 
         Args:
             obs: Observations of this process's worlds, (samples, nobs).

@@ -28,14 +28,14 @@ class NPGIteration(OnPolicyIteration):
     """
 
     step_norm: float
-    """Euclidean norm of the full step in the policy's parameters."""
+    """Euclidean norm of the step in the policy's parameters, before any shortening."""
     step_fraction: float
     """Fraction of the full step that was applied; less than 1 if the full step exceeded the limit of the KL
     divergence."""
     gradient_norm: float
     """Euclidean norm of the vanilla policy gradient."""
     value_error: float
-    """Squared error of the value function before the fit, divided by the squared error of predicting always 0."""
+    """Squared error of the value function before the fit, divided by the squared error of always predicting 0."""
     explained_variance: float
     """Fraction of the returns' variance that the value function explained before the fit."""
     outliers: int
@@ -52,7 +52,7 @@ class NPGIteration(OnPolicyIteration):
 
 
 class UpdateNumbers(NamedTuple):
-    """Statistics of one update of the policy, with the names of the fields of ``NPGIteration``."""
+    """Statistics of one update of the policy; the names are those of the fields of ``NPGIteration``."""
 
     # statistics that are equal in all processes
     finite: Scalar  # whether the step is finite
@@ -115,7 +115,7 @@ def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> ValueSums
 
 
 def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence[str] = ()) -> dict[str, Any]:
-    """Combine the numbers of all processes into statistics with the names of the fields of ``NPGIteration``.
+    """Combine the numbers of all processes into the values of fields of ``NPGIteration``.
 
     Args:
         processes: The ``ProcessNumbers`` of each process, as floats.

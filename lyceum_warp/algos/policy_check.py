@@ -26,7 +26,7 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
         twice: Whether the policy must be twice differentiable, as NPG requires.
 
     Raises:
-        ValueError: The policy violates a rule.
+        ValueError: The policy violates one of these rules.
     """
     if not isinstance(policy, GaussianPolicy):
         kind = getattr(policy, "__name__", None) or type(policy).__name__

@@ -260,8 +260,8 @@ class PPO(OnPolicyLearner):
 
         Advantages bootstrap from the observation after each step but before the task's events, such as a push or a new
         command. An event changes the value of the state, but no action caused this change, so advantages and targets
-        exclude it. The same observation is used at time limits, at faults and at the end of the rollout. The value
-        function's targets are its predictions plus the advantages.
+        exclude it. At time limits, at faults and at the end of the rollout, they bootstrap from the same observation.
+        The value function's targets are its predictions plus the advantages.
         """
         rollout, config, team = self.rollout, self.config, self.team
         obs, final_obs = rollout.obs_groups[self.value.group], rollout.final_obs_groups[self.value.group]
@@ -375,7 +375,7 @@ class PPO(OnPolicyLearner):
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
-        """Get the returns of the counted episodes that ended in any process's worlds, ordered by step."""
+        """Get the returns of the episodes that ended in all processes, without excluded episodes, ordered by step."""
         ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
         ended = self.team.gather(ended.T).T
         found: list[float] = ended[~ended.isnan()].tolist()

@@ -32,7 +32,8 @@ class Transitions(NamedTuple):
     reward: torch.Tensor
     """Discounted sums of the rewards of up to ``n_step`` steps, (batch,)."""
     discount: torch.Tensor
-    """Factors of the value of ``next_obs``, (batch,): gamma^k after k steps, or 0 if the episode was terminated."""
+    """Factors that multiply the value of ``next_obs``, (batch,): gamma^k after k steps, or 0 if the episode was
+    terminated."""
     next_obs: dict[str, torch.Tensor]
     """Observations of each group after the last step and before any reset."""
 

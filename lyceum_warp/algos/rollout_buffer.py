@@ -36,8 +36,8 @@ class Rollout:
         env: The environment.
         steps: Number of steps.
         groups: Groups of observations to store in addition to "policy", such as ``("critic",)``.
-        first_only: Whether to count only each world's first episode since ``restart``. If all worlds start together,
-            statistics of all finished episodes would be biased towards short episodes.
+        first_only: Whether the statistics include only each world's first episode since ``restart``. If all worlds
+            start together, statistics of all finished episodes would be biased towards short episodes.
 
     Raises:
         ValueError: The task has no group of observations of this name.
@@ -171,9 +171,9 @@ class Rollout:
         """Set the worlds' step counters to random values, so that time limits are spread over time.
 
         Worlds that start together and never terminate would otherwise all reach their time limits in the same rollout.
-        The returns of the shortened episodes are not counted. If ``lw.Task.settle`` is set and the engine is Warp, this
-        method does nothing: while one world settles after a reset, all others wait, so all worlds should reset at the
-        same time.
+        The statistics exclude the shortened episodes. If ``lw.Task.settle`` is set and the engine is Warp, this method
+        does nothing: while one world settles after a reset, all others wait, so all worlds should reset at the same
+        time.
 
         Args:
             generator: Random generator for the values; its state must be the same in every process.

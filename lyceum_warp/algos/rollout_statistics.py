@@ -116,7 +116,7 @@ def metric_sums(rollout: Rollout) -> tuple[torch.Tensor, ...]:
 
 
 def _ended(rollout: Rollout) -> torch.Tensor:
-    """Compute a mask of the steps in which a counted episode ended, (steps, nworld) bool."""
+    """Compute a mask of the steps that ended an episode, without excluded episodes, (steps, nworld) bool."""
     return rollout.done & ~rollout.episode_return.isnan()
 
 

@@ -24,7 +24,7 @@ class ValueFunction(Normalized):
         scale: Initial factor on the network's output; ``rescale`` later fits the factor to returns.
         time_orders: Highest power of the time features t, t^2, ... with t = step / 1000 (as in mjrl); 0 means no time
             features. Time features help if the observations do not contain the time that is left in the episode,
-            because returns depend on it.
+            because returns depend on this time.
         normalize: Whether to normalise observations by their running mean and variance.
         limit: Normalised observations are clipped to [-limit, limit]; inf means no limit.
         discount: Discount factor of the predicted returns, if known.

@@ -131,7 +131,7 @@ class Engine(abc.ABC):
         return 8 * _integration_size(model) + 4 * floats + 8
 
     def prepare_capture(self) -> None:  # noqa: B027
-        """Allocate memory for graphs; called when every kernel is compiled, before the first capture.
+        """Allocate memory for graphs; called after all kernels have been compiled, before the first capture.
 
         Raises:
             ValueError: The memory is too small for this many worlds.

@@ -49,7 +49,7 @@ _MOST_MASKS = 16
 
 
 class MujocoEngine(Engine):
-    """Steps worlds in float64 in ``mujoco.batch.Batch``, and copies its fields to float32 arrays.
+    """Steps worlds in float64 in ``mujoco.batch.Batch``, and copies the batch's fields to float32 arrays.
 
     Args:
         model, nworld, fields, dynamics: See ``Engine``.

@@ -86,7 +86,7 @@ class NativeRollout:
         self._outputs: dict[str, Any] = {"record": list(self.rows), "out": self.rows}
 
     def run(self, *given: Any) -> None:
-        """Roll out the worlds, and copy the fields; the batch keeps the final states and the warnings.
+        """Roll out the worlds, and copy the fields; the final states and the warnings stay in the batch.
 
         Args:
             given: The state, the controls and the buffers of ``Engine.rollout``.

@@ -20,7 +20,7 @@ class CanonicalOrder:
     are solved. ``order_kernels`` describes the order.
 
     Args:
-        model: MuJoCo Warp's model; its callbacks are set.
+        model: MuJoCo Warp's model, whose callbacks this class sets.
         data: MuJoCo Warp's data.
         between: A function that each callback calls before it sorts.
 

@@ -27,7 +27,7 @@ _FEW = 256
 
 
 class DeterministicEngine(WarpEngine):
-    """A Warp engine whose steps are reproducible bit for bit on a CUDA device, as on the CPU.
+    """A Warp engine whose steps are reproducible bit for bit on a CUDA device, not only on the CPU.
 
     The engine sorts contacts and constraint rows, makes MuJoCo Warp sum in a fixed order, and uses the same scratch
     memory for all launches. The constructor takes the same arguments as ``WarpEngine``.

@@ -36,7 +36,7 @@ class Scratch(Reserve):
         """The largest single allocation, bytes."""
 
     def open(self) -> None:
-        """Reuse the memory from its start for the following launches."""
+        """Let the following launches reuse the memory from its start."""
         self._block, self._used, self._now = 0, 0, 0
 
     @contextlib.contextmanager
@@ -93,6 +93,6 @@ class ScratchSizes:
 
 
 def _line(few: int, more: int) -> tuple[int, int]:
-    """Compute the fixed bytes and the bytes per world from the bytes for two numbers of worlds."""
+    """Compute fixed bytes and bytes per world from the total bytes for two numbers of worlds."""
     each = -(-(more - few) // (_PROBED[1] - _PROBED[0]))
     return max(0, few - _PROBED[0] * each), each

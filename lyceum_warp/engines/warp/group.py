@@ -125,12 +125,12 @@ class Arena(Reserve):
         self._serving = False
 
     def open(self) -> None:
-        """Reuse the reserve from the start."""
+        """Reuse the reserved memory from its start."""
         self._used = 0
 
     @contextlib.contextmanager
     def __call__(self) -> Iterator[None]:
-        """Return a context for launches: captures allocate from the reserve, other runs count and reserve bytes."""
+        """Return a context for launches: captures use the reserved memory; other runs count and reserve the bytes."""
         if self.device.is_cpu:
             yield
             return

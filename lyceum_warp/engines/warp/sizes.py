@@ -78,7 +78,7 @@ def warn_of_little_room(
     nconmax: float,
     njmax: int,
 ) -> None:
-    """Log a warning if worlds start with more contacts or constraints than their capacities.
+    """Log a warning if worlds start with more contacts or constraints than the capacities allow.
 
     Args:
         model: The compiled model.
@@ -137,7 +137,7 @@ def _equalities(model: mujoco.MjModel) -> int:
 
 
 def _limits(model: mujoco.MjModel, varied: Collection[str]) -> int:
-    """Count all limits if randomized fields determine which limits are reached; otherwise return 0."""
+    """Count all limits of joints and tendons if the task randomizes fields that affect limits; otherwise return 0."""
     drawn = not _LIMITS.isdisjoint(varied)
     return int(model.jnt_limited.sum() + model.tendon_limited.sum()) if drawn else 0
 
@@ -177,7 +177,7 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
 
 _TEMPORARIES = 1.25
 """The memory of a world, divided by the memory of a world in MuJoCo Warp's Data. In measurements, a step's temporary
-arrays took 1 to 9 %; the rest of the excess is for graphs and for the group of a partial forward pass. CPU graphs keep
+arrays took 1 to 9 %; the rest of the margin is for graphs and for the group of a partial forward pass. CPU graphs keep
 all temporary arrays alive and take up to three times as much."""
 
 _TEMPORARIES_CONVEX = 3.5

@@ -115,8 +115,7 @@ class ModelRows:
     """Make the model of a group of worlds.
 
     The group's model has its own rows of the fields that differ between worlds, and shares all other fields. In the
-    model of all worlds, row w belongs to world w; for world w of the group, MuJoCo Warp would read the row of a wrong
-    world.
+    model of all worlds, row w belongs to world w; for world w of the group, MuJoCo Warp would read another world's row.
 
     Args:
         whole: The model of all worlds.

@@ -196,7 +196,7 @@ class WarpEngine(Engine):
         data: mjw.Data | None = None,
         model: mjw.Model | None = None,
     ) -> None:
-        """Run parts of a forward pass in every world of a Data; with None, run all parts up to ``stage``."""
+        """Run the given parts of a forward pass in every world of a Data; if None, run all parts up to ``stage``."""
         m, d = self.m if model is None else model, self.d if data is None else data
         with self._on_device():
             if parts is not None:
