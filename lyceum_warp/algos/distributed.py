@@ -163,7 +163,7 @@ class Captured:
         self.forget()
 
     def forget(self) -> None:
-        """Discard the graph, as required after replacing one of the graph's tensors."""
+        """Discard the graph; call this after replacing a tensor that the graph uses."""
         self._warm = False
         self.graph: torch.cuda.CUDAGraph | None = None
 

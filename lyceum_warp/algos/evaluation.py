@@ -27,7 +27,7 @@ def evaluation_seed(seed: int) -> int:
 @document_attributes
 @dataclasses.dataclass(frozen=True)
 class Episodes:
-    """Results of finished episodes. All tensors are (episodes,), on the CPU."""
+    """Results of finished episodes. Every tensor has the shape (episodes,) and is on the CPU."""
 
     returns: torch.Tensor
     """Sums of rewards."""

@@ -30,7 +30,7 @@ class Iteration:
     """
 
     iteration: int
-    """Number of the iteration, from 1."""
+    """Number of the iteration, counted from 1."""
     samples: int
     """Number of samples in all iterations so far."""
     reward_mean: float | None = None

@@ -196,7 +196,7 @@ class Rollout:
         a restarted world would count as its first. The host does not wait for the device.
 
         Args:
-            least: Minimum number of worlds in all processes.
+            least: Minimum number of such worlds, over all processes.
             generator: Random generator for the choice of worlds; its state must be the same in every process.
             team: The processes.
         """

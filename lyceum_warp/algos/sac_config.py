@@ -77,7 +77,7 @@ class SACConfig:
     """Target entropy of the policy, per element of the action scaled to [-1, 1]. SAC adapts the temperature so that the
     policy's entropy reaches the target. The default is 0 with 256 or more worlds, and otherwise -1."""
     action_limit: float = 1.0
-    """Absolute limit of actions for which the task gives no bounds."""
+    """Limit of the absolute value of actions for which the task gives no bounds."""
     hidden: tuple[int, ...] | None = None
     """Widths of the policy's hidden layers. The default widths are 512 256 128 with 256 or more worlds, and otherwise
     256 256."""

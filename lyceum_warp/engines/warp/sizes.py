@@ -165,7 +165,7 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
     for _ in range(_HOLDS):
         batch.ctrl[:] = rng.uniform(low, high, size=(_WORLDS, model.nu))
         for _ in range(_SUBSTEPS):
-            # the counts are correct even if the memory is too small
+            # ignore errors: the counts are correct even if the memory is too small
             with contextlib.suppress(SimulationError):
                 batch.step()
             contacts, constraints = max(contacts, int(ncon.max())), max(constraints, int(nefc.max()))
@@ -181,8 +181,8 @@ arrays took 1 to 9 %; the rest of the margin is for graphs and for the group of 
 all temporary arrays alive and take up to three times as much."""
 
 _TEMPORARIES_CONVEX = 3.5
-"""The factor for models with convex collisions or the noslip solver. On adroit_pen, the temporary arrays take 1.5 to
-2.4 times the memory of the Data."""
+"""The same factor for models with convex collisions or the noslip solver. On adroit_pen, the temporary arrays take 1.5
+to 2.4 times the memory of the Data."""
 
 _CONVEX = {mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_MESH,
            mujoco.mjtGeom.mjGEOM_HFIELD}  # fmt: skip
