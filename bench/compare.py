@@ -8,8 +8,8 @@ OLD and NEW are git revisions or folders with a checkout; NEW is this working tr
 subprocess, with the same Python and packages, and both compute the same units of work side by side. A unit is one part
 of the comparison for one task on one engine.
 
-OLD must run again each time, because its numbers depend on the processor. The program uses only public names of the
-package (probes/checkout.py). Exit code: 0 without differences, 1 with differences, 2 for bad input.
+OLD runs again in every comparison, because its numbers depend on the processor. The program uses only public names of
+the package (probes/checkout.py). Exit code: 0 without differences, 1 with differences, 2 for bad input.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PROBE = ROOT / "bench" / "probes" / "checkout.py"
 PACKAGE = "lyceum_warp"
 PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "numpy")
-"""Packages that both checkouts share; --out stores their versions."""
+"""Packages that both checkouts use; --out stores the versions of these packages."""
 LINES = 12
 """Maximum number of differences that are printed per unit; --out writes all of them."""
 
@@ -242,8 +242,8 @@ class Side:
         # Warp's compiler leaves temporary files here if the process is killed
         own = {"PYTHONPATH": path, "TMPDIR": str(self.folder), "CUBLAS_WORKSPACE_CONFIG": ":4096:8"}
         with self._log.open("w") as log:
-            # -P omits bench/ from the path, because its modules could shadow others. A separate process group can be
-            # killed as a whole
+            # Python's flag -P keeps bench/ off sys.path, because modules in bench/ could shadow other modules. A
+            # separate process group can be killed as a whole
             self._process = subprocess.Popen(
                 [sys.executable, "-P", str(PROBE), str(self._file)], cwd=self.folder, env=os.environ | own, text=True,
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, start_new_session=True,
@@ -263,7 +263,7 @@ class Side:
             self.start()
             self.answer()
         assert self._process is not None and self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # if the process has ended, answer() reports it
+        with contextlib.suppress(BrokenPipeError):  # answer() reports an ended process
             print(json.dumps(unit), file=self._process.stdin, flush=True)
 
     def answer(self) -> dict[str, Any]:
@@ -340,7 +340,7 @@ class Report:
     units: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     found: list[Difference] = dataclasses.field(default_factory=list)
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)
-    """The message about the missing model, by the name of the skipped unit."""
+    """Maps the name of each skipped unit to the message about its missing model."""
     arrays: int = 0
     """Number of compared arrays."""
     ignored: int = 0
@@ -373,7 +373,7 @@ class Report:
 
 
 def failures(name: str, answers: Mapping[str, Mapping[str, Any]]) -> list[Difference]:
-    """Return a unit's failures; each text names the checkout. A failure of both checkouts is also listed, because
+    """Return a unit's failures; each message names the checkout. A failure of both checkouts is also listed, because
     nothing was compared."""
     failed = {side: answer["failure"] for side, answer in answers.items() if "failure" in answer}
     for failure in failed.values():

@@ -1,8 +1,9 @@
 """Step worlds with lyceum_warp, ``mujoco.rollout`` and other libraries, for the experiment "throughput".
 
-A sample is one environment step whose observation and reward the caller has received. All contestants use the same
-model, substeps and bounds of uniformly random actions. Worlds start from random initial states, step a few times before
-the clock starts, and restart when an episode ends. Each contestant runs with its best number of worlds per thread.
+A sample is one environment step of which the caller has received the observation and the reward. All contestants use
+the same model, substeps and bounds of uniformly random actions. Worlds start from random initial states, step a few
+times before the clock starts, and restart when an episode ends. Each contestant runs with its best number of worlds per
+thread.
 """
 
 import importlib.util
@@ -109,7 +110,7 @@ class LyceumWarp:
 
 
 def actions(env: lw.Env, seed: int) -> list[torch.Tensor]:
-    """Return a list with the actions of several steps, (nworld, nact) each; indexing a tensor would take time."""
+    """Return the actions of several steps as a list of tensors (nworld, nact), because indexing a tensor takes time."""
     low, high = (np.nan_to_num(x, posinf=1.0, neginf=-1.0) for x in (env.action_space.low, env.action_space.high))
     drawn = sampling.draw(np.asarray(low), np.asarray(high), env.nworld, seed)
     return list(torch.as_tensor(drawn, dtype=torch.float32, device=env.obs.device))

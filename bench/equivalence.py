@@ -2,11 +2,11 @@
 
     lyceum-warp bench equivalence --device cuda
 
-The area under a learning curve is the run's mean return: the mean over all iterations of the mean return of the
-episodes that ended. Two one-sided t tests (TOST) at the level 0.05 decide whether the areas of 20 seeds on each engine
-are equivalent. The areas are equivalent if the 90 % interval of the difference of the means (Welch) lies within the
-margin. The margin is one standard deviation between seeds, pooled over both engines. The margin, the tasks and the
-seeds were chosen before the first run.
+The area under a learning curve is the run's mean return: the mean return of the episodes that ended in an iteration,
+averaged over all iterations. Two one-sided t tests (TOST) at the level 0.05 decide whether the areas of 20 seeds on
+each engine are equivalent. The areas are equivalent if the 90 % interval of the difference of the means (Welch) lies
+within the margin. The margin is one standard deviation between seeds, pooled over both engines. The margin, the tasks
+and the seeds were chosen before the first run.
 """
 
 import dataclasses

@@ -38,7 +38,7 @@ NAMES = ("throughput", "npg", "learning", "records", "gate", "mppi", "latency", 
 """Names of the experiments."""
 
 SOFTWARE = ("python", "mujoco", "mujoco_warp", "warp_lang", "torch", "numpy", "gymnasium")
-"""Packages; results are compared only if their versions and the hardware are equal."""
+"""Packages whose versions must be equal, like the hardware, for a comparison of results."""
 
 STYLES = (
     ("#D55E00", "o", "-"), ("#0072B2", "s", "--"), ("#009E73", "^", "-."), ("#CC79A7", "D", ":"),
@@ -72,7 +72,7 @@ class Options:
     seeds: tuple[int, ...] = ()
     """Seeds, if the experiment uses any."""
     jobs: int = 1
-    """Number of cases that run at the same time, each on separate cores, if the experiment allows it."""
+    """Number of cases that run at the same time, each on separate cores; the experiment must allow this."""
     dry_run: bool = False
     """Print the cases and their durations without measuring."""
 
@@ -108,7 +108,8 @@ class Experiment:
     """An experiment.
 
     A case is a frozen dataclass with everything that affects the result, except for the machine and the versions.
-    Compared contestants take turns: list the cases with repeats as the outer loop and contestants as the inner loop.
+    List the cases with repeats as the outer loop and contestants as the inner loop, so that compared contestants take
+    turns.
     """
 
     name: str
@@ -176,7 +177,7 @@ def installed(module: str, requirement: str) -> Any:
 
 
 def stored(names: Sequence[str], results: Path) -> dict[str, Path]:
-    """Return a folder's results files by experiment, for the given experiments or for all experiments with results.
+    """Map the given experiments, or all experiments with results, to their results files in a folder.
 
     Raises:
         ValueError: A name is unknown.
@@ -307,7 +308,7 @@ def median_and_range(values: Sequence[float], form: str = ".2f") -> str:
 
 @contextlib.contextmanager
 def cores(number: int | None) -> Iterator[None]:
-    """Limit this thread, and all threads and processes that it starts, to the first ``number`` cores.
+    """Restrict this thread, and all threads and processes that it starts later, to the first ``number`` cores.
 
     Raises:
         Skipped: There are too few cores.

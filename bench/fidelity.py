@@ -1,4 +1,4 @@
-"""Measure after how many steps trajectories of the two engines diverge.
+"""Measure the number of steps after which trajectories of the two engines diverge.
 
     lyceum-warp bench fidelity --device cuda --jobs 4
 
@@ -145,7 +145,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def quantiles(error: torch.Tensor, shown: Sequence[int]) -> dict[str, list[float | None]]:
-    """Return the median and the 99 % quantile of the worlds' differences after given numbers of steps."""
+    """Return the median and the 99 % quantile of the worlds' differences after each of the given numbers of steps."""
     rows = error[[t - 1 for t in shown]].double()
     found = {name: rows.nanquantile(q, dim=1).tolist() for name, q in (("median", 0.5), ("p99", 0.99))}
     return {name: [value if math.isfinite(value) else None for value in values] for name, values in found.items()}

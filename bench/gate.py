@@ -4,12 +4,12 @@
     lyceum-warp bench gate --policy runs/go1-1 runs/go1-2
 
 The mean policy controls the robot on the C engine under the task's exact physics. A Unitree G1 must pass nanoG1's gate
-(kingjulio8238/nanoG1, eval.py). The gate plays six commands of 20 s, each from four noisy initial states. The gate also
+(kingjulio8238/nanoG1, eval.py). The gate tests six commands of 20 s, each from four noisy initial states. The gate also
 measures the gait in 2,000 steps at 0.5 m/s. The gate has no noise, no pushes and no differences between robots. In
 nanoG1, actions are clipped to 1 and multiplied by 0.25 rad. To compare with nanoG1's limit, the action change is
-computed here as the change of a servo's target, divided by 0.25 rad. Other robots play 100 episodes of 20 s. Noise and
-differences between robots are the same as in training. The 100 episodes combine ten commands with ten initial states,
-and are played once without and once with pushes. After a fall, a world returns to its initial state.
+computed here as the change of a servo's target, divided by 0.25 rad. Any other robot is tested in 100 episodes of 20 s.
+Noise and differences between robots are the same as in training. The 100 episodes combine ten commands with ten initial
+states, and are played once without and once with pushes. After a fall, a world returns to its initial state.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.tasks.velocity.g1 import LEGS
 
 NEVER = 1e6
-"""Seconds until the next push or command. This is longer than any episode, so neither occurs."""
+"""Seconds until the next push or command. No episode is this long, so neither occurs."""
 NOISES = ("linear_velocity_noise", "angular_velocity_noise", "gravity_noise", "joint_position_noise",
           "joint_velocity_noise")  # fmt: skip
 STEPS = 1000
@@ -78,7 +78,8 @@ class Options(experiment.Options):
     which: str = "last"
     """Policy of each run: last, best, or the number of a saved iteration."""
     task: str | None = None
-    """Velocity task to play instead of the run's task. The parameters of the run are not applied to this task."""
+    """Velocity task on which to test the policy, instead of the run's task. The parameters of the run are not applied
+    to this task."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +112,7 @@ def digest(folder: Path, options: Options) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Steps:
-    """Results of each step in each world."""
+    """Results of every step in every world."""
 
     velocity_error: torch.Tensor
     """(steps, nworld), m/s."""
@@ -127,11 +128,11 @@ class Steps:
 
 @torch.no_grad()
 def play(env: lw.Env, policy: Any, commands: Sequence[Sequence[float]], steps: int, start: torch.Tensor) -> Steps:
-    """Play from given states with fixed commands; after a fall, a world returns to its initial state.
+    """Run a policy from given states under fixed commands; after a fall, a world returns to its initial state.
 
     Args:
         env: The environment, which must have no horizon.
-        policy: Maps observations to actions.
+        policy: Function from observations to actions.
         commands: The command of each world.
         steps: Number of steps.
         start: States, as ``env.get_state`` returns them.
@@ -180,7 +181,7 @@ def rms(numbers: torch.Tensor) -> float:
 
 
 def nano_g1(case: Case, folder: Path, options: Options) -> dict[str, Any]:
-    """Play the commands of nanoG1's gate, and measure the gait."""
+    """Run a policy under the commands of nanoG1's gate, and measure the gait."""
     policy = lw.load(folder, which=options.which)
     quiet = calm(worlds(folder, 1, options))
     commands = [command for command in BATTERY for _ in range(case.starts)]
@@ -207,7 +208,7 @@ def nano_g1(case: Case, folder: Path, options: Options) -> dict[str, Any]:
 
 
 def walks(case: Case, folder: Path, options: Options) -> dict[str, Any]:
-    """Play 100 episodes of the task with fixed commands, once without and once with pushes."""
+    """Run 100 episodes of the task with fixed commands, once without and once with pushes."""
     policy = lw.load(folder, which=options.which)
     commands = [command for command in COMMANDS for _ in range(case.starts)]
     found: dict[str, Any] = {}

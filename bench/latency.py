@@ -8,8 +8,8 @@ A case combines a task, the physics of the planner's worlds, a number of samples
 Episodes run in real time (``lw.control_async``) until their steps take ``--seconds``: the plant keeps its rate, and the
 planner plans as often as it can. A plan meets its deadline if it takes no longer than one step of the plant. Run this
 on idle cores, because other processes delay plans. Without --samples and --horizons, cases whose plans would take long
-on two cores are omitted. With --own, each task has one case: the samples and the horizon that the task suggests for
-planners.
+on two cores are omitted. With --own, each task has one case: with the samples and the horizon that the task suggests
+for planners.
 """
 
 import dataclasses
@@ -51,7 +51,7 @@ class Options(experiment.Options):
     """Whether to use the samples and the horizon that each task suggests."""
     physics: tuple[str, ...] = ()
     """Names of the planner's physics: exact, or a name that the task defines. By default, the physics that the task
-    suggests; if these physics have a name, the exact physics are also measured."""
+    suggests; if they have a name, a second measurement uses the exact physics."""
     seconds: float = 10.0
     """Seconds of a case; the 99.9 % quantile needs a thousand plans."""
 
@@ -99,7 +99,7 @@ def cases(options: Options) -> list[Case]:
 
 
 def physics_of(task: str, names: Sequence[str]) -> Sequence[str]:
-    """Return those of the given names that the task defines; without given names, return the task's default physics."""
+    """Return the given names that the task defines, or the task's default physics if no names are given."""
     found = find_task(task)
     if names:
         return [name for name in names if name == "exact" or name in found.physics]

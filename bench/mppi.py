@@ -59,7 +59,7 @@ class Options(experiment.Options):
     episodes: int = 100
     """Number of episodes per set of seeds."""
     sets: tuple[int, ...] = (1, 2, 3)
-    """Sets of seeds to run; set i begins at seed 1000 i."""
+    """Sets of seeds to run; the seeds of set i begin at 1000 * i."""
     block: int = 10
     """Number of episodes that a contestant runs per turn."""
     seconds: float = 20.0

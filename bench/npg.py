@@ -3,9 +3,9 @@
     lyceum-warp bench npg --threads 2 --jobs 16
 
 Both NPGs are the same class with the same settings, number of worlds and seeds. The two NPGs differ only in the
-environments that fill the rollout buffer; Gymnasium uses the faster of its two vector modes. stable-baselines3's PPO
-and sb3-contrib's TRPO each learn for twelve minutes, with the settings that RL Baselines3 Zoo tuned for these tasks.
-With --device cuda, lw.NPG and lw.PPO learn on the same worlds on a GPU.
+environments that fill the rollout buffer, and Gymnasium uses the faster of its two vector modes. stable-baselines3's
+PPO and sb3-contrib's TRPO each learn for twelve minutes, with the settings that RL Baselines3 Zoo tuned for these
+tasks. With --device cuda, lw.NPG and lw.PPO learn on the same worlds on a GPU.
 
 All policies are evaluated by their mean actions in single Gymnasium environments, from the same initial states. The
 clock stops during evaluations, and starts after kernels are compiled and environments are made. Each case runs in a
@@ -209,7 +209,7 @@ class Curve:
         return (2 if self.case.short else EVALUATIONS) * progress
 
     def add(self, samples: int, act: Act) -> None:
-        """Evaluate a policy and add a point to the curve, unless this number of samples has a point."""
+        """Evaluate a policy and add a point to the curve, unless the curve has a point at this number of samples."""
         if self.points and self.points[-1][0] == samples:
             return
         seconds, self._next = self.seconds(), int(self._evaluations(samples)) + 1

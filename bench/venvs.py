@@ -57,7 +57,7 @@ def _made(name: str) -> tuple[Path, str]:
             return python, ""
         print(f"making a virtual environment for {name}: {folder}", flush=True)
         shutil.rmtree(folder, ignore_errors=True)
-        # pip of this process installs into the new environment, because installing pip there would take seconds
+        # this process's pip installs into the new environment, because installing pip there would take seconds
         pip = [sys.executable, "-m", "pip", "--python", str(python), "--disable-pip-version-check", "--retries", "1"]
         for command in (
             [sys.executable, "-m", "venv", "--without-pip", str(folder)],

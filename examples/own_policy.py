@@ -3,8 +3,8 @@
     python examples/own_policy.py
     python examples/own_policy.py --task half_cheetah --iterations 100
 
-The network is any torch module from observations (..., nobs) to mean actions (..., nact). ``lw.GaussianPolicy`` adds
-noise, log-probabilities and the normaliser of observations.
+The network is any torch module that maps observations (..., nobs) to mean actions (..., nact). ``lw.GaussianPolicy``
+adds noise, log-probabilities and the normaliser of observations.
 """
 
 import torch
@@ -17,7 +17,7 @@ import lyceum_warp as lw
 class Feedback(nn.Module):
     def __init__(self, nobs: int, low: torch.Tensor, high: torch.Tensor) -> None:
         super().__init__()
-        self.register_buffer("middle", 0.5 * (high + low))  # buffers move to a GPU with the parameters
+        self.register_buffer("middle", 0.5 * (high + low))  # a buffer moves to the GPU with the module
         self.register_buffer("extent", 0.5 * (high - low))
         nact = len(self.middle)
         self.gains = nn.Linear(nobs, nact)

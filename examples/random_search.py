@@ -20,7 +20,7 @@ class SearchConfig:
     """Hyperparameters."""
 
     step: float = 1.0
-    """Step size for a perturbation whose two returns differ by one standard deviation of all returns."""
+    """Learning rate of the weights, with returns in units of their standard deviation."""
     noise: float = 0.5
     """Standard deviation of the perturbations of the weights."""
 

@@ -55,7 +55,7 @@ class Numbers:
             name: Name of the value; the names of leaves are appended to it.
             value: The value. None is omitted.
             axes: Names of the leading axes.
-            along: Name of an additional leading axis that stacks the values of several calls.
+            along: Name of an additional leading axis, along which the values of several calls are stacked.
         """
         if dataclasses.is_dataclass(value):
             value = vars(value)
