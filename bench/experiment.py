@@ -144,8 +144,7 @@ def load(name: str) -> Experiment:
 
 
 def choose(given: Sequence[str], known: Iterable[str], default: Sequence[str] = (), *, what: str) -> tuple[str, ...]:
-    """Return the given names. Without given names, return the default names. Without default names, return all known
-    names.
+    """Return the given names, or else the default names, or else all known names.
 
     Raises:
         ValueError: A name is unknown.
@@ -398,7 +397,7 @@ def run(experiment: Experiment, options: Options) -> int:
 def outcomes(
     experiment: Experiment, cases: Sequence[Any], options: Options
 ) -> Iterator[tuple[Any, dict[str, Any] | Exception, float]]:
-    """Yield each case with its duration, and its result or the exception that it raised."""
+    """Yield each case with the duration of its measurement, and with the result or the exception."""
     if not experiment.apart and options.jobs == 1:
         for case in cases:
             began = time.perf_counter()
@@ -415,7 +414,7 @@ def outcomes(
 
     def alone(case: Any) -> tuple[Any, dict[str, Any] | Exception, float]:
         began, place = time.perf_counter(), places.get()
-        os.sched_setaffinity(0, place)  # the subprocess inherits this thread's affinity
+        os.sched_setaffinity(0, place)  # the subprocess inherits this thread's CPU affinity
         try:
             with concurrent.futures.ProcessPoolExecutor(1, context) as process:
                 result = process.submit(_measure_apart, experiment.measure, case, options).result()

@@ -36,8 +36,8 @@ STEPS = 1000
 BATTERY = ((0.8, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.3, 0.0, 1.0), (0.3, 0.0, -1.0), (0.0, 0.4, 0.0), (0.0, 0.0, 0.0))
 """nanoG1's commands: forward and lateral velocity, m/s, and yaw rate, rad/s."""
 GAIT = (0.5, 0.0, 0.0)
-"""The command for nanoG1's measurement of the gait. This measurement takes twice as many steps as the commands
-above."""
+"""The command for nanoG1's measurement of the gait. This measurement takes twice as many steps as each command
+in ``BATTERY``."""
 COMMANDS = (
     (1.0, 0.0, 0.0), (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0),
     (0.5, 0.0, 0.5), (0.5, 0.0, -0.5), (0.5, 0.3, 0.0), (0.0, 0.0, 0.0),
@@ -160,7 +160,7 @@ def worlds(folder: Path, nworld: int, options: Options, **params: Any) -> lw.Env
 
 
 def calm(env: lw.Env) -> dict[str, Any]:
-    """Return parameters that turn off noise, pushes and differences between robots. The friction is as in the model."""
+    """Return parameters that turn off noise, pushes and differences between robots. Friction does not change."""
     slide, spin, roll = env.model.geom_friction[env.task.params["foot_geoms"][0]].tolist()
     return dict.fromkeys(NOISES, 0.0) | {
         "encoder_bias": 0.0, "trunk_offset": [0.0, 0.0, 0.0], "push_seconds": [NEVER, NEVER],

@@ -5,11 +5,11 @@
     lyceum-warp bench latency --tasks dm/cartpole_swingup --own --seconds 50
 
 A case combines a task, the physics of the planner's worlds, a number of samples, a horizon, an engine and its device.
-Episodes run in real time (``lw.control_async``) until their steps take ``--seconds``: the plant keeps its rate, and the
-planner plans as often as it can. A plan meets its deadline if it takes no longer than one step of the plant. Run this
-on idle cores, because other processes delay plans. Without --samples and --horizons, cases whose plans would take long
-on two cores are omitted. With --own, each task has one case: with the samples and the horizon that the task suggests
-for planners.
+Episodes run in real time (``lw.control_async``) until their total duration reaches ``--seconds``: the plant keeps its
+rate, and the planner plans as often as it can. A plan meets its deadline if it takes no longer than one step of the
+plant. Run this on idle cores, because other processes delay plans. Without --samples and --horizons, cases whose plans
+would take long on two cores are omitted. With --own, each task has one case: with the samples and the horizon that the
+task suggests for planners.
 """
 
 import dataclasses

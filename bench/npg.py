@@ -43,7 +43,7 @@ CONFIGS = {
 """Settings of NPG: the defaults, except for Swimmer's discount."""
 
 SHORT: dict[str, Any] = {"samples": 500, "value_epochs": 1}
-"""Settings of NPG that --short replaces."""
+"""Settings of NPG under --short."""
 
 CONTESTANTS = {
     "npg": "NPG, lyceum_warp",

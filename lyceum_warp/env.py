@@ -107,8 +107,8 @@ class Env:
     episode_metric_sums: torch.Tensor
     """``episode_metrics`` as one tensor (nworld, number of metrics) in the order of ``metrics``."""
     shared: dict[str, torch.Tensor]
-    """The memory that all worlds share, by name; only ``update_shared`` changes the memory, by calling the task's
-    ``share``."""
+    """The memory that all worlds share, by name; only ``update_shared``, which calls the task's ``share``, changes the
+    memory."""
     success: torch.Tensor
     """Whether the task's goal has been met for ``success_steps`` steps in a row, (nworld,), bool."""
     done: torch.Tensor
@@ -193,7 +193,7 @@ class Env:
                 self.engine.prepare_capture()
             self.engine.reset(worlds.everyone)
             probe = Probe(self.task, worlds.after, worlds.params, self.device)
-            # find faulty writes now, before the task's functions run on the environment's own arrays
+            # find writes out of bounds now, before the task's functions run on the environment's own arrays
             probe.check_bounds()
             self.rand_reset(options.seed)
             if self.task.dynamics and not _replica:  # later resets report invalid values as faults
@@ -377,7 +377,7 @@ class Env:
 
         Scratch worlds compute the rewards of given transitions, so that the environment's worlds do not change. The
         result differs from ``env.reward`` if an event of the task changed fields that the reward reads, because events
-        follow the reward.
+        run after the reward is computed.
 
         Args:
             before: States before the transitions, (nworld, state_space.size).
@@ -424,9 +424,9 @@ class Env:
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
         """Get a live view of a field of MjData or MjModel, by MuJoCo's name.
 
-        Available are ``time``, ``ctrl`` and the fields that the task reads. Request other fields when making the
-        environment, as in ``make("hopper", fields=["site_xpos", "body_mass"])``. Do not write into the view: use
-        ``set_state`` or ``set_dynamics``.
+        The view of ``time``, of ``ctrl`` and of every field that the task reads is always available. Request other
+        fields when making the environment, as in ``make("hopper", fields=["site_xpos", "body_mass"])``. Do not write
+        into the view: use ``set_state`` or ``set_dynamics``.
 
         Args:
             name: Attribute of MjData or MjModel, for instance "qpos", "site_xpos" or "body_mass".
@@ -464,8 +464,8 @@ class Env:
                 all worlds.
 
         Raises:
-            ValueError: A field is unknown, or all worlds share its value; or a value has the wrong size, is not finite,
-                or is negative although the field must be positive.
+            ValueError: A field is unknown or shared by all worlds, or a value has the wrong size, is not finite, or is
+                negative although the field must be positive.
         """
         state = self.get_state()
         put_rows(self.task.model, fields, self._columns_of_dynamics(state))
@@ -580,7 +580,7 @@ class Env:
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
         """Get the values of the named parameters, for ``nworld`` worlds."""
         known, worlds = self.task.parameters, np.arange(nworld) % self.nworld
-        # return values other than tables as they were given, for example an element's name instead of its index
+        # return a parameter as it was given, such as an element's name instead of its index, unless it is a table
         given = {name: value for name, value in self._given_params.items() if name not in known.tables}
         values = {name: (known.values | given)[name] for name in names}
         return values | {name: known.values[name][worlds] for name in names if name in known.per_world}

@@ -104,7 +104,7 @@ _KINDS = {
     "subtree_angmom".split(),
     _Kind.mjOBJ_BODY,
 ) | dict.fromkeys(("xanchor", "xaxis"), _Kind.mjOBJ_JOINT)  # fmt: skip
-"""The kinds of objects of fields that have one row per object, by the field's name or prefix."""
+"""Maps the name or prefix of a field with one row per object to the kind of these objects."""
 
 _QPOS = (_Kind.mjOBJ_JOINT, "jnt_qposadr", "nq")
 _DOFS = (_Kind.mjOBJ_JOINT, "jnt_dofadr", "nv")
@@ -128,9 +128,9 @@ _RANGES = (
     | {"sensordata": _SENSORS, "flexvert_xpos": _VERTICES}
     | dict.fromkeys(("flexedge_length", "flexedge_velocity"), _EDGES)
 )  # fmt: skip
-"""Fields in which an object may have several rows, by the field's name or prefix. The values are the kind of object,
-the MjModel array with the index of each object's first row, and the name of the array of row counts or of the total
-number of rows."""
+"""Maps the name or prefix of a field in which an object may have several rows to three entries. They are the kind of
+object, the MjModel array with the index of each object's first row, and the name of either an array of row counts or
+the total number of rows."""
 
 _COUNTS = {
     _Kind.mjOBJ_ACTUATOR: "nactuator",
@@ -204,7 +204,7 @@ def describe(
         name: MuJoCo's name of the field, an attribute of MjData.
         lagged: Whether to keep the value left by ``mj_step``. This value lags one substep behind the state. Fields of
             the acceleration stage always lag; fields of the integration state never do.
-        cleared: Whether the field is 0 at the start of an episode instead of computed from the first state.
+        cleared: Whether the field is 0 at the start of an episode instead of being computed from the first state.
         written: Whether the task writes the field before a step. Controls are always written.
 
     Raises:

@@ -49,7 +49,7 @@ class Mirror:
         Args:
             parts: The columns of each part, in the format of ``Space.parts``.
             task: Name of the task for error messages.
-            whole: Name of a reflection that replaces the reflections of the parts, if it is declared.
+            whole: Name of a reflection of the whole; if the task declares it, it replaces the reflections of the parts.
 
         Raises:
             ValueError: A part has no reflection, or its reflection has a different size.

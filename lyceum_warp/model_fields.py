@@ -209,7 +209,7 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
 
     Args:
         model: The compiled model.
-        name: MuJoCo's name of the field. A field is an attribute of MjModel or, as "gravity" is, of MjModel.opt.
+        name: MuJoCo's name of the field. A field is an attribute of MjModel or of MjModel.opt, such as "gravity".
         varies: Whether to accept only fields that can differ between worlds.
 
     Raises:

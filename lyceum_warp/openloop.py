@@ -44,7 +44,7 @@ class OpenLoop:
             of the values in ``state``.
         models: Values for model fields that differ between worlds, by name, each (n, size) float64 on the environment's
             device. World w uses row w % n instead of the values in ``state``. Every run reads the values again.
-        states: Number of initial states. nworld / states consecutive worlds start from each of them.
+        states: Number of initial states. Each of them is the start of nworld / states consecutive worlds.
 
     Raises:
         ValueError: The environment resets its worlds automatically, ``keys`` has the wrong shape, type or device, the
@@ -108,7 +108,7 @@ class OpenLoop:
             for group, space in env.obs_spaces.items():
                 setattr(self._obs, group, wp.zeros((n, space.size), dtype=float))
             self._no_memory = wp.zeros((rows + n, 0), dtype=float)
-            # one buffer per field: views of it are the states before each step, after each step and at the end
+            # each field has one buffer; the batches before, after and last contain views of the buffer
             self._fields: dict[str, wp.array] = {}
             self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
             if task.shared:

@@ -32,11 +32,11 @@ JACOBIANS = {
     "auto": mujoco.mjtJacobian.mjJAC_AUTO,
 }  # fmt: skip
 SOLVER_LIMITS = {"iterations": 1, "ls_iterations": 1, "noslip_iterations": 0}
-"""Limits of the constraint solver that ``solver`` accepts, each with its smallest value."""
+"""Limits that the option ``solver`` accepts, each with its smallest value."""
 
 
 def _for_engine(default: Any) -> Any:
-    """Make the dataclass field of an option for the engine's constructor."""
+    """Make the dataclass field of an option that is passed to the engine's constructor."""
     return dataclasses.field(default=default, metadata={"engine": True})
 
 
@@ -194,7 +194,7 @@ class EnvOptions:
         check_kind("device", self.device, str | None, "as 'cpu' or 'cuda:0'")
         if not isinstance(self.engine, str) and not callable(self.engine):
             raise ValueError(f"engine must be 'auto', 'mujoco', 'warp' or a callable, not {described(self.engine)}")
-        # the binding of the task raises a clearer error for an MjModel
+        # binding the task raises a clearer error for an MjModel
         if self.model is not None and not isinstance(self.model, mujoco.MjModel):
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         object.__setattr__(self, "physics", _physics(self.physics))

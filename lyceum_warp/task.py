@@ -43,7 +43,7 @@ class TaskFunction:
     about: str
     """Purpose and default of the function, for the documentation."""
     default: str | None = None
-    """Body of the default function; None without a default."""
+    """Body of the default function; None if there is no default."""
     optional: str = ""
     """Optional last arguments, in the syntax of a task's file."""
     writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -343,8 +343,8 @@ def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
         parameter is recomputed if another parameter changes, unless a value was given explicitly.
 
     Args:
-        function: Function of two arguments: the MjModel, and an object with parameters as attributes. These are the
-            parameters with ordinary defaults, and the computed parameters that Params declares earlier.
+        function: Function of two arguments: the MjModel, and an object with parameters as attributes. These attributes
+            are the parameters with ordinary defaults, and the computed parameters that Params declares earlier.
     """
     return FromModel(function)
 
@@ -460,7 +460,7 @@ class Task:
     method that computes the sizes from the Params. A task may have several groups of observations, such as ``{"policy":
     {"position": 5}, "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy`` (``env.obs``).
     ``observe_critic`` has the same arguments, and writes the group ``critic``. Omit ``obs`` if the last argument of
-    ``observe`` is a Warp struct, whose fields have the defaults ``lw.part(size)``."""
+    ``observe`` is a Warp struct with the default ``lw.part(size)`` for each field."""
     rewards: ClassVar[Mapping[str, float]] = {}
     """Terms of the reward with weights per second, such as ``{"upright": 1.0, "effort": -0.1}``, in place of
     ``reward``. A term is a function of the module that returns a float. The arguments of a term are found by name:
@@ -496,19 +496,19 @@ class Task:
     keyframe: ClassVar[str | None] = None
     """Name of the model's keyframe to which ``reset`` sets the state before ``initialize``; None means ``qpos0``."""
     draws: ClassVar[int] = 10
-    """Maximum number of initial states that a reset draws until ``reject`` accepts one. If none is accepted, the reset
-    uses the last."""
+    """Maximum number of initial states that a reset draws until ``reject`` accepts one. If it accepts none of them, the
+    reset uses the last one."""
     settle: ClassVar[int] = 0
     """Number of substeps that are simulated from an initial state before the first observation of the episode, so that
-    the objects come to rest. They use the initial state's controls, and do not call ``substep``. The episode's time
-    starts at 0 after these substeps."""
+    the objects come to rest. These substeps use the initial state's controls, and do not call ``substep``. The
+    episode's time starts at 0 after these substeps."""
     gymnasium: ClassVar[str | None] = None
     """Id of the Gymnasium environment that the task reimplements, such as "Hopper-v5"; None without such an
     environment. Model, observation, reward, termination, reset and parameters are the same. Subclasses do not inherit
     this attribute."""
     trace: ClassVar[str | None] = None
-    """Name of a site or body. For a planner's samples, the viewer draws the path of this site or body. If None, it
-    draws the path of the centre of mass if the robot has a floating base, or else of the end of the arm."""
+    """Name of a site or body. For a planner's samples, the viewer draws the path of this site or body. If None, the
+    viewer draws the path of the centre of mass if the robot has a floating base, or else of the end of the arm."""
     mirror: ClassVar[Any] = None
     """The task's mirror image, for learning symmetric policies: ``lw.Mirror(...)``, or a static method ``mirror(model,
     p)`` that returns an ``lw.Mirror``. None means that the task has no mirror image."""

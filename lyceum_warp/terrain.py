@@ -24,7 +24,7 @@ _BASE = 1.0
 
 
 def _inwards(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Compute the distance of points from the outline of a patch, in m, at most the distance of the flat platform."""
+    """Compute the distance of points from the outline of a patch, in m; it stays constant on the flat platform."""
     half = float(x.max())
     return np.clip(half - np.maximum(abs(x), abs(y)), 0.0, max(half - _PLATFORM, 0.0))
 
@@ -273,9 +273,9 @@ def height_field(name: str) -> Any:
     """Make a default for Params: the table of a model's height field.
 
     The table is for ``lw.ground_height`` and ``lw.height_scan``. The table has the shape (1 + points along y, 1 +
-    points along x). The table's first row has the x coordinates of the points, and its first column the y coordinates.
-    All other elements are heights z. Coordinates are in the world's frame, in m. All worlds share the table. Declare
-    the table as in ``ground: wp.array2d[float] = lw.height_field("terrain")``.
+    points along x). The table's first row has the x coordinates of the points, and the first column has their y
+    coordinates. All other elements are heights z. Coordinates are in the world's frame, in m. All worlds share the
+    table. Declare the table as in ``ground: wp.array2d[float] = lw.height_field("terrain")``.
 
     Args:
         name: Name of the height field in the model. ``lw.Terrain.add_to`` uses the name "terrain" by default.

@@ -123,7 +123,7 @@ def train(
         NoVideoError: ``video_every`` is given, but the extra ``viz`` is not installed.
         OSError: The folder cannot be written; the run can be resumed from the last save later.
         FloatingPointError: An update of the learner is not finite.
-        Interrupted: A rank received a signal, and there are several ranks.
+        Interrupted: One of several ranks received a signal.
     """
     check_kind("learner", learner, Learner, "as lw.NPG(env)")
     check_kind("folder", folder, str | Path, "as 'runs/mine'")
@@ -189,8 +189,7 @@ def train(
 
 
 _PAIRS = 64
-"""Number of episodes, each played under both settings, from which the transfer verdict at the end of training is
-computed."""
+"""Number of episodes for the transfer verdict at the end of training; each episode is played under both settings."""
 
 
 def _judge_transfer(run: Run, learner: Learner, wanted: bool | None, display: Display) -> None:

@@ -252,7 +252,7 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
         found[:, :3] -= data.xanchor[_last_joint(model, foot)]
         spheres.append(found)
     most = max(map(len, spheres))
-    return np.array([np.resize(found, (most, 4)) for found in spheres])  # repeat the spheres of feet that have fewer
+    return np.array([np.resize(found, (most, 4)) for found in spheres])  # pad with copies of spheres
 
 
 def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:

@@ -28,7 +28,7 @@ from lyceum_warp.world_arrays import WorldArrays
 
 @dataclasses.dataclass(frozen=True)
 class Programs:
-    """The programs of an environment: its phases as callables, for one combination of horizon, autoreset and graphs."""
+    """The phases of an environment as callables, for one combination of horizon, autoreset and graphs."""
 
     graphs: Graphs
     step: Calls
@@ -190,7 +190,7 @@ class Worlds(WorldArrays):
         return phases
 
     def _observe_phases(self) -> list[Phase]:
-        """List the phases that again observe the worlds that have changed since the transition was evaluated."""
+        """List the phases that observe worlds again if they changed after the transition was evaluated."""
         changed = self.restarting if self.task.kernels.run_events is None else self._outdated
         return [Phase("observe", partial(self._observe, changed), by_world=True)]
 

@@ -15,7 +15,7 @@ _SEEDS = 2**31
 """Seeds of an environment are smaller than this number."""
 
 _OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode (in adapters that have it)"}
-"""Options of ``lw.make`` that adapters do not accept, each with the adapter's argument to use instead."""
+"""Options of ``lw.make`` that adapters do not accept, each mapped to the adapter's argument to use instead."""
 
 
 def environment_of(
@@ -84,7 +84,7 @@ class ResetSeeds:
 
 
 def per_world(value: Any, nworld: int) -> list[Any]:
-    """Return one value per world: the rows of a tensor with a row per world, or the same value for every world."""
+    """Split a tensor with one row per world into rows; repeat any other value for every world."""
     if isinstance(value, torch.Tensor) and value.ndim and len(value) == nworld:
         return list(value)
     return [value] * nworld

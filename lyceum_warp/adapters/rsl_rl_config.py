@@ -47,7 +47,7 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
     return {
         "num_steps_per_env": config.num_steps,
         "save_interval": 50,
-        "check_for_nan": False,  # the check would wait for the device; the environment itself ends episodes at NaN
+        "check_for_nan": False,  # the check would wait for the device; the environment already reports NaN as a fault
         "obs_groups": {"actor": ["policy"], "critic": [value_group(env, config.value_group)]},
         "actor": network | _layers(config.hidden, config.activation) | {"distribution_cfg": distribution},
         "critic": network | _layers(config.value_hidden, config.value_activation),

@@ -116,7 +116,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             - ``final_obs``: a dict of observation groups after the step, before any reset.
             - ``log``: ``metrics/NAME``, means of the task's metrics over about the last 100 ended episodes, and
               ``faults/worlds``, the number of worlds with a fault. The means are 0 until the first episode has ended.
-              They include all episodes that end in this step.
+              The means include all episodes that end in this step.
 
         Raises:
             ValueError: The actions have the wrong shape, type or device.

@@ -24,10 +24,10 @@ from stable_baselines3.common.vec_env import VecEnv  # noqa: E402
 class StableBaselines3VecEnv(VecEnv):
     """Many worlds as a ``stable_baselines3.common.vec_env.VecEnv``.
 
-    When a world's episode ends, its info dict has ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (as
-    from Stable-Baselines3's Monitor: return ``r``, length ``l``, seconds since the start ``t``), ``eval``,
-    ``done_reason``, ``is_success`` if the task has a goal, and ``episode_metrics`` if it has metrics. The info dicts of
-    all other worlds are empty, and are the same objects in every step.
+    When a world's episode ends, its info dict has ``terminal_observation``, ``TimeLimit.truncated``, ``eval``,
+    ``done_reason`` and ``episode`` (return ``r``, length ``l`` and seconds since the start ``t``, as from
+    Stable-Baselines3's Monitor). It also has ``is_success`` if the task has a goal, and ``episode_metrics`` if the task
+    has metrics. The info dicts of all other worlds are empty, and are the same objects in every step.
 
     By default, observations are only the group ``policy``, because Stable-Baselines3 feeds all groups to the policy.
 

@@ -127,7 +127,7 @@ class Infos:
         return [*self._plain.values(), *self._metrics.values()]
 
     def named(self, values: list[Any]) -> dict[str, Any]:
-        """Make a dict of values that are listed in the order of ``tensors``."""
+        """Make a dict of infos from values in the order of ``tensors``."""
         infos = dict(zip(self._plain, values, strict=False))
         for name, table in zip(self._metrics, values[len(self._plain) :], strict=True):
             infos[name] = dict(zip(self._names, table.T, strict=True))
@@ -140,7 +140,7 @@ class StepResults:
     Args:
         env: The environment.
         observations: The format of the observations.
-        given: A function that converts all buffers to the caller's arrays or tensors in one call.
+        given: A function that converts all buffers, in one call, to the arrays or tensors that the caller gets.
     """
 
     def __init__(self, env: Env, observations: Observations, given: Callable[..., list[Any]]) -> None:

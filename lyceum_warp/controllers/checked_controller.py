@@ -22,8 +22,8 @@ class CheckedController:
 
     Raises:
         ValueError: The controller cannot be called with a state and an observation, simulates its plans in the plant
-            itself, or plans for several plants; or the larger of the controller's and the plant's time steps is not a
-            multiple of the smaller.
+            itself, or plans for several plants; or neither the controller's nor the plant's time step is a multiple of
+            the other.
     """
 
     def __init__(self, controller: Controller, env: Env) -> None:
@@ -64,7 +64,7 @@ class CheckedController:
         """
         action = self._controller(state, obs, **({"shift": shift} if self._takes_shift else {}))
         plan = getattr(self._controller, "actions", None)
-        # do not copy the returned action: it is also in the plan, and two copies would synchronise twice
+        # do not copy the returned action to the CPU: the plan contains it, and a second copy would synchronise again
         return self._checked(action, 1, step)[None] if plan is None else self._checked(plan, 2, step)
 
     def reset(self, seed: int | None) -> None:
@@ -133,7 +133,7 @@ class CheckedController:
             found |= settings
         if isinstance(env := getattr(controller, "env", None), Env):
             found |= {"engine": env.engine.name, "device": env.device.alias}
-        # convert to JSON and back, so that the result equals that from a saved file; other types become strings
+        # convert to JSON and back, so that a loaded file gives the same result; other types become strings
         return dict(json.loads(json.dumps(found, default=str)))
 
     def _checked(self, value: Any, ndim: int, step: int) -> torch.Tensor:

@@ -63,8 +63,8 @@ class ControlReport:
     miss_share: float | None
     """Fraction of plans with a planning time above the deadline."""
     blind_plans: int | None
-    """Number of plans whose samples all failed, including first plans. The planner then only shifts the previous plan
-    in time."""
+    """Number of plans whose samples all failed, including first plans. For such a plan, the planner only shifts the
+    previous plan in time."""
     known_plans: int
     """Number of plans, including first plans, for which the controller reports the number of failed samples."""
     failed_share: float | None
@@ -106,7 +106,7 @@ class ControlReport:
     controller: Mapping[str, Any]
     """Name and settings of the controller; see ``Trajectory.controller``."""
     versions: Mapping[str, Any]
-    """The first trajectory's versions of Python and packages, and its machine."""
+    """Versions of Python and packages, and the machine, from the first trajectory."""
 
     def to_json(self) -> str:
         """Convert the report to JSON; missing and non-finite numbers become null."""
@@ -223,7 +223,7 @@ def _joined(parts: Iterable[torch.Tensor]) -> np.ndarray:
 
 
 def _std(values: np.ndarray) -> float | None:
-    """Compute the sample standard deviation (n - 1); None if there are fewer than two values or one is not finite."""
+    """Compute the sample standard deviation (n - 1); None if there are fewer than two values or any is not finite."""
     return float(values.std(ddof=1)) if len(values) > 1 and np.isfinite(values).all() else None
 
 
@@ -255,7 +255,7 @@ def _plan_statistics(episodes: Sequence[Trajectory], deadline: float) -> dict[st
 
 
 def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:
-    """Compute the number of plans per second, without the first plan of each episode and without its planning time."""
+    """Compute the number of plans per second; the first plan of each episode and its planning time do not count."""
     plans, seconds = 0, 0.0
     for episode in episodes:
         ends = episode.plan_starts + episode.plan_times

@@ -49,7 +49,7 @@ def control(
             ``on_abort``.
 
     Returns:
-        The trajectory of the episode; its ``period`` is the plant's time step.
+        The trajectory of the episode; the plant's time step is stored as ``period``.
 
     Raises:
         ValueError: The environment has several worlds or automatic resets, the episode is over or may never end, an

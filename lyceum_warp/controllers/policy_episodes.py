@@ -30,8 +30,8 @@ def policy_episodes(
         env: An environment made with ``autoreset=False``; its worlds are reset.
         policy: Function from observations (nworld, nobs) to actions (nworld, nact).
         episodes: Number of episodes.
-        seed: Seed of the initial states. Without a seed, they depend on the random numbers that the worlds have used
-            before.
+        seed: Seed of the initial states. Without a seed, the initial states depend on the random numbers that the
+            worlds have used before.
         controller: Description of the policy; see ``Trajectory.controller``.
         progress: Called every ten steps with the number of steps so far and the maximum number.
 
@@ -103,7 +103,7 @@ class _Batch:
         self._reasons[over] = env.done_reason.cpu()[over].long()
 
     def trajectory(self, world: int, **origin: Any) -> Trajectory:
-        """Make the trajectory of a world; ``origin`` has the attributes that ``provenance`` returns, and others."""
+        """Make the trajectory of a world; ``origin`` holds more attributes, such as the results of ``provenance``."""
         env, steps = self.env, int(self._lengths[world])
         states, obs = (torch.stack([row[world] for row in rows[: steps + 1]]) for rows in (self._states, self._obs))
         rewards, evals, success = torch.stack([row[:, world] for row in self._outcomes[:steps]], 1)

@@ -36,7 +36,7 @@ class RealTimeSetting:
 
 @dataclasses.dataclass(frozen=True)
 class RealTimeChoice:
-    """A chosen setting of a planner, and the measured planning times behind the choice.
+    """The chosen setting of a planner, and the planning times on which the choice is based.
 
     Planning times are 99 % quantiles in seconds.
     """
@@ -48,8 +48,8 @@ class RealTimeChoice:
     deadline: float
     """Longest permitted planning time, in seconds."""
     larger: tuple[int, float] | None
-    """The smallest measured number of samples that misses the deadline, and its planning time; None if there is
-    none."""
+    """The smallest measured number of samples that misses the deadline, and its planning time; None if no number misses
+    the deadline."""
 
     @property
     def replan_every(self) -> int:

@@ -51,8 +51,8 @@ def episode_env(
 
     Args:
         episodes: The episodes, as ``load_episodes`` returns them.
-        task: The task. This argument is required if the task was defined in a notebook, if the task's file has moved,
-            or if other users can write to the file. It must have the same name as the episodes' task.
+        task: The task. The task, which is required if the task was defined in a notebook, if the task's file has moved,
+            or if other users can write to the file. The task must have the same name as the episodes' task.
         changes: Additional options and parameters of ``lw.make``.
 
     Raises:
@@ -178,7 +178,7 @@ def _foreign(file: Path) -> str:
 
 
 def _is_private(group: int) -> bool:
-    """Check whether a group is root's, or has only this user as a member (many systems make such a group per user)."""
+    """Check whether a group belongs to root or contains only this user (many systems make such a group per user)."""
     import grp
     import pwd
 

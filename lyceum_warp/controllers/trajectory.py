@@ -105,7 +105,7 @@ class Trajectory:
     seed: int | None
     """Seed of the initial state and of the controller, or None."""
     controller: Mapping[str, Any]
-    """The controller's ``name``, and settings, ``engine`` and ``device`` if the controller has them."""
+    """The controller's ``name``, and its settings, ``engine`` and ``device`` if it has them."""
     state_parts: Mapping[str, Sequence[int]]
     """Columns [start, stop] of each part of a state, by the part's name."""
     obs_parts: Mapping[str, Sequence[int]]
@@ -113,9 +113,9 @@ class Trajectory:
     action_names: Sequence[str]
     """Names of the action columns."""
     source: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """The arguments of ``lw.make`` from which ``episode_env`` makes the plant again: ``task`` is a name or "file:class"
-    (None for a task from a notebook or script); ``params`` lists the names of those task parameters that were given;
-    and ``options`` holds the options. Files of earlier releases lack these arguments."""
+    """The arguments of ``lw.make`` from which ``episode_env`` makes the plant again. ``task`` is a name or "file:class"
+    (None for a task from a notebook or script), ``params`` lists the names of the task parameters that were given, and
+    ``options`` holds the options. Files of earlier releases lack these arguments."""
 
     @property
     def steps(self) -> int:

@@ -53,8 +53,8 @@ class Graphs:
         device: Device of the launches; Warp can also capture graphs on the CPU.
         enabled: Whether to capture graphs; False calls every phase directly.
         capture_engine: Whether calls of the engine consist of launches, so that graphs can include them.
-        workers: Threads for phases with ``by_world``. The threads replay the graphs of these phases; by default, only
-            the caller's thread does.
+        workers: Threads for phases with ``by_world``. The threads replay the graphs of these phases; by default, the
+            caller's thread replays them alone.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Make views of Warp arrays, including torch tensors, and launch kernels over worlds and their rows."""
+"""View Warp arrays as other arrays or as torch tensors, and launch kernels over worlds."""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -18,7 +18,7 @@ _SPARE = 256
 
 
 def alias(array: wp.array, dtype: type, shape: tuple[int, ...], strides: tuple[int, ...] | None = None) -> wp.array:
-    """Make an alias of an array's memory with a different type, shape or strides; it keeps the memory alive."""
+    """Make an alias of an array's memory with a different type, shape or strides; the alias keeps the memory alive."""
     view: Any = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device)
     view.owner = array
     return view

@@ -18,7 +18,7 @@ class Interrupted(BaseException):
 
 
 def _ignore(number: int, frame: Any) -> None:
-    """Ignore a signal. Unlike SIG_IGN, this handler is replaced by ``obeyed``."""
+    """Ignore a signal. ``obeyed`` replaces this handler, but leaves SIG_IGN."""
 
 
 def _interrupt(number: int, frame: Any) -> None:
@@ -57,7 +57,7 @@ def signals(handler: Callable[[int, Any], None] = _interrupt, *, replaces: Any =
 
 
 def obeyed() -> contextlib.AbstractContextManager[object]:
-    """After the first Ctrl-C, SIGTERM or SIGHUP (see ``signals``), let a further one raise Interrupted, too.
+    """After the first Ctrl-C, SIGTERM or SIGHUP (see ``signals``), let the next signal raise Interrupted, too.
 
     The user can then cancel long work at the end of a program.
     """
@@ -79,7 +79,7 @@ def _raise(number: int) -> None:
 
 @contextlib.contextmanager
 def postponed(*, insist: bool = False) -> Iterator[list[int]]:
-    """Return a context that collects Ctrl-C, SIGTERM and SIGHUP in a list; at its end, the first one is handled.
+    """Return a context that collects Ctrl-C, SIGTERM and SIGHUP in a list; at its end, the first signal is handled.
 
     If the program has no handler for this signal, the context raises SystemExit. After Interrupted is raised, further
     signals are ignored.

@@ -46,7 +46,8 @@ def share_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]
     """Compute the difference of two paired proportions, and the half-width of its 95 % confidence interval.
 
     As in Agresti and Min (2005, "Simple improved confidence intervals for comparing matched proportions"), half an
-    observation is added to each of a pair's four outcomes, so that the interval has a width even if all pairs agree.
+    observation is added to each of a pair's four outcomes, so that the width of the interval is positive even if all
+    pairs agree.
 
     Args:
         first: The first outcome of each pair, (pairs,) bool.

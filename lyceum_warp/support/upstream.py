@@ -108,7 +108,7 @@ their tiles in a static variable, so two threads would overwrite each other's ti
 
 
 def separate_tiles() -> None:
-    """Serialise CPU launches of kernels that use tiles, and set ``tiles.launched`` at each of them."""
+    """Serialise CPU launches of kernels that use tiles, and set ``tiles.launched`` at each such launch."""
     launch_tiled = wp.launch_tiled
 
     def launch(*args: Any, **options: Any) -> Any:
@@ -143,7 +143,7 @@ def replaced_in_this_thread(functions: Mapping[str, Callable[..., Any]]) -> Iter
 
 _REMADE = ("reset_data", "get_state", "set_state")
 """The functions of MuJoCo Warp that define their kernels again in every call. Each kernel is a closure over one
-variable, the mask, and depends only on whether it is None."""
+variable, the mask, and depends only on whether the mask is None."""
 
 
 def quicken_mujoco_warp() -> None:

@@ -1,4 +1,4 @@
-"""AlohaLift: lift a pot by its two handles with two arms (ALOHA and pot of mujoco_warp's test data).
+"""AlohaLift: lift a pot by its two handles with two arms (robot and pot from mujoco_warp's test data).
 
 Meshes are visual only. Collision geoms are the simple shapes in the task's MJCF file, and capsules fitted to the arms.
 The arms do not collide with each other. Actions are velocities of the position servos' targets.

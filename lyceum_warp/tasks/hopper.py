@@ -70,7 +70,7 @@ class Hopper(lw.Task):
     obs = staticmethod(lambda p: {"position": 6 - p.exclude_current_positions_from_observation, "velocity": 6})
     # Euler's method is 3 to 4 times faster than RK4; returns differ by up to 2 %
     physics = {"fast": lw.PhysicsOptions(integrator="euler")}
-    # a higher healthy_reward keeps a planner with a short horizon from falling over
+    # a higher healthy_reward keeps the robot from falling over when the planner's horizon is short
     planning = lw.Planning(
         settings={"horizon": 128, "samples": 128, "noise": 0.1},
         options={"integrator": "euler"},

@@ -97,5 +97,5 @@ class Reach(lw.Task):
     horizon = 75
     # one long substep is 1.7 times faster than two short ones; returns differ by up to 0.2 %
     physics = {"fast": lw.PhysicsOptions(frame_skip=1, timestep=0.02)}
-    # the paper's settings, with its inverse temperature of 5
+    # the paper's settings, including an inverse temperature of 5
     planning = lw.Planning(settings={"horizon": 16, "samples": 30, "temperature": 0.2, "noise": 1.0})

@@ -7,7 +7,7 @@ from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 
 
 def check_spaces(ctx: Context) -> None:
-    """A space has its buffer's shape and type; its parts cover it, and lower bounds are below upper bounds."""
+    """A space has its buffer's shape and type; its parts cover all columns, and lower bounds are below upper bounds."""
     env = ctx.a
     pairs = {
         "obs": (env.obs_space, env.obs), "action": (env.action_space, env.action),

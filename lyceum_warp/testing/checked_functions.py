@@ -19,7 +19,7 @@ from lyceum_warp.binding.sources import FunctionSource, is_row, is_struct, name_
 from lyceum_warp.kernels import index_checks
 
 _SHAPES = ("shape", "strides")
-"""Attributes of an array whose values are tuples."""
+"""The attributes of an array that are tuples."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,9 +58,9 @@ class CheckedFunctions:
     """Makes checked copies of functions, and a kernel for each copy.
 
     A kernel takes the report and, for each argument of the function, the values of all worlds. The values of a World
-    are a ``Batch``, those of Params an array (nworld,) or (1,), and those of a row an array (nworld, size). The report,
-    (places, 3) int32, has a row per indexing expression. A row holds how often the index was out of range, the first
-    such index, and the size of the array.
+    are a ``Batch``, the values of Params are an array (nworld,) or (1,), and the values of a row are an array (nworld,
+    size). The report, (places, 3) int32, has a row per indexing expression. A row holds how often the index was out of
+    range, the first such index, and the size of the array.
 
     Raises:
         Unchecked: A function can't be copied.
@@ -98,7 +98,7 @@ class CheckedFunctions:
         return len(self.places) - 1
 
     def number(self, function: wp.Function) -> int:
-        """Return the index of a function's copy, which the first call makes."""
+        """Return the index of a function's copy; the first call makes the copy."""
         if function not in self._numbers:
             number = self._numbers[function] = len(self._numbers)
             for overload in overloads(function):
@@ -304,7 +304,8 @@ def checked_functions(
 ) -> CheckedFunctions:
     """Get the checked copies of a task's functions, compiled for a device; equal functions share cached copies.
 
-    ``name`` is the name of the copies' Warp module, and ``views`` are those of the task's kernels.
+    ``name`` is the name of the copies' Warp module, and ``views`` maps types of arguments to functions that read one
+    world's value.
 
     Raises:
         Unchecked: A function can't be checked.

@@ -37,7 +37,7 @@ def check_noise(ctx: Context) -> None:
     state = env.get_state()
     ctx.equal(env.get_obs(state), env.obs, "the noise of a state")
     parts = env.state_space.parts
-    # these copies of a state differ only in where their sequence of random numbers continues
+    # these copies of a state differ only in the positions of their random streams
     same = state[:1].expand_as(state).contiguous()
     changes: dict[str, torch.Tensor] = {"key": state[:, parts["key"]]}
     for name in ("episode", "step"):

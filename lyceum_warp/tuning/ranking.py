@@ -19,7 +19,7 @@ _SAMPLES = 64
 _MOVING_STEPS, _FALLING_STEPS, _LYING_STEPS = 30, 200, 10
 _REPLAN_EVERY = 6
 _IMPROVEMENTS = 2
-"""How often a plan is improved before the samples to compare are drawn around it."""
+"""Number of improvements of a plan before the compared samples are drawn around it."""
 
 
 class Rankings:

@@ -50,7 +50,7 @@ SHORT = Effort(repeats=7, block_seconds=0.1, judging_seconds=5.0, steps=100, rec
 
 
 class Trials:
-    """Compares settings with the unchanged task, alternating between both in one process.
+    """Compares settings with the unchanged task; a setting and the unchanged task alternate in one process.
 
     Args:
         reference: Environment of the unchanged task, made with ``autoreset=False``.

@@ -1,4 +1,4 @@
-"""Judge balance by the capture point, and push robots: the parts that the tasks of this folder share.
+"""Define what the tasks of this folder share: rewards for balance, based on the capture point, and pushes.
 
 Balance is measured by the distance of the capture point from the line between the feet. A foot at the capture point
 would stop the robot (Pratt et al. 2006, "Capture point: a step toward humanoid push recovery").

@@ -342,7 +342,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     draw_command(s, p, rng)
 
 
-# the reward terms get their arguments by name; their command is the one in the state before the step
+# the reward terms get their arguments by name; they use the command from the state before the step
 
 
 @wp.func
