@@ -51,8 +51,8 @@ def episode_env(
 
     Args:
         episodes: The episodes, as ``load_episodes`` returns them.
-        task: The task. The task, which is required if the task was defined in a notebook, if the task's file has moved,
-            or if other users can write to the file. The task must have the same name as the episodes' task.
+        task: The task, with the same name as the episodes' task. This argument is required if the task was defined in a
+            notebook, if the task's file has moved, or if other users can write to the file.
         changes: Additional options and parameters of ``lw.make``.
 
     Raises:
