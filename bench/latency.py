@@ -8,7 +8,7 @@ A case combines a task, the physics of the planner's worlds, a number of samples
 Episodes run in real time (``lw.control_async``) until their total duration reaches ``--seconds``: the plant keeps its
 rate, and the planner plans as often as it can. A plan meets its deadline if it takes no longer than one step of the
 plant. Run this on idle cores, because other processes delay plans. Without --samples and --horizons, cases whose plans
-would take long on two cores are omitted. With --own, each task has one case: with the samples and the horizon that the
+would take long on two cores are omitted. With --own, each task has one case, with the samples and the horizon that the
 task suggests for planners.
 """
 
@@ -31,8 +31,8 @@ COST = {
     ("point_mass", "own"): 2.0, ("reach", "own"): 6.0, ("cartpole_swingup", "own"): 2.0, ("half_cheetah", "own"): 15.0,
     ("humanoid", "fast"): 9.0, ("humanoid", "exact"): 120.0, ("adroit_pen", "own"): 95.0,
 }  # fmt: skip
-"""Microseconds to simulate one step of one sample on two cores, by task and planning physics. The tasks in the keys are
-the default tasks."""
+"""Microseconds to simulate one step of one sample on two cores, by task and planning physics. By default, the tasks in
+the keys are measured."""
 LONGEST = 0.2
 """Maximum expected duration of a plan, in seconds; longer plans run only if samples or horizons are given."""
 SAMPLES, HORIZONS = (16, 64, 256, 1024), (16, 32, 64)

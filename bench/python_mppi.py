@@ -20,7 +20,7 @@ STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
 class ReachEnv:
-    """Reach, written for Gymnasium with MuJoCo's objects and NumPy."""
+    """The task reach, written for Gymnasium with MuJoCo's objects and NumPy."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model, self.data = model, mujoco.MjData(model)

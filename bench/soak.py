@@ -5,8 +5,8 @@
     lyceum-warp bench soak --parts faults --device cuda --work runs/soak
 
 Part "faults": worlds step under random actions, and each world gets a fault every thousand steps on average. The
-program writes invalid states, states with excessive velocities, and non-finite actions. For the other faults, it writes
-a variant of the task (``VARIANT``), in which an additional action requests a NaN reward, a NaN observation or a
+program injects invalid states, states with excessive velocities, and non-finite actions. For the other faults, it
+writes a variant of the task (``VARIANT``), in which an additional action requests a NaN reward, a NaN observation or a
 negative mass. Every fault must be reported in the world and the step in which it was injected, no other fault may be
 reported, and ``env.fault_counts`` must agree. A second environment without faults must give bitwise equal numbers for
 each world until its first fault. Every fourth world gets no faults, so its numbers must be equal in both environments

@@ -1,4 +1,4 @@
-"""Train a policy with a custom network by NPG: linear feedback plus a nonlinear correction within the action range.
+"""Train a custom network by NPG: linear feedback plus a nonlinear correction, limited to the action range.
 
     python examples/own_policy.py
     python examples/own_policy.py --task half_cheetah --iterations 100

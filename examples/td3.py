@@ -36,7 +36,7 @@ class TD3Config:
     target_noise: float = 0.2
     noise_limit: float = 0.5
     actor_every: int = 2
-    """Updates of the critics for each update of the actor."""
+    """Number of updates of the critics for each update of the actor."""
 
 
 class TD3(lw.Learner):

@@ -104,7 +104,7 @@ _KINDS = {
     "subtree_angmom".split(),
     _Kind.mjOBJ_BODY,
 ) | dict.fromkeys(("xanchor", "xaxis"), _Kind.mjOBJ_JOINT)  # fmt: skip
-"""Maps the name or prefix of a field with one row per object to the kind of these objects."""
+"""Kind of the objects of a field that has one row per object, by the field's name or prefix."""
 
 _QPOS = (_Kind.mjOBJ_JOINT, "jnt_qposadr", "nq")
 _DOFS = (_Kind.mjOBJ_JOINT, "jnt_dofadr", "nv")
@@ -128,7 +128,7 @@ _RANGES = (
     | {"sensordata": _SENSORS, "flexvert_xpos": _VERTICES}
     | dict.fromkeys(("flexedge_length", "flexedge_velocity"), _EDGES)
 )  # fmt: skip
-"""Maps the name or prefix of a field in which an object may have several rows to three entries. They are the kind of
+"""Fields in which an object may have several rows, by the field's name or prefix. The three entries are the kind of
 object, the MjModel array with the index of each object's first row, and the name of either an array of row counts or
 the total number of rows."""
 

@@ -49,7 +49,7 @@ class Mirror:
         Args:
             parts: The columns of each part, in the format of ``Space.parts``.
             task: Name of the task for error messages.
-            whole: Name of a reflection of the whole; if the task declares it, it replaces the reflections of the parts.
+            whole: Name of a reflection that, if the task declares it, replaces the reflections of all parts.
 
         Raises:
             ValueError: A part has no reflection, or its reflection has a different size.

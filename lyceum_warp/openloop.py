@@ -44,7 +44,7 @@ class OpenLoop:
             of the values in ``state``.
         models: Values for model fields that differ between worlds, by name, each (n, size) float64 on the environment's
             device. World w uses row w % n instead of the values in ``state``. Every run reads the values again.
-        states: Number of initial states. Each of them is the start of nworld / states consecutive worlds.
+        states: Number of initial states. Each state is the start of nworld / states consecutive worlds.
 
     Raises:
         ValueError: The environment resets its worlds automatically, ``keys`` has the wrong shape, type or device, the
@@ -98,7 +98,7 @@ class OpenLoop:
         with wp.ScopedDevice(env.device):
             self._state = wp.zeros((states, env.state_space.size), dtype=wp.float64)
             self._actions = wp.zeros((self.horizon, n, nact), dtype=float)
-            # stepwise rollouts compute controls step by step instead
+            # stepwise rollouts compute only the controls of the current step
             self._controls = wp.zeros((self.horizon, n, 0 if stepwise else task.model.nu), dtype=float)
             self._reward = wp.zeros(rows, dtype=float)
             self._terminated = wp.zeros(rows, dtype=bool)
@@ -169,7 +169,7 @@ class OpenLoop:
         )
 
     def _step_by_step(self) -> tuple[Phase, ...]:
-        """List the phases for tasks with ``control`` or ``substep``, which need the current state at every call."""
+        """List the phases for tasks whose functions ``control`` or ``substep`` need the current state at every call."""
         engine, worlds = self.env.engine, self.worlds
         phases = [
             Phase("start", self._start),

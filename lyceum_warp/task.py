@@ -47,9 +47,9 @@ class TaskFunction:
     optional: str = ""
     """Optional last arguments, in the syntax of a task's file."""
     writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Map arguments to the fields that the function may write: "inputs", "memory", "lasting" (lasting memory and the
-    model), or "start" (every field that a reset may write). A function may always write into rows for results, such as
-    ``obs``."""
+    """Maps each argument to the kind of fields that the function may write: "inputs", "memory", "lasting" (lasting
+    memory and the model), or "start" (every field that a reset may write). A function may always write into rows for
+    results, such as ``obs``."""
 
     @property
     def signature(self) -> str:
@@ -463,18 +463,18 @@ class Task:
     ``observe`` is a Warp struct with the default ``lw.part(size)`` for each field."""
     rewards: ClassVar[Mapping[str, float]] = {}
     """Terms of the reward with weights per second, such as ``{"upright": 1.0, "effort": -0.1}``, in place of
-    ``reward``. A term is a function of the module that returns a float. The arguments of a term are found by name:
-    ``s0``, ``action``, ``s1`` (or ``s``), ``p``, the result of another function, a parameter, or a field of World. The
-    reward is dt times the weighted sum of the terms. ``lw.make(task, upright=2.0)`` and ``set_params`` change weights.
-    Each term, multiplied by its weight and dt, is also a metric. ``env.task.reward_text`` shows the generated
-    source."""
+    ``reward``. A term is a function that returns a float; it belongs to the task's module. The arguments of a term are
+    found by name: ``s0``, ``action``, ``s1`` (or ``s``), ``p``, the result of another function, a parameter, or a field
+    of World. The reward is dt times the weighted sum of the terms. ``lw.make(task, upright=2.0)`` and ``set_params``
+    change weights. Each term, multiplied by its weight and dt, is also a metric. ``env.task.reward_text`` shows the
+    generated source."""
     terminations: ClassVar[tuple[str, ...]] = ()
     """Names of functions that end the episode if any of them returns True, in place of ``terminated``. The functions
     may take the arguments ``s`` and ``p``, and arguments that are found by name, as in terms. Each function is also a
     metric, which is 1 if the function returns True after the step, and otherwise 0."""
     metrics: ClassVar[tuple[str, ...]] = ()
-    """Names of the metrics that ``measure`` writes. If the task has no ``measure``, each name is a function with the
-    arguments of a term that returns a float or a bool."""
+    """Names of the metrics that ``measure`` writes. If the task has no ``measure``, each name is the name of a function
+    that returns a float or a bool, and takes arguments as a term does."""
     horizon: ClassVar[int] = 1000
     """Number of steps after which an episode is truncated; 0 means never."""
     success_steps: ClassVar[int] = 1

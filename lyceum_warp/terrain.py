@@ -168,7 +168,7 @@ class Terrain:
     def origins(self) -> np.ndarray:
         """Compute the patches' centres relative to the plane that the field replaces, in m, (levels, columns, 3).
 
-        The z coordinate of a centre is the greatest height within 0.5 m.
+        The z coordinate of a centre is the greatest height within 0.5 m of the centre.
         """
         cells, edge, around = self._cells, round(self.border / self.resolution), round(0.5 / self.resolution)
         around = min(around, cells // 2)
@@ -183,9 +183,9 @@ class Terrain:
         """Add the ground to a model in place of the world's plane.
 
         The plane becomes the height field and keeps its name, friction and material; without a plane, the model gets a
-        geom ``name``. The plane's position becomes a corner between patches in the middle of the field. Corners have
-        height 0, so a robot that stood on the plane stands on the field. The model's extent, on which cameras depend,
-        does not change.
+        geom called ``name``. The plane's position becomes a corner between patches in the middle of the field. Corners
+        have height 0, so a robot that stood on the plane stands on the field. The model's extent, on which cameras
+        depend, does not change.
 
         Args:
             spec: The model, which is changed in place, for example in a task's ``edit_model``.

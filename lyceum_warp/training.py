@@ -108,8 +108,8 @@ def train(
             training on CPU cores, with the Warp engine.
         resume: Whether to continue the run in the folder. To resume, make the learner with the same arguments as
             before.
-        take_over: Whether to continue a run that another process has locked, on the same or another host. The locking
-            process then ends at its next write.
+        take_over: Whether to continue a run that another process has locked, on the same or another host. The process
+            that held the lock then ends at its next write.
         entries: Additional JSON entries for config.json.
         display: Object that shows the progress; by default, only messages are logged.
 
@@ -215,7 +215,7 @@ def _learn(
     learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None,
     limit: float,
 ) -> None:  # fmt: skip
-    """Iterate up to the target, the last iteration or the time limit; all ranks save and end together."""
+    """Iterate until the target, the last iteration or the time limit is reached; all ranks save and end together."""
     team, run, deadline = learner.team, saver.run, time.monotonic() + limit
     ended = False
     with postponed(insist=team.size == 1) as noted:

@@ -353,7 +353,7 @@ class Worlds(WorldArrays):
             launch_lanes(kernels.replace_observations, self.nworld, args, self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
-        """Compute observations, evaluations and terminations of the masked worlds' states, which need no transition."""
+        """Compute observations, evaluations and terminations of the masked worlds; these results need no transition."""
         # states that were set without a check may be invalid: find faults, so that such a world keeps its last valid
         # observation
         self.engine.find_faults(self.mask)

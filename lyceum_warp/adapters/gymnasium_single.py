@@ -17,7 +17,7 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
     """One world as a ``gymnasium.Env``, for evaluation, for debugging, and for tools that need a single environment.
 
     ``info`` holds ``eval``, ``done_reason`` and, if the task has them, ``success``, ``metrics`` and
-    ``episode_metrics``. For many worlds, ``GymnasiumVectorEnv`` is much faster than many such environments.
+    ``episode_metrics``. For many worlds, ``GymnasiumVectorEnv`` is much faster than many single environments.
 
     Args:
         task: A task, as in ``lw.make``, or an environment with one world, made with ``autoreset=False``.

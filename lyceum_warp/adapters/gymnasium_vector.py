@@ -30,9 +30,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
       and ``final_info`` exist only if an episode ended, and ``final_obs`` is an object array with None for the other
       worlds, as Gymnasium's wrappers expect. If ``torch`` is True, ``final_obs`` and ``final_info`` exist after every
       step and hold tensors over all worlds, so that a step need not wait for the device.
-    - DISABLED leaves resets to ``reset(options={"reset_mask": mask})``. After the end of its episode, a world keeps
-      stepping until it is reset, and its termination or truncation stays True. A world with a fault is reset at once,
-      but returns its last valid observation.
+    - DISABLED resets worlds only in ``reset(options={"reset_mask": mask})``. After the end of its episode, a world
+      keeps stepping until it is reset, and its termination or truncation stays True. A world with a fault is reset at
+      once, but returns its last valid observation.
     - NEXT_STEP resets the world in the next step, which ignores the world's action. In this mode, every step runs
       the kernels of a reset twice. Some wrappers, such as ``NormalizeObservation``, require NEXT_STEP.
 

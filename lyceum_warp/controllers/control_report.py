@@ -23,7 +23,7 @@ class ControlReport:
 
     A value is None if there are too few plans, if the value does not apply, or if the controller does not report the
     value. The first plan of each trajectory takes longer, because it loads kernels and captures graphs. Statistics of
-    planning times therefore exclude it; ``first_plan_ms`` is its planning time.
+    planning times therefore exclude the first plan, whose planning time is ``first_plan_ms``.
     """
 
     task: str

@@ -119,7 +119,7 @@ class EpisodeCollector:
         self.controller = controller.description()
         self.states, self.obs = [env.get_state()[0]], [env.obs[0].clone()]
         self.times: list[float] = []
-        # each entry has action, plan, age and late
+        # the action, its plan, its age, and whether the step was late
         self._applied: list[tuple[torch.Tensor, TimedPlan, float, bool]] = []
         self._outcomes: list[tuple[float, float, bool]] = []
         self._plans: list[tuple[int, float, float, float, float]] = []

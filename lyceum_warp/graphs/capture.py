@@ -42,8 +42,8 @@ class Phase:
     engine: bool = False
     """Whether the phase calls the engine; such a call consists of Warp launches only on some engines."""
     by_world: bool = False
-    """Whether the worlds can be divided among threads. This requires that the phase launches kernels only through
-    functions such as ``arrays.launch_worlds``, and that no world depends on another world."""
+    """Whether the worlds can be divided among threads. The division requires that the phase launches kernels only
+    through functions such as ``arrays.launch_worlds``, and that no world depends on another world."""
 
 
 class Graphs:

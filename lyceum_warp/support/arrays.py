@@ -109,7 +109,7 @@ def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp
 def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.array) -> None:
     """Launch one of the copying kernels of ``kernels.state`` over the masked rows of the target, (nworld, n).
 
-    The kernel's last arguments are the number of lanes and the first row.
+    The kernel's last arguments are the number of threads per row and the first row.
     """
     if target.size == 0:
         return

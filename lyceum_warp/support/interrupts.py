@@ -18,7 +18,7 @@ class Interrupted(BaseException):
 
 
 def _ignore(number: int, frame: Any) -> None:
-    """Ignore a signal. ``obeyed`` replaces this handler, but leaves SIG_IGN."""
+    """Ignore a signal. ``obeyed`` replaces this handler, but not SIG_IGN."""
 
 
 def _interrupt(number: int, frame: Any) -> None:
@@ -41,7 +41,7 @@ def signals(handler: Callable[[int, Any], None] = _interrupt, *, replaces: Any =
             make background programs ignore SIGINT, and nohup makes programs ignore SIGHUP.
 
     Yields:
-        The replaced handlers by signal, which the context restores at its end.
+        Replaced handlers, by signal; the context restores them at its end.
     """
     previous: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # only the main thread may set signal handlers
@@ -65,7 +65,7 @@ def obeyed() -> contextlib.AbstractContextManager[object]:
 
 
 def _raise(number: int) -> None:
-    """Raise a signal for its current handler.
+    """Send a signal to this process, so that the signal's current handler runs.
 
     The default handlers of SIGTERM and SIGHUP would end the program without running its ``finally`` blocks.
 

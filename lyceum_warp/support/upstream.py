@@ -96,7 +96,7 @@ def separate_captures() -> None:
 
 
 class _Tiles(threading.local):
-    """Thread-local flag: a kernel with tiles was launched."""
+    """Thread-local flag that is set when a kernel with tiles was launched."""
 
     launched = False
 

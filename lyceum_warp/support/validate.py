@@ -57,7 +57,7 @@ def check_flag(name: str, value: Any) -> None:
 
 
 def check_word(name: str, value: Any, words: Sequence[str], others: str = "") -> None:
-    """Check that a value is one of the given words; ``others`` ends the error message with more valid values.
+    """Check that a value is one of the given words; ``others`` adds other valid values to the message.
 
     Raises:
         ValueError: The value is not one of the words.

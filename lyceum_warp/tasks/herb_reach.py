@@ -4,8 +4,8 @@ The paper's model is not published, so the task's model was built from published
 action is a fraction of the peak torque of each motor, fingers included. The motors add the action's torque to gravity
 compensation. The targets are mocap bodies, so that they are part of the state. The targets are drawn from two boxes
 within reach, in front of the shoulders. Episodes start near HERB's home position. Success: both palms have been within
-5 cm of their targets for ten consecutive steps, 0.2 s. Between two boxes of the arms, MuJoCo Warp finds fewer contact
-points than MuJoCo.
+5 cm of their targets for ten consecutive steps, 0.2 s. If two box geoms of the arms touch, MuJoCo Warp finds fewer
+contact points than MuJoCo.
 """
 
 import warp as wp

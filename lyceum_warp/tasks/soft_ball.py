@@ -10,7 +10,7 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row
 
-NODE = 4  # the ball's first index in qpos and qvel, after the gripper's joints; it has 8 corners with 3 numbers each
+NODE = 4  # the ball's first index in qpos and qvel, after the gripper's joints; the ball has 8 corners with 3 numbers
 
 
 @wp.struct

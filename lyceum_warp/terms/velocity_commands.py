@@ -1,6 +1,6 @@
-"""Draw random velocity commands, and time them: (forward velocity, lateral velocity, yaw rate) in the base's axes.
+"""Draw random velocity commands (forward velocity, lateral velocity, yaw rate) in the base's axes, and time them.
 
-A command is stored in several rows of memory, which one function each fills with random numbers::
+A command is stored in several rows of memory, and a separate function fills each row with random numbers::
 
     terms.draw_timer(s.command_timer, p.command_seconds, rng)
     terms.draw_velocity(s.drawn_velocity, p.command_low, p.command_high, rng)
@@ -9,7 +9,7 @@ A command is stored in several rows of memory, which one function each fills wit
     terms.draw_forward_only(s.drawn_velocity, p.forward_share, p.least_forward_velocity, rng)
 
 The order of the calls follows ``UniformVelocityCommand`` of mjlab 1.6.0. ``velocity_command`` computes the command from
-the parts.
+these rows.
 """
 
 import warp as wp

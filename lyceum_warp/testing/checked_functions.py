@@ -127,7 +127,7 @@ class CheckedFunctions:
         types |= {"bounds_report_type": wp.array2d(dtype=int), "bounds_result_type": returned}
         scope = source.scope | _HELPERS | types | defaults
         scope |= {"bounds_wp": wp, "bounds_module": wp.get_module(self._module)}
-        if number in self._copies:  # with the same key, Warp adds the new copy as an overload
+        if number in self._copies:  # if the key exists, Warp adds the copy as an overload
             scope[tree.name] = self._copies[number]
         self._scopes.append((scope, rewriter.callees))
         self._run(ast.unparse(ast.fix_missing_locations(tree)), scope, len(self._scopes))

@@ -1,7 +1,7 @@
 """Check that a world's inputs (such as applied forces) and its own model fields affect its physics.
 
-The reference is ``mj_step``. An engine's result must be nearer to the reference than to ``mj_step`` without these
-inputs and fields.
+The reference is ``mj_step``. An engine's result must be nearer to the reference than to the result of ``mj_step``
+without these inputs and fields.
 """
 
 import copy

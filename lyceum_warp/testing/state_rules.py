@@ -150,8 +150,8 @@ def _lasting_columns(env: Env) -> list[slice]:
 def check_reset(ctx: Context) -> None:
     """With zero actions, ``reset`` leads to the same state regardless of the past.
 
-    Resets preserve some columns, and the state may depend on them. The check therefore first sets these columns to
-    equal values in all worlds.
+    Resets preserve some columns of a state, and the other columns may depend on them. The check therefore first sets
+    these columns to equal values in all worlds.
     """
     env = ctx.a
     lasting = _lasting_columns(env)
@@ -199,7 +199,7 @@ def check_masked_reset(ctx: Context) -> None:
 
 
 def check_rand_reset(ctx: Context) -> None:
-    """``rand_reset(seed)`` is reproducible and clears actions; resets, worlds and seeds give different states."""
+    """``rand_reset(seed)`` is reproducible and clears actions; other resets, worlds and seeds give other states."""
     a, b = ctx.a, ctx.b
     ctx.run(a, ctx.actions(5))
     ctx.restart()

@@ -17,7 +17,7 @@ RANK_CORRELATIONS = {"strict": 0.9, "loose": 0.8, "any": -1.0}
 of the tolerance. The program bench/rank_loss.py compares rank correlations with losses of planned return."""
 
 LEAST_GAIN = 1.03
-"""Minimum speed-up of a setting for which returns are compared; settings that take less memory are always compared."""
+"""Minimum speed-up at which a setting's returns are compared; settings that take less memory are always compared."""
 _LEAST_SAVING = 0.95
 
 

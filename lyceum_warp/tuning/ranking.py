@@ -19,7 +19,7 @@ _SAMPLES = 64
 _MOVING_STEPS, _FALLING_STEPS, _LYING_STEPS = 30, 200, 10
 _REPLAN_EVERY = 6
 _IMPROVEMENTS = 2
-"""Number of improvements of a plan before the compared samples are drawn around it."""
+"""How many times a plan is improved before the compared samples are drawn around it."""
 
 
 class Rankings:
@@ -81,7 +81,7 @@ class Rankings:
         return found
 
     def _prepared(self, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Plan from some states. Return the plans, and the returns of samples around the plans, (states, samples)."""
+        """Plan from some states; return the plans, and the returns (states, samples) of samples drawn around them."""
         self.exact.reset(self.seed)
         for _ in range(_IMPROVEMENTS):
             self.exact(start, shift=0)

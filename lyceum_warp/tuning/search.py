@@ -168,7 +168,7 @@ def _params_of(run: str | Path, task: type[Task]) -> Mapping[str, Any]:
 
 
 class _Search:
-    """Searches over physics settings."""
+    """Runs a search over physics settings."""
 
     def __init__(
         self, trials: Trials | Rankings, file: RowFile, tolerance: str, progress: Callable[[Row], object] | None

@@ -79,7 +79,7 @@ class Trials:
     def _record(self) -> None:
         """Record states, and the next 50 actions after each state.
 
-        Half of the worlds follow the policy, and half of the worlds act at random.
+        Half of the worlds follow the policy, and the other half acts at random.
         """
         env, draw = self.reference, random_actions(self.reference, self.seed)
         policy_worlds = torch.arange(env.nworld, device=env.obs.device)[:, None] % 2 == 1

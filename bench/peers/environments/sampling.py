@@ -204,7 +204,8 @@ def timed(
     """Return the number of steps and the seconds that they took.
 
     Args:
-        step: Function that takes a step. Its argument counts from 0 to ``period`` - 1 and selects the actions.
+        step: Function that takes a step. The function's argument counts from 0 to ``period`` - 1 and selects the
+            actions.
         period: Number of steps after which the actions repeat.
         warm: Number of steps before the clock starts.
         seconds: Duration of the measurement.

@@ -1,7 +1,7 @@
 """Add rough ground to velocity tasks: patches with levels of difficulty, a height scan, and changes of level.
 
-The kinds of patches, and their arrangement in columns, come from Isaac Lab's rough terrain, and the height scan from
-legged_gym.
+The kinds of patches, and their arrangement in columns, come from Isaac Lab's rough terrain, and the height scan comes
+from legged_gym.
 """
 
 import warp as wp
