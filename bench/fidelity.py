@@ -32,7 +32,7 @@ SHOWN = (1, 10, 100)
 """Steps at which differences are stored; the last step is always stored."""
 
 SETTLING = 20
-"""Number of steps before the trajectories start. These steps bring robots into contact with the ground."""
+"""Number of steps before the trajectories start. In these steps, robots come into contact with the ground."""
 
 ROUNDING = 2.0**-24
 """Largest relative rounding error of float32."""

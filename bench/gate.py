@@ -37,8 +37,8 @@ STEPS = 1000
 BATTERY = ((0.8, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.3, 0.0, 1.0), (0.3, 0.0, -1.0), (0.0, 0.4, 0.0), (0.0, 0.0, 0.0))
 """nanoG1's commands: forward and lateral velocity, m/s, and yaw rate, rad/s."""
 GAIT = (0.5, 0.0, 0.0)
-"""The command for nanoG1's measurement of the gait. This measurement takes twice as many steps as each command
-in ``BATTERY``."""
+"""The command for nanoG1's measurement of the gait. The gait is measured for twice as many steps as the tracking of
+each command in ``BATTERY``."""
 COMMANDS = (
     (1.0, 0.0, 0.0), (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0),
     (0.5, 0.0, 0.5), (0.5, 0.0, -0.5), (0.5, 0.3, 0.0), (0.0, 0.0, 0.0),
@@ -80,7 +80,7 @@ class Options(experiment.Options):
     """Policy of each run: last, best, or the number of a saved iteration."""
     task: str | None = None
     """Velocity task on which to test the policy, instead of the run's task. The parameters of the run are not applied
-    to this task."""
+    to this velocity task."""
 
 
 @dataclasses.dataclass(frozen=True)

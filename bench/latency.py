@@ -7,9 +7,9 @@
 A case combines a task, the physics of the planner's worlds, a number of samples, a horizon, an engine and its device.
 Episodes run in real time (``lw.control_async``) until their total duration reaches ``--seconds``: the plant keeps its
 rate, and the planner plans as often as it can. A plan meets its deadline if it takes no longer than one step of the
-plant. Run this on idle cores, because other processes delay plans. Without --samples and --horizons, cases whose plans
-would take long on two cores are omitted. With --own, each task has one case, with the samples and the horizon that the
-task suggests for planners.
+plant. Run the benchmark on idle cores, because other processes delay plans. Without --samples and --horizons, cases
+whose plans would take long on two cores are omitted. With --own, each task has one case, with the samples and the
+horizon that the task suggests for planners.
 """
 
 import dataclasses

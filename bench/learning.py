@@ -6,7 +6,7 @@
 The time includes graph captures, sampling and updates, and excludes kernel compilation and evaluations. The mean
 return is taken over the last 100 episodes, without each world's first episode, which starts at a random step. If
 iterations are too short for whole episodes, the mean is taken over 16 separate episodes of the stochastic policy every
-few iterations. On go1_velocity, a robot that stands still also reaches high returns. On this task, the program
+few iterations. On go1_velocity, a robot that stands still also reaches high returns. For go1_velocity, the program
 therefore also measures the tracking errors and falls of the mean policy, over 10 s in new worlds with noise and pushes.
 """
 

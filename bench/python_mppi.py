@@ -46,8 +46,8 @@ class GymnasiumEnv:
     Args:
         name: Gymnasium's name.
         model: The model of this package's task; states belong to this model.
-        target: Name of a mocap body of ``model``. In Gymnasium's model, a body with this name is the target; its
-        orientation is constant.
+        target: Name of a mocap body of ``model``. In Gymnasium's model, the target is a body of the same name with a
+            constant orientation.
     """
 
     def __init__(self, name: str, model: mujoco.MjModel, target: str | None = None) -> None:

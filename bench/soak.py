@@ -5,12 +5,12 @@
     lyceum-warp bench soak --parts faults --device cuda --work runs/soak
 
 Part "faults": worlds step under random actions, and each world gets a fault every thousand steps on average. The
-program injects invalid states, states with excessive velocities, and non-finite actions. For the other faults, it
-writes a variant of the task (``VARIANT``), in which an additional action requests a NaN reward, a NaN observation or a
-negative mass. Every fault must be reported in the world and the step in which it was injected, no other fault may be
-reported, and ``env.fault_counts`` must agree. A second environment without faults must give bitwise equal numbers for
-each world until its first fault. Every fourth world gets no faults, so its numbers must be equal in both environments
-throughout.
+program injects invalid states, states with excessive velocities, and non-finite actions. For the other faults, the
+program writes a variant of the task (``VARIANT``), in which an additional action requests a NaN reward, a NaN
+observation or a negative mass. Every fault must be reported in the world and the step in which it was injected, no
+other fault may be reported, and ``env.fault_counts`` must agree. A second environment without faults must give bitwise
+equal numbers for each world until its first fault. Every fourth world gets no faults, so its numbers must be equal in
+both environments throughout.
 
 A run is divided into chunks. Each chunk is one result, and ends by writing the worlds' states to a file in the folder
 ``--work``. The next chunk continues from this file, even on another machine with a copy of the folder.

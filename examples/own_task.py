@@ -52,7 +52,7 @@ class Pendulum(lw.Task):
 
 
 if __name__ == "__main__":
-    print(check_task(Pendulum, steps=100))  # this checks the rules that the package's own tasks follow
+    print(check_task(Pendulum, steps=100))  # check the rules that the package's own tasks follow
     env = lw.make(Pendulum, nworld=4, effort_weight=0.1)
     env.action[:] = 0.5  # Nm
     env.step()

@@ -434,7 +434,7 @@ class Env:
                 geom or camera.
 
         Raises:
-            ValueError: The environment does not keep the field, or the model has no element of this name.
+            ValueError: The environment has no such field, or the model has no element of this name.
         """
         if name not in self._fields:
             check_field_name(name)

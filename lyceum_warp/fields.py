@@ -163,7 +163,7 @@ class Field:
     reset: Stage
     """The stage that updates the field after a reset; ``Stage.NONE`` for a field that a reset sets to zero."""
     lagged: bool
-    """Whether the field keeps the value left by ``mj_step``. This value lags one substep behind the state."""
+    """Whether the field keeps the value left by ``mj_step``, which lags one substep behind the state."""
     snapshot: bool
     """Whether states include the field, because it is not a function of the integration state."""
     written: bool = False

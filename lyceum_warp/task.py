@@ -424,10 +424,10 @@ class Task:
     {functions}
 
     The argument ``s`` holds one world's fields in the current state, ``s0`` in the state before the step, and ``s1`` in
-    the state after the step. Fields of the position and velocity stages belong to this state; fields of the
-    acceleration stage (forces, accelerations) come from the last substep. A sensor belongs to the stage that computes
-    its quantity. Controls are clipped to the model's ranges, but ``reward`` gets the unclipped action. Pass the
-    argument ``rng``, the world's random stream, to ``lw.uniform`` and ``lw.normal``.
+    the state after the step. In these arguments, fields of the position and velocity stages belong to the state itself;
+    fields of the acceleration stage (forces, accelerations) come from the last substep. A sensor belongs to the stage
+    that computes its quantity. Controls are clipped to the model's ranges, but ``reward`` gets the unclipped action.
+    Pass the argument ``rng``, the world's random stream, to ``lw.uniform`` and ``lw.normal``.
 
     A function may write the following fields if ``World`` lists them; any other write is refused:
 
@@ -481,8 +481,8 @@ class Task:
     """Number of successive steps that must end in success before ``env.success`` is True. If ``success_steps`` is more
     than 1, the state has a part ``success_steps`` with the current count; a reset clears the count."""
     lagged: ClassVar[tuple[str, ...]] = ()
-    """Fields that keep the values left by ``mj_step``. These values lag one substep behind the state, as in some
-    Gymnasium tasks."""
+    """Fields that keep the values left by ``mj_step``, which lag one substep behind the state, as in some Gymnasium
+    tasks."""
     cleared: ClassVar[tuple[str, ...]] = ()
     """Fields of the last substep, such as contact forces, which a reset must clear before ``initialize`` runs. For all
     other fields of the last substep, a forward pass computes the values in the worlds that restart."""

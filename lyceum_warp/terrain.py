@@ -13,7 +13,7 @@ from lyceum_warp.task import from_model
 
 Shape = Callable[[np.ndarray, np.ndarray, float, np.random.Generator], np.ndarray]
 """Function ``shape(x, y, amount, rng)`` that returns the heights of a square patch. ``x`` and ``y`` are the coordinates
-of the points relative to the patch's centre. The heights and both coordinates are arrays (n, n), in m. The outline of a
+of the points relative to the patch's centre. The heights and both coordinates are arrays (n, n) in m. The outline of a
 patch is set to 0 afterwards, so that patches meet without a step."""
 
 _PLATFORM = 1.0
@@ -108,7 +108,7 @@ class Terrain:
 
     kinds: Mapping[str | Shape, int]
     """Kinds of patches, in order, each with a number of columns. A kind is a name from the table, or a function
-    ``shape(x, y, difficulty, rng)`` that returns the heights of a patch, (n, n), in m. The arguments x and y are the
+    ``shape(x, y, difficulty, rng)`` that returns the heights of a patch, (n, n) in m. The arguments x and y are the
     coordinates of the points relative to the patch's centre, (n, n)."""
     levels: int = 10
     """Number of rows."""
@@ -122,7 +122,7 @@ class Terrain:
     seed: int = 0
     """Seed of all random heights."""
     scale: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Sizes at difficulty 1, by kind. These sizes replace the sizes in the table."""
+    """Sizes at difficulty 1, by kind, instead of the sizes in the table."""
 
     def __post_init__(self) -> None:
         """Check the description.
@@ -153,7 +153,7 @@ class Terrain:
 
     @functools.cached_property
     def heights(self) -> np.ndarray:
-        """Compute the heights of all points, in m, (points along y, points along x)."""
+        """Compute the heights of all points, (points along y, points along x) in m."""
         cells, edge = self._cells, round(self.border / self.resolution)
         found = np.zeros([count * cells + 1 + 2 * edge for count in (self.levels, len(self.columns))])
         for level in range(self.levels):
@@ -166,7 +166,7 @@ class Terrain:
 
     @functools.cached_property
     def origins(self) -> np.ndarray:
-        """Compute the patches' centres relative to the plane that the field replaces, in m, (levels, columns, 3).
+        """Compute the patches' centres relative to the plane that the field replaces, (levels, columns, 3) in m.
 
         The z coordinate of a centre is the greatest height within 0.5 m of the centre.
         """
@@ -216,11 +216,11 @@ class Terrain:
 
     @property
     def _corner(self) -> np.ndarray:
-        """Return the corner of the first patch, in m, (2,)."""
+        """Return the corner of the first patch, (2,) in m."""
         return -self.patch * np.array([len(self.columns) // 2, self.levels // 2])
 
     def _patch(self, level: int, column: int) -> np.ndarray:
-        """Compute the heights of one patch, in m, (n, n)."""
+        """Compute the heights of one patch, (n, n) in m."""
         kind, difficulty = self.columns[column], (level + 1) / self.levels
         side = self.resolution * (np.arange(self._cells + 1) - self._cells / 2)
         x, y = np.meshgrid(side, side)
@@ -239,7 +239,7 @@ class Terrain:
 
 
 def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Make the table of a model's height field, in m, (1 + points along y, 1 + points along x); see ``height_field``.
+    """Make the table of a model's height field, (1 + points along y, 1 + points along x) in m; see ``height_field``.
 
     Raises:
         ValueError: The model has no height field of this name, or the height field does not belong to exactly one fixed
@@ -272,7 +272,7 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
 def height_field(name: str) -> Any:
     """Make a default for Params: the table of a model's height field.
 
-    The table is for ``lw.ground_height`` and ``lw.height_scan``. The table has the shape (1 + points along y, 1 +
+    Pass the table to ``lw.ground_height`` and ``lw.height_scan``. The table has the shape (1 + points along y, 1 +
     points along x). The table's first row has the x coordinates of the points, and the first column has their y
     coordinates. All other elements are heights z. Coordinates are in the world's frame, in m. All worlds share the
     table. Declare the table as in ``ground: wp.array2d[float] = lw.height_field("terrain")``.
@@ -284,7 +284,7 @@ def height_field(name: str) -> Any:
 
 
 def scan_grid(length: float, width: float, *, spacing: float = 0.1) -> np.ndarray:
-    """Make a default for Params: a grid of points around a robot, (n, 2), in m, for ``lw.height_scan``.
+    """Make a default for Params: a grid of points around a robot, (n, 2) in m, for ``lw.height_scan``.
 
     The first point is at the rear right. Points are ordered by x (forwards), then by y (to the left).
     ``lw.scan_grid(1.6, 1.0)`` has 17 x 11 points. Declare the grid as in ``scan: wp.array[wp.vec2] = lw.scan_grid(1.6,

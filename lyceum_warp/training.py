@@ -78,8 +78,8 @@ def train(
     """Train a learner, and write metrics, policies and checkpoints into a run folder, as ``lyceum-warp train`` does.
 
     The call ``lw.load(folder)`` returns the last policy, and ``lw.load(folder, which="best")`` returns the policy with
-    the best return. This return is ``mean_return`` if the learner evaluates the mean policy. Otherwise, it is
-    ``return_mean`` of the iteration's episodes, which were sampled by the policy before the update.
+    the best return. Returns are compared by ``mean_return`` if the learner evaluates the mean policy. Otherwise, they
+    are compared by ``return_mean`` of the iteration's episodes, which were sampled by the policy before the update.
 
     The policy and the complete state are saved at the start, at the end, and every 30 s, or more often if saving takes
     at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run resumes from the last save and produces the

@@ -68,7 +68,7 @@ def controls(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Compute mjlab's scale of actions, 0.25 * limit / kp, in rad, (joints,).
+    """Compute mjlab's scale of actions, 0.25 * limit / kp, (joints,) in rad.
 
     The scale is a quarter of the position error at which a joint's servo reaches its force limit.
 
@@ -83,7 +83,7 @@ def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def force_limits(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the largest force of each joint's servo, in N m, (joints,). Joints without a limit get 0."""
+    """Get the largest force of each joint's servo, (joints,) in N m. Joints without a limit get 0."""
     actuators = servos(model, p)
     return np.where(
         model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators, 1],
@@ -98,7 +98,7 @@ def home_qpos(model: mujoco.MjModel) -> np.ndarray:
 
 
 def home_pose(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the positions of the joints in ``home_qpos``, in rad, (joints,)."""
+    """Get the positions of the joints in ``home_qpos``, (joints,) in rad."""
     return home_qpos(model)[joint_qpos(model, p)]
 
 
@@ -226,7 +226,7 @@ def leg_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def foot_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the position of each foot's site relative to the foot's last joint, in m, (feet, 3)."""
+    """Get the position of each foot's site relative to the foot's last joint, (feet, 3) in m."""
     data = _straight(model)
     return np.array([data.site_xpos[foot] - data.xanchor[_last_joint(model, foot)] for foot in p.feet])
 
@@ -234,7 +234,7 @@ def foot_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
 def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
     """Compute spheres that replace each foot: they touch a plane if and only if the foot does.
 
-    The result has the shape (feet, most spheres, 4), and contains centres and radii, in m. Centres are relative to the
+    The result has the shape (feet, most spheres, 4), and contains centres and radii in m. Centres are relative to the
     foot's last joint. A capsule becomes spheres at both ends, a box becomes spheres at its corners, and any other geom
     becomes spheres at the corners of its bounding box. Radii include the margin at which a contact starts to exert
     force.
@@ -477,7 +477,7 @@ def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0
 def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.015) -> None:
     """Replace each colliding box of a foot by two capsules along the box's longer side, for height fields.
 
-    MuJoCo Warp 4.0 finds contacts of boxes and height fields with wrong normals and depths. Such contacts throw robots
+    MuJoCo Warp 4.0 finds contacts of boxes and height fields with wrong normals and depths. Wrong contacts throw robots
     into the air. The capsules lie within the outline of the foot's sole and touch the sole's lowest plane; masses do
     not change.
 

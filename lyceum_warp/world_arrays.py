@@ -206,7 +206,7 @@ class WorldArrays:
             launch_rows(state.widen, self.everyone, array, columns)
 
     def unpack_state(self) -> None:
-        """Set the masked worlds' counters, memory and sums from ``state``."""
+        """Set the selected worlds' counters, memory and sums from ``state``."""
         self.restore_counters(self.mask, self.state[:, self.engine.state_size :])
         for array, columns in self._own_parts():
             launch_rows(state.narrow, self.mask, columns, array)
@@ -220,7 +220,7 @@ class WorldArrays:
             yield arrays[name] if name in arrays else getattr(self, name), self.state[:, place]
 
     def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
-        """Set the masked worlds' counters from ``columns``, the states' columns after those of the engine."""
+        """Set the selected worlds' counters from ``columns``, the states' columns after those of the engine."""
         own = self.counters
         counters = [mask, columns, own.step, own.key, own.episode, self.outcome.done_reason]
         wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)

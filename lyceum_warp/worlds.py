@@ -163,7 +163,7 @@ class Worlds(WorldArrays):
         ]
 
     def _restart_phases(self, mask: wp.array, *, randomly: bool) -> list[Phase]:
-        """List the phases that set masked worlds to initial states, without derived fields."""
+        """List the phases that set selected worlds to initial states, without derived fields."""
         phases = [Phase("restart", partial(self._restart, mask, randomly=randomly), by_world=True)]
         if self.task.reset_dynamics:
             phases.append(Phase("dynamics", partial(self.engine.apply_model, mask), engine=True))
@@ -204,7 +204,7 @@ class Worlds(WorldArrays):
         return [Phase("read state", self._read_state)]
 
     def restore_phases(self) -> list[Phase]:
-        """List the phases that restore the masked worlds from ``state``, and update everything that getters read."""
+        """List the phases that restore the selected worlds from ``state``, and update everything that getters read."""
         engine_columns = self.state[:, : self.engine.state_size]
         return [
             Phase("restore engine", partial(self.engine.set_state, engine_columns, self.mask), engine=True),
@@ -285,7 +285,7 @@ class Worlds(WorldArrays):
             launch_worlds(steps.hold_success, self.nworld, args, self.device)
 
     def _restart(self, mask: wp.array, *, randomly: bool, again: bool = False) -> None:
-        """Set the masked worlds to the task's fixed initial state, or to random initial states."""
+        """Set the selected worlds to the task's fixed initial state, or to random initial states."""
         self.engine.reset(mask)
         self._clear(mask, "memory", *self.task.task.cleared, *([] if again else ["metric_sums", "success_counts"]))
         if self.task.kernels.reject_worlds is not None:  # a rejected draw must not change lasting memory
@@ -302,12 +302,12 @@ class Worlds(WorldArrays):
                 launch_rows(state.fill_rows, mask, self._zeros[: array.shape[1]], array)
 
     def _make_nominal(self, mask: wp.array, names: Iterable[str]) -> None:
-        """Set model fields of the masked worlds to nominal values."""
+        """Set model fields of the selected worlds to nominal values."""
         for name in names:
             launch_rows(state.fill_rows, mask, flat(self.engine.nominal[name])[0], flat(self.engine.arrays[name]))
 
     def _redraw(self, kernel: wp.Kernel, mask: wp.array) -> None:
-        """Draw new initial states for the masked worlds whose initial state the task rejects."""
+        """Draw new initial states for the selected worlds whose initial state the task rejects."""
         wp.copy(self._rejected, mask)
         for _ in range(self.task.task.draws - 1):
             # on a GPU, reading the mask would wait for the device, so all launches run, even if the mask is empty
@@ -344,7 +344,7 @@ class Worlds(WorldArrays):
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
 
     def _observe(self, mask: wp.array) -> None:
-        """Observe the masked worlds; other worlds were already observed when the transition was evaluated."""
+        """Observe the selected worlds; other worlds were already observed when the transition was evaluated."""
         kernels, finite, parts = self.task.kernels, self._finite_obs, self._observing
         args = [mask, self.after, self.params, self.counters, self.final_obs, finite, self.obs, parts]
         launch_parts(kernels.observe_worlds, parts, self.nworld, args, self.device)
@@ -353,7 +353,7 @@ class Worlds(WorldArrays):
             launch_lanes(kernels.replace_observations, self.nworld, args, self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
-        """Compute observations, evaluations and terminations of the masked worlds; these results need no transition."""
+        """Compute observations, evaluations and terminations of the selected worlds, without a transition."""
         # states that were set without a check may be invalid: find faults, so that such a world keeps its last valid
         # observation
         self.engine.find_faults(self.mask)
@@ -373,7 +373,7 @@ class Worlds(WorldArrays):
         self._judge(self.everyone, self._judged, self._no_fault, transition=True)
 
     def seed_streams(self, seed: int) -> None:
-        """Restart the random streams of the masked worlds, and call the task's ``startup`` in these worlds."""
+        """Restart the random streams of the selected worlds, and call the task's ``startup`` in these worlds."""
         self._seed.fill_(seed)
         args = [self.mask, self._seed, self.first_world, self.counters.key, self.counters.episode]
         wp.launch(random.seed_worlds, self.nworld, args, device=self.device)

@@ -33,7 +33,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     - DISABLED resets worlds only in ``reset(options={"reset_mask": mask})``. After the end of its episode, a world
       keeps stepping until it is reset, and its termination or truncation stays True. A world with a fault is reset at
       once, but returns its last valid observation.
-    - NEXT_STEP resets the world in the next step, which ignores the world's action. In this mode, every step runs
+    - NEXT_STEP resets the world in the next step, which ignores the world's action. In NEXT_STEP mode, every step runs
       the kernels of a reset twice. Some wrappers, such as ``NormalizeObservation``, require NEXT_STEP.
 
     If neither the constructor nor the first reset gets a seed, the seed is random, as in Gymnasium's own environments.

@@ -26,8 +26,8 @@ class StableBaselines3VecEnv(VecEnv):
 
     When a world's episode ends, its info dict has ``terminal_observation``, ``TimeLimit.truncated``, ``eval``,
     ``done_reason`` and ``episode`` (return ``r``, length ``l`` and seconds since the start ``t``, as from
-    Stable-Baselines3's Monitor). It also has ``is_success`` if the task has a goal, and ``episode_metrics`` if the task
-    has metrics. The info dicts of all other worlds are empty, and are the same objects in every step.
+    Stable-Baselines3's Monitor). The dict also has ``is_success`` if the task has a goal, and ``episode_metrics`` if
+    the task has metrics. The info dicts of all other worlds are empty, and are the same objects in every step.
 
     By default, observations are only the group ``policy``, because Stable-Baselines3 feeds all groups to the policy.
 

@@ -66,7 +66,7 @@ class PlanningController(Controller, Protocol):
     def timestep(self) -> float:
         """Simulated seconds between two actions of the plan; by default the plant's time step.
 
-        This time step must be a whole multiple or a whole fraction of the plant's time step.
+        The controller's time step must be a whole multiple or a whole fraction of the plant's time step.
         """
         ...
 

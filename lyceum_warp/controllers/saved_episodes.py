@@ -51,8 +51,8 @@ def episode_env(
 
     Args:
         episodes: The episodes, as ``load_episodes`` returns them.
-        task: The task, with the same name as the episodes' task. This argument is required if the task was defined in a
-            notebook, if the task's file has moved, or if other users can write to the file.
+        task: The task, with the same name as the episodes' task; required if the task was defined in a notebook, if the
+            task's file has moved, or if other users can write to the file.
         changes: Additional options and parameters of ``lw.make``.
 
     Raises:
@@ -126,7 +126,7 @@ def _check_same(first: Path, one: Trajectory, path: Path, other: Trajectory) -> 
 def _difference(wanted: Mapping[str, Sequence[int]], found: Mapping[str, Sequence[int]]) -> str:
     """Describe the first difference between two state layouts, such as "qpos of 7 numbers, not 9".
 
-    The description is empty if the layouts are equal.
+    The returned text is empty if the layouts are equal.
     """
     for name in {**wanted, **found}:
         one, other = (parts[name][1] - parts[name][0] if name in parts else None for parts in (wanted, found))

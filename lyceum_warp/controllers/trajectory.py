@@ -17,7 +17,7 @@ from lyceum_warp.support.files import replaced, unknown_format
 from lyceum_warp.support.versions import versions
 
 FORMAT = 1
-"""Version of the file format. The version increases when older releases cannot read new files."""
+"""Version of the file format. A release increases the version if older releases cannot read its files."""
 
 # dtype and axes of each array; axes with the same name must have the same length
 _ARRAYS = {
@@ -113,7 +113,7 @@ class Trajectory:
     action_names: Sequence[str]
     """Names of the action columns."""
     source: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """The arguments of ``lw.make`` from which ``episode_env`` makes the plant again. ``task`` is a name or "file:class"
+    """The arguments of ``lw.make`` with which ``episode_env`` makes the plant again. ``task`` is a name or "file:class"
     (None for a task from a notebook or script), ``params`` lists the names of the task parameters that were given, and
     ``options`` holds the options. Files of earlier releases lack these arguments."""
 

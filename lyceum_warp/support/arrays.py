@@ -107,7 +107,7 @@ def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp
 
 
 def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.array) -> None:
-    """Launch one of the copying kernels of ``kernels.state`` over the masked rows of the target, (nworld, n).
+    """Launch one of the copying kernels of ``kernels.state`` over the selected rows of the target, (nworld, n).
 
     The kernel's last arguments are the number of threads per row and the first row.
     """
@@ -122,7 +122,7 @@ PAIRS_A_LAUNCH = 4
 
 
 def launch_several_rows(kernel: wp.Kernel, mask: wp.array, pairs: Sequence[tuple[wp.array, wp.array]]) -> None:
-    """Launch ``narrow_four`` or ``widen_four`` of ``kernels.state`` over the masked rows of sources and targets.
+    """Launch ``narrow_four`` or ``widen_four`` of ``kernels.state`` over the selected rows of sources and targets.
 
     On the CPU, a launch takes longer than copying a few short rows, so one launch copies up to four arrays.
 

@@ -26,8 +26,8 @@ def check_truncation(ctx: Context) -> None:
 
     ``final_obs`` is the last observation of the episode, and ``obs`` the first observation of the next one.
 
-    Truncation does not set ``terminated``. In worlds that continue, ``final_obs`` and ``obs`` are equal. These rules
-    hold for every group of observations.
+    Truncation does not set ``terminated``. In worlds that continue, ``final_obs`` and ``obs`` are equal. The rules on
+    observations hold for every group of observations.
     """
     a, b, horizon = ctx.a, ctx.b, 4
     with ctx.changed(a, horizon=horizon, autoreset=True), ctx.changed(b, horizon=horizon, autoreset=False):

@@ -12,7 +12,7 @@ from lyceum_warp.testing.context import SHORT, Context
 def check_round_trip(ctx: Context) -> None:
     """After ``set_state(state)``, ``get_state()`` returns the same state.
 
-    With a mask, ``get_state`` writes only the rows of masked worlds.
+    With a mask, ``get_state`` writes only the rows of selected worlds.
     """
     env = ctx.a
     ctx.restart()

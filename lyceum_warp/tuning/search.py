@@ -94,11 +94,11 @@ def tune(
             episodes.
         episodes: Number of episodes of each setting, rounded up to a multiple of the number of worlds. By default, the
             width of the interval determines the number, within the time limit of a minute, or of 5 s if ``short``.
-        planning: Whether to find physics options for the worlds of the task's planner. The search then compares
-            planning times and the rankings of the same samples, from standing, moving and fallen states. A setting is
-            suggested if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8 ("loose"). With
-            ``planning``, ``nworld`` is the number of samples, by default 64, and ``episodes`` is the number of states
-            of each kind.
+        planning: Whether to find physics options for the worlds of the task's planner. In this case, the search
+            compares planning times and the rankings of the same samples, from standing, moving and fallen states. A
+            setting is suggested if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8
+            ("loose"). With ``planning``, ``nworld`` is the number of samples, by default 64, and ``episodes`` is the
+            number of states of each kind.
         out: File of the results, to which rows are appended; existing rows are not measured again. The default is
             tune/TASK.jsonl, or tune/TASK-planning.jsonl.
         seed: Seed of initial states and actions.

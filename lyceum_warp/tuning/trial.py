@@ -23,7 +23,7 @@ DIVERGENCE_STEPS = (1, 10, 50)
 NUDGE = 1e-6
 """Standard deviation of a perturbation of positions and velocities. The perturbation shows how chaotic the task is."""
 _HALF_WIDTH = TOLERANCES["strict"] / 2
-"""Target half-width of the difference's confidence interval. The target determines the number of episodes."""
+"""Target half-width of the difference's confidence interval. This width determines the number of episodes."""
 _CONTACT_STATES = 64
 
 Policy = Callable[[torch.Tensor], torch.Tensor]

@@ -19,7 +19,7 @@ def solid(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def centers(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Return the centres of the geoms in the torso's axes, (geoms, 3), in m."""
+    """Return the centres of the geoms in the torso's axes, (geoms, 3) in m."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     return data.geom_xpos[p.geoms] - data.xpos[p.torso]
@@ -33,7 +33,7 @@ def axes(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def radii(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Return each geom's radii along its axes, and a capsule's or cylinder's half length, (geoms, 4), in m."""
+    """Return each geom's radii along its axes, and a capsule's or cylinder's half length, (geoms, 4) in m."""
     kind = mujoco.mjtGeom
     found = np.zeros((len(p.geoms), 4))
     for row, geom in zip(found, p.geoms, strict=True):

@@ -5,8 +5,8 @@ the actuated joints and the feet, and sets the robot's parameters. The tables in
 Observations, rewards, commands, pushes and resets are taken from mjlab 1.6.0's velocity tasks.
 
 The robot's base is the body of the model's first joint, which is a free joint. Functions read the state after the last
-substep. Only the forces on the feet are older: MuJoCo computes them at the start of the last substep. These forces are
-0 at the start of an episode. Positions and velocities of the feet are computed from the joints, which saves a forward
+substep. Only the forces on the feet are older: MuJoCo computes them at the start of the last substep. The forces are 0
+at the start of an episode. Positions and velocities of the feet are computed from the joints, which saves a forward
 pass. A foot is in contact if a sphere of its sole (``soles``) reaches the ground. Only ``ground`` and ``distance``
 depend on the shape of the ground.
 """
@@ -342,7 +342,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     draw_command(s, p, rng)
 
 
-# the reward terms get their arguments by name; they use the command from the state before the step
+# the reward terms get their arguments by name, and take the command from the state before the step
 
 
 @wp.func
