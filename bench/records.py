@@ -168,7 +168,7 @@ def timed(
             process.wait()  # the process saves the policy and evaluates it
             return reached, seconds
         if code is not None:
-            raise RuntimeError(f"{' '.join(words)} ended with code {code} before its target")
+            raise RuntimeError(f"{' '.join(words)} ended with code {code} before it reached the target")
         if seconds > limit:
             process.send_signal(signal.SIGTERM)  # the process saves the run after the current iteration
             process.wait()

@@ -441,8 +441,8 @@ class Env:
             (describe_model_field if is_model_field(name) else describe)(self.task.model, name)
             kept = ", ".join(sorted(self._fields))
             raise ValueError(
-                f"this environment of {self.task.name!r} does not keep the field {name!r}: make the environment with "
-                f"fields=[{name!r}] (it keeps {kept})"
+                f"this environment of {self.task.name!r} does not provide the field {name!r}: make the environment "
+                f"with fields=[{name!r}] (it provides {kept})"
             )
         view = self._fields[name]
         if element is None:

@@ -254,7 +254,7 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
     reached, target, done = run.config.get("reached"), settings["target_return"], content["iteration"]
     if reached is not None and target is not None and reached["return"] >= target:
         raise ValueError(
-            f"the run in {folder} is finished: its return reached {reached['return']:.6g} in iteration "
+            f"the run in {folder} is finished, because its return reached {reached['return']:.6g} in iteration "
             f"{reached['iteration']}: use a larger target return, or inf for none"
         )
     if settings["iterations"] <= done:

@@ -19,7 +19,7 @@ def test_error_of_an_unavailable_field_suggests_a_fix() -> None:
     env = lw.make("hopper")
     size = env.state_space.size
     with pytest.raises(
-        ValueError, match=r"does not keep the field 'site_xpos': make the environment with fields=\['site_xpos'\]"
+        ValueError, match=r"does not provide the field 'site_xpos': make the environment with fields=\['site_xpos'\]"
     ):
         env.field("site_xpos")
     assert env.state_space.size == size

@@ -245,7 +245,10 @@ def test_training_ends_at_the_target_return(tmp_path: Path, capsys: pytest.Captu
     resume = ["train", "--resume", str(folder), "--iterations", "4", *QUIET]
     assert cli.main(resume) == 2
     refused(
-        capsys, f"the run in {folder} is finished: its return reached", "in iteration 2", "use a larger target return"
+        capsys,
+        f"the run in {folder} is finished, because its return reached",
+        "in iteration 2",
+        "use a larger target return",
     )
     assert cli.main([*resume, "--target-return", "inf"]) == 0
     assert len(run.rows()) == 4

@@ -93,7 +93,7 @@ def begin_episode(
     elif seed is not None:
         raise ValueError(f"seed={seed} has no effect with reset=False: omit one of the two arguments")
     if env.done.item():
-        raise ValueError("the episode is over before its first step: reset the environment, or omit reset=False")
+        raise ValueError("the current episode is already over: reset the environment, or omit reset=False")
     return limit, 0 if reset else int(env.episode_step.item())
 
 

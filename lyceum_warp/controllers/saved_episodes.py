@@ -120,7 +120,7 @@ def _check_same(first: Path, one: Trajectory, path: Path, other: Trajectory) -> 
             "separately"
         )
     if difference := _difference(one.state_parts, other.state_parts):
-        raise ValueError(f"{path} is of a different model than {first}: its states have {difference}")
+        raise ValueError(f"{path} has a different model than {first}: its states have {difference}")
 
 
 def _difference(wanted: Mapping[str, Sequence[int]], found: Mapping[str, Sequence[int]]) -> str:

@@ -89,7 +89,7 @@ class _Report:
         self._progress.start()
         if self._lines:
             cores = f"{cpu_cores()} cores" if cpu_cores() > 1 else "1 core"
-            print(f"{self._text}: {self._total} modules on {cores}, once", file=sys.stderr, flush=True)
+            print(f"{self._text}: {self._total} modules on {cores}, needed only once", file=sys.stderr, flush=True)
         return self
 
     def __call__(self, module: str, seconds: float) -> None:

@@ -98,7 +98,7 @@ def check_tensor(value: Any, name: str, like: torch.Tensor) -> None:
     if not isinstance(value, torch.Tensor) or value.shape != like.shape or value.dtype != like.dtype:
         raise ValueError(f"{name} must be {described(like)}, not {described(value)}")
     if value.device != like.device:
-        raise ValueError(f"{name} must lie on {like.device}, not on {value.device}: move it with .to()")
+        raise ValueError(f"{name} must be on {like.device}, not on {value.device}: move it with .to()")
 
 
 def described(value: Any) -> str:

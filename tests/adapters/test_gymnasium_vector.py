@@ -315,7 +315,7 @@ def test_pictures_show_the_current_state_of_each_world(vector: Callable[..., Gym
         (False, [[0.0] * 3] * 4, r"float32 array of shape \(4, 3\), not list"),
         (True, torch.zeros(4, 2), r"float32 tensor of shape \(4, 3\), not a float32 tensor of shape \(4, 2\)"),
         (True, torch.zeros(4, 3, dtype=torch.float64), r"actions must be a float32 tensor .*, not a float64 tensor"),
-        (True, torch.zeros(4, 3, device="meta"), r"actions must lie on cpu, not on meta: move it with .to\(\)"),
+        (True, torch.zeros(4, 3, device="meta"), r"actions must be on cpu, not on meta: move it with .to\(\)"),
         (
             True,
             np.zeros((4, 3), dtype=np.float32),

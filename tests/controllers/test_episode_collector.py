@@ -41,7 +41,7 @@ def test_control_with_invalid_arguments_raises_an_error(run: Run, env: lw.Env) -
     for arguments, message in (
         ({"steps": 0}, "steps must be a whole number from 1 to .*, not 0"),
         ({"seed": 1, "reset": False}, "seed=1 has no effect with reset=False"),
-        ({"reset": False}, "over before its first step: reset the environment"),
+        ({"reset": False}, "current episode is already over: reset the environment"),
     ):
         with pytest.raises(ValueError, match=message):
             run(env, towards, **arguments)

@@ -101,7 +101,7 @@ def test_episode_of_another_model_raises_an_error(folder: Path, env: lw.Env, tmp
     first = min(folder.iterdir())
     plain = lw.make("point_mass", autoreset=False, horizon=3)
     path = lw.control(plain, towards).save(tmp_path / "plain.npz")
-    with pytest.raises(ValueError, match=f"{path} is of a different model than {first}: its states have no body_mass"):
+    with pytest.raises(ValueError, match=f"{path} has a different model than {first}: its states have no body_mass"):
         load_episodes([first, path])
     with pytest.raises(
         ValueError, match=rf"a different model than {path}: its states have body_mass of \d+ numbers, not 0"

@@ -53,7 +53,7 @@ def test_tensor_must_have_the_shape_and_type_of_the_buffer() -> None:
     for text, value in wrong.items():
         with pytest.raises(ValueError, match=rf"action must be a float32 tensor of shape \(2, 3\), not {text}"):
             check_tensor(value, "action", buffer)
-    with pytest.raises(ValueError, match=r"action must lie on cpu, not on meta: move it with \.to\(\)"):
+    with pytest.raises(ValueError, match=r"action must be on cpu, not on meta: move it with \.to\(\)"):
         check_tensor(torch.ones(2, 3, device="meta"), "action", buffer)
 
 
