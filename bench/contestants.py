@@ -1,9 +1,8 @@
 """Step worlds with lyceum_warp, ``mujoco.rollout`` and other libraries, for the experiment "throughput".
 
-A sample is one environment step of which the caller has received the observation and the reward. All contestants use
-the same model, substeps and bounds of uniformly random actions. Worlds start from random initial states, step a few
-times before the clock starts, and restart when an episode ends. Each contestant runs with its best number of worlds per
-thread.
+A sample is one environment step; the caller must have received its observation and reward. All contestants use the same
+model, substeps and bounds of uniformly random actions. Worlds start from random initial states, step a few times before
+the clock starts, and restart when an episode ends. Each contestant runs with its best number of worlds per thread.
 """
 
 import importlib.util

@@ -104,7 +104,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     seconds, curve, mean = 0.0, [], -math.inf
     while seconds < case.seconds and mean < case.target:
         began = time.perf_counter()
-        it = next(made)  # an iteration ends with a copy to the host, which waits for the device
+        it = next(made)  # an iteration ends with a copy to the host, and the copy waits for the device
         seconds += time.perf_counter() - began
         if judge is None:
             returns = made.rollout.episode_return[made.rollout.done]

@@ -3,9 +3,9 @@
     lyceum-warp bench npg --threads 2 --jobs 16
 
 Both NPGs are the same class with the same settings, number of worlds and seeds. The two NPGs differ only in the
-environments that fill the rollout buffer, and Gymnasium uses the faster of its two vector modes. stable-baselines3's
-PPO and sb3-contrib's TRPO each learn for twelve minutes, with the settings that RL Baselines3 Zoo tuned for these
-tasks. With --device cuda, lw.NPG and lw.PPO learn on the same worlds on a GPU.
+environments that fill the rollout buffer; Gymnasium uses the faster of its two vector modes. The PPO of
+stable-baselines3 and the TRPO of sb3-contrib each learn for twelve minutes, with the settings that RL Baselines3 Zoo
+tuned for these tasks. With --device cuda, lw.NPG and lw.PPO learn on the same worlds on a GPU.
 
 All policies are evaluated by their mean actions in single Gymnasium environments, from the same initial states. The
 clock stops during evaluations, and starts after kernels are compiled and environments are made. Each case runs in a
@@ -279,7 +279,7 @@ def iterate(learner: Any, curve: Curve) -> dict[str, Any]:
     sampling = 0.0
     curve.start(mean_action(learner.policy))
     while not curve.ended(learner.samples):
-        sampling += next(learner).time_sample  # an iteration ends with a copy to the host, which waits for the GPU
+        sampling += next(learner).time_sample  # an iteration ends with a copy to the host; the copy waits for the GPU
         if curve.due(learner.samples):
             curve.add(learner.samples, mean_action(learner.policy))
     curve.add(learner.samples, mean_action(learner.policy))

@@ -3,7 +3,7 @@
     lyceum-warp bench rank_loss half_cheetah hopper
 
 Each line of results/rank-loss.jsonl belongs to one task and one setting, and holds the rank correlations that
-``lyceum-warp tune --planning`` measures. The line also holds three returns of the same episodes, which always run in
+``lyceum-warp tune --planning`` measures. The line also holds three returns of the same episodes; the plant always has
 the task's own physics. The planner uses the task's physics for R_exact, and the setting's physics for R_setting; R_none
 is measured without a planner. The loss is (R_exact - R_setting) / (R_exact - R_none). Episodes do not run in real time,
 so the results do not depend on the load of the machine.

@@ -130,8 +130,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def cache(case: Case, options: Options, folder: Path) -> Iterator[dict[str, str]]:
-    """Return the command's environment variables. One of the variables is the path of the kernel cache, which is empty
-    or filled."""
+    """Return the command's environment variables. They select an empty or a filled kernel cache."""
     if case.cache == "warm":
         if not folder.exists():
             with tempfile.TemporaryDirectory() as spare:

@@ -297,9 +297,10 @@ class Env:
     def get_state(self, out: torch.Tensor | None = None, mask: torch.Tensor | None = None) -> torch.Tensor:
         """Get the complete state of every world, (nworld, state_space.size), float64.
 
-        A state determines the future of its world: the engine's integration state, fields left by the last substep,
-        model fields that differ between worlds, the step and episode counters, the random stream, the task's memory,
-        the metric sums, and the count for ``success_steps``. ``state_space.parts`` names the columns of a state.
+        A state contains everything that determines the future of its world: the engine's integration state, fields left
+        by the last substep, model fields that differ between worlds, the step and episode counters, the random stream,
+        the task's memory, the metric sums, and the count for ``success_steps``. ``state_space.parts`` names the columns
+        of a state.
 
         Args:
             out: Tensor into which the states are written.

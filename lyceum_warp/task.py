@@ -204,7 +204,7 @@ def part(size: int | str = 1) -> Any:
 
 
 class Element(int):
-    """Name of a model's element, which is replaced by the element's index; made by ``site`` and similar functions."""
+    """Name of an element of the model, made by ``site`` and similar functions; the index replaces the name."""
 
     field: str
     name: str

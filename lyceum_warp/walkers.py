@@ -475,7 +475,7 @@ def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0
 
 
 def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.015) -> None:
-    """Replace each colliding box of a foot by two capsules along the box's longer side, for height fields.
+    """Replace each colliding box of a foot by two capsules along the box's longer side, to use height fields.
 
     MuJoCo Warp 4.0 finds contacts of boxes and height fields with wrong normals and depths. Wrong contacts throw robots
     into the air. The capsules lie within the outline of the foot's sole and touch the sole's lowest plane; masses do

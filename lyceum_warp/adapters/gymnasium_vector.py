@@ -25,7 +25,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     ``autoreset_mode`` determines when a world is reset after its episode ends:
 
     - SAME_STEP resets the world within that step. The world returns the first observation of its next episode;
-      ``infos["final_obs"]`` and ``infos["final_info"]`` hold the last observations and infos of ended episodes, and the
+      ``infos["final_obs"]`` and ``infos["final_info"]`` hold the last observations and infos of ended episodes. The
       masks ``_final_obs`` and ``_final_info`` mark the worlds of these episodes. If ``torch`` is False, ``final_obs``
       and ``final_info`` exist only if an episode ended, and ``final_obs`` is an object array with None for the other
       worlds, as Gymnasium's wrappers expect. If ``torch`` is True, ``final_obs`` and ``final_info`` exist after every

@@ -112,7 +112,7 @@ class CheckedController:
         """Check that a plan of length ``horizon`` covers a number of plant steps.
 
         Raises:
-            ValueError: The plan covers fewer steps.
+            ValueError: The plan is too short.
         """
         if (needed := self.steps(steps - 1) + 1) > horizon:
             plan = (
@@ -153,7 +153,7 @@ def _steps(plant: float, plan: float) -> tuple[int, int]:
     """Compute how many plan steps and how many plant steps fit into the longer time step.
 
     Raises:
-        ValueError: The larger time step is not a multiple of the smaller.
+        ValueError: The larger time step is not a multiple of the smaller one.
     """
     many = round(max(plant, plan) / min(plant, plan))
     if not math.isclose(many * min(plant, plan), max(plant, plan), rel_tol=1e-6):

@@ -22,8 +22,8 @@ class ControlReport:
     """Statistics of a controller's episodes, computed by ``control_report``.
 
     A value is None if there are too few plans, if the value does not apply, or if the controller does not report the
-    value. The first plan of each trajectory takes longer, because it loads kernels and captures graphs. Statistics of
-    planning times therefore exclude the first plan, whose planning time is ``first_plan_ms``.
+    value. The first plan of each trajectory takes longer than later plans, because it loads kernels and captures
+    graphs. Statistics of planning times therefore exclude the first plan, whose planning time is ``first_plan_ms``.
     """
 
     task: str

@@ -45,9 +45,9 @@ def mean_interval(values: Sequence[float] | np.ndarray, confidence: float = 0.95
 def share_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
     """Compute the difference of two paired proportions, and the half-width of its 95 % confidence interval.
 
-    As in Agresti and Min (2005, "Simple improved confidence intervals for comparing matched proportions"), half an
-    observation is added to each of a pair's four outcomes, so that the width of the interval is positive even if all
-    pairs agree.
+    The method is that of Agresti and Min (2005, "Simple improved confidence intervals for comparing matched
+    proportions"). Half an observation is added to each of a pair's four outcomes, so the width of the interval is
+    positive even if all pairs agree.
 
     Args:
         first: The first outcome of each pair, (pairs,) bool.

@@ -147,7 +147,7 @@ variable, the mask, and depends only on whether the mask is None."""
 
 
 def quicken_mujoco_warp() -> None:
-    """Cache results in MuJoCo Warp's host code, which takes most of a step's or reset's time if graphs are not used.
+    """Cache results in MuJoCo Warp's host code; without graphs, this code takes most of the time of a step or a reset.
 
     For each pair of geom types, MuJoCo Warp calls a Warp function from Python, and each call resolves overloads. The
     functions in ``_REMADE`` parse and hash their kernels in every call, and ``put_model`` parses packages' metadata.

@@ -35,10 +35,11 @@ class Tuning:
 
     rows: list[Row]
     """Results of each setting, the fastest first; docs/physics.md describes the entries. The entry ``verdict`` is
-    "same", "different" or "not shown" (the interval of the returns lies within, outside or across the tolerance),
-    "faults" (more than twice as many faults as in the unchanged task), "no gain" (less than 3 % faster and not smaller,
-    so that returns are not compared), "refused" (by MuJoCo or the engine; ``refused`` has the reason), or, for a
-    planner, "ranks badly"."""
+    "same", "different" or "not shown" if the interval of the returns lies within, outside or across the tolerance. It
+    is "faults" if the setting has more than twice as many faults as the unchanged task. It is "no gain", without a
+    comparison of returns, if the setting is less than 3 % faster and does not save memory. It is "refused" if MuJoCo or
+    the engine refuses the setting; the entry ``refused`` has the reason. A setting of a planner may also have the
+    verdict "ranks badly"."""
     reference: Row
     """Results of comparing the unchanged task with itself."""
     not_tried: list[str]

@@ -1,9 +1,9 @@
 """G1Stand: a Unitree G1 with a rigid upper body steps in place, and keeps its balance when it is pushed.
 
-Actions are offsets of the leg joints' targets. The targets lift the feet in time with a gait clock, so that the robot
-steps in place under a plan of zeros until it falls after about a second. A planner thus only needs to find corrections
-of a step, not the step itself. The gains of the servos are those of unitree_rl_gym, which also keeps waist and arms
-rigid. The 17 joints of the upper body and the dry friction of the legs' joints would double the time of a substep.
+Actions are offsets of the leg joints' targets. The targets lift the feet in time with a gait clock, so that, with zero
+actions, the robot steps in place until it falls after about a second. A planner thus only needs to find corrections of
+a step, not the step itself. The gains of the servos are those of unitree_rl_gym, which also keeps waist and arms rigid.
+The 17 joints of the upper body and the dry friction of the legs' joints would double the time of a substep.
 """
 
 import mujoco
