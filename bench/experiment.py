@@ -418,7 +418,7 @@ def outcomes(
         try:
             with concurrent.futures.ProcessPoolExecutor(1, context) as process:
                 result = process.submit(_measure_apart, experiment.measure, case, options).result()
-        except Exception as error:  # the case raised an error, or its process died
+        except Exception as error:  # the case failed, or the process of the case died
             result = error
         places.put(place)
         return case, result, time.perf_counter() - began

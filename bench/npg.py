@@ -179,7 +179,7 @@ class Judge:
 
 
 class Curve:
-    """Collect the learning curve of a run; its clock stops during evaluations."""
+    """Collect the learning curve of a run; the run's clock stops during evaluations."""
 
     def __init__(self, case: Case) -> None:
         self.case, self.judge = case, Judge(case.task, 2 if case.short else EPISODES)

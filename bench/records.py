@@ -150,7 +150,7 @@ def run(words: Sequence[str], environment: dict[str, str]) -> "subprocess.Popen[
 def timed(
     words: Sequence[str], folder: Path, environment: dict[str, str], limit: float
 ) -> tuple[dict[str, Any] | None, float]:
-    """Run the command up to its target, or for ``limit`` seconds; return the entry in config.json and the seconds.
+    """Run the command to its target, or for ``limit`` seconds; return the entry in config.json and the seconds.
 
     Raises:
         RuntimeError: The command failed.

@@ -57,7 +57,7 @@ class ModelFile:
             files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.xml"))
             close = difflib.get_close_matches(file, files, 3) or files[:10]
             raise FileNotFoundError(
-                f"there is no model file {file!r} in {folder}; it has {', '.join(close) or 'no XML files'}"
+                f"there is no model file {file!r} in {folder}; the folder has {', '.join(close) or 'no XML files'}"
             )
         return folder / file
 

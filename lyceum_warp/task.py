@@ -426,8 +426,8 @@ class Task:
     The argument ``s`` holds one world's fields in the current state, ``s0`` in the state before the step, and ``s1`` in
     the state after the step. In these arguments, fields of the position and velocity stages belong to the state itself;
     fields of the acceleration stage (forces, accelerations) come from the last substep. A sensor belongs to the stage
-    that computes its quantity. Controls are clipped to the model's ranges, but ``reward`` gets the unclipped action.
-    Pass the argument ``rng``, the world's random stream, to ``lw.uniform`` and ``lw.normal``.
+    that computes the sensor's quantity. Controls are clipped to the model's ranges, but ``reward`` gets the unclipped
+    action. Pass the argument ``rng``, the world's random stream, to ``lw.uniform`` and ``lw.normal``.
 
     A function may write the following fields if ``World`` lists them; any other write is refused:
 
@@ -504,8 +504,8 @@ class Task:
     episode's time starts at 0 after these substeps."""
     gymnasium: ClassVar[str | None] = None
     """Id of the Gymnasium environment that the task reimplements, such as "Hopper-v5"; None without such an
-    environment. Model, observation, reward, termination, reset and parameters are the same. Subclasses do not inherit
-    this attribute."""
+    environment. Model, observation, reward, termination, reset and parameters are the same as in that environment.
+    Subclasses do not inherit this attribute."""
     trace: ClassVar[str | None] = None
     """Name of a site or body. For a planner's samples, the viewer draws the path of this site or body. If None, the
     viewer draws the path of the centre of mass if the robot has a floating base, or else of the end of the arm."""

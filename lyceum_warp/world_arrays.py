@@ -220,7 +220,7 @@ class WorldArrays:
             yield arrays[name] if name in arrays else getattr(self, name), self.state[:, place]
 
     def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
-        """Set the selected worlds' counters from ``columns``, the states' columns after those of the engine."""
+        """Set the selected worlds' counters from ``columns``, the part of the states after the engine's part."""
         own = self.counters
         counters = [mask, columns, own.step, own.key, own.episode, self.outcome.done_reason]
         wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)

@@ -197,7 +197,7 @@ def test_only_a_fault_restarts_a_world_without_automatic_resets(engine: str) -> 
         ({"terminate_when_unhealthy": 0.5}, "terminate_when_unhealthy=0.5 of 'hopper' must be a whole number"),
         ({"device": "cuda:77"}, "no device 'cuda:77' on this machine; it has 'cpu'.*nvidia-smi"),
         ({"engine": None}, "engine must be .* not NoneType None"),
-        ({"model": "hoper.xml"}, "no model file 'hoper.xml' in .*; it has hopper.xml"),
+        ({"model": "hoper.xml"}, "no model file 'hoper.xml' in .*; the folder has hopper.xml"),
         ({"model": "/nowhere/hopper.xml"}, "no model file '/nowhere/hopper.xml'"),
     ],
     ids=lambda value: "-".join(f"{k}={v}" for k, v in value.items()) if isinstance(value, dict) else "",

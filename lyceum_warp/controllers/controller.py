@@ -77,7 +77,7 @@ class PlanningController(Controller, Protocol):
 
     @property
     def plants(self) -> int:
-        """Number of plants for which the controller plans, by default 1. The control loops require 1."""
+        """Number of plants for which the controller plans, by default 1. Control loops require one plant."""
         ...
 
     @property

@@ -97,10 +97,10 @@ def launch_parts(kernel: wp.Kernel, parts: int, nworld: int, args: Sequence[Any]
 
 
 def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device) -> None:
-    """Launch a kernel over (nworld, lanes); its last arguments are the number of lanes and the first world's index.
+    """Launch a kernel over (nworld, lanes); the last arguments are the number of lanes and the first world's index.
 
-    The lanes of a world are threads that share the work on its rows: one thread on the CPU, and a warp on a GPU, for
-    coalesced memory access.
+    The lanes of a world are threads that share the work on the world's rows: one thread on the CPU, and a warp on a
+    GPU, for coalesced memory access.
     """
     lanes = 32 if device.is_cuda else 1
     _launch(kernel, (nworld, lanes), 0, [*args, lanes], device)

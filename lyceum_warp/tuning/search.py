@@ -81,8 +81,8 @@ def tune(
 
     Every setting is compared with the unchanged task in the same process: steps per second, memory, faults, divergence,
     and the returns of the same episodes under random actions and under a policy. Settings are first tried alone.
-    Afterwards, the best settings of all groups are combined, and as long as the combination changes the returns, its
-    least useful setting is removed.
+    Afterwards, the best settings of all groups are combined, and as long as the combination changes the returns, the
+    least useful setting of the combination is removed.
 
     Args:
         task: Name of a task, path of a task file, or a task class.
