@@ -150,7 +150,7 @@ def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] 
         new: The array to compare with it.
         axes: Names of the leading axes.
     """
-    if old.dtype.kind == new.dtype.kind == "U" and old.shape == new.shape:  # NumPy's string types include a length
+    if old.dtype.kind == new.dtype.kind == "U" and old.shape == new.shape:  # NumPy's string dtypes contain a length
         longer = max(old.dtype, new.dtype)
         old, new = old.astype(longer), new.astype(longer)
     if (old.dtype, old.shape) != (new.dtype, new.shape):

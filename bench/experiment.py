@@ -279,7 +279,7 @@ def key(case: Mapping[str, Any]) -> str:
     return json.dumps(case, sort_keys=True)
 
 
-# helpers that several experiments use
+# shared helpers
 
 
 def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[float]]:

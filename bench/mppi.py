@@ -123,7 +123,7 @@ def estimate(case: Case) -> float:
     return case.count * case.steps * plan * max(2 / case.threads, 0.1)
 
 
-# planners and plants, which later cases reuse
+# later cases reuse these planners and plants
 
 
 @functools.cache

@@ -52,7 +52,7 @@ CONTESTANTS = {
     "trpo_sb3": "TRPO, sb3-contrib",
     "npg_gpu": "NPG, lyceum_warp on a GPU",
     "ppo_gpu": "PPO, lyceum_warp on a GPU",
-    # only stored results of an earlier commit have this contestant
+    # this contestant is only in stored results of an earlier commit
     "ppo_rsl_rl": "rsl_rl's PPO, lyceum_warp on a GPU",
 }
 ON_CPU, ON_GPU, YARDSTICKS = tuple(CONTESTANTS)[:4], tuple(CONTESTANTS)[4:6], ("ppo_sb3", "trpo_sb3")

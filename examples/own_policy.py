@@ -33,7 +33,7 @@ def main(
     task: str = "point_mass", nworld: int = 40, samples: int = 10_240, iterations: int = 15, seed: int = 0
 ) -> None:
     """Train the policy and evaluate it."""
-    torch.manual_seed(seed)  # the network's initial weights
+    torch.manual_seed(seed)  # seed of the network's initial weights
     env = lw.make(task, nworld=nworld, seed=seed)
     nobs, nact = env.obs_space.size, env.action_space.size
     low, high = torch.tensor(env.action_space.low), torch.tensor(env.action_space.high)

@@ -40,7 +40,7 @@ def main(nworld: int = 256, iterations: int = 100, steps: int = 32, device: str 
 
         obs, action, next_value, reward, done, distance = map(torch.stack, zip(*samples, strict=True))
         target = reward + gamma * next_value
-        for t in reversed(range(steps - 1)):  # bootstrapped returns, which end with the episode or the rollout
+        for t in reversed(range(steps - 1)):  # accumulate returns backwards until the episode or the rollout ends
             target[t] = torch.where(done[t], target[t], reward[t] + gamma * target[t + 1])
         value = critic(obs.flatten(0, 1))
         advantage = target.flatten() - value.detach()

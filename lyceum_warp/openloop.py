@@ -98,7 +98,7 @@ class OpenLoop:
         with wp.ScopedDevice(env.device):
             self._state = wp.zeros((states, env.state_space.size), dtype=wp.float64)
             self._actions = wp.zeros((self.horizon, n, nact), dtype=float)
-            # stepwise rollouts compute only the controls of the current step
+            # stepwise rollouts convert the actions in each step, and need no buffer of controls
             self._controls = wp.zeros((self.horizon, n, 0 if stepwise else task.model.nu), dtype=float)
             self._reward = wp.zeros(rows, dtype=float)
             self._terminated = wp.zeros(rows, dtype=bool)

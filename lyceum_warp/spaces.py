@@ -93,7 +93,7 @@ def _controls(model: mujoco.MjModel) -> dict[str, int]:
     sizes: dict[str, int] = {}
     for i in np.argsort(model.actuator_ctrladr, kind="stable").tolist():
         name = given[i] or f"actuator_{i}"
-        while not given[i] and name in given:  # avoid a name that an actuator has
+        while not given[i] and name in given:  # the name must differ from all names of actuators
             name = f"{name}_"
         if model.actuator_ctrlnum[i]:
             sizes[name] = int(model.actuator_ctrlnum[i])

@@ -78,7 +78,7 @@ class Numbers:
         return {name: np.stack(value) if isinstance(value, list) else value for name, value in self._arrays.items()}
 
 
-# helpers of the parts
+# helpers
 
 
 def make(task: str, engine: str, device: str, **options: Any) -> Any:

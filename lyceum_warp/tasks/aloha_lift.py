@@ -111,7 +111,7 @@ class AlohaLift(lw.Task):
                 geom.type, geom.conaffinity = mujoco.mjtGeom.mjGEOM_CAPSULE, 1
             elif geom.name.startswith("partnet"):
                 geom.rgba = (0.75, 0.77, 0.8, 1.0)
-        spec.camera("collaborator_pov").mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK  # the camera of videos
+        spec.camera("collaborator_pov").mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK  # camera for videos
         for light in spec.lights:
             light.castshadow = False  # without a GPU, shadows make rendering 17 times slower
         child = lw.package_model("lyceum_warp", "tasks/aloha_lift.xml").spec()
