@@ -38,7 +38,7 @@ def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     statistics = np.stack([_welch(both[first], both[~first]) for first in chosen])
     observed = _welch(a, b)
     largest = statistics.max(axis=1)
-    # with this tolerance, the observed split counts despite rounding
+    # the tolerance keeps rounding from excluding the observed split
     return (largest[:, None] >= observed * (1.0 - 1e-9)).mean(axis=0)
 
 

@@ -444,7 +444,7 @@ def agreement(task: str, same: dict[str, list[Row]]) -> Table | None:
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    """Draw returns over samples and over seconds: mean over the seeds with its 95 % interval."""
+    """Plot returns over samples and over seconds: mean over the seeds with its 95 % interval."""
     found = runs(rows)
     drawn = new_figure("npg", max(4.0 * len(found), 7.0), 6.6)
     axes = drawn.subplots(2, len(found), squeeze=False)

@@ -419,8 +419,8 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
 
     Args:
         spec: The model.
-        feet: Maps the name of each new site to a pair. The pair consists of the name of a body (or of one of its joints
-            or geoms) and the site's position in this body, in m.
+        feet: Maps the name of each new site to the name of a body (or of one of its joints or geoms) and the site's
+            position in this body, in m.
 
     Raises:
         ValueError: The model has no element of this name.

@@ -26,10 +26,10 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     - SAME_STEP resets the world within that step. The world returns the first observation of its next episode;
       ``infos["final_obs"]`` and ``infos["final_info"]`` hold the last observations and infos of ended episodes. The
-      masks ``_final_obs`` and ``_final_info`` mark the worlds of these episodes. If ``torch`` is False, ``final_obs``
-      and ``final_info`` exist only if an episode ended, and ``final_obs`` is an object array with None for the other
-      worlds, as Gymnasium's wrappers expect. If ``torch`` is True, ``final_obs`` and ``final_info`` exist after every
-      step and hold tensors over all worlds, so that a step need not wait for the device.
+      masks ``_final_obs`` and ``_final_info`` mark the worlds whose episodes ended. If ``torch`` is False,
+      ``final_obs`` and ``final_info`` exist only if an episode ended, and ``final_obs`` is an object array with None
+      for the other worlds, as Gymnasium's wrappers expect. If ``torch`` is True, ``final_obs`` and ``final_info`` exist
+      after every step and hold tensors over all worlds, so that a step need not wait for the device.
     - DISABLED resets worlds only in ``reset(options={"reset_mask": mask})``. After the end of its episode, a world
       keeps stepping until it is reset, and its termination or truncation stays True. A world with a fault is reset at
       once, but returns its last valid observation.

@@ -49,7 +49,7 @@ class PlanningController(Controller, Protocol):
 
         Returns:
             The first action of the plan, (nu,). If the controller has an attribute ``actions``, the loops instead read
-            the whole plan from it.
+            the whole plan from this attribute.
         """
         ...
 

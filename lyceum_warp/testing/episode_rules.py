@@ -10,7 +10,7 @@ from lyceum_warp.done import Done
 from lyceum_warp.env import Env
 from lyceum_warp.testing.context import Context
 
-# bytes that the interpreter's caches may take; a leak of one float per step is 3,200 bytes after 100 steps
+# tolerated bytes of the interpreter's caches; one leaked float per step takes 3,200 bytes after 100 steps
 _PYTHON_BYTES = 2_048
 
 
