@@ -85,8 +85,8 @@ class Options:
     ignore: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="PATTERN")] = ()
     """Names to ignore, such as '*/metrics.csv/*' or 'plans/hopper/*'; may be repeated."""
     short: bool = False
-    """Compare only four tasks. The parts "plans" and "commands" run only on the C engine. The comparison then takes
-    about three minutes instead of sixteen, with a warm kernel cache on two busy cores."""
+    """Compare only four tasks. The parts "plans" and "commands" run only on the C engine. With --short, the comparison
+    takes about three minutes instead of sixteen, with a warm kernel cache on two busy cores."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,8 +29,7 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.tasks.velocity.g1 import LEGS
 
 NEVER = 1e6
-"""Seconds until the next push or command. It exceeds the length of every episode, so that no push and no new command
-occurs."""
+"""Seconds until the next push or command: longer than any episode, so that neither occurs."""
 NOISES = ("linear_velocity_noise", "angular_velocity_noise", "gravity_noise", "joint_position_noise",
           "joint_velocity_noise")  # fmt: skip
 STEPS = 1000

@@ -196,8 +196,8 @@ def describe(
 
     Fields of the position and velocity stages match the current state after every step, restart and event. Fields of
     the acceleration stage, such as ``qacc``, ``cfrc_ext`` or actuator forces, come from the last substep, which
-    computes them from the state before the substep. At the start of an episode, these fields are computed from the
-    first state. In ``sensordata``, each sensor's columns belong to the stage that computes the sensor.
+    computes them from the state before the substep. At the start of an episode, the fields of this stage are computed
+    from the first state. In ``sensordata``, each sensor's columns belong to the stage that computes the sensor.
 
     Args:
         model: The compiled model.

@@ -88,7 +88,7 @@ def check_metrics(ctx: Context) -> None:
 def check_success_steps(ctx: Context) -> None:
     """``success`` requires ``success_steps`` consecutive steps that meet the goal.
 
-    The count of such steps belongs to the state, and a reset clears it.
+    The number of steps in a row that met the goal belongs to the state, and a reset clears it.
 
     To find out whether a state meets the goal, the check sets the count to its maximum, sets the state, and reads
     ``success``.
