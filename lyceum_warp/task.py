@@ -440,7 +440,7 @@ class Task:
     - ``startup``: model fields and lasting memory. Resets do not change these values.
     - ``substep``: memory and lasting memory. ``advance``: memory and lasting memory of ``s1``.
 
-    ``reject`` is called before the substeps of ``settle``. In these substeps, ``substep`` is not called.
+    ``reject`` is called before the substeps of ``settle``. ``substep`` is not called in the substeps of ``settle``.
 
     An event runs after the reward and the termination of a step and before the next observation, but not in worlds that
     restart. Open-loop rollouts and planners run no events.

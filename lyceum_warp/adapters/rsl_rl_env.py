@@ -70,7 +70,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Steps since the reset, (nworld,) int32, a live view. Assign to it to change the worlds' step counters.
+        """Steps since the reset, (nworld,) int32, a live view. Assign a tensor to change the step counters.
 
         An assignment also moves the time limits: a world at step ``max_episode_length - 1`` is truncated by the next
         step.
