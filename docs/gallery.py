@@ -41,9 +41,9 @@ class Show:
     """Settings for the picture of a task."""
 
     settings: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Settings of the planner, and options of its worlds, that replace the task's."""
+    """Planner settings, and options of the planner's worlds, that override the task's suggestions."""
     params: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Parameters of the task that only the planner uses."""
+    """Task parameters that apply only in the planner's worlds."""
     replan_every: int = 1
     """Number of steps from one MPPI plan to the next."""
     seconds: float = 4.0
@@ -147,7 +147,7 @@ SHOWS = {
        for robot, distance in (("go1", 1.7), ("go1_rough", 2.2), ("spot", 2.6), ("g1", 2.8), ("g1_full", 2.8),
                                ("g1_rough", 3.2), ("h1", 3.6), ("t1", 2.8))},
 }  # fmt: skip
-"""The tasks that need other settings than the defaults of Show."""
+"""The settings of tasks for which the defaults of Show do not suffice."""
 
 # there is no policy for these tasks, and a planner lets the robots fall soon
 for _name in ("g1_full_velocity", "g1_rough_velocity"):
@@ -181,7 +181,7 @@ def draw(name: str, run: Path | None) -> dict[str, str]:
 
 
 def training(name: str, run: Path, config: dict[str, Any]) -> str:
-    """Write the command that repeats a run, with every flag that changes the policy."""
+    """Return the command that repeats a run, with every flag that affects the policy."""
     algorithm = config["algorithm"]
     rows = (run / "metrics.csv").read_text().splitlines()
     flags = {"algorithm": algorithm} | ({"device": "cuda"} if config["device"].startswith("cuda") else {})
@@ -276,10 +276,12 @@ def families() -> dict[str, tuple[str, list[str]]]:
 
 def page(results: dict[str, dict[str, str]]) -> str:
     """Return the gallery's page."""
-    lines = ["# Gallery", "", "Each picture shows a task under a policy or a planner, with the result and a command "
-             "that shows or trains it. The", "return of a policy is the mean over whole episodes. The return of a "
-             "planner counts from the start of the episode to", "the end of the picture. Each name links to the task's "
-             "details.", ""]  # fmt: skip
+    introduction = (
+        "Each picture shows a task under a policy or a planner, with the result and a command that shows or trains it. "
+        "The return of a policy is the mean over whole episodes. The return of a planner is the sum of the rewards from "
+        "the start of the episode to the end of the picture. Each name links to the task's details."
+    )
+    lines = ["# Gallery", "", *textwrap.wrap(introduction, 120), ""]
     for stem, (title, names) in families().items():
         cells = []
         for name in names:

@@ -92,7 +92,7 @@ def is_public(cls: type) -> bool:
 
 
 def members(cls: type) -> list[str]:
-    """Return a class's public members with docstrings, including members of base classes without a public name."""
+    """Return a class's public members with docstrings, including members inherited from private base classes."""
     found: dict[str, None] = {}
     for base in reversed(cls.__mro__):
         if base is cls or (base.__module__.startswith("lyceum_warp.") and not is_public(base)):
@@ -115,7 +115,7 @@ def converted(text: str) -> list[str]:
 
 
 def short_signature(app: Any, what: str, name: str, obj: Any, options: Any, signature: str, result: str) -> Any:
-    """Omit the fields from a dataclass's signature, because members document them, and shorten default objects."""
+    """Shorten a signature: omit a dataclass's fields, which are documented as members, and shorten default objects."""
     if what == "class" and dataclasses.is_dataclass(obj):
         return "", result
     return signature and re.sub(r"(PhysicsOptions)\(.*?\)", r"\1()", signature), result
@@ -273,7 +273,7 @@ def spelled(default: Any, value: Any) -> str:
 
 
 def comments(task: type) -> dict[str, str]:
-    """Return the comments after the fields of ``Params``, from the files of a task and of its base classes."""
+    """Return the comments behind the fields of ``Params`` in the files of a task and of its base classes."""
     found: dict[str, str] = {}
     for cls in reversed(task.__mro__[:-1]):
         lines = inspect.getsource(sys.modules[cls.__module__]).splitlines()
@@ -302,7 +302,7 @@ def count(number: int, noun: str) -> str:
 
 
 def folded(title: str, lines: list[str]) -> list[str]:
-    """Put lines into a block that a reader can unfold."""
+    """Put lines into a collapsible block."""
     return [f"<details><summary>{title}</summary>", "", *lines, "", "</details>", ""]
 
 
