@@ -278,8 +278,8 @@ def page(results: dict[str, dict[str, str]]) -> str:
     """Return the gallery's page."""
     introduction = (
         "Each picture shows a task under a policy or a planner, with the result and a command that shows or trains it. "
-        "The return of a policy is the mean over whole episodes. The return of a planner is the sum of the rewards from "
-        "the start of the episode to the end of the picture. Each name links to the task's details."
+        "The return of a policy is the mean over whole episodes. The return of a planner is the sum of the rewards "
+        "from the start of the episode to the end of the picture. Each name links to the task's details."
     )
     lines = ["# Gallery", "", *textwrap.wrap(introduction, 120), ""]
     for stem, (title, names) in families().items():

@@ -55,7 +55,7 @@ ARGUMENTS = {
     "actuator_biasprm": "the model field",
     "actuator_gainprm": "the model field",
     "actuators": "array of Params: indices of actuators",
-    "age": "number of newer values in the history",
+    "age": "age of a value in a history: the number of newer values",
     "air_time": "row of memory: seconds since each foot left the ground (0 in contact)",
     "angular_velocity": "angular velocity of the base in the base's axes (rad/s)",
     "angular_velocity_variance": "squared error at which the term is 1 / e (rad^2/s^2)",

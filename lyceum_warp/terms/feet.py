@@ -77,7 +77,7 @@ def follow_swing(
 ):
     """Track the greatest height of a foot's swing in ``peak_height``.
 
-    When the foot lands, move the height to ``swing_height``.
+    When the foot lands, store this height in ``swing_height``, and reset ``peak_height`` to 0.
     """
     if landed(contact_time[foot], dt):
         swing_height[foot] = peak_height[foot]

@@ -1,7 +1,7 @@
-"""Keep the last values of a row in a ring, for observation histories and delays.
+"""Store the last values of a row in a ring buffer, for observation histories and delays.
 
 To store the last n values of ``width`` numbers, declare ``history: Row[float] = lw.memory(1 + n * width)``. The row
-holds a counter and the ring. Memory is 0 at the start of an episode, so the history is empty.
+holds a counter and the ring buffer. Memory is 0 at the start of an episode, so the history is empty.
 """
 
 import warp as wp
@@ -29,10 +29,10 @@ def push_history(history: Row[float], value: Row[float]):
 
 @wp.func
 def read_history(history: Row[float], width: int, age: int, i: int) -> float:
-    """Get element i of a value in a history.
+    """Get element i of the value of a given age in a history.
 
-    ``age`` counts back from the last value. If the history has no value of this age, the result is taken from its
-    oldest value, or 0 if the history is empty.
+    The last value has age 0, the value before it has age 1, and so on. If the history has no value of this age, the
+    result is taken from its oldest value, or 0 if the history is empty.
     """
     pushes = int(history[0])
     if pushes == 0:

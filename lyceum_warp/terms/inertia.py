@@ -50,7 +50,7 @@ def change_inertia(
     shear: wp.vec3,
     shift: wp.vec3,
 ):
-    """Map the mass of a body by x -> D x + t in the body's frame, and multiply it by exp(2 density).
+    """Move each mass point x of a body to D x + t in the body's frame, and multiply all masses by exp(2 density).
 
     The matrix D is [[exp d1, s12, s13], [0, exp d2, s23], [0, 0, exp d3]], with (d1, d2, d3) = stretch, (s12, s13, s23)
     = shear and t = shift. With all parameters zero, the body does not change. Sources: Rucker and Wensing 2022, and

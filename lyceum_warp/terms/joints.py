@@ -37,8 +37,8 @@ def pose(
 ) -> float:
     """Compute ``posture`` with separate standard deviations of each joint for standing and for walking.
 
-    The robot stands if ``command_size`` is below ``least_command``. Source: mjlab 1.6.0, ``variable_posture``, with the
-    same values for walking and running.
+    The values for standing apply if ``command_size`` is below ``least_command``. Source: mjlab 1.6.0,
+    ``variable_posture``, with the same values for walking and running.
     """
     if command_size(command) < least_command:
         return posture(qpos, joint_qpos, default_pose, standing_pose_std)
@@ -79,7 +79,7 @@ def pose_l1(qpos: Row[float], joint_qpos: wp.array[int], default_pose: wp.array[
 def joint_limits(
     qpos: Row[float], joint_qpos: wp.array[int], jnt_range: Row[wp.vec2], joints: wp.array[int], soft_limit: float
 ) -> float:
-    """Sum how far joints exceed their soft limits: max(|q - middle| - soft_limit * half range, 0), rad.
+    """Sum by how much joints exceed their soft limits: max(|q - middle| - soft_limit * half range, 0), rad.
 
     Source: mjlab 1.6.0, ``joint_pos_limits``.
     """
