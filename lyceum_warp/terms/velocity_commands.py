@@ -1,4 +1,4 @@
-"""Draw and time random commands: (forward velocity, lateral velocity, yaw rate) in the base's axes.
+"""Draw random velocity commands (forward velocity, lateral velocity, yaw rate) in the base's axes, and time them.
 
 A command is stored in several rows of memory, and a separate function fills each row with random numbers::
 
