@@ -37,7 +37,7 @@ _PARTS = 'the parts of its observation, as obs = {"position": 5}'
 
 
 def task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSpec:
-    """Load a task's model, or the model given instead, as an MjSpec, and apply the task's ``edit_model``."""
+    """Load a task's model, or another given model, as an MjSpec, and apply the task's ``edit_model``."""
     return _edited(task, _read_spec(task, model))
 
 
@@ -106,7 +106,7 @@ def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict
         if not (isinstance(group, str) and group.isidentifier()) or keyword.iskeyword(group):
             raise ValueError(
                 f"obs of the task {name!r} has the group {group!r}: a group's name must be a Python name, such as "
-                "'critic', which observe_critic writes"
+                "'critic', whose function is observe_critic"
             )
     return {group: _layout(name, layout) for group, layout in given.items()}
 
@@ -115,7 +115,7 @@ def obs_slices(source: TaskSource, params: Mapping[str, Any]) -> dict[str, parts
     """Compute the layouts of observation groups that are declared as structs; return {} if the task has ``obs``.
 
     Raises:
-        ValueError: ``observe`` takes no struct, or a struct has no parts, or has fields that are not parts.
+        ValueError: ``observe`` takes no struct, or a struct has no parts, or a field of it has no size.
     """
     if hasattr(source.task, "obs"):
         return {}
@@ -138,7 +138,9 @@ def obs_slices(source: TaskSource, params: Mapping[str, Any]) -> dict[str, parts
 
 def _layout(task: str, layout: Mapping[str, Any]) -> dict[str, int]:
     if per_world := [name for name, size in layout.items() if np.ndim(size)]:
-        raise ValueError(f"obs of the task {task!r} differs between worlds in {per_world}: give one value")
+        raise ValueError(
+            f"obs of the task {task!r} has sizes that differ between worlds, {per_world}: give one size for all worlds"
+        )
     return {name: int(size) for name, size in layout.items() if size}
 
 
@@ -191,7 +193,7 @@ class BoundTask:
         own = [name for name in named if is_data_field(name)]
         of_model = [name for name in named if name not in own]
         self.spec = _read_spec(task, model)
-        """The model before ``edit_model``. Replicas copy this spec, because the file may have changed."""
+        """The model before ``edit_model``. Replicas copy it, because the file may have changed."""
         self.model = models.compile_model(_edited(task, self.spec), own, physics, varied={*of_model, *dynamics})
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.frame_skip = whole_number(f"frame_skip of the task {self.name!r}", skip, low=1)
@@ -212,7 +214,7 @@ class BoundTask:
         self.actions = self._checked_actions()
         """Sizes of an action's parts, by name; None if the actions are MuJoCo's controls."""
         self.memory = self._memory_layouts()
-        """The layouts of the rows ``memory`` and ``lasting_memory``."""
+        """The layouts of a world's two rows, ``memory`` and ``lasting_memory``."""
         self.obs_layouts = obs_layouts(self.source, self.params)
         """The parts of each group of observations and their sizes."""
         self.observers = self.source.group_functions(self.obs_layouts)
@@ -226,7 +228,7 @@ class BoundTask:
 
     @property
     def params(self) -> dict[str, Any]:
-        """The values of the parameters by name; a parameter that differs between worlds has an array."""
+        """The values of the parameters by name; the value is an array if it differs between worlds."""
         return self.parameters.values
 
     @property
@@ -244,7 +246,7 @@ class BoundTask:
         rights: dict[str, Rights] = {name: self._rights(function) for name, function in FUNCTIONS.items()}
         check_writes(self.name, written, rights)
         for name, function in self.source.terms.functions.items():
-            for overload in overloads(function):  # terms may not write fields
+            for overload in overloads(function):  # a term must not write a field
                 check_writes(self.name, {name: overload}, rights | {name: dict.fromkeys(overload.input_types, ())})
         memory = self.source.memory
         return {
@@ -264,7 +266,7 @@ class BoundTask:
         }
 
     def _rights(self, function: TaskFunction) -> Rights:
-        """Return, for each argument of a function, the fields that the function may write."""
+        """Return the fields that a function may write, by the name of the argument to which the fields belong."""
         model = [name for name in self.types if is_model_field(name)]
         memory = tuple(self.source.memory)
         lasting = (*(name for name, part in self.source.memory.items() if part.kind == "lasting_memory"), *model)
@@ -294,8 +296,8 @@ class BoundTask:
         drawn_constants = [field.name for field in self.dynamics if field.constants]
         if drawn_constants and (stale := [field.name for field in self.constants if field.follows]):
             raise ValueError(
-                f"the task {self.name!r} reads {stale[0]!r}, which differs between worlds, because MuJoCo "
-                f"computes it from {drawn_constants[0]!r}: read the fields from which it is computed"
+                f"the task {self.name!r} reads {stale[0]!r}, which MuJoCo computes from {drawn_constants[0]!r}, a "
+                "field that differs between worlds: read the fields from which it is computed instead"
             )
 
     def change_params(self, params: Mapping[str, Any]) -> None:
@@ -307,13 +309,13 @@ class BoundTask:
         previous, self.parameters = self.parameters, self.parameters.changed(params)
         try:
             changed = "the observation's" if obs_layouts(self.source, self.params) != self.obs_layouts else ""
-        except ValueError:  # obs_layouts refuses a size that differs between worlds
+        except ValueError:  # raised by obs_layouts if a size differs between worlds
             changed = "the observation's"
         layouts = (self._memory_layouts(), self._shared_layouts())
         changed = changed or ("the memory's" if layouts != (self.memory, self.shared) else "")
         if changed:
             self.parameters = previous
-            raise ValueError(f"{', '.join(params)} would change {changed} parts: make a new environment")
+            raise ValueError(f"{', '.join(params)} would change the sizes of {changed} parts: make a new environment")
 
     def _check_class(self) -> None:
         task = self.task
@@ -334,7 +336,7 @@ class BoundTask:
         for kind in ("lagged", "cleared"):
             for name in getattr(task, kind):
                 if name not in self.source.world.vars:
-                    raise ValueError(f"{kind} of the task {self.name!r} has {name!r}: list it in World, too")
+                    raise ValueError(f"{kind} of the task {self.name!r} has {name!r}: make it a field of World, too")
         whole_number(f"horizon of the task {self.name!r}", task.horizon, low=0)
         self._check_success_steps()
         if task.action_range is not None:

@@ -1,4 +1,4 @@
-"""Generate the source that turns a task's functions of one world into kernels over a batch of worlds.
+"""Generate the source of a task's kernels, which call the task's functions for every world of a batch.
 
 The generated source defines a struct whose fields have an additional axis for the worlds, a function that returns a
 view of one world, and defaults for the functions that a task omits. The code is generated as text, because Warp
@@ -167,7 +167,7 @@ def _generated(
             rows += [f"{name} = batch.{name}[w]", *view_lines(memory[name], "s", name, scope)]
         else:
             rows.append(f"s.{name} = batch.{name}[w]")
-        if name in memory or is_data_field(name):  # a step does not change model fields, so it need not copy them
+        if name in memory or is_data_field(name):  # a step does not change model fields, so they are not copied
             state += _copy(name, ndim)
     scope |= {"substream": random.substream, "finite_row": kernel_rows.finite_row, "copy_row": kernel_rows.copy_row}
     scope["restored_row"] = kernel_rows.restored_row

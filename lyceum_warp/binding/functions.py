@@ -38,7 +38,7 @@ class TaskSource:
         self.world: Any = self._struct("World")
         own: Any = self._struct("Params")
         self.defaults: type = own.cls
-        """The class whose attributes are the parameters' defaults."""
+        """The class that has the parameters' defaults as attributes."""
         self.params: Any = self._with_functions(own)
         self._variant = variant_of(name, self._owners, self.world, self.params, own)
         self.memory: dict[str, Part] = self._memory()
@@ -83,7 +83,7 @@ class TaskSource:
         return {group: list(function.input_types.values())[2] for group, function in functions.items()}
 
     def _observers(self, owner: type[Task]) -> list[str]:
-        """Find functions that write observation groups, in the class, and in its module if no function calls them."""
+        """Find the functions that write observation groups: all in the class, and those in its module without a caller."""
         module = vars(sys.modules[owner.__module__])
         functions = {name: self._seen(value) for name, value in module.items() if isinstance(value, wp.Function)}
         tasks = [kind for kind in (owner, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
@@ -151,12 +151,12 @@ class TaskSource:
         return own
 
     def _memory(self) -> dict[str, Part]:
-        """Return the fields of World that are memory, by name; refuse memory that is declared as a number."""
+        """Return the fields of World that are memory, by name; refuse memory that is not declared in parts."""
         counted = [name for name in MEMORIES if hasattr(self.task, name)]
         parts = parts_of(self.world, "World")
         if old := [*counted, *(name for name in MEMORIES if name in self.world.vars and name not in parts)]:
             raise ValueError(
-                f"{old[0]} of the task {self.name!r} has no names: declare its parts in World instead of {old[0]}, as "
+                f"{old[0]} of the task {self.name!r} is a row without named parts: replace it by parts in World, as "
                 f"air_time: Row[float] = lw.{old[0]}(4), and use them as s.air_time[0]"
             )
         if wrong := [name for name, part in parts.items() if part.kind not in MEMORIES]:
@@ -178,8 +178,8 @@ class TaskSource:
                    if isinstance(function, wp.Function) and len(function.input_types) > 1]  # fmt: skip
         if field is None or not is_struct(field.type) or len(structs) < 2 or structs[0] is not structs[1]:
             raise ValueError(
-                f"memory that the worlds of the task {self.name!r} share needs a struct Shared, listed in World as "
-                f"shared: Shared, a struct Sums, and two functions: {FUNCTIONS['tally'].signature}; and "
+                f"the worlds of the task {self.name!r} can share memory only if World has a field shared: Shared, and "
+                f"the task has the structs Shared and Sums and two functions: {FUNCTIONS['tally'].signature}; and "
                 f"{FUNCTIONS['share'].signature}"
             )
         return field.type, structs[0]
@@ -195,7 +195,7 @@ class TaskSource:
         structs = [kind for kind in types if is_struct(kind)]
         foreign = structs and self.world not in structs and self.params not in structs
         if foreign and function.func.__module__ in {owner.__module__ for owner in self.task.__mro__}:
-            return None  # a function with another World belongs to another task in the module
+            return None  # it takes the World of another task in the module
         annotations = function.func.__annotations__
         if any(isinstance(annotation, str) for annotation in annotations.values()):
             raise ValueError(
@@ -231,7 +231,7 @@ class TaskSource:
                     )
 
     def _kind(self, argument: Any) -> str:
-        """Return an argument's type as the annotation that ``FUNCTIONS`` uses."""
+        """Return the text that ``FUNCTIONS`` uses for an argument's type, such as "World" or "Row[float]"."""
         if argument is self.world:
             return "World"
         if argument is self.params:
@@ -267,7 +267,7 @@ def draws_noise(observer: wp.Function) -> bool:
 
 
 def _may_list(task: type[Task], group: str) -> bool:
-    """Whether ``obs`` of a class may have the given observation group; always True if ``obs`` is a method."""
+    """Whether the ``obs`` of a task may have the given group; True if ``obs`` is a method, whose result is unknown."""
     obs = getattr(task, "obs", None)
     return callable(obs) or (isinstance(obs, Mapping) and isinstance(obs.get(group), Mapping))
 

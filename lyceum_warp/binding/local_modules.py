@@ -10,10 +10,10 @@ from types import ModuleType
 from typing import TypeAlias
 
 Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
-"""The modification time and size of each file; None if the file does not exist."""
+"""The stamp of each file: its modification time and its size; None if the file does not exist."""
 
 _taken: dict[str, Stamps] = {}
-"""The modules in ``sys.modules`` that task files imported from their folders, and the files' stamps at that time."""
+"""The modules that task files imported from their folders: the stamp of each module's file when it was imported."""
 
 
 def local_modules(file: Path) -> dict[str, Path]:
@@ -49,7 +49,7 @@ def _imported_names(tree: ast.AST, package: str) -> Iterator[str]:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            with contextlib.suppress(ImportError):  # a relative import with too many dots would leave the package
+            with contextlib.suppress(ImportError):  # a relative import with too many dots leads out of the package
                 owner = importlib.util.resolve_name("." * node.level + (node.module or ""), package or None)
                 yield from (owner, *(f"{owner}.{alias.name}" for alias in node.names))
 
@@ -71,7 +71,7 @@ def _module_file(folder: Path, name: str) -> Path | None:
 
 
 def stamps(files: Iterable[Path]) -> Stamps:
-    """Read the stamps of files, which change when a file is edited."""
+    """Read the modification times and sizes of files."""
     found: Stamps = dict.fromkeys(files)
     for file in found:
         with contextlib.suppress(OSError):

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
-    """Load a model as an editable MjSpec that compiles from any current folder.
+    """Load a model as an editable MjSpec, which also compiles after a change of the working directory.
 
     Args:
         source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec, which is copied. A relative
@@ -55,7 +55,7 @@ def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFil
         start = textwrap.shorten(source, 24, placeholder=" ...")
         raise ValueError(f"the model {start!r} is XML, not a file: pass mujoco.MjSpec.from_string(...)")
     folder = Path()
-    if owner is not None:  # a subclass may inherit the path from a class in another folder
+    if owner is not None:  # the path may be inherited from a class in another folder
         owner = next((kind for kind in owner.__mro__ if "model" in vars(kind)), owner)
     if owner is not None and (file := getattr(sys.modules.get(owner.__module__), "__file__", None)):
         folder = Path(file).parent
@@ -102,7 +102,7 @@ def compile_model(
     - Newton replaces the PGS solver, which MuJoCo Warp lacks. Newton converges to the same accelerations.
     - Sleep is turned off, because a saved state does not say which bodies are asleep.
     - For each field that MuJoCo computes only for sensors, a sensor is added after the model's own sensors; if no field
-      needs sensors, sensors are turned off. The energy is computed if a function reads it.
+      needs sensors, all sensors are turned off. The energy is computed if a function reads it.
     - If ``contact`` lists a pair of geoms twice, only the first entry is kept: MuJoCo would make the contact twice, and
     MuJoCo Warp would make it once.
 

@@ -237,7 +237,7 @@ class Parameters:
         return table
 
     def _indices(self, what: str, value: Any, field: str | None) -> Any:
-        """Replace model elements in a table by their indices; if ``field`` is given, names are replaced as well."""
+        """Replace model elements in a table by their indices; replace names, too, if ``field`` is given."""
         if isinstance(value, list | tuple):
             return [self._indices(what, entry, field) for entry in value]
         if isinstance(value, Element):
@@ -266,7 +266,7 @@ class Parameters:
 
 
 def _element_field(default: Any) -> str | None:
-    """Return the field that a table's default refers to, such as "site_xpos" if the default lists sites.
+    """Return the field that holds a table's default elements, such as "site_xpos" for a default that lists sites.
 
     The result is None if the default consists of numbers.
     """
@@ -278,7 +278,7 @@ def _element_field(default: Any) -> str | None:
 def _loaded(what: str, path: str | Path) -> np.ndarray:
     """Load the array in a file written by ``numpy.save``."""
     try:
-        # map the file instead of reading it, because a broken header may request any amount of memory
+        # map the file instead of reading it, because a broken header could make NumPy allocate any amount of memory
         loaded: np.ndarray = np.load(path, allow_pickle=False, mmap_mode="r")
     except FileNotFoundError:
         raise FileNotFoundError(f"{what} cannot be read, because there is no such file") from None

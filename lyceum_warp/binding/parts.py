@@ -34,10 +34,10 @@ Layout = dict[str, Slice]
 
 
 def parts_of(struct: Any, owner: str) -> dict[str, Part]:
-    """Return the fields of a struct that have parts as defaults; ``owner`` is its name in error messages.
+    """Return the fields of a struct that have parts as defaults; ``owner`` is the struct's name in error messages.
 
     Raises:
-        ValueError: A part's type is not a row of numbers.
+        ValueError: The type of a field with a part is not a row of numbers.
     """
     found = {name: getattr(struct.cls, name, None) for name in struct.vars}
     parts = {name: part for name, part in found.items() if isinstance(part, Part)}
@@ -52,7 +52,7 @@ def parts_of(struct: Any, owner: str) -> dict[str, Part]:
 
 
 def layout(struct: Any, kind: str, params: Mapping[str, Any], owner: str) -> Layout:
-    """Compute the layout of a struct's parts of the given kind; ``params`` has the tables that sizes may name.
+    """Compute the layout of a struct's parts of one kind; a part's size may be the name of a table in ``params``.
 
     Raises:
         ValueError: A size is neither a positive number nor the name of a table of Params.
@@ -72,7 +72,7 @@ def sizes(layout: Layout) -> dict[str, int]:
 
 
 def view_lines(layout: Layout, struct: str, row: str, scope: dict[str, Any]) -> list[str]:
-    """Generate lines of Warp source that set a struct's fields to slices of a row; add their types to ``scope``."""
+    """Generate Warp source that sets a struct's fields to slices of a row; add the fields' types to ``scope``."""
     lines = []
     for name, part in layout.items():
         scope[f"dtype_{struct}_{name}"] = part.dtype
@@ -87,7 +87,7 @@ def _floats(dtype: Any) -> int:
 
 
 def length(what: str, size: int | str, params: Mapping[str, Any]) -> int:
-    """Resolve a size: a number, or the name of a table in ``params`` with that number of rows.
+    """Return a size as a number; if the size is the name of a table in ``params``, return the table's number of rows.
 
     ``what`` names the size in error messages.
 

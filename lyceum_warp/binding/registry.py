@@ -25,8 +25,8 @@ from lyceum_warp.task import Task
 _tasks: dict[str, type[Task]] = {}
 
 _loaded: dict[str, Stamps] = {}
-"""For each task module, the stamps of its file and of the modules that it imports from its folder, at the time of their
-last run. A stamp is a modification time and a size."""
+"""For each task module, the stamps (times and sizes) of its file and of the modules that it imports from its folder, as
+they were when the file was last run."""
 
 _LOADING = threading.RLock()
 """A lock that is held while a file is loaded, because imports and linecache are global to the process."""
@@ -118,7 +118,7 @@ def spelled_task(task: type[Task]) -> str | None:
 def task_name(task: type[Task]) -> str:
     """Return the name under which a task is registered: the class's name in snake_case.
 
-    A family of the package may declare its names in a namespace: ``dm/walker_walk`` for WalkerWalk.
+    Names in a family of the package's tasks may have a prefix: ``dm/walker_walk`` for WalkerWalk.
     """
     name = snake_case(task.__name__)
     declared = (known for known, module in _package_modules().items() if module == task.__module__)
@@ -171,10 +171,10 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
 
 
 def source_files(task: type[Task]) -> Mapping[Path, bytes]:
-    """Return the contents that a task's file, and the modules that it imports from its folder, had when loaded.
+    """Return the source, when it was loaded, of a task's file and of the modules that it imports from its folder.
 
-    If the program itself imports or defines the class, the contents are those at the first ``find_task`` of the class.
-    A class without a file, as in a notebook, has no sources.
+    If the program itself imports or defines the class, the files are read when ``find_task`` is first called with the
+    class. A class without a file, as in a notebook, has no sources.
     """
     if task not in _sources:
         file = Path(_file(task) or "")
@@ -194,7 +194,7 @@ def _run(path: Path, name: str, source: bytes) -> None:
     before = sys.modules.get(name)
     sys.modules[name] = module
     try:
-        code = compile(source, file, "exec")  # bytecode with the same time stamp may be stale
+        code = compile(source, file, "exec")  # cached bytecode with the same time stamp may be stale
         # Warp reads the source of functions from linecache, where later changes of the file do not appear
         text = importlib.util.decode_source(source)
         linecache.cache[file] = (len(text), None, list(io.StringIO(text)), file)
@@ -249,7 +249,7 @@ def _task_of_file(path: Path, attribute: str) -> type[Task]:
 
 
 def kernel_name(task: type[Task]) -> str:
-    """Return the task's name in Warp's cache, with a hash of the file, so that copies of the file share kernels."""
+    """Return the task's name in Warp's cache; it contains a hash of the file, so copies of a file share kernels."""
     module = task.__module__
     if module.startswith(_FILE) and task in _sources:
         module = f"{module[:-8]}{zlib.crc32(b''.join(_sources[task].values())):08x}"

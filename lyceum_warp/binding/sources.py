@@ -1,4 +1,4 @@
-"""Read the source of a Warp function: parse it, resolve its names and its calls, and run generated source."""
+"""Parse the source of a Warp function, and resolve its names and calls; run generated source."""
 
 import ast
 import builtins
@@ -85,7 +85,7 @@ class FunctionSource:
         return "helper" if has_source(callee) else "native", callee
 
     def condition(self, node: ast.expr) -> bool | None:
-        """Evaluate a condition that is a ``wp.static(...)``; Warp compiles only the branch that it selects.
+        """Evaluate a condition that is a ``wp.static(...)``; Warp compiles only the selected branch.
 
         The result is None for other conditions.
         """

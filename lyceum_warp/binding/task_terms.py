@@ -16,13 +16,13 @@ from lyceum_warp.binding.sources import FunctionSource, is_struct, overloads, ru
 from lyceum_warp.task import Row, Task
 
 _STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
-"""The arguments of reward terms and metrics that refer to a transition, and their names in the generated text."""
+"""Names of arguments by which reward terms and metrics get a transition, each with its name in the generated text."""
 
 _STATE = {"s": "s", "s1": "s", "p": "p"}
-"""The arguments of terminations that refer to the state or to Params, and their names in the generated text."""
+"""Names of arguments by which terminations get the state and Params, each with its name in the generated text."""
 
 _OWN = ("weights", "metrics", "total")
-"""Other names in the generated text."""
+"""Names that the generated text uses for itself."""
 
 _HEAD = "s0: World, action: Row[float], s1: World, p: Params, weights: Row[float]"
 
@@ -104,7 +104,7 @@ class Terms:
         return {term: float(weight) for term, weight in rewards.items()}
 
     def _names(self, attribute: str, names: Any, *, written: bool = False) -> tuple[str, ...]:
-        """Check and return the names in an attribute; return no names if the task defines the function itself."""
+        """Check and return the names in an attribute; return () if a function of the task is already ``written``."""
         if not isinstance(names, tuple | list) or not all(isinstance(name, str) and name for name in names):
             raise ValueError(
                 f"{attribute} of the task {self._name!r} must be names, such as ('forward', 'cost'), not {names!r}"
@@ -159,12 +159,12 @@ class Terms:
 
         Args:
             name: The function's name.
-            given: The names that refer to states, the action and parameters.
-            within: The names of the functions that need this function.
+            given: The text for each name that refers to a state, the action or Params.
+            within: The chain of functions whose arguments led to this function, to detect cycles.
         """
         if name in within:
             raise ValueError(
-                f"terms of the task {self._name!r} need each other in a circle: {' needs '.join((*within, name))}"
+                f"terms of the task {self._name!r} depend on each other in a cycle: {' needs '.join((*within, name))}"
             )
         function = self.lookup(name)
         assert function is not None
@@ -243,7 +243,7 @@ class _Body:
         self._values: dict[str, tuple[wp.Function, Any]] = {}
 
     def value(self, name: str, *wanted: type) -> str:
-        """Return the variable that holds a function's result; check the result's type if types are given."""
+        """Return the variable that holds a function's result; if types are given, check the type of the result."""
         if name not in self._values:
             function, kind = self._terms.choose(name, self._given)
             arguments, named = [], False

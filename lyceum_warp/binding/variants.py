@@ -1,8 +1,9 @@
 """Copy the functions of a family of tasks, so that each task can run them with structs and functions of its own.
 
 Warp compiles a function for the structs in its annotations. If a task extends its parent's World, the parent's
-functions are therefore copied. The copies take the task's World, and call the task's functions instead of the functions
-that these replace. Copies have the source of the original, so error messages name the original's file and line.
+functions are therefore copied. The copies take the task's World. If the task replaces one of the parent's functions,
+the copies call the replacement. Copies have the source of the original, so error messages name the original's file and
+line.
 """
 
 import sys
@@ -143,7 +144,7 @@ def _home(function: wp.Function) -> str:
 
 
 def _values(module: types.ModuleType, owners: Sequence[type[Task]]) -> Iterator[Any]:
-    """Yield the attributes of a module's tasks, and its globals, both when each task was defined and now."""
+    """Yield the attributes of a module's tasks, and its globals, both those at each task's definition and those now."""
     for owner in owners:
         if owner.__module__ == module.__name__:
             own = (value.__func__ if isinstance(value, staticmethod) else value for value in vars(owner).values())

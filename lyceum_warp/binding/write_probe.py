@@ -46,7 +46,7 @@ class GuardedRows:
             wp.copy(self.array, values[: shape[0]])
 
     def outside(self) -> np.ndarray:
-        """Return the ascending indices of written elements outside a row; elements before it have negative indices."""
+        """Return the ascending indices of elements written outside a row; those before the row are negative."""
         words: np.ndarray = self._memory.numpy()
         changed = 4 * np.flatnonzero(words != _UNWRITTEN)[:, None] + np.arange(4)
         unwritten = np.array(_UNWRITTEN, dtype=np.uint32).reshape(1).view(np.uint8)
@@ -151,7 +151,7 @@ class Probe:
                 )
 
     def _named(self, group: str, chosen: np.ndarray) -> str:
-        """Name the chosen elements of an observation, for messages."""
+        """Return the names of the chosen elements of an observation, for messages."""
         columns = Space.of(self._layouts[group]).columns
         return ", ".join(columns[i] for i in np.flatnonzero(chosen))
 

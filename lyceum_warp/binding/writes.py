@@ -113,7 +113,7 @@ class _Place:
     position: int
     field: str | None
     kind: Any
-    """The type of a struct, (axes, element type) of an array, or None for an element, which is read by value."""
+    """A struct: its type. An array: (number of axes, element type). An element, which is read by value: None."""
 
     def attribute(self, name: str) -> "_Place | None":
         if is_struct(self.kind):
@@ -139,8 +139,8 @@ class _Reader:
 
     Args:
         function: The function.
-        places: For each argument of ``function``, the place in the analysed function's arguments to which it refers, or
-            None.
+        places: For each argument of ``function``, the argument of the analysed function, or the part of one, that the
+            caller passed; None if the caller passed something else.
         arguments: Names of the arguments of the analysed function.
         writes: The dict to which writes are added.
         seen: The functions that were already read, each together with the places of its arguments.
@@ -171,10 +171,10 @@ class _Reader:
         self.writes[Write(place.position, place.field, target, self.source.name, where, replaced, use)] = None
 
     def _read(self, node: ast.AST) -> _Place | None:
-        """Record the writes in an expression or a statement; return the part of an argument to which it refers."""
+        """Record the writes in an expression or a statement; return the part of an argument that it refers to."""
         if isinstance(node, ast.Name):
             for name, place in self.places.items():
-                if place is not None and name.startswith(f"{node.id}."):  # the name of a local struct that holds rows
+                if place is not None and name.startswith(f"{node.id}."):  # a local struct of rows, used as a whole
                     self._note(place, node, follows=False)
             return self.places.get(node.id)
         if isinstance(node, ast.Attribute):
@@ -196,7 +196,7 @@ class _Reader:
         return None
 
     def _read_all(self, parent: ast.AST, nodes: Any, *, elements: bool = False) -> None:
-        """Analyse the children of a syntax node, and record every row that they use as a whole."""
+        """Analyse the children of a syntax node, and record each row that a child uses as a whole, not by element."""
         for node in nodes:
             place = self._read(node)
             if place is not None and (elements or place.kind is not None):
@@ -246,7 +246,7 @@ class _Reader:
             self._read_all(node, given)
 
     def _call_helper(self, callee: wp.Function, node: ast.Call) -> None:
-        """Record the arguments of a call that the called function writes."""
+        """Record which arguments of a call the called function writes."""
         expressions: dict[str, ast.expr] = dict(zip(callee.input_types, node.args, strict=False))
         expressions |= {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg}
         places = {name: place for name, given in expressions.items() if (place := self._read(given)) is not None}

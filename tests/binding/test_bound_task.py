@@ -25,10 +25,10 @@ def bound(file: Path, **options: Any) -> BoundTask:
     ("line", "message"),
     [
         ("obs = 10", "obs of the task 'tiny' is 10: add the parts of its observation"),
-        ("memory = 1", r"memory of the task 'tiny' has no names: .*, as air_time: Row\[float\] = lw\.memory\(4\)"),
+        ("memory = 1", r"memory of the task 'tiny' is a row without .*, as air_time: Row\[float\] = lw\.memory\(4\)"),
         ("del model", "the task 'tiny' has no model: add one to its class, such as model = \"robot.xml\""),
-        ("lagged = ('qvel',)", "lagged of the task 'tiny' has 'qvel': list it in World, too"),
-        ("cleared = ('qacc',)", "cleared of the task 'tiny' has 'qacc': list it in World, too"),
+        ("lagged = ('qvel',)", "lagged of the task 'tiny' has 'qvel': make it a field of World, too"),
+        ("cleared = ('qacc',)", "cleared of the task 'tiny' has 'qacc': make it a field of World, too"),
         ("frame_skip = 0", "frame_skip of the task 'tiny' must be a whole number from 1 to .*, not 0"),
         ("success_steps = 2.5", r"^success_steps of the task 'tiny' must be a whole number from 1 to \d+, not 2\.5$"),
         (
@@ -155,14 +155,14 @@ def test_success_steps_longer_than_an_episode_raise_an_error(tmp_path: Path) -> 
 
 def test_observation_size_that_differs_between_worlds_raises_an_error() -> None:
     flags = [True, False]
-    with pytest.raises(ValueError, match=r"obs of the task 'hopper' differs between worlds in \['position'\]"):
+    with pytest.raises(ValueError, match=r"'hopper' has sizes that differ between worlds, \['position'\]"):
         lw.make("hopper", nworld=2, exclude_current_positions_from_observation=flags)
 
 
 def test_parameters_that_change_the_observation_size_raise_an_error_and_are_not_set() -> None:
     env = lw.make("hopper", nworld=2)
     for value in (False, [True, False]):
-        with pytest.raises(ValueError, match="would change the observation's parts: make a new environment"):
+        with pytest.raises(ValueError, match="would change the sizes of the observation's parts: make a new"):
             env.set_params(exclude_current_positions_from_observation=value)
     assert env.task.params["exclude_current_positions_from_observation"] is True
     env.step(torch.zeros(2, 3))

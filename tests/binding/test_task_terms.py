@@ -149,7 +149,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     "terms that need each other": (
         term("def a(b: float) -> float:\n    return b", 'rewards = {"a": 1.0}',
              before="@wp.func\ndef b(a: float) -> float:\n    return a\n\n"),
-        "terms of the task 'tiny' need each other in a circle: a needs b needs a",
+        "terms of the task 'tiny' depend on each other in a cycle: a needs b needs a",
     ),
     "a term that writes": (
         term("def upright(s: World) -> float:\n    s.qpos[0] = 1.0\n    return 1.0"),

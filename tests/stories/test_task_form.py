@@ -479,9 +479,9 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     ),
     "memory that is counted": (
         [line("lasting_memory = 1")],
-        r"lasting_memory of the task 'tiny' has no names: .*, as air_time: Row\[float\] = lw\.lasting_memory\(4\)",
+        r"lasting_memory of the task 'tiny' is a row without .*, as air_time: Row\[float\] = lw\.lasting_memory\(4\)",
     ),
-    "memory without a size": ([field("memory: Row[float]")], "memory of the task 'tiny' has no names"),
+    "memory without a size": ([field("memory: Row[float]")], "memory of the task 'tiny' is a row without named parts"),
     "memory of no numbers": (
         [field("level: Row[wp.uint32] = lw.memory()")], r"World\.level has a size, .*: .* as level: Row\[float\]",
     ),
