@@ -60,11 +60,11 @@ _UNIONS = (UnionType, type(typing.Union[int, str]))  # noqa: UP007 (the type of 
 
 @typing.dataclass_transform(kw_only_default=True, frozen_default=True)
 class OptionFlags:
-    """Base class of groups of flags: a field of a given dataclass becomes a flag, and its docstring the help text.
+    """Base class of groups of flags: each field of the given dataclasses becomes a flag.
 
-    A field must be declared in the subclass itself if its type is a union, or if its type or help text differs on the
-    command line. Values are validated when the options are made; if the parser validated them, it would print errors in
-    a multi-line box.
+    The field's docstring becomes the flag's help text. A subclass must declare a field again if the field's type is a
+    union, or if its type or help text differs on the command line. Values are validated when the options are made,
+    because the parser would print errors in a multi-line box.
 
     Args:
         options: The dataclasses. If several dataclasses have the same field, the first one determines its type and help
@@ -77,7 +77,7 @@ class OptionFlags:
     def __init_subclass__(
         cls, *, options: Sequence[type] = (), omit: Collection[str] = (), default: str | Mapping[str, str] | None = None
     ) -> None:
-        if not options:  # a subclass of a subclass, which omits flags from the help
+        if not options:  # derived from a finished group, to omit flags from the help
             return
         own = dict(vars(cls).get("__annotations__", {}))
         flags: dict[str, Any] = {}
@@ -91,7 +91,7 @@ class OptionFlags:
                     setattr(cls, name, field.default if default is None else None)
                 value = getattr(cls, name)
                 flag = own.pop(name, None) or hints[name]
-                if value is None and flag is hints[name]:  # the word None is not accepted; to get None, omit the flag
+                if value is None and flag is hints[name]:  # to get None, omit the flag; the word None is not accepted
                     (kind_of_flag,) = {*(typing.get_args(flag) if isinstance(flag, _UNIONS) else [flag])} - {type(None)}
                     flag = Annotated[kind_of_flag | None, tyro.conf.DisallowNone]
                 text = default[name] if isinstance(default, Mapping) else default or ""
@@ -114,8 +114,8 @@ def given(flags: Any) -> dict[str, Any]:
 
 
 NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "model", "fields", "dynamics", "physics")
-"""Options of an environment that have no generated flag. Commands declare flags for nworld, seed and the model, and
-``Physics`` declares the flags of ``physics``. All other options without a flag are only for Python."""
+"""Options of an environment for which no flag is generated. Commands declare flags for nworld, seed and the model, and
+``Physics`` declares the flags of ``physics``. The other options can be set only in Python."""
 
 
 class Placement(OptionFlags, options=[EnvOptions], omit=(*NO_FLAGS, "horizon")):
@@ -134,7 +134,7 @@ class EnvFlags(OptionFlags, options=[EnvOptions], omit=NO_FLAGS, default=""):
     """mujoco (the C engine, on CPU cores), warp, or auto (the default): warp on a CUDA device and mujoco on the CPU."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """cpu (the default), or a CUDA device such as cuda:0. By default, the policy is evaluated on the CPU if the run's
-    engine is auto, because a few worlds step fastest there."""
+    engine is auto, because a CPU is faster than a GPU for a few worlds."""
 
 
 class Physics(OptionFlags, options=[PhysicsOptions], omit=["base"], default=""):
@@ -155,7 +155,7 @@ def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str]
         texts: The strings, each NAME=VALUE.
         command: The command's arguments. If a name in the strings is an option instead of a parameter, the error names
             the option's flag.
-        instead: For options whose flag has a different name in this command: the flag, by the option's name.
+        instead: Flags by option name, for options whose flag has another name in this command.
 
     Raises:
         ValueError: A string is not of the form NAME=VALUE, or NAME is an option instead of a parameter.

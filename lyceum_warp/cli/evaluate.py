@@ -146,7 +146,7 @@ class Eval:
 
 
 def _print_transfer(verdict: Transfer, console: Console) -> None:
-    """Print a table of the differences of each comparison, and its verdict."""
+    """Print the verdict of each comparison, and a table of the differences."""
     for comparison in verdict.comparisons:
         found = comparison.differences
         columns = {
@@ -171,11 +171,11 @@ def run_worlds(
 
     Args:
         run: The run.
-        words: Options that override the run's options. If the engine is auto and no device is given, the worlds run on
+        words: Options that replace the run's options. If the engine is auto and no device is given, the worlds run on
             the CPU.
-        params: Parameters that override the run's parameters.
+        params: Parameters that replace the run's parameters.
         nworld: Number of worlds.
-        task: A different task to use, with this task's options and parameters.
+        task: A task to use instead of the run's task, with its own default options and parameters.
         trust: Whether to execute the run's task even if the run was not made by this user on this machine.
     """
     saved = Configuration.of(run)
@@ -211,7 +211,7 @@ def _save_episodes(env: Env, policy: Policy, options: Eval, run: Run, source: di
 
 
 def _source(env: Env, run: Run) -> dict[str, Any]:
-    """Return the ``source`` of saved episodes, with the path of the run's copy of the model if that copy was used."""
+    """Return the ``source`` of saved episodes; if the run's copy of the model was used, add the path of the copy."""
     made, copy = source(env), run.config.get("kept", {}).get("model")
     if copy is not None and env.options.model is not None and "model" not in made["options"]:
         made["options"]["model"] = str((run.task_folder / copy).resolve())

@@ -50,8 +50,8 @@ class New:
     model: Annotated[str, tyro.conf.arg(metavar="FILE")]
     """An MJCF or URDF file; menagerie:ROBOT/FILE.xml for a model of MuJoCo Menagerie (from the extra "menagerie", the
     package mujoco-menagerie, or a checkout to which MENAGERIE_ROOT points); or gymnasium:FILE.xml or
-    gymnasium_robotics:PATH for a model in the package of that name. The task file stores a relative path as relative to
-    the task file's folder."""
+    gymnasium_robotics:PATH for a model in the package of that name. In the task file, a relative path becomes
+    relative to that file's folder."""
 
     template: Literal["plain", "velocity"] = "plain"
     """With velocity, the task trains a walking robot to follow velocity commands. The robot needs a floating base, and

@@ -123,8 +123,8 @@ class Plan:
     real_time: bool = False
     """Step the world in real time while the planner plans, instead of waiting for each plan."""
     predict: bool = False
-    """With --real-time, plan from the state that is predicted for the end of the current step, when the plan can first
-    apply."""
+    """With --real-time, plan from the predicted state at the end of the current step, because the plan cannot apply
+    earlier."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder; by default runs/plan-TASK-DATE."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
@@ -155,9 +155,7 @@ class Plan:
         whole_number("seed of the last episode", self.seed + self.episodes - 1, low=0)
         every = whole_number("replan_every", self.replan_every, low=1)
         if self.predict and not self.real_time:
-            raise ValueError(
-                "--predict has no effect without --real-time, where the world waits for each plan: omit it"
-            )
+            raise ValueError("without --real-time, the world waits for each plan, so --predict has no effect: omit it")
         if every > 1 and self.real_time:
             raise ValueError(
                 f"--replan-every {every} has no effect with --real-time, where plans follow one another without a "
@@ -221,7 +219,7 @@ def _stem(task: str) -> str:
 def _worlds(
     options: Plan, params: dict[str, Any], planner_params: dict[str, Any]
 ) -> tuple[Env, Callable[[RealTimeSetting | None], MPPI]]:
-    """Make the controlled world, and a function that makes a planner with settings from ``_choice`` or from flags."""
+    """Make the controlled world, and a function that makes a planner from a ``RealTimeSetting`` or from flags."""
     steps: dict[str, Any] = {} if options.steps is None else {"horizon": whole_number("steps", options.steps, low=1)}
     plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
     if plant.horizon == 0:
@@ -251,10 +249,10 @@ _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 
 
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
-    """Choose the settings that flags leave open by measuring planning times; return None if flags set all of them.
+    """Choose the settings that have no flag, by measuring planning times; return None if every setting has a flag.
 
-    A plan must be ready within a step of the plant. If no setting is fast enough, a plan may take as long as a step of
-    the planner.
+    A plan must be ready within one step of the controlled world. If no setting is fast enough, a plan may take as long
+    as one step of the planner's worlds.
     """
     task, flags = plant.task.task, given(options.mppi)
     config = options.mppi.on_top_of(task_config(task))
@@ -343,7 +341,7 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
 
 
 def _left(run: Run, whole: int, aborted: list[Trajectory], path: Path | None) -> str:
-    """Describe where the episodes are saved if the command is interrupted after ``whole`` complete episodes."""
+    """Say where the episodes are saved if the command is interrupted after ``whole`` complete episodes."""
     steps = f"after {aborted[0].steps} step{'s' * (aborted[0].steps != 1)}" if aborted else "before its first step"
     if not whole:
         where = f"it is in {path}" if path else f"{run.folder} holds no episode"

@@ -45,7 +45,7 @@ _FINAL_EPISODES = 32
 _SETTINGS: dict[str, Any] = {
     "iterations": 100, "target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0,
 }  # fmt: skip
-"""Settings that may change when a run is resumed, with their defaults."""
+"""The defaults of the settings that may be changed when a run is resumed."""
 
 _KEPT = {
     "from_run": "--from", "task": "TASK", "algorithm": "--algorithm", "seed": "--seed", "threads": "--threads",
@@ -212,7 +212,7 @@ class Train:
             return self._report(run, learner)
 
     def _suggestion(self) -> Training:
-        """Return the suggested algorithm and settings, or only the algorithm that a flag chooses instead."""
+        """Return the task's suggested training; if --algorithm names another algorithm, return it without settings."""
         assert self.task is not None
         suggestion = find_task(self.task).training
         if self.algorithm in (None, suggestion.algorithm):
@@ -220,14 +220,14 @@ class Train:
         return Training(algorithm=self.algorithm)
 
     def configuration(self, source: Run | None, team: Team) -> Configuration:
-        """Return the configuration of the source run, or the defaults, with the given flags applied."""
+        """Return the configuration of the ``source`` run, or the task's defaults, with the given flags applied."""
         words = given(self.env) | given(self.physics)
         for name, value in (("nworld", self.nworld), ("seed", self.seed)):
             if value is not None:
                 words[name] = value
         if source is None:
             suggestion = self._suggestion()
-            few = 8 if suggestion.algorithm == "sac" else 64  # SAC makes one update per world and step
+            few = 8 if suggestion.algorithm == "sac" else 64  # SAC makes an update for each step of each world
             nworld = 4096 * team.size if (self.env.device or "cpu").startswith("cuda") else few
             options = EnvOptions(nworld=nworld, device="cpu")
             suggested = None

@@ -24,7 +24,7 @@ class Tune:
 
     Each setting is compared with the unchanged task: steps per second, memory, faults, the divergence of trajectories,
     and the returns of the same episodes under random actions and, with --run, under a policy. Every result is appended
-    to a JSON Lines file; the same command continues a stopped search. docs/physics.md explains the table.
+    to a JSON Lines file; the same command continues a search that was stopped. docs/physics.md explains the table.
 
     $ lyceum-warp tune hopper --short
     $ lyceum-warp tune humanoid --run runs/humanoid-20260101-120000
@@ -44,12 +44,12 @@ class Tune:
     short: bool = False
     """Compare the first 100 steps of episodes, for a few seconds for each setting, instead of whole episodes."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Number of episodes of each setting. By default, as many as the confidence interval needs, for at most a
+    """Number of episodes for each setting. By default, as many as the confidence interval needs, for at most a
     minute (5 s with --short)."""
     planning: bool = False
     """Find physics options for the task's planner: compare planning times, and test whether coarser physics rank the
     samples in the same order as the task's default physics. --nworld is then the number of samples, and --episodes the
-    number of states of each kind."""
+    number of standing, of moving and of fallen states from which the planner plans."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of worlds; by default 256, or 4096 on a GPU. With --planning, the number of the planner's samples, by
     default 64."""

@@ -11,16 +11,16 @@ from lyceum_warp import walkers
 from lyceum_warp.cli.task_text import literal
 
 TRAINING = "--algorithm ppo --device cuda --iterations 800"
-"""Options of lyceum-warp train with which robots learn to walk on one GPU."""
+"""Options of lyceum-warp train that are enough to learn walking on one GPU."""
 
 _STEP = 0.02
 """Seconds in a step."""
 
 _NEAR = 0.1
-"""The end of a leg is a foot if it is at most this fraction of the base's height above the lowest foot."""
+"""A leg's end is a foot if it is not much higher than the lowest end: at most by this fraction of the base's height."""
 
 _FLAT = 0.01
-"""A sphere of the foot belongs to the sole if it is at most this many metres above the foot's lowest sphere."""
+"""A sphere of a foot is part of the sole if its bottom is at most this many metres above the foot's lowest point."""
 
 _AT = 0.06
 """The maximum distance in metres between the centre of a sole and a site that marks the foot."""
@@ -50,8 +50,8 @@ class Walker:
         joints: Names of the joints to control; by default the leg joints that have an actuator.
 
     Raises:
-        ValueError: The robot has no floating base, no feet or no joints, or an element that the task file must name has
-            no name.
+        ValueError: The robot has no floating base, no feet or no joints, or the model does
+            not name an element that the task file refers to.
     """
 
     def __init__(self, spec: mujoco.MjSpec, feet: Sequence[str] = (), joints: Sequence[str] = ()) -> None:
@@ -119,7 +119,7 @@ class Walker:
         """Find a site near the centre of a body's sole; if there is none, describe a new site."""
         spheres = self._spheres(body)
         if not len(spheres):
-            raise ValueError(f"the body {self._called(body)} of a foot has no geom that can touch the ground")
+            raise ValueError(f"the foot {self._called(body)} has no geom that can touch the ground")
         bottoms = spheres[:, 2] - spheres[:, 3]
         middle = spheres[bottoms <= bottoms.min() + _FLAT, :3].mean(axis=0)
         for site in np.flatnonzero(self.model.site_bodyid == body).tolist():

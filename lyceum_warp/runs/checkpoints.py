@@ -24,11 +24,11 @@ PolicyContent = dict[str, Any]
 """Content of a saved policy: ``iteration``, ``policy``, and ``value`` if there is a value function."""
 
 _CLASSES: dict[str, type[nn.Module]] = {"policy": GaussianPolicy, "value": ValueFunction}
-"""Network classes to use if a file does not name the class."""
+"""The class of each network, for files that do not name the class."""
 
 
 def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> PolicyContent:
-    """Copy a policy and a value function to the CPU, in the format of a file.
+    """Copy a policy and a value function to the CPU, in the format in which they are saved.
 
     Args:
         iteration: Number of complete iterations.
@@ -116,7 +116,7 @@ def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
     kind: Any = _CLASSES[name]
     own, shape = saved.get("class"), saved["shape"]
     if own is not None:
-        # do not import modules outside algos, because importing may run code
+        # import only modules of algos, because a file could name any module, and importing runs its code
         kind = pydoc.locate(own) if own.startswith("lyceum_warp.algos.") and shape is not None else None
         if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
             fix = f": give one, as in lw.load(run, policy={own.rpartition('.')[2]}(...))" if name == "policy" else ""
@@ -174,7 +174,7 @@ def read_checkpoint(
     try:
         data = io.BytesIO(path.read_bytes())
         with zipfile.ZipFile(data) as archive:
-            # torch neither checks all checksums nor refuses entries marked as folders, which it ignores
+            # torch does not check all checksums, and ignores entries that are marked as folders
             folders = (record.filename for record in archive.infolist() if record.external_attr & 0x10)
             if (name := archive.testzip() or next(folders, None)) is not None:
                 raise ValueError(f"the record {name} is corrupt")
@@ -205,7 +205,7 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
     "state": lambda value: isinstance(value, dict) and type(value.get("iteration", 0)) is int,
     "score": lambda value: isinstance(value, dict) and isinstance(value.get("value"), int | float),
 }  # fmt: skip
-"""Map entries of a checkpoint to functions that check their values."""
+"""Maps the names of a checkpoint's entries to functions that check the entries' values."""
 
 
 def _first_sentence(error: BaseException) -> str:

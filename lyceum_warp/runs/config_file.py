@@ -9,7 +9,7 @@ from lyceum_warp.support.files import unknown_format
 from lyceum_warp.support.validate import whole_number
 
 _COUNT = 0
-"""The type, in ``_ENTRIES``, of entries that are non-negative whole numbers."""
+"""Stands in ``_ENTRIES`` for the type of non-negative whole numbers."""
 
 _ENTRIES: dict[str, Any] = {
     "task": str | None, "params": dict, "options": dict, "physics": dict, "engine": str, "device": str,

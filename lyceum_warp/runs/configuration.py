@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 ALGORITHMS: dict[str, tuple[Any, Any]] = {
     "npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig), "sac": (SAC, SACConfig)
 }  # fmt: skip
-"""Map names of algorithms, as in config.json, to the classes of the learner and its hyperparameters."""
+"""Maps an algorithm's name in config.json to two classes: the learner, and its hyperparameters."""
 
 
 def describe(learner: Learner) -> dict[str, Any]:
@@ -83,7 +83,7 @@ class Configuration:
 
     @classmethod
     def of(cls, run: Run) -> "Configuration":
-        """Read a run's configuration; if a table's file is missing, use the run's copy.
+        """Read a run's configuration; if the file of a table parameter is missing, use the run's copy of the file.
 
         Raises:
             ValueError: A value is missing or not valid.
@@ -92,7 +92,7 @@ class Configuration:
         try:
             # earlier releases stored options that were given as --param in "params", or wrote no "physics"
             words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
-            words.pop("unroll", None)  # ignore an option of earlier releases that changed no numbers
+            words.pop("unroll", None)  # an option of earlier releases, which had no effect on results
             base = EnvOptions(
                 engine=config["engine"], device=config["device"], nworld=config["nworld"], seed=config["seed"]
             )  # fmt: skip
@@ -125,7 +125,7 @@ class Configuration:
 
         Args:
             team: The processes that train together.
-            run: The run that provides the task. The run's copies replace files that have moved or changed.
+            run: The run that provides the task. If a file has moved or changed, the run's copy of it is used.
             networks: The initial policy and value function; None for new networks.
             note: Function that is called with messages about the task's files.
             task: A task, in its current version, to use instead of the run's task.
@@ -161,13 +161,13 @@ class Configuration:
 
 
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:
-    """Get a learner's initial policy and value function from a run, and the iteration after which they were saved.
+    """Load a learner's initial policy and value function from a run, and the iteration after which they were saved.
 
     Args:
         run: The run that saved the networks.
-        which: Policy of the run, or None to resume the run. To resume, a learner usually makes new networks from the
-            hyperparameters, so the returned networks are None. They are loaded only if the run started from another
-            run's networks, or uses ``limit``.
+        which: Policy of the run, or None to resume the run. A learner that resumes usually makes its networks from the
+            hyperparameters, so the returned networks are None. They are loaded only if the hyperparameters do not
+            describe them: if the run started from another run's networks, or if ``limit`` differs from its default.
 
     Raises:
         FileNotFoundError: The run has no policy of this name or number.

@@ -43,7 +43,7 @@ class Run:
     ``metrics.csv``     one row per iteration
     ``policy.pt``       the last policy and the value function
     ``best.pt``         the policy with the best return
-    ``policies/``       the policy of every n-th iteration, with ``keep_every``
+    ``policies/``       the policy of every n-th iteration, if ``keep_every`` is set
     ``checkpoint.pt``   the complete state to resume from exactly, at the same iteration as ``policy.pt``
     ``previous.pt``     the previous checkpoint
     ``replay/``         the replay buffer of the checkpoint, if the algorithm has one
@@ -114,17 +114,17 @@ class Run:
         device: str = "cpu",
         files: Mapping[str, Path | bytes] | None = None,
     ) -> "Run":
-        """Create a run folder with the copy of the task, the configuration and the versions.
+        """Create a run folder with a copy of the task, the configuration and the versions.
 
-        A failure leaves no files in the folder. If the task, its model or a parameter is a file of the user, the run is
-        recorded as trusted in the user's state directory (``lyceum_warp.runs.trust``), so later calls can execute the
-        run's task without ``trust=True``.
+        If an error occurs, the folder is deleted. If the task, its model or a parameter is a file of the user, the run
+        is recorded as trusted in the user's state directory (``lyceum_warp.runs.trust``), so later calls can execute
+        the run's task without ``trust=True``.
 
         Args:
             folder: A new or empty folder.
             config: The configuration, which consists of JSON values.
             device: Device of the run; the entry ``versions`` names the device's hardware.
-            files: The files to write into the folder ``task``, by path: each is the path of a file to copy, or bytes.
+            files: The files of the folder ``task``: maps paths in the folder to files to copy, or to bytes to write.
 
         Raises:
             ValueError: The folder is not empty, or is a file.
@@ -132,7 +132,7 @@ class Run:
         folder = Path(folder)
         cls.check_free(folder)
         run, task = cls(folder, {"format": FORMAT, **config, "versions": versions(device)}), folder / f"{_TASK}.tmp"
-        text = json.dumps(run.config, indent=2)  # may fail, so the folder is created afterwards
+        text = json.dumps(run.config, indent=2)  # before the folder is created, because this may fail
         try:
             shutil.rmtree(task, ignore_errors=True)
             folder.mkdir(parents=True, exist_ok=True)
@@ -144,7 +144,7 @@ class Run:
                 temporary.write_text(text)
                 if files:
                     task.rename(run.task_folder)
-        except BaseException:  # for example a full disk, missing permissions or a signal
+        except BaseException:  # for example, the disk is full, or a signal ends the program
             shutil.rmtree(folder, ignore_errors=True)
             raise
         if files or "model" in run.config.get("options", {}):
@@ -172,7 +172,7 @@ class Run:
             temporary.write_text(json.dumps(self.config, indent=2))
 
     def note_settings(self, error: Exception) -> None:
-        """Add the path of ``config.json`` to an error that the settings may have caused."""
+        """Add the path of ``config.json`` to an error, because a setting in it may be the cause."""
         if str(self.folder) not in str(error):
             error.add_note(f"with the settings in {self.folder / _CONFIG}")
 

@@ -56,7 +56,7 @@ def run_lock(folder: Path, *, take_over: bool = False) -> Iterator[Callable[[], 
                     "run over with --take-over (take_over=True in Python)"
                 )
             if not path.exists() or not os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                continue  # the file was deleted after this process had opened it
+                continue  # another process has deleted or replaced the file since it was opened here
             file.truncate(0)
             file.write(own)
             file.flush()

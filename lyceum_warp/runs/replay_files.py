@@ -1,8 +1,8 @@
-"""Save a replay buffer in files that are written only once, in addition to a run's checkpoint.
+"""Save a replay buffer beside a run's checkpoint, in files that are not changed after they were written.
 
 The sequence of all steps is divided into equal parts, each about 1/64 of the buffer, with one file per part. A save
-only writes the parts that have grown, so the duration of a save is proportional to the number of new steps. A part that
-has grown gets a new file name. The old files are deleted after the checkpoint has been replaced, so the files always
+writes only the parts with new steps, so its duration is proportional to the number of new steps. A part with new steps
+is written to a new file. The part's old file is deleted after the checkpoint has been replaced, so the files always
 contain the checkpoint's steps.
 """
 
@@ -17,7 +17,7 @@ _PARTS = 64
 
 
 def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, check: Callable[[], None] | None) -> None:
-    """Write the parts of the replay buffer that have grown; all ranks must call this function.
+    """Write the parts of the replay buffer that have new steps; all ranks must call this function.
 
     Args:
         folder: The folder of the files; None on ranks that do not write.
@@ -29,7 +29,7 @@ def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, ch
     oldest = replay.stored - replay.count
     for start, end in _parts(replay, max(since, oldest), replay.stored):
         first = max(start, oldest)
-        rows = {  # move the axis of the worlds first, because gather concatenates along the first axis
+        rows = {  # make the worlds the first axis, because gather concatenates along it
             name: team.gather(part.transpose(0, 1).contiguous()).transpose(0, 1).cpu().contiguous()
             for name, part in replay.rows(first, end).items()
         }
@@ -63,7 +63,7 @@ def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
     """
     oldest = max(0, stored - replay.steps)
     for start, end in _parts(replay, oldest, stored):
-        # ignore additional steps, written by a later save that was interrupted before its checkpoint
+        # a later save that was interrupted may have written additional steps, which are ignored
         longer = sorted(path for path in folder.glob(f"{start:012d}-*.pt") if path.name >= _name(start, end))
         if not longer:
             raise ValueError(f"{folder} lacks steps {start} to {end} of the replay buffer")
@@ -76,7 +76,7 @@ def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
 
 
 def _parts(replay: Replay, first: int, stored: int) -> Iterator[tuple[int, int]]:
-    """Yield the range of steps, (start, end), of each part with any of the steps from ``first`` to ``stored``."""
+    """Yield (first step, end) of each part that contains a step between ``first`` and ``stored``."""
     each = -(-replay.steps // _PARTS)
     for start in range(first // each * each, stored, each):
         yield start, min(start + each, stored)

@@ -14,13 +14,13 @@ from lyceum_warp.runs.replay_files import clean_replay, write_replay
 log = logging.getLogger(__name__)
 
 SAVE_SECONDS = 30.0
-"""Maximum number of seconds between saves, unless ``LONG`` requires more."""
+"""Maximum time between saves in seconds; slow saves may be further apart, see ``LONG``."""
 
 SHARE = 100
-"""Usual time between saves, as a multiple of the last save's duration; at most ``SAVE_SECONDS``."""
+"""Usual time between saves, as a multiple of the last save's duration."""
 
 LONG = 20
-"""Minimum time between saves, as a multiple of the last save's duration, even if this exceeds ``SAVE_SECONDS``."""
+"""Minimum time between saves, as a multiple of the last save's duration; it may exceed ``SAVE_SECONDS``."""
 
 
 class Saver:
@@ -80,7 +80,7 @@ class Saver:
         score = None if score is None or math.isnan(score) else score
         better = score is not None and score > self._best
         numbered = self.keep_every > 0 and learner.iteration % self.keep_every == 0
-        # the episodes behind return_mean were sampled by the policy before the update
+        # return_mean belongs to the policy before the update, which sampled the episodes
         sampled = name == "return_mean"
         before = self._before
         if better or numbered or sampled:
@@ -106,7 +106,7 @@ class Saver:
         """Save the last policy and the complete state."""
         start = time.perf_counter()
         learner, run, replay = self.learner, self.run, self.learner.replay
-        state = learner.state_dict()  # all ranks call state_dict, which gathers the worlds
+        state = learner.state_dict()  # on all ranks, because it gathers the worlds of all ranks
         if replay is not None:
             write_replay(None if run is None else run.replay, replay, learner.team, self._stored, self._check)
         with learner.team.together():

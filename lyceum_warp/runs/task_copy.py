@@ -26,12 +26,12 @@ log = logging.getLogger(__name__)
 Note = Callable[[str], None]
 
 Files = dict[Path, Path | bytes]
-"""The files of a copy, by path: each is the content, or the path of the file to copy."""
+"""Maps the path of each file to its content, or to the file from which to copy the content."""
 
 _MODEL, TABLES = "model", "tables"
 _APART = 2
-"""The copy preserves the paths of the task's file and the model relative to their common parent folder. If the task's
-file is more than this many levels below this folder, the copy has separate folders instead."""
+"""The task's file and the model usually keep their paths relative to their common parent folder. If the task's file is
+more than this many levels below that folder, the file and the model are copied into separate folders."""
 _LARGEST = 512 * 2**20
 """Maximum size of a model's files in bytes; larger models are not copied."""
 _MOST_MODULES, _LARGEST_MODULES = 100, 8 * 2**20
@@ -43,7 +43,7 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
     """Collect the files of an environment's task for a run folder, except for tasks of the package.
 
     Returns:
-        The entry ``kept`` of config.json, and the files for the folder ``task`` by path.
+        The entry ``kept`` of config.json, and the files for the folder ``task``, by their paths in it.
     """
     task, given = env.task.task, env.options.model is not None
     loaded, own = source_files(task), not task.__module__.startswith("lyceum_warp.")
@@ -130,7 +130,7 @@ def run_env(
         options: Options of the environment.
         params: Parameters of the task.
         note: Function that is called with each message.
-        task: A different task, in its current version.
+        task: Another task to use in place of the run's task, in its current version.
         trust: Whether to execute the task and read the files even if this user did not make the run on this machine;
             see ``lyceum_warp.runs.trust``.
 
@@ -184,7 +184,7 @@ def run_env(
 
 
 def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, bytes] | None = None) -> list[str]:
-    """List changes to a task's file and its modules since the run started.
+    """List the changes to a task's file, and to the modules that it imports, since the run started.
 
     Args:
         file: The task's file.
@@ -211,7 +211,7 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = 
         run: The run.
         env: The environment.
         note: Function that is called with each message.
-        model: Whether to compare the compiled model, too. Different physics options also change the compiled model.
+        model: Whether to compare the compiled models, too; they also differ if the physics options differ.
     """
     kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
     file = next(iter(loaded), None)
@@ -236,7 +236,7 @@ def _digest(content: bytes) -> str:
 
 
 def _model_hash(env: Env) -> str:
-    """Hash the compiled model, independently of the process and of paths."""
+    """Hash the compiled model; the hash does not depend on the process or on paths."""
     found = hashlib.sha256()
     for owner in (env.task.model, env.task.model.opt):
         for name in sorted(dir(owner)):
@@ -259,7 +259,7 @@ def _names_in_copy(paths: Collection[Path], file: Path | None, modules: Collecti
     """Choose paths within the folder ``task`` for a task's file, its modules and its model's files.
 
     Relative paths are preserved, so that the copied task finds the copied model. If the folders of the task's file and
-    the model are too far apart, each gets its own folder in the copy.
+    the model are too far apart, the copy has a separate folder for the model.
     """
     if not paths:
         return {}
@@ -289,7 +289,7 @@ def _model_files(env: Env) -> tuple[Path | None, Files]:
         spec = env.task.spec.copy()
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the environment has already logged the warnings
+                warnings.simplefilter("ignore")  # already logged when the environment was made
                 spec.compile()
                 text = spec.to_xml()
         except (ValueError, mujoco.FatalError) as error:

@@ -1,4 +1,4 @@
-"""Record runs that this user made or trusts, and refuse to execute or read the files of all other runs."""
+"""Record the runs that this user made or trusts; do not execute or read the files of other runs."""
 
 import datetime
 import hashlib
@@ -35,7 +35,7 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
         folder: The run's folder.
         config: Content of the run's config.json.
         named: The file that the error message names.
-        runs: Whether the command executes the run's task, or only reads files.
+        runs: Whether the command would execute the run's task; otherwise it only reads files.
         trust: Whether to trust and record the run.
 
     Raises:
@@ -53,7 +53,7 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
 
 
 def _record(folder: Path, config: Mapping[str, Any]) -> Path:
-    """Get the file that records a run as trusted, named by a hash of all that the run can execute or read."""
+    """Get the file that records a run as trusted; its name is a hash of all that the run can execute or read."""
     kept = config.get("kept", {})
     paths = [{key: value for key, value in config.get(part, {}).items() if isinstance(value, str)}
              for part in ("params", "options")]  # fmt: skip
