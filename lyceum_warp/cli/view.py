@@ -44,7 +44,7 @@ class Place(
     """Engine and device of the displayed worlds or, if --mppi is given, of the planner's worlds."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """mujoco (the C engine, on CPU cores), warp, or auto."""
+    """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """cpu, or a CUDA device such as cuda:0. By default, a run with engine auto is shown on the CPU."""
 
@@ -55,7 +55,7 @@ class View:
 
     For a task, the viewer shows its worlds, lets you push bodies with the mouse and, with --mppi, runs a planner in
     real time. For a run, it shows the run's policy; with --follow, it shows the newest policy while the run trains.
-    Episode files, or a folder of lyceum-warp plan, are played back.
+    Episode files, or a folder that lyceum-warp plan has written, are played back.
 
     The viewer is a web page. The command prints the address of the page; the address contains a secret. Over ssh, it
     also prints the command that forwards the port.
@@ -165,7 +165,7 @@ def _check(options: View) -> None:
 
 
 def _kind(what: tuple[str, ...]) -> str:
-    """Return the kind of the arguments: "task", "run" or "episodes"."""
+    """Say what the arguments are: "task", "run" or "episodes"."""
     first = Path(what[0])
     if first.suffix == ".npz":
         return "episodes"
@@ -191,7 +191,7 @@ def _episodes_env(options: View, episodes: dict[Path, Trajectory]) -> Env:
 def _task_worlds(options: View) -> Env:
     params = parameters(options.param, options)
     nworld = options.nworld or 1
-    if options.mppi and nworld == 1:  # the planner controls this world
+    if options.mppi and nworld == 1:  # the planner controls this world itself instead of a copy
         return Env(options.what[0], autoreset=False, nthread=1, **params)
     return Env(options.what[0], nworld=nworld, **_words(options), **params)
 

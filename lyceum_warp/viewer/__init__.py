@@ -1,6 +1,6 @@
 """View worlds interactively in a browser.
 
-The viewer has two processes, and each process has a folder.
+The viewer has two processes, and the code of each process has its own folder.
 
 - ``show.py`` opens a session and its window: ``lw.view``.
 - ``follow.py`` follows a training run: ``lw.RunViewer``.

@@ -61,7 +61,7 @@ class Follower:
         return read_checkpoint(self.run.policy_file(), self.device, parts=("iteration", "policy"))
 
     def _stamp(self) -> tuple[int, int, int] | None:
-        """Read those attributes of the policy's file that change when the file is replaced."""
+        """Read attributes of the policy's file that change when the file is replaced."""
         try:
             found = os.stat(self.run.policy_file())
         except OSError:

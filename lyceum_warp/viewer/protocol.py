@@ -11,7 +11,7 @@ import numpy as np
 Mode: TypeAlias = Literal["passive", "controller", "playback"]
 
 WorldChoice: TypeAlias = int | Literal["next", "previous", "best", "worst"]
-"""The number of a world, or a rule that selects a world; "best" and "worst" compare the returns so far."""
+"""The number of a world, or a rule that selects one; "best" and "worst" compare the returns of unfinished episodes."""
 
 MOST_GHOSTS = 32
 """The maximum number of other worlds, and of other episodes, that are drawn at once."""
@@ -23,7 +23,7 @@ BEST_COLOUR = (0.1, 0.75, 0.3, 1.0)
 """Colours of a planner's samples and of the best sample, in the window and in videos."""
 
 MAX_POINTS, MAX_MESSAGES = 20_000, 200
-"""The maximum number of curve points, and of messages, that a frame may take over from skipped frames."""
+"""The maximum number of curve points, and of messages, in a frame that includes those of skipped frames."""
 
 
 # messages to the window
@@ -31,7 +31,7 @@ MAX_POINTS, MAX_MESSAGES = 20_000, 200
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """The part of the display that stays the same: title, model, modes, controllers, episodes and curves."""
+    """What does not change during a session: title, model, modes, controllers, episodes and names of curves."""
 
     title: str
     """The title of the window."""
@@ -70,7 +70,7 @@ class Ghost:
     colour: tuple[float, float, float, float] | None
     """Red, green, blue and opacity, from 0 to 1; None for the model's own colours."""
     shift: tuple[float, float] = (0.0, 0.0)
-    """The displacement of the ghost from its world's position, in metres."""
+    """By how much the ghost is moved in x and y, in metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,13 +88,12 @@ class SetGhosts:
     """Choose the ghosts to draw."""
 
     worlds: int = 0
-    """The number of worlds to draw as ghosts, at most ``MOST_GHOSTS``. The ghosts are the worlds that follow the shown
-    world in the order of their numbers."""
+    """The number of worlds to draw as ghosts, at most ``MOST_GHOSTS``: those with the next numbers after the displayed
+    world's."""
     grid: bool = False
-    """Whether to draw the other worlds beside each other, in the model's colours."""
+    """Whether to draw the other worlds side by side in a grid, in the model's colours."""
     episodes: int = 0
-    """The number of episodes to draw as ghosts, all at the same step as the shown episode. The ghosts are the episodes
-    that follow the shown episode."""
+    """The number of episodes to draw as ghosts: those after the displayed episode in the list, at the same step."""
     burst: int = 0
     """The number of past (red) and future (blue) states to draw along the trajectory, at most ``MOST_BURST``."""
     plan: bool = True
@@ -132,11 +131,11 @@ class Status:
     command: tuple[float, float, float] | None = None
     """The command of a walking robot: forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s)."""
     driven: bool = False
-    """Whether the command comes from the user."""
+    """Whether the user drives the robot; otherwise, the task chooses the command."""
     planner: tuple[tuple[str, float], ...] = ()
-    """The names and values of the planner's settings that the user can change."""
+    """The planner's settings that the user can change, as names and values."""
     params: tuple[tuple[str, float], ...] = ()
-    """The names and values of the task's parameters that the user can change."""
+    """The task's parameters that the user can change, as names and values."""
     seekable: tuple[int, int] = (0, 0)
     """The first and the last step on the slider."""
     text: tuple[tuple[str, str], ...] = ()
@@ -145,7 +144,7 @@ class Status:
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """The shown world at one moment."""
+    """The displayed world at one moment."""
 
     pose: Pose
     state: np.ndarray
@@ -160,10 +159,10 @@ class Frame:
     """The index of the best sample."""
     arrows: tuple[Arrow, ...] = ()
     samples: np.ndarray | None = None
-    """New points of the curves, (points, 2 + curves). A point holds simulated seconds, 1 if the episode ended, and a
-    value per curve."""
+    """New points of the curves, (points, 2 + curves). The columns are the simulated time in seconds, 1 if the episode
+    ended (otherwise 0), and a value for each curve."""
     messages: tuple[str, ...] = ()
-    """New messages about ends of episodes, faults and refused commands."""
+    """New messages: why episodes ended, faults, and why commands were refused."""
     files: tuple[str, ...] = ()
     """The absolute paths of new videos, pages and pictures, which the page offers for download."""
 
@@ -240,7 +239,7 @@ class SetBackwards:
 
 @dataclasses.dataclass(frozen=True)
 class Reset:
-    """Start a new episode of the shown world."""
+    """Start a new episode of the displayed world."""
 
     random: bool
 
@@ -267,8 +266,8 @@ class Drive:
     """Command a walking robot."""
 
     command: tuple[float, float, float] | None
-    """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s). None returns the choice of commands to the
-    task."""
+    """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s). If None, the task chooses the
+    commands again."""
 
 
 @dataclasses.dataclass(frozen=True)

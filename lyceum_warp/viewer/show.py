@@ -32,9 +32,9 @@ def view(
     back. The panel and its keys choose the mode, the world, the speed, ghosts and the camera.
 
     The viewer steps the worlds of ``env``, and leaves them in their last state. A policy acts in all worlds. A
-    controller of one world acts in a copy of the shown world. The copy runs in real time, like the world in
-    ``lw.control_async``, and all other worlds wait. Afterwards, the shown world gets the copy's state. If ``env`` is
-    one world on the CPU without automatic resets, no copy is made.
+    controller of one world acts in a copy of the displayed world. The copy runs in real time, like the world in
+    ``lw.control_async``, and all other worlds wait. Afterwards, the displayed world gets the copy's state. If ``env``
+    is one world on the CPU without automatic resets, no copy is made.
 
     Args:
         env: The worlds, on any engine and device.
@@ -90,7 +90,7 @@ has the same host name as the notebook."""
 
 
 class BackgroundView:
-    """A view that steps its worlds in a thread; ``lw.view`` returns a view if ``block`` is false.
+    """A view that steps its worlds in a thread; ``lw.view`` returns it if ``block`` is False.
 
     A notebook shows the page as the output of the cell, and a link that opens the page in a separate tab. If the
     notebook is served by another machine, or the browser is Firefox or Safari, only the link is shown.

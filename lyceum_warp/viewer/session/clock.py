@@ -33,11 +33,11 @@ from lyceum_warp.viz import NoVideoError
 _FPS = 30.0
 """The maximum number of frames per second."""
 _LAG = 0.25
-"""The maximum lag of the worlds behind the wall clock, in seconds; any further lag is not caught up."""
+"""The maximum lag of the worlds behind the wall clock, in seconds; the worlds do not catch up a longer lag."""
 _IDLE = 0.5
-"""The seconds between two frames while nothing changes."""
+"""The seconds between two frames of a paused view in which nothing changes."""
 _CHECK = 0.5
-"""The seconds between two calls of a watcher."""
+"""The seconds between two calls of the watchers."""
 
 Watcher = Callable[[], Sequence[str]]
 """A function that returns new messages; called about twice a second."""
@@ -54,7 +54,7 @@ class Session:
         env: The worlds.
         controllers: See ``lw.view``.
         watchers: Functions that return messages; called about twice a second.
-        shown: The other arguments of ``Stage``.
+        shown: ``episodes``, ``seed`` and ``paused``; see ``Stage``.
 
     Raises:
         ValueError: An argument is invalid.
@@ -84,7 +84,7 @@ class Session:
         now = time.perf_counter()
         self._next_frame = self._next_check = now
         self._next_step = now + self.stage.env.timestep / self.stage.speed
-        with contextlib.ExitStack() as ends:  # these contexts close in reverse order
+        with contextlib.ExitStack() as ends:  # called in reverse order: the window closes first
             ends.enter_context(self.stage.videos.finishing(print))
             ends.callback(self.stage.close)
             ends.callback(window.close)
@@ -159,7 +159,7 @@ class Session:
     # real time
 
     def _by_the_clock(self) -> bool:
-        """Whether a controller of one world is running its plant in real time."""
+        """Whether a controller of one world is in use and its plant is to run in real time."""
         stage = self.stage
         return isinstance(stage.control, WorldControl) and not stage.paused and not stage.live.past.ahead
 
@@ -179,9 +179,8 @@ class Session:
         """Update the statistics after a step of the plant."""
         self.stage.live.stepped()
         self.stage.steps += 1
-        if (
-            time.perf_counter() - self._last_work > 1 / _FPS
-        ):  # a plant that is late or runs fast does not wait between steps, so `work` is not called otherwise
+        # a plant that is late or runs fast does not wait between its steps, so nothing else calls `_work`
+        if time.perf_counter() - self._last_work > 1 / _FPS:
             self._work()
 
     def _work(self) -> None:
@@ -218,9 +217,9 @@ class Session:
             stage.live.expect_steps()
 
     def _calls_have_ended(self) -> bool:
-        """Show frames until no controller is being called; return whether the window is still open.
+        """Show frames until no call of a controller is in progress; return whether the window is still open.
 
-        The first calls of a new controller may capture graphs, and a capture must not run during other calls.
+        The first calls of a new controller may capture CUDA graphs, and no other controller may run during a capture.
         """
         while any(isinstance(each, WorldControl) and each.busy for each in self.stage.controllers.values()):
             if (window := self._window) is not None:

@@ -70,7 +70,7 @@ def obey(stage: Stage, command: protocol.Command) -> None:
 
 
 def _set_mode(stage: Stage, command: protocol.SetMode) -> None:
-    """Change the mode, the controller or the episode; after a playback, the world continues from the shown state."""
+    """Change the mode, the controller or the episode. After a playback, the world continues from the state it shows."""
     mode, controller = command.mode, command.controller
     if command.episode is not None:
         stage.playback.choose(command.episode)
@@ -83,7 +83,7 @@ def _set_mode(stage: Stage, command: protocol.SetMode) -> None:
 
 
 def _perturb(stage: Stage, command: protocol.Perturb) -> None:
-    """Push bodies of the shown world, or move bodies while paused."""
+    """Push bodies of the displayed world, or move bodies while paused."""
     given = {"mocap_pos": command.mocap_pos, "mocap_quat": command.mocap_quat}
     given["qpos"] = command.qpos if stage.paused else None
     parts = {name: value for name, value in given.items() if value is not None}

@@ -16,7 +16,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.validate import described
 
 MOST_SAMPLES = 24
-"""The maximum number of samples per plan for which the viewer draws paths."""
+"""The maximum number of a plan's samples whose paths the viewer draws."""
 
 
 class ControllerError(Exception):
@@ -86,7 +86,7 @@ class PolicyControl:
 
 
 class WorldControl:
-    """Calls a controller of one world; several runs of a control loop share the controller.
+    """Calls a controller of one world, in one control loop after another.
 
     Args:
         name: The controller's name in the viewer.
@@ -103,10 +103,10 @@ class WorldControl:
         self._reset_due = self._wanted = False
         self._seen: PlanView | None = None
         self.hidden: slice | None = None
-        """The part of the state that is hidden from the controller (set to zero): the forces of the user's push."""
+        """The slice of the state that controllers see as zero, because it holds the forces of the user's push."""
 
     def new_run(self) -> "ControlRun":
-        """Return the controller for a new run of a control loop; from now on, calls from earlier runs fail."""
+        """Return the controller for a new control loop; from now on, calls from earlier control loops fail."""
         self._run += 1
         return ControlRun(self, self._run)
 
@@ -132,11 +132,11 @@ class WorldControl:
         """Call the controller.
 
         Raises:
-            ControllerError: The controller raised an exception, or a newer run has begun.
+            ControllerError: The controller raised an exception, or a newer control loop has begun.
         """
-        with self._busy:  # wait until a call of an interrupted run has ended
+        with self._busy:  # an interrupted control loop may still be in a call
             if run != self._run:
-                raise ControllerError(self.name, RuntimeError("this run has ended"))
+                raise ControllerError(self.name, RuntimeError("its control loop has ended"))
             self._reset_now()
             if (hidden := self.hidden) is not None:
                 state = state.clone()
@@ -162,17 +162,14 @@ class WorldControl:
                 raise ControllerError(self.name, error) from error
 
     def look(self) -> PlanView | None:
-        """Return the plan that was copied since the last call of ``look``, if any.
-
-        The controller's next plan will be copied.
-        """
+        """Return the plan that was copied since the last call, if any, and request a copy of the next plan."""
         seen, self._seen = self._seen, None
         self._wanted = True
         return seen
 
 
 class ControlRun:
-    """Wraps a controller for one run of a control loop; has the controller's attributes and signature."""
+    """Wraps a controller for one control loop; has the controller's attributes and signature."""
 
     def __init__(self, control: WorldControl, number: int) -> None:
         self._control, self._number = control, number
@@ -196,7 +193,7 @@ def plan_view(controller: Any, state: torch.Tensor) -> PlanView | None:
     samples, best = torch.empty(len(actions), 0, actions.shape[1]), None
     sampled, returns = getattr(controller, "sampled", None), getattr(controller, "returns", None)
     if isinstance(sampled, torch.Tensor) and isinstance(returns, torch.Tensor) and sampled.shape[1] == len(returns):
-        # samples are independent, so the first samples represent all of them
+        # samples are drawn independently, so the first ones represent all
         shown = torch.arange(min(MOST_SAMPLES, len(returns)), device=returns.device)
         shown[0] = returns.argmax()
         samples = sampled.index_select(1, shown).to("cpu", torch.float32)
@@ -233,7 +230,7 @@ def controls(given: Mapping[str, Any], env: Env) -> dict[str, Control]:
 
 
 def _is_policy(controller: Any) -> bool:
-    """Whether a controller takes one argument, the observations."""
+    """Whether a controller is a policy: it takes one argument, the observations."""
     function: Any = acting(controller)
     if module := isinstance(function, torch.nn.Module):
         function = function.forward

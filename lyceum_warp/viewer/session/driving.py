@@ -14,8 +14,8 @@ from lyceum_warp.viewer.protocol import Arrow
 from lyceum_warp.viewer.session.live import Live
 
 _MEMORY = ("drawn_velocity", "heading_target", "heading_controlled", "standing", "command_timer")
-_NEVER = 1e9  # seconds until the task would choose a new command
-_HEIGHT, _SECONDS = 0.25, 0.4  # height of arrows above the base, m, and duration of the motion that an arrow shows, s
+_NEVER = 1e9  # seconds until the task chooses a new command
+_HEIGHT, _SECONDS = 0.25, 0.4  # height of arrows above the base, m; the time whose motion an arrow shows, s
 _COMMANDED, _MEASURED = (0.1, 0.35, 0.95, 1.0), (0.1, 0.85, 0.55, 1.0)
 
 
@@ -29,8 +29,8 @@ class Driving:
     def __init__(self, env: Env) -> None:
         self._parts, self._params = env.state_space.parts, env.task.params
         self.limits: tuple[float, float, float] | None = None
-        """The task's largest forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s); None without a
-        command."""
+        """The task's largest forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s); None if the task does
+        not have commands."""
         if all(name in self._parts for name in _MEMORY):
             _, _, forward, turn = np.asarray(self._params["stages"])[0]
             self.limits = float(forward), float(self._params["lateral_velocity"]), float(turn)
@@ -51,7 +51,7 @@ class Driving:
         return float(velocity[0]), float(velocity[1]), float(turn)
 
     def apply(self, live: Live) -> None:
-        """Write the user's command into the shown world, or let the task choose a command in the next step."""
+        """Write the user's command into the displayed world, or let the task choose a command in the next step."""
         if self.wanted is None:
             live.write(command_timer=np.zeros(1))
         else:

@@ -21,7 +21,7 @@ _COLOURS = (
     (0.30, 0.80, 0.80),
 )  # fmt: skip
 _PAST, _FUTURE, _PLAN = (0.90, 0.25, 0.20), (0.25, 0.40, 0.95), (0.25, 0.90, 0.45)
-_OPACITY, _FADE = 0.35, 0.95  # fade: the opacity of a state relative to the opacity of the state before it
+_OPACITY, _FADE = 0.35, 0.95  # _FADE: ratio of the opacities of successive states
 
 
 class FrameMaker:
@@ -30,7 +30,7 @@ class FrameMaker:
     Args:
         env: The worlds.
         curves: The number of curves.
-        driving: Reads and replaces the command of a walking robot.
+        driving: Reads the command of a walking robot.
     """
 
     def __init__(self, env: Env, curves: int, driving: Driving) -> None:
@@ -47,7 +47,7 @@ class FrameMaker:
         self.messages.append(text)
 
     def forget_seen(self, live: Live) -> None:
-        """Do not report ends of episodes and faults that have happened so far."""
+        """Report only ends of episodes and faults that happen from now on."""
         self._seen_end = self._seen_fault = float(live.made)
 
     def add_point(self, playback: Playback) -> None:
@@ -60,15 +60,14 @@ class FrameMaker:
     def of_worlds(
         self, live: Live, main: Live, traces: Traces | None, status: Callable[..., Status], *, paused: bool
     ) -> Frame:
-        """Make a frame of the shown world, and of other worlds as ghosts.
+        """Make a frame of the displayed world, and of other worlds as ghosts.
 
         Args:
-            live: The worlds.
-            main: All worlds. ``live`` is either ``main`` itself, or a plant, which is a copy of the shown world of
-                ``main``.
+            live: The worlds that are stepped: ``main``, or the plant, a copy of the displayed world of ``main``.
+            main: All worlds.
             traces: The paths of a planner's samples.
             status: A function that makes the complete status.
-            paused: Whether the session is paused. The frame then shows the present state; otherwise it may show the
+            paused: Whether the session is paused. If so, the frame shows the present state; otherwise it may show the
                 state at the time of the previous frame.
         """
         shown = _following(main.world, main.env.nworld, self.ghosts.worlds)
@@ -134,7 +133,7 @@ class FrameMaker:
         )  # fmt: skip
 
     def _report(self, rows: Rows, plant_of: int | None) -> None:
-        """Report the end of an episode, and faults; a plant is a copy of the world ``plant_of``."""
+        """Report the end of an episode, and faults; ``plant_of`` is the world that a plant copies, or None."""
         number, bits, returned, length, success = rows.end
         if number > self._seen_end:
             why = "success" if success else reasons(int(bits))
@@ -151,14 +150,14 @@ class FrameMaker:
         return [Ghost(self._pose(row), (*_COLOURS[i % len(_COLOURS)], _OPACITY)) for i, row in enumerate(states)]
 
     def _beside(self, states: Iterable[np.ndarray]) -> list[Ghost]:
-        """Place other worlds in a grid around the shown world."""
+        """Place other worlds in a grid around the displayed world."""
         cells = sorted(itertools.product(range(-3, 4), repeat=2), key=lambda cell: (max(map(abs, cell)), cell))[1:]
         step = self._grid_step
         return [Ghost(self._pose(row), None, (step * x, step * y)) for row, (x, y) in zip(states, cells, strict=False)]
 
     @functools.cached_property
     def _grid_step(self) -> float:
-        """The distance between the worlds of a grid, in m. The distance is slightly larger than the robot."""
+        """The distance between the worlds of a grid, in m: slightly more than the robot's size."""
         model = self._env.task.model
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
@@ -167,7 +166,7 @@ class FrameMaker:
         return 2.2 * float(far[moving].max(initial=0.1))
 
     def _burst(self, states: Iterable[np.ndarray], colour: tuple[float, float, float]) -> list[Ghost]:
-        """Make ghosts along a trajectory, beginning with the nearest to the present."""
+        """Make ghosts along a trajectory; the first states are the nearest to the present, and the most opaque."""
         return [Ghost(self._pose(row), (*colour, _OPACITY * _FADE ** (i + 1))) for i, row in enumerate(states)]
 
     def _pose(self, state: np.ndarray) -> Any:
@@ -177,7 +176,7 @@ class FrameMaker:
         return state[: mujoco.mj_stateSize(self._env.task.model, mujoco.mjtState.mjSTATE_INTEGRATION)].copy()
 
     def _model_fields(self, state: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the model fields of a state that differ from the model."""
+        """Return the model fields in a state whose values differ from the model's."""
         found = {}
         for field in self._env.task.dynamics:
             owner = self._env.task.model if hasattr(self._env.task.model, field.name) else self._env.task.model.opt

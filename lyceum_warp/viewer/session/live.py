@@ -1,6 +1,6 @@
 """Step the worlds of a session, keep their history, and copy the data of a frame to the host.
 
-The history, the returns and the points of the curves stay on the worlds' device. On a GPU, no step waits for the
+The history, the returns and the points of the curves stay on the worlds' device. On a GPU, steps do not wait for the
 device, and the data of a frame are copied to the host asynchronously.
 """
 
@@ -17,15 +17,15 @@ from lyceum_warp.viewer.protocol import Pose
 HISTORY_BYTES = 240 * 2**20
 """The memory for the history of all worlds, in bytes."""
 PLANT_HISTORY_BYTES = 16 * 2**20
-"""The memory for the history of a plant, in bytes."""
+"""The memory for the history of a plant (see ``plant.py``), in bytes."""
 HISTORY_STEPS = 2000
 """The maximum number of steps in the history."""
 
-_CURVE_ROWS = 512  # curve points between two frames; further points overwrite the oldest
+_CURVE_ROWS = 512  # most curve points between two frames; further points overwrite the oldest
 
 
 class Past:
-    """A ring buffer of states: the states of all worlds before each of the most recent steps.
+    """A ring buffer that holds the states of all worlds before each of the most recent steps.
 
     If the memory is too small for two states of all worlds, the buffer stays empty.
 
@@ -75,17 +75,17 @@ class Rows:
     """The data of a frame, copied to the host."""
 
     worlds: tuple[int, ...]
-    """The indices of the worlds; the shown world comes first."""
+    """The indices of the worlds; the displayed world comes first."""
     states: np.ndarray
     """The states of the worlds, (worlds, state_space.size) float64."""
     back: np.ndarray
-    """Earlier states of the shown world, the latest first, (burst, state_space.size) float64."""
+    """Earlier states of the displayed world, the latest first, (burst, state_space.size) float64."""
     episode_return: float
-    """The return of the shown world's episode so far."""
+    """The return of the displayed world's episode so far."""
     end: tuple[float, ...]
-    """The last end of an episode in the shown world: the step's number, bits of ``Done``, return, length, success."""
+    """The last episode that ended in the displayed world: its last step, bits of ``Done``, return, length, success."""
     fault: tuple[float, ...]
-    """The last fault in any world: the step's number, bits of ``Done``, the world, and the number of faults so far."""
+    """The last fault in any world: its step, bits of ``Done``, the world, and the number of faults so far."""
     points: np.ndarray
     """New points of the curves, (points, 2 + curves) float64."""
 
@@ -110,7 +110,7 @@ class Live:
         """Whether the data of a frame are copied to the host asynchronously."""
         self.returns = torch.zeros(n, dtype=torch.float64, device=device)
         """The return of each world's episode so far, (nworld,)."""
-        self._clock = 0  # steps since the session began, without steps that were taken back
+        self._clock = 0  # steps since the session began, minus the steps that were taken back
         self._ends = torch.zeros(n, 5, dtype=torch.float64, device=device)
         self._fault = torch.zeros(4, dtype=torch.float64, device=device)
         self._ended, self._reward = torch.zeros(n, dtype=torch.bool, device=device), torch.zeros_like(env.reward)
@@ -154,13 +154,13 @@ class Live:
         self._after_step()
 
     def expect_steps(self) -> None:
-        """Prepare for steps that other code makes directly on ``env``; that code calls ``stepped`` after each step."""
+        """Prepare for steps that a control loop makes on ``env``; ``stepped`` must be called after each of them."""
         self.past.drop_ahead()
         self.env.get_state(out=self._state)
         self._before_step()
 
     def stepped(self) -> None:
-        """Update the statistics after a step that other code made."""
+        """Update the history and the statistics after a step that a control loop made."""
         self._keep(self._state)
         self._after_step()
         self.env.get_state(out=self._state)
@@ -186,7 +186,7 @@ class Live:
             ended.logical_and_(~self._over)
             reward.masked_fill_(self._over, 0.0)
         self.returns.add_(reward)
-        # on a GPU, do not read the mask, because reading would wait for the device
+        # on a GPU, do not read the mask, because reading it waits for the device
         if self.asynchronous or ended.any():
             self._note_ends(ended)
         values = [
@@ -199,7 +199,7 @@ class Live:
         self._times.append(self._clock * env.timestep)
 
     def _note_ends(self, ended: torch.Tensor) -> None:
-        """Store ends of episodes and faults, without waiting for the device."""
+        """Store which episodes ended and which worlds had faults, without waiting for the device."""
         env, reason = self.env, self.env.done_reason
         made = torch.full_like(self.returns, self.made)
         end = torch.stack([made, reason.double(), self.returns, self._length + 1.0, env.success.double()], dim=1)
@@ -222,7 +222,7 @@ class Live:
             Number of steps that were taken back, at most ``past.behind``.
         """
         past = self.past
-        if not past.ahead and past.behind:  # the history does not contain the current state yet
+        if not past.ahead and past.behind:  # the current state is not in the history yet
             past.put(self.env.get_state(out=self._state), self.returns, self.pushed)
         steps = min(steps, past.behind)
         if steps > 0:
@@ -248,7 +248,7 @@ class Live:
     # user requests
 
     def reset(self, *, random: bool) -> None:
-        """Start a new episode of the shown world."""
+        """Start a new episode of the displayed world."""
         mask = self._number == self.world
         self.past.drop_ahead()
         if random:
@@ -265,7 +265,7 @@ class Live:
         Args:
             state: (state_space.size,) float64, on any device.
             new_episode: Whether the world's return starts from 0.
-            world: The index of the world; by default the shown world.
+            world: The index of the world; by default the displayed world.
         """
         world = self.world if world is None else world
         mask = self._number == world
@@ -277,7 +277,7 @@ class Live:
             self.returns.masked_fill_(mask, 0.0)
 
     def push(self, forces: np.ndarray) -> None:
-        """Push bodies of the shown world, until ``end_push``.
+        """Push bodies of the displayed world, until ``end_push``.
 
         Args:
             forces: Forces (N) and torques (Nm) on all bodies in world coordinates, (nbody, 6).
@@ -296,11 +296,11 @@ class Live:
             self.set_row(state, world=world)
 
     def row(self) -> torch.Tensor:
-        """Return the state of the shown world, (state_space.size,) float64, on the world's device."""
+        """Return the state of the displayed world, (state_space.size,) float64, on the world's device."""
         return self.env.get_state()[self.world]
 
     def write(self, **parts: np.ndarray) -> None:
-        """Change parts of the shown world's state, by their names in ``env.state_space``."""
+        """Change parts of the displayed world's state, by their names in ``env.state_space``."""
         state = self.row()
         for name, value in parts.items():
             where = self.env.state_space.parts[name]
@@ -310,7 +310,7 @@ class Live:
     # worlds to show
 
     def choose(self, choice: int | str) -> int:
-        """Return the index of the chosen world; "best" and "worst" wait for the device.
+        """Return the index of the chosen world. "best" and "worst" wait for the device.
 
         Args:
             choice: An index; "next" or "previous"; "best" or "worst" by the return of the episode so far.
@@ -327,8 +327,8 @@ class Live:
         """Start to copy the data of a frame to the host, unless a copy is already in progress.
 
         Args:
-            worlds: The worlds to copy in addition to the shown world.
-            burst: The number of earlier states of the shown world.
+            worlds: The worlds to copy in addition to the displayed world.
+            burst: The number of earlier states of the displayed world.
         """
         if self._reading is not None:
             return

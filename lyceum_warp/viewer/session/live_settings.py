@@ -7,7 +7,7 @@ from lyceum_warp.algos.planner import Planner
 from lyceum_warp.env import Env
 
 _SETTINGS = ("noise", "temperature", "horizon", "samples")
-_OF_THE_PLANNER = ("nworld", "autoreset", "horizon", "seed", "first_world")  # a planner sets these options itself
+_OF_THE_PLANNER = ("nworld", "autoreset", "horizon", "seed", "first_world")  # options that a planner sets itself
 
 Numbers = tuple[tuple[str, float], ...]
 """Names and values."""
@@ -28,7 +28,7 @@ def task_numbers(env: Env) -> Numbers:
 
 
 def rebuilt_planner(planner: Planner, name: str, value: float) -> Planner:
-    """Make a planner with another value of a setting, because a planner's graphs contain its settings.
+    """Make a planner with another value of a setting. The planner is new because its CUDA graphs contain the settings.
 
     Raises:
         ValueError: The value is not valid.

@@ -1,4 +1,4 @@
-"""Run a controller of one world in real time, in a copy of the shown world."""
+"""Run a controller of one world in real time, in a copy of the displayed world."""
 
 import threading
 import time
@@ -13,17 +13,17 @@ from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
 POLL = 0.005
 """The seconds between two polls of the window's commands."""
 
-_RESERVE = 0.0015  # no other work starts in the last seconds before a step
-_PART = 10_000  # maximum steps of a run, because a run stores all its states
-_WARM_UP = 3  # number of first calls during which no other work runs, because they may capture graphs
+_RESERVE = 0.0015  # seconds before a step in which no other work may start
+_PART = 10_000  # maximum steps of a control loop, which stores all its states
+_WARM_UP = 3  # no other work runs during this many first calls, because they may capture CUDA graphs
 
 
 class InterruptedByCommand(BaseException):
-    """Raised to end a run of the plant, because a command of the user needs the plant's state."""
+    """Raised to stop the plant, because a command of the user needs the plant's state."""
 
 
 def make_plant(main: Live) -> Live:
-    """Make the plant, a single world on the CPU, so that its steps do not wait for a planner's GPU."""
+    """Make the plant: a single world on the CPU, so that its steps do not wait for the GPU of a planner."""
     env, plant = main.env, main
     if env.nworld > 1 or env.autoreset or env.device.is_cuda:
         options = options_for_plant(env.options.engine, env.device)
@@ -50,7 +50,7 @@ def run_plant(
         control: Its controller.
         speed: Simulated seconds per second.
         work: A function that is called while the plant waits for its next step; it may raise ``InterruptedByCommand``
-            to end the run.
+            to stop the plant.
         on_step: A function that is called after each step.
 
     Raises:
@@ -67,11 +67,11 @@ def run_plant(
     except ValueError as error:  # from invalid actions
         raise ControllerError(control.name, error) from error
     finally:
-        control.new_run()  # from now on, calls from this run fail
+        control.new_run()  # calls from this control loop now fail
 
 
 class _WorkingClock(Clock):
-    """A wall clock that calls ``work`` while the plant waits.
+    """A wall clock that calls ``work`` during the waiting times.
 
     Args:
         work: A function that is called while the plant waits for its next step.

@@ -56,7 +56,7 @@ def episodes_of(given: Any, env: Env) -> list[Episode]:
     if isinstance(given, str | Path | Trajectory | torch.Tensor):
         given = [given]
     if not isinstance(given, Sequence):
-        raise ValueError(f"episodes must be trajectories, files of them or tensors of states, not {described(given)}")
+        raise ValueError(f"episodes must be trajectories, their files or tensors of states, not {described(given)}")
     return [_episode(None, each, env, i) for i, each in enumerate(given)]
 
 
@@ -85,7 +85,7 @@ def _of_trajectory(name: str, trajectory: Trajectory, env: Env) -> Episode:
 
 
 class Playback:
-    """Holds episodes, and the shown step of one episode."""
+    """Holds episodes, and the displayed step of one episode."""
 
     def __init__(self, episodes: Sequence[Episode]) -> None:
         self.episodes = list(episodes)
@@ -93,17 +93,17 @@ class Playback:
 
     @property
     def episode(self) -> Episode:
-        """The shown episode."""
+        """The displayed episode."""
         return self.episodes[self.index]
 
     @property
     def state(self) -> np.ndarray:
-        """The shown state, (state_space.size,) float64."""
+        """The displayed state, (state_space.size,) float64."""
         return self.episode.states[self.step]
 
     @property
     def next_step(self) -> int:
-        """Return the next step in the playback's direction; at its end the episode is repeated."""
+        """The next step in the direction of the playback; the last step is followed by the first again."""
         return (self.step + (-1 if self.backwards else 1)) % (self.episode.steps + 1)
 
     def choose(self, index: int) -> None:
@@ -116,7 +116,7 @@ class Playback:
         self.step = min(max(step, 0), self.episode.steps)
 
     def around(self, count: int) -> list[int]:
-        """Return at most ``count`` evenly spaced steps of the episode, without the shown step."""
+        """Return at most ``count`` evenly spaced steps of the episode, except the displayed step."""
         last = self.episode.steps
         steps = {round(i * last / max(count - 1, 1)) for i in range(count)}
         return sorted(steps - {self.step})

@@ -31,8 +31,8 @@ _OLD = 1.0  # seconds after which traces disappear
 class Stage:
     """Holds the worlds, controllers and episodes of a session.
 
-    Policies act in all worlds. A controller of one world, such as a planner, acts in a copy of the shown world, called
-    the plant. The other worlds wait. ``lw.view`` explains the arguments.
+    Policies act in all worlds. A controller of one world, such as a planner, acts in a copy of the displayed world,
+    called the plant, while the other worlds wait. ``lw.view`` explains the arguments.
 
     Raises:
         ValueError: An argument is invalid.
@@ -86,7 +86,7 @@ class Stage:
 
     @property
     def live(self) -> Live:
-        """The stepped worlds: the plant if a controller of one world is in use, otherwise the environment."""
+        """The worlds that are stepped: the plant if a controller of one world is in use, otherwise all worlds."""
         return self._plant if self._plant is not None and isinstance(self.control, WorldControl) else self.main
 
     @property
@@ -102,7 +102,7 @@ class Stage:
     # steps
 
     def advance(self, steps: int = 1) -> None:
-        """Make steps, without waiting for the clock.
+        """Make steps at once, not in real time.
 
         Raises:
             ControllerError: The controller raised an exception.
@@ -142,7 +142,7 @@ class Stage:
             self.reset(random=True)
 
     def reset(self, *, random: bool) -> None:
-        """Start a new episode of the shown world and its controller."""
+        """Start a new episode of the displayed world and its controller."""
         self.live.reset(random=random)
         self.reset_controller()
 
@@ -165,7 +165,7 @@ class Stage:
         self.frames.add_point(self.playback)
 
     def end_old_push(self) -> None:
-        """End a push that was active in a restored past state, before the worlds continue from this state."""
+        """End the push of a past state that was restored, before the worlds continue from this state."""
         live = self.live
         if live.pushed is not None and not self.dragging and not live.past.ahead:
             live.end_push()
@@ -177,7 +177,7 @@ class Stage:
     # which worlds
 
     def select(self, mode: Mode, controller: str | None) -> None:
-        """Change the mode and the controller. The shown world keeps its state."""
+        """Change the mode and the controller. The displayed world keeps its state."""
         before, chosen = self.live, (self.mode, self.controller)
         self.mode, self.controller = mode, controller
         if self.live is not before:
@@ -199,7 +199,7 @@ class Stage:
             self._threads[current.name] = TraceThread(TraceRollouts(current.controller, self.live.env))
 
     def set_number(self, of: str, name: str, value: float) -> None:
-        """Rebuild the planner in use with another value of a setting, or change a task parameter in all worlds.
+        """Change a setting of the planner in use, which is made anew, or a task parameter in all worlds.
 
         Raises:
             ValueError: The value is not valid.
@@ -220,7 +220,7 @@ class Stage:
         self._trace()
 
     def show_world(self, world: int) -> None:
-        """Show another world. The user stops pushing and driving the previous world."""
+        """Show another world; end the user's push and driving in the previous world."""
         before = self.live
         before.end_push()
         if self.driving.wanted is not None:
@@ -236,13 +236,13 @@ class Stage:
         self.frames.forget_seen(self.live)
 
     def go_on_from(self, state: torch.Tensor, live: Live, *, new_episode: bool = False) -> None:
-        """Set the state of the shown world, and let its episode continue."""
+        """Set the state of the displayed world, even if an episode has ended in this state; the episode continues."""
         state = state.clone()
         state[self.env.state_space.parts["done_reason"]] = 0.0
         live.set_row(state, new_episode=new_episode)
 
     def _transfer(self, before: Live, after: Live) -> None:
-        """Transfer the shown world's state to another environment."""
+        """Copy the displayed world's state, push and return from one environment to another."""
         self.go_on_from(before.row(), after)
         if before.pushed == before.world:
             after.pushed = after.world
@@ -262,7 +262,7 @@ class Stage:
         frame = self.frames.of_worlds(self.live, self.main, self._traces(), self._status, paused=self.paused)
         wanted, command, live = self.driving.wanted, frame.status.command, self.live
         if wanted and command and not live.past.ahead and not np.allclose(command, wanted, atol=1e-6):
-            self.driving.apply(live)  # after a reset or a change of world, the command differs from the user's
+            self.driving.apply(live)  # a reset or a change of world has replaced the user's command
             live.expect_steps()
         return frame
 

@@ -1,8 +1,8 @@
 """Roll out a planner's plan and samples again in a thread, to get their paths.
 
 A planner does not store positions. This module rolls out the actions of some samples from the plan's initial state, in
-worlds with the planner's task, model and time step. If the task is random during an episode, the paths differ from the
-planner's, because these worlds draw other random numbers.
+worlds with the planner's task, model and time step. If the task draws random numbers during an episode, the paths
+differ from the planner's, because these worlds draw other numbers.
 """
 
 import dataclasses
@@ -22,12 +22,12 @@ from lyceum_warp.viewer.session.drivers import MOST_SAMPLES, PlanView
 from lyceum_warp.viewer.session.live import pose
 
 SHARE = 0.15
-"""The maximum share of a core for the thread, which sleeps t / SHARE after t seconds of CPU time."""
+"""The share of a core that the thread may use: after t seconds of CPU time, it sleeps for t / SHARE seconds."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TracePoint:
-    """The point of a robot whose paths are drawn."""
+    """The point of a robot whose path is drawn."""
 
     field: str
     """The field with the point's position: "site_xpos", "xpos", "xipos" or "subtree_com"."""
@@ -35,7 +35,7 @@ class TracePoint:
 
 
 def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
-    """Choose the point of a robot whose paths are drawn.
+    """Choose the point of a robot whose path is drawn.
 
     For a robot with an unactuated base, such as a hopper or a humanoid, the default is the centre of mass. For an arm,
     the default is the last body in the longest chain of actuated bodies: the body's first site, or the body's centre of
@@ -132,7 +132,7 @@ class TraceRollouts:
         """Roll out a plan."""
         env, count = self.env, view.samples.shape[1]
         self._put(view.state)
-        actions = view.actions[:, None].repeat(1, MOST_SAMPLES + 1, 1)  # all worlds without a sample follow the plan
+        actions = view.actions[:, None].repeat(1, MOST_SAMPLES + 1, 1)  # the worlds without a sample follow the plan
         actions[:, :count] = view.samples
         actions = actions.to(env.action.device)
         env.set_state(self._states, check=False)
@@ -146,7 +146,7 @@ class TraceRollouts:
         return Traces(paths, view.best, ended, time.perf_counter())
 
     def _put(self, state: torch.Tensor) -> None:
-        """Copy the planner's state into every world; additional fields of these worlds stay unchanged."""
+        """Copy the planner's state into every world; parts of the state that the planner lacks stay unchanged."""
         parts = self.env.state_space.parts
         state = state.to(self._states.device)
         for name, part in self._parts.items():
@@ -162,7 +162,7 @@ class TraceThread:
     """A thread that rolls out the newest plan, and sleeps between rollouts.
 
     Args:
-        rollouts: Object that makes the rollouts. After this call, only the thread may use it.
+        rollouts: Makes the rollouts. From now on, only the thread may use this object.
     """
 
     def __init__(self, rollouts: TraceRollouts) -> None:
@@ -205,7 +205,7 @@ class TraceThread:
                 view, self._view = self._view, None
                 if view is None:
                     continue
-                begun = time.thread_time()  # CPU time, because on a busy machine the wall clock would count other work
+                begun = time.thread_time()  # CPU time; on a busy machine, wall time would include other programs
                 with self._working:
                     self._newest = self._rollouts(view)
                 self._rest((time.thread_time() - begun) / SHARE)

@@ -1,4 +1,4 @@
-"""Make videos and pictures of the viewer in subprocesses, and pages that play in a browser."""
+"""Make videos, pictures and HTML pages of what the viewer shows; subprocesses render the videos and pictures."""
 
 import contextlib
 import datetime
@@ -25,11 +25,11 @@ FPS = 30
 _PICTURE_SIZE = (1280, 960)
 _WIDTH = 2.0  # of lines, pixels
 _MOST_WAITING = 4 * FPS  # maximum number of waiting poses, because the rendering subprocess starts slowly
-_PATIENCE = 120.0  # seconds to finish videos when the viewer ends, unless a signal discards them
+_PATIENCE = 120.0  # seconds for which the viewer finishes videos when it ends, unless a signal discards them
 
 
 class VideoTaker:
-    """Makes one video at a time, while earlier videos may still be in progress.
+    """Records one video at a time; earlier videos may still be rendered in the background.
 
     Args:
         model: The model.
@@ -168,7 +168,7 @@ class VideoTaker:
                         thread.join(end - time.monotonic())
             finally:
                 for video in self._drawing:
-                    video.cancel()  # cancelling has no effect on a complete video
+                    video.cancel()  # no effect on a complete video
                 for line in self.completed():
                     show(line)
 
@@ -197,7 +197,7 @@ def _camera(values: dict[str, Any]) -> mujoco.MjvCamera:
 
 
 def _completed(video: Recorder) -> str:
-    """Format a line about an ended video."""
+    """Return a line about a video that is complete or has failed."""
     try:
         line = f"video: {video.close()}"
     except (NoVideoError, OSError) as error:

@@ -43,7 +43,7 @@ class Window:
     guard. The window process ends when this process ends, even by SIGKILL. Ctrl-C does not reach the window process.
 
     Args:
-        scene: The part of the display that never changes.
+        scene: What does not change during the session.
         host: The address on which the page is served; see ``lw.view``.
         port: The port of the page; see ``lw.view``.
 
@@ -72,7 +72,7 @@ class Window:
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
                 stderr=self._log,
-                process_group=0,  # a separate process group, because a terminal sends Ctrl-C to its whole group
+                process_group=0,  # its own process group, because a terminal sends Ctrl-C to a whole group
             )
         self.error: str | None = None
         """The error that ended the window, if there was one."""
@@ -102,7 +102,7 @@ class Window:
     def show(self, frame: Frame) -> None:
         """Send a frame, without waiting for the window.
 
-        A previous frame that has not been sent is skipped, and the new frame takes over its curve points and messages.
+        If the previous frame has not been sent yet, it is skipped; its curve points and messages move to the new frame.
         """
         with self._lock:
             self._pending = protocol.latest(self._pending, frame)
@@ -127,7 +127,7 @@ class Window:
     def close(self) -> None:
         """End the window process. A second call does nothing."""
         self._end()
-        with contextlib.suppress(OSError):  # shutting down the socket wakes both threads and the process
+        with contextlib.suppress(OSError):  # the shutdown wakes both threads and the window process
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
         try:
@@ -152,7 +152,7 @@ class Window:
         self._taken.release()
 
     def _last_words(self) -> str:
-        """Return the signal that ended the process, or the process's last line of output."""
+        """Say which signal ended the process, or return the process's last line of output."""
         code = self._process.returncode
         if code is None:
             return "its process closed the connection"

@@ -15,26 +15,26 @@ from lyceum_warp.viewer.window.studio import imgui, inputs, ux
 SPEEDS = tuple(2.0**power for power in range(-4, 5))
 """The available speeds, in simulated seconds per second."""
 MANY_STEPS = 50
-"""The number of steps by which an arrow key with Shift moves."""
+"""The number of steps that an arrow key with Shift makes."""
 
 _DRIVING = tuple(getattr(imgui.Key, name) for name in "WSADQE")  # forward, back, left, right, turn left, turn right
 
 KEY_NAMES = {"Right": "RightArrow", "Left": "LeftArrow", "Up": "UpArrow", "Down": "DownArrow"}
-"""Studio's names of keys, by the panel's names, where the two differ."""
+"""Maps the panel's name of a key to studio's name, for keys whose names differ."""
 
 
 class Actions:
     """Stores the user's choices, and sends the corresponding commands.
 
     Args:
-        scene: The part of the display that never changes.
+        scene: What does not change during the session.
         do: A function that sends a command to the session.
     """
 
     def __init__(self, scene: Scene, do: Callable[[Command], None]) -> None:
         self.scene, self.do = scene, do
         self.frame: Frame | None = None
-        """The shown frame; None before the first frame."""
+        """The displayed frame; None before the first frame."""
         self.viewer: Any
         """Studio's viewer, which is set when the window starts."""
         self.cameras: ViewCameras
@@ -43,7 +43,7 @@ class Actions:
         """The titles of the open windows."""
         self.messages: deque[str] = deque(maxlen=200)
         self.scroll_down = False
-        """Whether a message has not been drawn yet."""
+        """Whether the list of messages must scroll down to a new message."""
         self._keys = key_table()
         self._steering = (0.0, 0.0, 0.0)  # the last command from keys
 
@@ -161,7 +161,7 @@ class Key:
 
 
 def key_table() -> list[Key]:
-    """The keys of the panel. Browsers pass all keys of the panel to the page."""
+    """The keys of the panel; browsers pass all of them on to the page."""
     return [
         Key("F1", "show or hide this table", lambda p: p.toggle_window("keys")),
         Key("F2", "messages", lambda p: p.toggle_window("messages")),

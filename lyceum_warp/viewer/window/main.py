@@ -22,7 +22,7 @@ from lyceum_warp.viewer.window.sockets import private_socket
 IDLE_TIME = 0.25
 """The seconds between two frames while no page is open."""
 NICE = 5
-"""The niceness of the window process, because the session's planner may need every core."""
+"""The niceness of the window process: a low priority, because the session's planner may need every core."""
 END_TIME = 3.0
 """The maximum time that studio may take to end, in seconds."""
 
@@ -46,7 +46,7 @@ class WindowEnd:
             self._connection.send(reply)
 
     def take(self) -> Frame | None:
-        """Return the latest frame, unless it was returned before."""
+        """Return the latest frame; None if it was already returned."""
         self._looked = time.monotonic()
         with self._lock:
             frame, self._frame = self._frame, None
@@ -72,7 +72,7 @@ class WindowEnd:
 
 def main(descriptor: int) -> None:
     """Draw until the session or the user ends the window; ``descriptor`` is the connection to the session."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session handles Ctrl-C, and ends the window
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session handles Ctrl-C, and then ends this process
     if hasattr(os, "nice"):  # not on Windows
         os.nice(NICE)
     connection = Connection(descriptor)

@@ -22,10 +22,10 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
     """A plugin of studio that shows frames and sends commands.
 
     Args:
-        scene: The part of the display that never changes.
+        scene: What does not change during the session.
         model: The scene's model.
         send: A function that sends a message to the session.
-        newest: A function that returns the latest frame if it was not shown yet.
+        newest: A function that returns the latest frame; None if it was already returned.
         screen: The screen that runs the plugin.
         opened: The message that is sent to the session when the window is open.
         offer: A function that offers a file for download.
@@ -97,7 +97,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
             self._offer(file)
         if frame.messages:
             self.actions.say(*frame.messages)
-        # keep the last finite pose; the session reports other states as faults
+        # if the state is not finite, keep the previous pose; the session reports the fault
         if np.isfinite(frame.state).all():
             mujoco.mj_setState(model, data, frame.state, mujoco.mjtState.mjSTATE_INTEGRATION)
             mujoco.mj_forward(model, data)

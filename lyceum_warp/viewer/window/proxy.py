@@ -42,7 +42,7 @@ HEAD_SECONDS = 10.0
 WRITE_SECONDS = 60.0
 """The timeout for a client that does not read, in seconds."""
 UNCHECKED = 128
-"""The maximum number of connections that have not sent the secret; the oldest connections are closed first."""
+"""The maximum number of connections that have not sent the secret; above it, the oldest ones are closed."""
 MESSAGE_BYTES = 2**20
 """The maximum size of a WebSocket message from a browser, in bytes."""
 QUIET_SECONDS = 2.0
@@ -54,8 +54,8 @@ PROTECTION = {
     "Content-Security-Policy": "frame-ancestors http://localhost:* http://127.0.0.1:*",  # notebooks
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Embedder-Policy": "require-corp",  # browsers require this for memory that threads share
-    "Document-Isolation-Policy": "isolate-and-require-corp",  # Chromium requires this in notebooks
+    "Cross-Origin-Embedder-Policy": "require-corp",  # browsers require this for SharedArrayBuffer
+    "Document-Isolation-Policy": "isolate-and-require-corp",  # the same in notebooks, for Chromium
 }
 """The headers of every response. These headers stop other sites from reading or embedding the response, and from
 getting its address. Pages of this machine that know the token, such as notebooks, may embed a response."""
@@ -148,7 +148,7 @@ class Proxy:
         self._token, self._cookie, self._path = (secrets.token_urlsafe(32) for _ in range(3))
         machine = socket.gethostname().lower()
         self._names = {"localhost", machine, machine.partition(".")[0], host.lower()}
-        ssh = os.environ.get("SSH_CONNECTION", "").split()  # addresses and ports of the client and of this machine
+        ssh = os.environ.get("SSH_CONNECTION", "").split()  # the client's address and port, then this machine's
         self._ssh = (ssh[2], ssh[3]) if len(ssh) == 4 else (socket.gethostname(), "22")
         everywhere = any(address.is_unspecified for address in addresses)
         self._host = "127.0.0.1" if self.local or everywhere else host

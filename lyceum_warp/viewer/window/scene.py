@@ -18,13 +18,13 @@ MAX_LINES = 160
 """The maximum number of lines of all traces. A limit is necessary, because all geoms are sent to the browser 60 times a
 second, with about 600 bytes each."""
 FEWEST_SEGMENTS = 4
-"""The minimum number of lines to which a trace is reduced."""
+"""The minimum number of lines of a trace; if traces have too many lines with this number, some are not drawn."""
 VISIBLE = (
     "geom_size", "geom_pos", "geom_quat", "geom_rgba", "geom_matid", "geom_dataid", "geom_group", "site_", "body_pos",
     "body_quat", "jnt_pos", "jnt_axis", "qpos0", "mat_", "tendon_rgba", "tendon_width", "cam_", "light_", "hfield_",
     "mesh_", "skin_", "flex_",
 )  # fmt: skip
-"""The prefixes of the model fields that change the drawing."""
+"""The prefixes of the model fields that change how the model is drawn."""
 
 
 # ghosts and traces
@@ -42,7 +42,7 @@ class ExtraGeoms:
         self.model, self.limit = model, limit
         self._data = mujoco.MjData(model)
         self._options, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
-        # allocate twice the model's geoms and sites: for the shown world, and for a last ghost that exceeds the limit
+        # room for the geoms and sites of two more worlds: the displayed one, and the ghost that exceeds the limit
         self._scene = mujoco.MjvScene(model, limit + 2 * (model.ngeom + model.nsite) + 10)
 
     def draw(
@@ -57,7 +57,7 @@ class ExtraGeoms:
         """Make the geoms of a frame; the geoms are valid until the next frame.
 
         Args:
-            pose: The pose of the shown world.
+            pose: The pose of the displayed world.
             ghosts: Further poses.
             traces: The paths of samples, (samples, points, 3), in metres.
             best: The index of the best sample.
@@ -91,8 +91,10 @@ class ExtraGeoms:
             same = (near.max(1, initial=0.0) < 1e-3) & (turned.max(1, initial=0.0) < 1e-2)
             for geom in scene.geoms[begin : scene.ngeom]:
                 if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and same[geom.objid] and not beside:
-                    continue  # two surfaces in the same place would flicker
-                geom.size *= SHRUNK  # a capsule that is only rotated about its own axis would also flicker
+                    continue  # surfaces that coincide would flicker
+                geom.size *= (
+                    SHRUNK  # the surfaces may coincide even so, as those of a capsule that has turned about its axis
+                )
                 geom.pos[:2] += ghost.shift
                 if colour is not None:
                     geom.rgba = colour
@@ -143,7 +145,7 @@ def _arrows(arrows: Sequence[Arrow]) -> list[mujoco.MjvGeom]:
     return geoms
 
 
-# the model of the shown world
+# the model with the values of the displayed world
 
 
 class ModelValues:
@@ -192,7 +194,7 @@ class ViewCameras:
 
     Args:
         viewer: Studio's viewer.
-        values: The shown model.
+        values: The model with the displayed world's values.
     """
 
     def __init__(self, viewer: Any, values: ModelValues) -> None:

@@ -20,7 +20,7 @@ class _PrivateSocket(socket.socket):
         connection, address = super().accept()
         if not _is_own(connection):
             connection.close()
-            raise ConnectionAbortedError("another process tried to connect")  # event loops ignore this error
+            raise ConnectionAbortedError("another process tried to connect")  # a type of error that event loops ignore
         return connection, address
 
 
@@ -43,7 +43,7 @@ def _is_own(connection: socket.socket) -> bool:
     except OSError:  # the peer has closed the connection
         return False
     for name in os.listdir("/proc/self/fd" if os.path.isdir("/proc/self/fd") else "/dev/fd"):
-        with contextlib.suppress(OSError):  # the connection may be closed by now, or the socket not connected
+        with contextlib.suppress(OSError):  # the descriptor may be closed by now, or the socket may not be connected
             if stat.S_ISSOCK(os.fstat(int(name)).st_mode):
                 peer = socket.socket(fileno=int(name))
                 try:

@@ -11,12 +11,12 @@ from lyceum_warp.viewer.window.actions import MANY_STEPS, OTHER_KEYS, SPEEDS, Ac
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS, PLOT_SECONDS = 200, 20.0
-"""The maximum number of points of a plotted curve, and the length of a curve in seconds. Points are limited, because
-every frame sends all points to the browser."""
+"""The maximum number of points of a plotted curve, and the time in seconds that a curve covers. Points are limited,
+because every frame sends all points to the browser."""
 NARROW = 1100
 """The width in pixels below which the initial windows would cover the robot, for example in a notebook."""
 FEW_CURVES = 2
-"""The curves that are shown first: the reward and the evaluation."""
+"""The curves that are displayed at the start: the reward and the evaluation."""
 WINDOWS = ("messages", "curves", "view", "keys")
 
 
@@ -75,7 +75,7 @@ class Windows:
             content()
         if first:
             self._folded = not unfolded
-            if not still_open:  # studio draws a cross in every window
+            if not still_open:  # studio draws a close button in every window
                 imgui.SetWindowCollapsed(True)
         imgui.End()
         if not first and not still_open:
