@@ -18,8 +18,8 @@ def control_plot(episodes: Sequence[Trajectory], out: str | Path, *, title: str 
     deadline.
 
     Args:
-        episodes: The episodes, at least one, all of the same task. The deadline is the control period of the first
-            episode.
+        episodes: The episodes, at least one, all of the same task. The control period of the first episode is the
+            deadline.
         out: The PNG file.
         title: The title of the plot; by default task, engine and mode.
 

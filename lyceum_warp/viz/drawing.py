@@ -1,4 +1,4 @@
-"""Control the subprocess that renders a video or pictures."""
+"""Start and control the subprocess that renders a video or pictures."""
 
 import contextlib
 import importlib.util
@@ -22,7 +22,7 @@ from lyceum_warp.viz import EXTRA, NoVideoError
 from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
 from lyceum_warp.viz.render import CANNOT_DRAW, PICTURE, VIDEO, Shot
 
-_PATIENCE = 10.0  # seconds until the subprocess is killed
+_PATIENCE = 10.0  # seconds for which the subprocess may end before it is killed
 
 
 def check_video() -> None:
@@ -43,7 +43,7 @@ def libraries() -> list[str]:
 
 
 class DrawingProcess:
-    """A context manager for a subprocess that renders poses, with the first graphics library that works.
+    """A context manager for a subprocess that renders poses; it uses the first graphics library that works.
 
     Args:
         model: The model.
@@ -57,7 +57,7 @@ class DrawingProcess:
     """
 
     product = "the drawing"
-    """What the subprocess makes, as error messages name it."""
+    """The name of the result in error messages."""
 
     def __init__(
         self, model: mujoco.MjModel, *, camera: CameraChoice, size: tuple[int, int], fps: float | None,
@@ -72,7 +72,7 @@ class DrawingProcess:
         self._ends = contextlib.ExitStack()
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: Any = None
-        self._lock = threading.Lock()  # the lock is needed, because other threads may call `abandon`
+        self._lock = threading.Lock()  # because other threads may call `abandon`
         self._abandoned = False
 
     def __enter__(self) -> Self:
@@ -88,7 +88,7 @@ class DrawingProcess:
                 raise
             self._stop()
             failures.append(f"{library or 'OpenGL'}: {reason}")
-            if code > 0 and code != CANNOT_DRAW:  # no other graphics library would help
+            if code > 0 and code != CANNOT_DRAW:  # the graphics library is not the reason, so do not try another one
                 raise NoVideoError(f"{self.product} could not be written ({reason})")
         raise NoVideoError(
             f"this machine cannot draw off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "
@@ -113,7 +113,7 @@ class DrawingProcess:
         return pixels.reshape(self.size[1], self.size[0], 3)
 
     def abandon(self) -> None:
-        """Kill the subprocess, and do not start another one. Any thread may call this method. The method does not wait.
+        """Kill the subprocess without waiting, and do not start another one. Any thread may call this method.
 
         The rendering thread then gets a ``NoVideoError``.
         """
@@ -138,7 +138,7 @@ class DrawingProcess:
                 raise NoVideoError(f"{self.product} was cancelled")
             self._process = subprocess.Popen(
                 command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
-                start_new_session=True,  # Ctrl-C in the shell must reach the parent only
+                start_new_session=True,  # so that Ctrl-C in the shell reaches only the parent
             )  # fmt: skip
         self._send(self._job)
 
@@ -156,7 +156,7 @@ class DrawingProcess:
         """Read the next reply of the subprocess, or "" if the subprocess has ended."""
         assert self._process is not None and self._process.stdout is not None
         for line in self._process.stdout:
-            if line in (b"ready\n", b"frame\n"):  # skip other lines, which drivers may print
+            if line in (b"ready\n", b"frame\n"):  # drivers may print other lines
                 return line.decode().strip()
         return ""
 
@@ -208,7 +208,7 @@ class Drawing(DrawingProcess):
         self._frames = 0
 
     def draw(self, shot: Shot) -> None:
-        """Draw a pose, and write its frames."""
+        """Draw a pose, and add it to the video."""
         super().draw(shot)
         self._frames += 1
 

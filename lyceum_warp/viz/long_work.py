@@ -1,4 +1,4 @@
-"""Show the progress of long work: a transient bar on a terminal, otherwise lines."""
+"""Show the progress of long work: a temporary bar on a terminal, otherwise lines."""
 
 import time
 
@@ -7,7 +7,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 class LongWork:
-    """Shows the progress of long work: a transient bar on a terminal, otherwise a line after 3 s and then every 10 s.
+    """Shows the progress of long work: a temporary bar on a terminal, otherwise a line after 3 s and then every 10 s.
 
     Args:
         text: The name of the work.
@@ -32,7 +32,7 @@ class LongWork:
         self.progress.stop()
 
     def __call__(self, done: int, total: int) -> None:
-        """Show the number of finished units, and the total number."""
+        """Show how many units are done, of how many."""
         self.progress.update(self.bar, completed=done, total=total)
         seconds = time.monotonic() - self.start
         if not self.console.is_terminal and seconds >= self.next and done < total:

@@ -106,7 +106,7 @@ def _packed(array: np.ndarray) -> str:
 
 
 def _triangles(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[tuple[int, int]]]:
-    """Pack the triangles of the visible geoms: vertices, indices, and each body's first index and number of indices."""
+    """Return the visible geoms as vertices, indices of triangles, and each body's first index and number of indices."""
     kind = np.dtype([("at", np.float32, 3), ("normal", np.int8, 4), ("colour", np.uint8, 4)])
     vertices: list[np.ndarray] = []
     indices: list[np.ndarray] = []
@@ -182,7 +182,7 @@ def _ground(model: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _flat(points: np.ndarray, faces: np.ndarray) -> Surface:
-    """Make a surface from triangles; neighbours within 30 degrees share a normal, so that curved meshes look smooth."""
+    """Make a surface from triangles; those that meet at less than 30 degrees share normals, to look smooth."""
     corners = points[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)

@@ -22,7 +22,7 @@ from lyceum_warp.viz.video import Progress, write_video
 log = logging.getLogger(__name__)
 
 NamedProgress: TypeAlias = Callable[[str, str, int, int], object]
-"""A progress callback, called with (description, unit, finished amount, total amount)."""
+"""A progress callback, called with (description, unit, units done so far, units in total)."""
 
 
 def policy_video(
@@ -37,7 +37,7 @@ def policy_video(
         path: The file.
         seed: Seed of the initial state.
         camera: The camera; see ``write_video``.
-        progress: Called regularly. By default a bar is shown on a terminal, and otherwise lines on stderr.
+        progress: Called regularly. The default prints to stderr: a progress bar on a terminal, otherwise lines.
     """
     one = evaluation_worlds(env, 1, autoreset=False)
     policy = moved(policy, one) if isinstance(policy, torch.nn.Module) else policy
@@ -54,7 +54,7 @@ def policy_video(
 class Videos:
     """Writes a video of the mean policy every few iterations.
 
-    An error is reported once (for example if the machine cannot draw); training then continues without further videos.
+    After an error, for example because the machine cannot draw, training continues without further videos.
 
     Args:
         learner: The algorithm.

@@ -6,9 +6,9 @@
 instead. The process prints "ready" once it can draw, and "frame" after each picture. EOF without None means that the
 parent process has died; the program then deletes the folder.
 
-MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. Because the process
-may end, ``drawing.py`` starts a separate process for each graphics library that it tries. The program imports no module
-of the package. Exit code 3 means that the machine cannot draw with the chosen graphics library; the last line on stderr
+MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. For each graphics
+library that it tries, ``drawing.py`` therefore starts a separate process. The program imports no module of the
+package. Exit code 3 means that the machine cannot draw with the chosen graphics library; the last line on stderr
 holds the reason.
 """
 
@@ -31,12 +31,12 @@ VIDEO, PICTURE = "video.mp4", "picture.raw"
 
 
 class Shot(TypedDict):
-    """The content of one or more successive frames."""
+    """What to draw in one frame, or in several successive frames."""
 
     pose: tuple[np.ndarray, np.ndarray, np.ndarray]
     """The arrays qpos, mocap_pos and mocap_quat."""
     model_fields: dict[str, np.ndarray]
-    """The values of model fields by name. All other fields have the model's values."""
+    """The values of model fields that differ from the model's, by name."""
     ghosts: list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[float, ...] | None, tuple[float, float]]]
     """Additional poses of the model, each with a colour (None for the model's colours) and a shift in x and y."""
     lines: list[tuple[np.ndarray, tuple[float, ...], float]]
@@ -50,7 +50,7 @@ class Painter:
 
     Args:
         mujoco: The module.
-        model: The model. The renderer changes the model's fields.
+        model: The model, whose fields the painter changes.
         size: The width and the height in pixels.
         camera: The camera's values.
     """

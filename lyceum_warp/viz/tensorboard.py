@@ -20,34 +20,34 @@ _GROUPS = {
     "mean_": "mean_policy", "return_": "return", "value_": "value", "time_": "time", "metrics/": "metrics",
     "step_metrics/": "Episode_Metrics",
 }  # fmt: skip
-"""The groups of curves, by the prefix of their columns in metrics.csv. As in mjlab, means of a metric per step are in
-the group Episode_Metrics."""
+"""The group of a curve, by the prefix of the curve's column in metrics.csv. The group Episode_Metrics, with means per
+step, has mjlab's name."""
 
 _TAGS = {
-    # as in rsl_rl
+    # names that rsl_rl uses
     "return_mean": "Train/mean_reward", "length_mean": "Train/mean_episode_length", "std_mean": "Policy/mean_std",
     "value_loss": "Loss/value", "surrogate_loss": "Loss/surrogate", "entropy": "Loss/entropy",
     "learning_rate": "Loss/learning_rate", "total_fps": "Perf/total_fps", "time_sample": "Perf/collection_time",
     "time_update": "Perf/learning_time",
-    # names that do not follow from the columns
+    # names that cannot be made from the column and _GROUPS
     "iteration": "time/iteration", "samples": "time/samples", "samples_per_second": "time/samples_per_second",
     "terminal_reward": "episode/terminal_reward", "eval_mean": "episode/eval",
     "success": "episode/success", "faults": "episode/faults", "outliers": "episode/outliers",
     "skipped_updates": "policy/skipped_updates", "reward_mean": "return/reward",
     "explained_variance": "value/explained_variance",
 }  # fmt: skip
-"""The names of curves, by their columns."""
+"""The name of a curve, by the curve's column in metrics.csv."""
 
 
 class TensorBoard:
     """Writes a run's iterations to files for TensorBoard; the horizontal axis counts iterations from 0.
 
-    Every number of an iteration becomes a curve. A curve that rsl_rl or mjlab also writes has that library's name, unit
-    and axis, so that runs can be overlaid: Train/, Loss/, Policy/, Perf/, Episode_Metrics/ and, with ``env``,
-    Episode_Reward/ and Episode_Termination/. All other curves are in the groups return/, episode/, mean_policy/,
+    Every number of an iteration becomes a curve. A curve that rsl_rl or mjlab also writes has the same name, unit and
+    axis as there, so that runs can be overlaid: Train/, Loss/, Policy/, Perf/, Episode_Metrics/ and, if ``env`` is
+    given, Episode_Reward/ and Episode_Termination/. All other curves are in the groups return/, episode/, mean_policy/,
     policy/, value/, time/ and metrics/.
 
-    If the folder already has curves, they are continued; from the first new iteration on, new values replace old ones.
+    If the folder already has curves, they continue. Old values from the first new iteration on are replaced.
 
     Example:
         >>> with TensorBoard("runs/mine") as board:
@@ -79,7 +79,7 @@ class TensorBoard:
         self.close()
 
     def __call__(self, iteration: Iteration) -> None:
-        """Add an iteration. Non-finite numbers are omitted, such as the return if no episode has ended."""
+        """Add an iteration. Numbers that are not finite are omitted, such as the return if no episode has ended."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
         values = []
@@ -90,7 +90,7 @@ class TensorBoard:
         self._write(Summary(value=values), iteration.iteration - 1)
 
     def close(self) -> None:
-        """Close the file. A later iteration opens a new file."""
+        """Close the file. If another iteration is added later, a new file is opened."""
         if self._file is not None:
             file, self._file = self._file, None
             file.close()
@@ -104,7 +104,7 @@ class TensorBoard:
         self._file.flush()
 
     def _open(self, step: int) -> None:
-        """Open a file. The writers of torch and TensorBoard use a thread, which would hide the error of a full disk."""
+        """Open a file, without the writers of torch and TensorBoard: their threads would hide errors, as of a full disk."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
         from torch.utils.tensorboard import RecordWriter
 
@@ -112,7 +112,7 @@ class TensorBoard:
         name = f"events.out.tfevents.{int(time.time()):010d}.{number:04d}.{os.getpid()}"
         self._file = RecordWriter((self._folder / name).open("xb"))
         self._add(Event(file_version="brain.Event:2"))
-        if number:  # from this step on, TensorBoard discards points of earlier files
+        if number:  # makes TensorBoard discard earlier files' points from this step on
             self._add(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
 
     def _add(self, event: Any) -> None:
@@ -131,7 +131,7 @@ def check_tensorboard() -> None:
 
 
 def _terms(env: Env) -> dict[str, tuple[str, float]]:
-    """Return the curves with mjlab's names and units, by column: the name, and the factor that converts the units."""
+    """Return (mjlab's name, factor that converts to mjlab's unit) by column, for curves that mjlab also writes."""
     task, seconds = env.task.task, env.horizon * env.timestep
     rewards = task.rewards if seconds else ()  # mjlab divides rewards by the time limit
     return {f"metrics/{name}": (f"Episode_Reward/{name}", 1 / seconds) for name in rewards} | {
@@ -140,7 +140,7 @@ def _terms(env: Env) -> dict[str, tuple[str, float]]:
 
 
 def _total_fps(iteration: Iteration) -> dict[str, float]:
-    """Compute an iteration's samples per second, without the time of evaluations; empty if times are unknown."""
+    """Compute the samples per second, not counting the time of evaluations; return {} if the times are unknown."""
     times = {name: time for name, time in iteration.row().items() if name.startswith("time_") and name != "time_mean"}
     seconds = sum(filter(None, times.values()))
     return {"total_fps": iteration.samples / iteration.iteration / seconds} if seconds else {}

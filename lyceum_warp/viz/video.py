@@ -22,11 +22,11 @@ from lyceum_warp.viz.render import Shot
 __all__ = ["NoVideoError", "Progress", "Recorder", "check_video", "write_video"]
 
 Progress: TypeAlias = Callable[[int, int], object]
-"""A progress callback, called with the number of finished units and the total number."""
+"""A progress callback, called with two numbers: units done so far, and units in total."""
 
 _MAX_RATE = 60  # maximum frames per second, the rate of most screens
 _POSES = ("qpos", "mocap_pos", "mocap_quat")
-_KILLED = 5.0  # seconds to wait for the thread after the subprocess was killed
+_KILLED = 5.0  # seconds for which the thread may end after its subprocess was killed
 
 
 def write_video(
@@ -53,8 +53,8 @@ def write_video(
         that is fixed to the world, or else a camera that follows the first body.
         size: The width and the height in pixels, both even.
         speed: The simulated seconds per second of the video.
-        progress: A function that is called after each frame with the number of frames so far and the total number. By
-            default a bar is shown on a terminal, and otherwise lines on stderr.
+        progress: A function that is called after each frame with the number of frames so far and the total number. The
+            default prints to stderr: a progress bar on a terminal, otherwise lines.
 
     Returns:
         The file's path.
@@ -80,7 +80,7 @@ def write_video(
 
 
 def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
-    """Yield a shot of each state, with the state's model fields.
+    """Yield a shot (the content of a frame) for each state.
 
     Args:
         env: The environment of the states.
@@ -102,9 +102,9 @@ def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
 class Recorder:
     """Makes a video of shots that arrive one by one, for example from the viewer.
 
-    A subprocess draws shots at a low priority, and ``add`` never waits for the subprocess. Shots wait in a queue. If
-    the queue is full, further shots are dropped, and the last shot in the queue is shown longer, so that the video
-    keeps its duration. The file is written when the video is complete. After ``cancel``, or if the program is killed,
+    Shots wait in a queue until a subprocess of low priority draws them, so ``add`` returns at once. If the queue is
+    full, further shots are dropped, and the last shot in the queue is displayed longer, so that the video keeps its
+    duration. The file is written when the video is complete. After ``cancel``, or if the program is killed,
     an older file of the same name is unchanged.
 
     Args:
@@ -125,22 +125,22 @@ class Recorder:
     ) -> None:  # fmt: skip
         self.out = out
         self.added = 0
-        """The number of frames so far."""
+        """The number of frames so far, including dropped ones."""
         self.dropped = 0
-        """The number of frames whose shot was dropped."""
+        """The number of frames that repeat an earlier shot, because their own shot was dropped."""
         self._drawing = Drawing(model, out, camera=camera, size=size, fps=fps, background=True)
         self._most = most_waiting
         self._shots: deque[Shot] = deque()
-        self._changed = threading.Condition()  # the lock of the condition also guards the queue
+        self._changed = threading.Condition()  # its lock also guards the queue
         self._ended = self._cancelled = False
         self._error: NoVideoError | OSError | None = None
-        # in Python 3.11, a join that a signal interrupts would mark the thread as stopped
+        # instead of Thread.join, which in Python 3.11 marks the thread as stopped if a signal interrupts it
         self._done = threading.Event()
         threading.Thread(target=self._draw, name="lyceum-warp video", daemon=True).start()
 
     @property
     def finished(self) -> bool:
-        """Whether the subprocess has ended, either with a file or with an error that ``close`` raises."""
+        """Whether the video is complete, or has failed with an error that ``close`` raises."""
         return self._done.is_set()
 
     def add(self, shot: Shot) -> None:
@@ -161,13 +161,13 @@ class Recorder:
             self._changed.notify_all()
 
     def end(self) -> None:
-        """Stop accepting frames, and finish the video in the background."""
+        """End the video after the shots so far, and finish it in the background."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()
 
     def wait(self, seconds: float) -> None:
-        """Wait until the subprocess has ended, but at most for the given seconds."""
+        """Wait until the video is complete or has failed, but at most for the given seconds."""
         self._done.wait(seconds)
 
     def close(self) -> Path:
@@ -204,7 +204,7 @@ class Recorder:
                 drawing.finish()
         except (NoVideoError, OSError) as error:
             self._error = NoVideoError(f"the video {self.out} was cancelled") if self._cancelled else error
-        except Exception as error:  # store the error, because the thread has no caller that could catch it
+        except Exception as error:  # a thread has no caller that could catch the error
             self._error = NoVideoError(f"the video could not be written ({' '.join(str(error).split())})")
         finally:
             self._done.set()
