@@ -36,7 +36,7 @@ class Shot(TypedDict):
     pose: tuple[np.ndarray, np.ndarray, np.ndarray]
     """The arrays qpos, mocap_pos and mocap_quat."""
     model_fields: dict[str, np.ndarray]
-    """The values of model fields that differ from the model's, by name."""
+    """Values of fields that replace the model's values, by the fields' names."""
     ghosts: list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[float, ...] | None, tuple[float, float]]]
     """Additional poses of the model, each with a colour (None for the model's colours) and a shift in x and y."""
     lines: list[tuple[np.ndarray, tuple[float, ...], float]]

@@ -104,7 +104,7 @@ class TensorBoard:
         self._file.flush()
 
     def _open(self, step: int) -> None:
-        """Open a file, without the writers of torch and TensorBoard: their threads would hide errors, as of a full disk."""
+        """Open a file without the writers of torch or TensorBoard, whose thread would hide the error of a full disk."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
         from torch.utils.tensorboard import RecordWriter
 
