@@ -31,7 +31,7 @@ _SPELLED = {
 }  # fmt: skip
 
 _MOST_SUCCESS_STEPS = 2**24
-"""The largest value of ``success_steps``: steps are counted in a float32, which is exact up to 2**24."""
+"""The largest value of ``success_steps``: a float32 counts the steps, and it is exact up to 2**24."""
 
 _PARTS = 'the parts of its observation, as obs = {"position": 5}'
 
@@ -149,12 +149,12 @@ class BoundTask:
 
     Args:
         task: The task's class.
-        nworld: Number of worlds. Parameters that differ between worlds have this length.
+        nworld: Number of worlds, and the length of the array of a parameter that differs between worlds.
         model: A model to use instead of the task's own.
         fields: Fields that the engine provides in addition to those in ``World``.
         dynamics: Model fields that may differ between worlds in addition to those that the task writes.
         physics: Options of the simulation.
-        params: Values for the fields of ``Params``; a scalar takes one value, or one value per world.
+        params: Values for the fields of ``Params``; a scalar field takes one value, or one value per world.
 
     Raises:
         ValueError: The task is invalid, or a parameter or an option is invalid for this task.
@@ -193,7 +193,7 @@ class BoundTask:
         own = [name for name in named if is_data_field(name)]
         of_model = [name for name in named if name not in own]
         self.spec = _read_spec(task, model)
-        """The model before ``edit_model``. Replicas copy it, because the file may have changed."""
+        """The model before ``edit_model``. A replica of the environment copies this model, not the file."""
         self.model = models.compile_model(_edited(task, self.spec), own, physics, varied={*of_model, *dynamics})
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.frame_skip = whole_number(f"frame_skip of the task {self.name!r}", skip, low=1)
@@ -281,7 +281,7 @@ class BoundTask:
         drawn = {name: self.writes.get(name, frozenset()) for name in ("startup", "initialize", "randomize", "event")}
         between = drawn["initialize"] | drawn["randomize"] | drawn["event"]
         self.reset_dynamics = [name for name in named if name in between]
-        """Names of the model fields that resets or events write. A reset restores their nominal values first."""
+        """Names of the model fields that resets or events write. A reset first restores the fields' nominal values."""
         if both := [name for name in self.reset_dynamics if name in drawn["startup"]]:
             raise ValueError(
                 f"the model field {both[0]!r} of the task {self.name!r} is written by startup and by resets or "

@@ -83,7 +83,7 @@ class TaskSource:
         return {group: list(function.input_types.values())[2] for group, function in functions.items()}
 
     def _observers(self, owner: type[Task]) -> list[str]:
-        """Find functions that write observation groups: all in the class, and those in its module without a caller."""
+        """Find functions that write observation groups: all in the class, and uncalled ones in its module."""
         module = vars(sys.modules[owner.__module__])
         functions = {name: self._seen(value) for name, value in module.items() if isinstance(value, wp.Function)}
         tasks = [kind for kind in (owner, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
@@ -195,7 +195,7 @@ class TaskSource:
         structs = [kind for kind in types if is_struct(kind)]
         foreign = structs and self.world not in structs and self.params not in structs
         if foreign and function.func.__module__ in {owner.__module__ for owner in self.task.__mro__}:
-            return None  # it takes the World of another task in the module
+            return None  # the function belongs to another task in the module
         annotations = function.func.__annotations__
         if any(isinstance(annotation, str) for annotation in annotations.values()):
             raise ValueError(

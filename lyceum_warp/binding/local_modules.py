@@ -13,7 +13,7 @@ Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
 """The stamp of each file: its modification time and its size; None if the file does not exist."""
 
 _taken: dict[str, Stamps] = {}
-"""The modules that task files imported from their folders: the stamp of each module's file when it was imported."""
+"""Maps each module that a task's file imported from its folder to the stamp of the module's file at that time."""
 
 
 def local_modules(file: Path) -> dict[str, Path]:

@@ -130,8 +130,8 @@ class Parameters:
     def array(self, device: wp.Device) -> wp.array:
         """Make the kernels' array of ``Params``: one entry for all worlds, or one per world if any value differs.
 
-        The entries contain pointers to tables on the device, and this object keeps these tables alive. If a table's
-        values change but not its shape, the new values are copied into the existing table.
+        The entries contain pointers to tables on the device, and this object keeps these tables alive. If a table
+        gets new values of the same shape, the values are copied into the existing table.
         """
         for name, kind in self.tables.items():
             self._upload(name, kind.dtype, device)

@@ -171,7 +171,7 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
 
 
 def source_files(task: type[Task]) -> Mapping[Path, bytes]:
-    """Return the source, when it was loaded, of a task's file and of the modules that it imports from its folder.
+    """Return the source, as loaded, of a task's file and of the modules that it imports from its folder.
 
     If the program itself imports or defines the class, the files are read when ``find_task`` is first called with the
     class. A class without a file, as in a notebook, has no sources.

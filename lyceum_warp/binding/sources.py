@@ -116,7 +116,7 @@ def name_of(function: wp.Function) -> str:
 def builtin(name: str) -> Any:
     """Find a builtin function by name, first of Warp, then of Python.
 
-    The result is None if there is no such builtin. Warp's builtins need not be attributes of its module.
+    The result is None if there is no such builtin. Some of Warp's builtins are not attributes of the module ``warp``.
     """
     return builtin_functions().get(name) or getattr(wp, name, None) or getattr(builtins, name, None)
 
@@ -124,7 +124,7 @@ def builtin(name: str) -> Any:
 def overloads(function: wp.Function) -> list[wp.Function]:
     """Return the overloads of a function that have Python source."""
     found = [*function.user_overloads.values(), *function.user_templates.values()]
-    # Warp adds its instances of a generic function to the overloads
+    # the overloads include the instances that Warp has made of a generic function
     return [overload for overload in found if overload.generic_parent is None] or [function]
 
 

@@ -16,13 +16,13 @@ from lyceum_warp.binding.sources import FunctionSource, is_struct, overloads, ru
 from lyceum_warp.task import Row, Task
 
 _STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
-"""Names of arguments by which reward terms and metrics get a transition, each with its name in the generated text."""
+"""Maps the arguments s0, action, s1, s and p of a reward term or a metric to names in the generated text."""
 
 _STATE = {"s": "s", "s1": "s", "p": "p"}
-"""Names of arguments by which terminations get the state and Params, each with its name in the generated text."""
+"""Maps the arguments s, s1 and p of a termination to names in the generated text."""
 
 _OWN = ("weights", "metrics", "total")
-"""Names that the generated text uses for itself."""
+"""Other names in the generated text, which are not available to terms."""
 
 _HEAD = "s0: World, action: Row[float], s1: World, p: Params, weights: Row[float]"
 
@@ -72,8 +72,8 @@ class Terms:
     def generated(self, file: str) -> dict[str, wp.Function]:
         """Generate ``reward``, ``score`` and ``terminated``, except the functions that the task defines.
 
-        ``reward`` computes a transition's reward under weights; ``score`` also writes the metrics. ``file`` is the name
-        of the generated text in error messages.
+        ``reward`` computes a transition's reward with given weights; ``score`` also writes the metrics. ``file`` is the
+        name of the generated text in error messages.
         """
         if not self.text:
             return {}
@@ -104,7 +104,7 @@ class Terms:
         return {term: float(weight) for term, weight in rewards.items()}
 
     def _names(self, attribute: str, names: Any, *, written: bool = False) -> tuple[str, ...]:
-        """Check and return the names in an attribute; return () if a function of the task is already ``written``."""
+        """Check and return the names in an attribute; return () if the task has ``written`` a function for them."""
         if not isinstance(names, tuple | list) or not all(isinstance(name, str) and name for name in names):
             raise ValueError(
                 f"{attribute} of the task {self._name!r} must be names, such as ('forward', 'cost'), not {names!r}"

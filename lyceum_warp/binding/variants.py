@@ -144,7 +144,7 @@ def _home(function: wp.Function) -> str:
 
 
 def _values(module: types.ModuleType, owners: Sequence[type[Task]]) -> Iterator[Any]:
-    """Yield the attributes of a module's tasks, and its globals, both those at each task's definition and those now."""
+    """Yield the attributes of a module's tasks, the globals when each task was defined, and the globals now."""
     for owner in owners:
         if owner.__module__ == module.__name__:
             own = (value.__func__ if isinstance(value, staticmethod) else value for value in vars(owner).values())

@@ -113,7 +113,7 @@ class _Place:
     position: int
     field: str | None
     kind: Any
-    """A struct: its type. An array: (number of axes, element type). An element, which is read by value: None."""
+    """The type of a struct; (number of axes, element type) of an array; None for an element, which is read by value."""
 
     def attribute(self, name: str) -> "_Place | None":
         if is_struct(self.kind):
@@ -139,8 +139,8 @@ class _Reader:
 
     Args:
         function: The function.
-        places: For each argument of ``function``, the argument of the analysed function, or the part of one, that the
-            caller passed; None if the caller passed something else.
+        places: What the caller has passed for each argument of ``function``: an argument of the analysed function or a
+            part of it; None for anything else.
         arguments: Names of the arguments of the analysed function.
         writes: The dict to which writes are added.
         seen: The functions that were already read, each together with the places of its arguments.

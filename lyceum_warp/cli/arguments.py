@@ -77,7 +77,7 @@ class OptionFlags:
     def __init_subclass__(
         cls, *, options: Sequence[type] = (), omit: Collection[str] = (), default: str | Mapping[str, str] | None = None
     ) -> None:
-        if not options:  # derived from a finished group, to omit flags from the help
+        if not options:  # a subclass of a group, which only omits flags from the help
             return
         own = dict(vars(cls).get("__annotations__", {}))
         flags: dict[str, Any] = {}

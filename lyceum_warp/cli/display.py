@@ -108,7 +108,7 @@ class Display(training.Display):
 
 
 _COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skipped update"}
-"""Columns of metrics.csv that count problems, each with its label in messages. Some algorithms have only some of these
+"""Columns of metrics.csv that count problems, each with its label in messages. An algorithm may lack some of these
 columns."""
 
 _BAR_WIDTH = 36
@@ -173,7 +173,7 @@ def curve_table(rows: list[dict[str, float | None]], console: Console) -> Table:
             value = row.get(name, 0.0)
             cells.append(format(int(value) if form.endswith("d") else value, form) if name in row else "")
         if name == "reward_mean" and all("return_mean" in row for row in known):
-            continue  # this column is shown only until an episode ends
+            continue  # this column is for iterations without a return
         if any(cells):
             columns[heading] = cells
     table = fitting_table(console, columns, omit=("samples", "std", "KL", "samples/s", "length", "eval", "success"))
@@ -253,7 +253,7 @@ class PlanDisplay:
 
 
 def report_table(report: ControlReport, *, success: bool = True) -> Table:
-    """Make the table of a controller's report; ``success`` is False to omit the row "success"."""
+    """Make the table of a controller's report; omit the row "success" if ``success`` is False."""
     table = Table(box=rich.box.SIMPLE, show_header=False)
     for row in report.rows():
         if success or row[0] != "success":

@@ -30,7 +30,7 @@ To write your own task: lyceum-warp new --help"""
 _UNKNOWN = "-"
 
 _ONE_CONTROL = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE, mujoco.mjtGain.mjGAIN_MUSCLE)
-"""Types of actuators that have one control each."""
+"""Actuators with these types of gain have one control each."""
 
 _WIDTH = 100
 """Maximum width of a description, in characters."""
@@ -87,7 +87,7 @@ class _Entry:
     about: str = ""
     source: str = _UNKNOWN
     note: str = ""
-    """The reason why a value is unknown."""
+    """Why some of the values are unknown."""
 
     def has(self, word: str) -> bool:
         """Whether the entry contains a word, in any case."""

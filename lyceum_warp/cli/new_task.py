@@ -48,10 +48,10 @@ class New:
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
     """The task's name in snake_case, for the file TASK.py in the working directory; or a path, path/to/task.py."""
     model: Annotated[str, tyro.conf.arg(metavar="FILE")]
-    """An MJCF or URDF file; menagerie:ROBOT/FILE.xml for a model of MuJoCo Menagerie (from the extra "menagerie", the
-    package mujoco-menagerie, or a checkout to which MENAGERIE_ROOT points); or gymnasium:FILE.xml or
-    gymnasium_robotics:PATH for a model in the package of that name. In the task file, a relative path becomes
-    relative to that file's folder."""
+    """An MJCF or URDF file; or a model in a package, as gymnasium:FILE.xml, gymnasium_robotics:PATH or
+    menagerie:ROBOT/FILE.xml. MuJoCo Menagerie comes from the extra "menagerie", from the package mujoco-menagerie, or
+    from a checkout to which MENAGERIE_ROOT points. In the task file, a relative path becomes relative to that file's
+    folder."""
 
     template: Literal["plain", "velocity"] = "plain"
     """With velocity, the task trains a walking robot to follow velocity commands. The robot needs a floating base, and
@@ -134,7 +134,7 @@ def _class_name(path: Path) -> str:
 
 
 def _model(text: str, path: Path) -> tuple[str, str, mujoco.MjSpec]:
-    """Return the expression for a model in a task file, its description, and the model.
+    """Return three things: the Python expression for a model in a task file, a description of the model, and the model.
 
     Args:
         text: The model as given on the command line.

@@ -75,7 +75,7 @@ def _nested(hint: Any) -> Any:
 
 
 def _options(command: Any, group: str = "options") -> dict[str, dict[str, str]]:
-    """Return the flags of a command and their fields' names, by group."""
+    """Return the flags of a command, by group; each flag maps to the name of its field."""
     found: dict[str, dict[str, str]] = {group: {}}
     for name, hint in typing.get_type_hints(command, include_extras=True).items():
         own = next(filter(None, (getattr(marker, "name", None) for marker in _markers(hint))), name)

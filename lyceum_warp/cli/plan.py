@@ -249,7 +249,7 @@ _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 
 
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
-    """Choose the settings that have no flag, by measuring planning times; return None if every setting has a flag.
+    """Choose the settings that no flag gives, by measuring planning times; return None if flags give all of them.
 
     A plan must be ready within one step of the controlled world. If no setting is fast enough, a plan may take as long
     as one step of the planner's worlds.

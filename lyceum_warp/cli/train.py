@@ -235,7 +235,7 @@ class Train:
                 try:
                     suggested = ALGORITHMS[suggestion.algorithm][1](**suggestion.settings)
                 except (KeyError, TypeError, ValueError) as error:
-                    raise ValueError(f"training of the task {self.task} is not valid: {error}") from error
+                    raise ValueError(f"the attribute training of the task {self.task} is not valid: {error}") from error
             base = Configuration(
                 task=self.task, options=options, algorithm=suggestion.algorithm, hyperparameters=suggested
             )  # fmt: skip

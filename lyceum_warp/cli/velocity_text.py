@@ -80,7 +80,7 @@ class Walker:
             foot.height -= lowest
 
     def _bend(self) -> None:
-        """Limit joint positions to the middle 90 % of the joint ranges."""
+        """Move hinge joints into the middle 90 % of their ranges."""
         for joint in np.flatnonzero(self.model.jnt_limited & (self.model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)):
             low, high = self.model.jnt_range[joint]
             margin = 0.05 * (high - low)

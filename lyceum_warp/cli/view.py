@@ -46,7 +46,7 @@ class Place(
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu, or a CUDA device such as cuda:0. By default, a run with engine auto is shown on the CPU."""
+    """cpu, or a CUDA device such as cuda:0. By default, the worlds of a run with engine auto are on the CPU."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

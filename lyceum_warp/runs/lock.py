@@ -11,7 +11,7 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def run_lock(folder: Path, *, take_over: bool = False) -> Iterator[Callable[[], None]]:
-    """Lock a run within the context. The file ``lock`` stores the process and its host.
+    """Context manager that locks a run. The file ``lock`` stores the process and its host.
 
     The process locks this file by flock; the system releases the lock when the process ends, even after ``kill -9``.
     On some network file systems, other hosts do not see the lock, so a lock file that names another host counts as

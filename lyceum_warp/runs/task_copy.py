@@ -40,7 +40,7 @@ copied."""
 
 
 def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
-    """Collect the files of an environment's task for a run folder, except for tasks of the package.
+    """Collect the files of an environment's task to copy into a run folder: those that are not part of the package.
 
     Returns:
         The entry ``kept`` of config.json, and the files for the folder ``task``, by their paths in it.

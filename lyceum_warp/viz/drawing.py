@@ -22,7 +22,7 @@ from lyceum_warp.viz import EXTRA, NoVideoError
 from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
 from lyceum_warp.viz.render import CANNOT_DRAW, PICTURE, VIDEO, Shot
 
-_PATIENCE = 10.0  # seconds for which the subprocess may end before it is killed
+_PATIENCE = 10.0  # seconds to wait for the subprocess to end, before it is killed
 
 
 def check_video() -> None:

@@ -32,7 +32,7 @@ class LongWork:
         self.progress.stop()
 
     def __call__(self, done: int, total: int) -> None:
-        """Show how many units are done, of how many."""
+        """Show how many of all units are done."""
         self.progress.update(self.bar, completed=done, total=total)
         seconds = time.monotonic() - self.start
         if not self.console.is_terminal and seconds >= self.next and done < total:

@@ -1,4 +1,4 @@
-"""Write an episode as one HTML file: a scene that plays and turns in any browser, without a server or a network.
+"""Write an episode as one HTML file: a scene that can be played and turned in any browser, without a server or network.
 
 The file holds the triangles of the visible geoms in body coordinates, and the bodies' poses in each frame. The script
 in ``page.html`` draws the triangles with WebGL. Textures are omitted, except for the floor's squares.

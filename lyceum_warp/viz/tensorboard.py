@@ -20,8 +20,8 @@ _GROUPS = {
     "mean_": "mean_policy", "return_": "return", "value_": "value", "time_": "time", "metrics/": "metrics",
     "step_metrics/": "Episode_Metrics",
 }  # fmt: skip
-"""The group of a curve, by the prefix of the curve's column in metrics.csv. The group Episode_Metrics, with means per
-step, has mjlab's name."""
+"""The group of a curve, by the prefix of the curve's column in metrics.csv. mjlab also uses the name Episode_Metrics,
+for means per step."""
 
 _TAGS = {
     # names that rsl_rl uses
@@ -47,7 +47,7 @@ class TensorBoard:
     given, Episode_Reward/ and Episode_Termination/. All other curves are in the groups return/, episode/, mean_policy/,
     policy/, value/, time/ and metrics/.
 
-    If the folder already has curves, they continue. Old values from the first new iteration on are replaced.
+    Curves that the folder already has are continued; their values from the first new iteration on are replaced.
 
     Example:
         >>> with TensorBoard("runs/mine") as board:
@@ -58,8 +58,8 @@ class TensorBoard:
         folder: The folder, which is created if it does not exist. Pass this folder, or one above it, to ``tensorboard
             --logdir``.
         env: The environment of the run. Episode_Reward/NAME is the sum of a reward term over an episode, divided by the
-            time limit in seconds. Episode_Termination/NAME is how many episodes the function NAME ended in one step of
-            all worlds, on average.
+            time limit in seconds. Episode_Termination/NAME is the mean number of episodes, in all worlds, that the
+            function NAME ends in one step.
 
     Raises:
         ImportError: The package tensorboard is not installed.

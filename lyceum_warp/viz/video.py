@@ -26,7 +26,7 @@ Progress: TypeAlias = Callable[[int, int], object]
 
 _MAX_RATE = 60  # maximum frames per second, the rate of most screens
 _POSES = ("qpos", "mocap_pos", "mocap_quat")
-_KILLED = 5.0  # seconds for which the thread may end after its subprocess was killed
+_KILLED = 5.0  # maximum seconds to wait for the thread to end after its subprocess was killed
 
 
 def write_video(
@@ -41,8 +41,8 @@ def write_video(
 ) -> Path:
     """Render states into an mp4 file; model fields that differ between worlds are taken from the states.
 
-    The video has at most 60 frames per second; with a shorter time step, states are skipped. A subprocess draws the
-    video, without a display.
+    The video has at most 60 frames per second; if time steps are shorter than frames, states are skipped. A subprocess
+    draws the video, without a display.
 
     Args:
         env: The environment of the states.

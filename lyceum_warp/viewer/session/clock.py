@@ -194,7 +194,7 @@ class Session:
     def obey(self, command: Command) -> None:
         """Carry out a command; if it fails, show the error's message to the user.
 
-        A command that needs the plant's state interrupts a run in real time.
+        A command that needs the plant's state stops a plant that runs in real time.
         """
         push = isinstance(command, Drive) or (isinstance(command, Perturb) and command.qpos is None)
         if self._in_run and not push and not isinstance(command, SetVideo | TakePicture | SetGhosts):

@@ -66,7 +66,7 @@ class FrameMaker:
             live: The worlds that are stepped: ``main``, or the plant, a copy of the displayed world of ``main``.
             main: All worlds.
             traces: The paths of a planner's samples.
-            status: A function that makes the complete status.
+            status: A function that takes some fields of ``Status``, and returns a ``Status`` with all fields.
             paused: Whether the session is paused. If so, the frame shows the present state; otherwise it may show the
                 state at the time of the previous frame.
         """
@@ -108,7 +108,7 @@ class FrameMaker:
         )  # fmt: skip
 
     def of_playback(self, playback: Playback, status: Callable[..., Status]) -> Frame:
-        """Make a frame of a playback; the function ``status`` makes the complete status."""
+        """Make a frame of a playback; for ``status``, see ``of_worlds``."""
         episode, state = playback.episode, playback.state
         shown = _following(playback.index, len(playback.episodes), self.ghosts.episodes)
         others = [playback.episodes[index].states for index in shown]
@@ -176,7 +176,7 @@ class FrameMaker:
         return state[: mujoco.mj_stateSize(self._env.task.model, mujoco.mjtState.mjSTATE_INTEGRATION)].copy()
 
     def _model_fields(self, state: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the model fields in a state whose values differ from the model's."""
+        """Return the values of a state's model fields, except those that equal the model's."""
         found = {}
         for field in self._env.task.dynamics:
             owner = self._env.task.model if hasattr(self._env.task.model, field.name) else self._env.task.model.opt

@@ -48,13 +48,13 @@ class Past:
 
     @property
     def behind(self) -> int:
-        """The number of steps that can be taken back."""
-        # the first step back also stores the present state, in place of the oldest state
+        """The number of steps that can be undone."""
+        # the first step back stores the present state in place of the oldest state
         return min(self.now - self.oldest, max(self.length - 1, 0))
 
     @property
     def ahead(self) -> int:
-        """The number of steps that were taken back."""
+        """The number of steps that were undone, and can be redone."""
         return self.newest - self.now
 
     def put(self, state: torch.Tensor, returns: torch.Tensor, pushed: int | None) -> None:
@@ -66,7 +66,7 @@ class Past:
         self.oldest = max(self.oldest, self.now - self.length + 1)
 
     def drop_ahead(self) -> None:
-        """Discard the steps that were taken back."""
+        """Discard the steps that were undone."""
         self.newest = self.now
 
 
@@ -110,7 +110,7 @@ class Live:
         """Whether the data of a frame are copied to the host asynchronously."""
         self.returns = torch.zeros(n, dtype=torch.float64, device=device)
         """The return of each world's episode so far, (nworld,)."""
-        self._clock = 0  # steps since the session began, minus the steps that were taken back
+        self._clock = 0  # steps since the session began, except undone ones
         self._ends = torch.zeros(n, 5, dtype=torch.float64, device=device)
         self._fault = torch.zeros(4, dtype=torch.float64, device=device)
         self._ended, self._reward = torch.zeros(n, dtype=torch.bool, device=device), torch.zeros_like(env.reward)
@@ -124,7 +124,7 @@ class Live:
         self._number = torch.arange(n, device=device)
 
     def warm_up(self) -> None:
-        """Capture the graphs of all calls, and restore the state."""
+        """Make the calls that the viewer needs, so that CUDA graphs are captured, and restore the state."""
         env = self.env
         before = env.get_state()
         mask = torch.zeros(env.nworld, dtype=torch.bool, device=env.obs.device)
@@ -138,11 +138,11 @@ class Live:
     # steps
 
     def step(self, act: Callable[[], None]) -> None:
-        """Make a step, or restore the next state if steps were taken back.
+        """Make a step, or redo a step if steps were undone.
 
         Args:
-            act: A function that writes the actions of all worlds into ``env.action``. A restored state needs no
-                actions, so ``act`` is not called.
+            act: A function that writes the actions of all worlds into ``env.action``. It is not called to redo a step,
+                because the next state is restored from the history.
         """
         if self.past.ahead:
             self._move(1)
@@ -219,7 +219,7 @@ class Live:
         """Restore all worlds to an earlier state.
 
         Returns:
-            Number of steps that were taken back, at most ``past.behind``.
+            Number of steps that were undone, at most ``past.behind``.
         """
         past = self.past
         if not past.ahead and past.behind:  # the current state is not in the history yet
@@ -230,7 +230,7 @@ class Live:
         return steps
 
     def forward(self, steps: int) -> None:
-        """Restore all worlds to a later state, after steps were taken back."""
+        """Restore all worlds to a later state, after steps were undone."""
         if steps := min(steps, self.past.ahead):
             self._move(steps)
 

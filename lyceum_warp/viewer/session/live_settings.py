@@ -28,7 +28,7 @@ def task_numbers(env: Env) -> Numbers:
 
 
 def rebuilt_planner(planner: Planner, name: str, value: float) -> Planner:
-    """Make a planner with another value of a setting. The planner is new because its CUDA graphs contain the settings.
+    """Make a new planner with another value of a setting, because a planner's CUDA graphs contain its settings.
 
     Raises:
         ValueError: The value is not valid.

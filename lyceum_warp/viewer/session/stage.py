@@ -154,7 +154,7 @@ class Stage:
             thread.forget()
 
     def back(self, steps: int) -> None:
-        """Take steps back."""
+        """Undo steps."""
         done = self.live.back(steps)
         if done < steps:
             self.frames.say(f"the history ends here: it has at most {max(self.live.past.length - 1, 0)} steps")
@@ -199,7 +199,7 @@ class Stage:
             self._threads[current.name] = TraceThread(TraceRollouts(current.controller, self.live.env))
 
     def set_number(self, of: str, name: str, value: float) -> None:
-        """Change a setting of the planner in use, which is made anew, or a task parameter in all worlds.
+        """Change a setting of the planner in use, by making a new planner, or change a task parameter in all worlds.
 
         Raises:
             ValueError: The value is not valid.
@@ -236,7 +236,7 @@ class Stage:
         self.frames.forget_seen(self.live)
 
     def go_on_from(self, state: torch.Tensor, live: Live, *, new_episode: bool = False) -> None:
-        """Set the state of the displayed world, even if an episode has ended in this state; the episode continues."""
+        """Set the displayed world's state, and continue its episode from there, even if it had ended."""
         state = state.clone()
         state[self.env.state_space.parts["done_reason"]] = 0.0
         live.set_row(state, new_episode=new_episode)

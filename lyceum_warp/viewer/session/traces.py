@@ -74,7 +74,7 @@ def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
 
 
 def _driven_bodies(model: mujoco.MjModel) -> np.ndarray:
-    """Find the bodies that actuators move at joints, by tendons or at sites; (nbody,) bool."""
+    """Find the bodies that actuators move through joints, tendons or sites; (nbody,) bool."""
     data, moment = mujoco.MjData(model), np.zeros((model.nu, model.nv))
     mujoco.mj_fwdPosition(model, data)
     if model.nu:

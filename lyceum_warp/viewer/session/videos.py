@@ -105,7 +105,7 @@ class VideoTaker:
         return self._folder / f"{title}-{datetime.datetime.now():%Y%m%d-%H%M%S-%f}{ending}"
 
     def add(self, frame: Frame) -> None:
-        """Extend the last frame until the present time, and add a frame.
+        """Add a frame as often as needed for the video to reach the present time.
 
         Raises:
             NoVideoError: The rendering subprocess has failed.

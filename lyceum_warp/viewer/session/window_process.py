@@ -112,7 +112,7 @@ class Window:
     def wants_frame(self) -> bool:
         """Whether the window can draw another frame now; if it cannot, the caller need not make a frame.
 
-        The window draws about 60 frames per second while a page is open, and otherwise four.
+        The window draws about 60 frames per second while a page is open, and about 4 while none is.
         """
         return self._pending is None and time.monotonic() >= self._next and not self._ended
 

@@ -46,8 +46,8 @@ UNCHECKED = 128
 MESSAGE_BYTES = 2**20
 """The maximum size of a WebSocket message from a browser, in bytes."""
 QUIET_SECONDS = 2.0
-"""The seconds without input after which the controlling page counts as closed or hidden. An open page sends input every
-frame."""
+"""The seconds without input after which the page in control counts as closed or hidden. An open page sends input with
+every frame."""
 PROTECTION = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -193,7 +193,7 @@ class Proxy:
 
         Args:
             upstream: The host and the port of studio's server.
-            on_quiet: A function that this thread calls after the controlling page was closed or hidden.
+            on_quiet: A function that this thread calls after the page in control was closed or hidden.
         """
         self._upstream, self._on_quiet = "http://{}:{}".format(*upstream), on_quiet
         ready = threading.Event()
@@ -370,7 +370,7 @@ class Proxy:
         return browser
 
     def _hear(self) -> None:
-        """Restart the timer of the controlling page."""
+        """Restart the timer that detects that the page in control was closed or hidden."""
         if self._silence is not None:
             self._silence.cancel()
         self._silence = self._loop.call_later(QUIET_SECONDS, self._on_quiet)

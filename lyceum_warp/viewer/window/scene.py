@@ -18,7 +18,7 @@ MAX_LINES = 160
 """The maximum number of lines of all traces. A limit is necessary, because all geoms are sent to the browser 60 times a
 second, with about 600 bytes each."""
 FEWEST_SEGMENTS = 4
-"""The minimum number of lines of a trace; if traces have too many lines with this number, some are not drawn."""
+"""The minimum number of lines of a trace; if this is too many for all traces, some are not drawn."""
 VISIBLE = (
     "geom_size", "geom_pos", "geom_quat", "geom_rgba", "geom_matid", "geom_dataid", "geom_group", "site_", "body_pos",
     "body_quat", "jnt_pos", "jnt_axis", "qpos0", "mat_", "tendon_rgba", "tendon_width", "cam_", "light_", "hfield_",

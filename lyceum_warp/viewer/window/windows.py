@@ -414,7 +414,7 @@ class Curves:
                 self.rows = np.concatenate([kept, part])[-MAX_POINTS:]
 
     def thinned(self, points: int, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Reduce the last ``seconds`` to at most ``points`` rows, by minimum, mean and maximum of successive rows."""
+        """Reduce the last ``seconds`` to at most ``points`` rows: the minimum, mean and maximum of successive rows."""
         rows = self.rows[np.searchsorted(self.rows[:, 0], self.rows[-1:, 0].sum() - seconds) :]
         if len(rows) <= points:
             return rows, rows, rows
