@@ -37,7 +37,7 @@ def parts_of(struct: Any, owner: str) -> dict[str, Part]:
     """Return the fields of a struct that have parts as defaults; ``owner`` is the struct's name in error messages.
 
     Raises:
-        ValueError: The type of a field with a part is not a row of numbers.
+        ValueError: A field has a part as its default, but is not declared as a row of floats.
     """
     found = {name: getattr(struct.cls, name, None) for name in struct.vars}
     parts = {name: part for name, part in found.items() if isinstance(part, Part)}

@@ -128,7 +128,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
     taken = {kind for f in functions for overload in overloads(f) for kind in overload.input_types.values()
              if is_struct(kind)}  # fmt: skip
     structs = {struct: new for struct, new in structs.items() if struct in taken}
-    if not structs and not replaced:  # for example, the task changes only defaults
+    if not structs and not replaced:  # the task needs no copies, for example because it changes only defaults
         return None
     key = (tuple(modules), tuple(functions), tuple(structs.items()), tuple(replaced.items()))
     if key not in _made:

@@ -21,8 +21,8 @@ nothing."""
 _ALIGNED = 64
 
 _UNWRITTEN = 0x7FA5C3E1
-"""The sentinel, a signaling NaN. Arithmetic turns a signaling NaN into a quiet NaN, so that ``+=`` counts as a
-write."""
+"""The sentinel that marks unwritten memory: a signaling NaN. Arithmetic turns it into a quiet NaN, so that ``+=``
+counts as a write."""
 
 
 class GuardedRows:

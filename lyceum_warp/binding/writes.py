@@ -1,6 +1,6 @@
 """Find all places where a Warp function, or a function that it calls, writes into its arguments.
 
-The analysis follows elements, components, calls, local variables that hold rows, and local structs with rows. A row
+The analysis follows a row into its elements and their components, into calls, local variables and local structs. A row
 that is used in any other way (returned, put into a tuple, selected by ``wp.where``, passed to a native function) counts
 as written.
 """

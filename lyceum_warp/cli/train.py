@@ -212,7 +212,7 @@ class Train:
             return self._report(run, learner)
 
     def _suggestion(self) -> Training:
-        """Return the task's suggested training; if --algorithm names another algorithm, return it without settings."""
+        """Return the training that the task suggests; if --algorithm differs, return only that algorithm."""
         assert self.task is not None
         suggestion = find_task(self.task).training
         if self.algorithm in (None, suggestion.algorithm):

@@ -67,7 +67,7 @@ def policy_of(content: PolicyContent, path: Path, given: nn.Module | None = None
 
     Args:
         content: Content of the file.
-        path: The file, which error messages name.
+        path: The file's path, for error messages.
         given: A policy into which the weights are loaded; by default a new policy.
 
     Raises:
@@ -81,7 +81,7 @@ def value_of(content: PolicyContent, path: Path) -> nn.Module:
 
     Args:
         content: Content of the file.
-        path: The file, which error messages name.
+        path: The file's path, for error messages.
 
     Raises:
         ValueError: The file has no value function.
@@ -131,7 +131,7 @@ def check_sizes(policy: Any, env: Env, path: Path) -> None:
     Args:
         policy: The policy.
         env: The environment.
-        path: The policy's file, which the error message names.
+        path: The path of the policy's file, for the error message.
 
     Raises:
         ValueError: The sizes of the policy and the environment differ.

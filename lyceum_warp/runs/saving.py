@@ -67,7 +67,7 @@ class Saver:
         self._stored = learner.replay.stored if learner.replay is not None and saved >= 0 else 0
 
     def write(self, iteration: Iteration) -> float | None:
-        """Write an iteration's metrics. Also write the policy if it is the best so far, or if a numbered file is due.
+        """Write an iteration's metrics; also write the policy if it is the best so far or needs a numbered file.
 
         Returns:
             The iteration's return, which decides whether its policy is the best; None if the iteration has no return.

@@ -34,7 +34,7 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
     Args:
         folder: The run's folder.
         config: Content of the run's config.json.
-        named: The file that the error message names.
+        named: The file to name in the error message.
         runs: Whether the command would execute the run's task; otherwise it only reads files.
         trust: Whether to trust and record the run.
 

@@ -131,7 +131,7 @@ def check_tensorboard() -> None:
 
 
 def _terms(env: Env) -> dict[str, tuple[str, float]]:
-    """Return (mjlab's name, factor that converts to mjlab's unit) by column, for curves that mjlab also writes."""
+    """Return mjlab's name, and a factor that converts to mjlab's unit, for each column that mjlab also writes."""
     task, seconds = env.task.task, env.horizon * env.timestep
     rewards = task.rewards if seconds else ()  # mjlab divides rewards by the time limit
     return {f"metrics/{name}": (f"Episode_Reward/{name}", 1 / seconds) for name in rewards} | {

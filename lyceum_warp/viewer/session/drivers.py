@@ -20,7 +20,7 @@ MOST_SAMPLES = 24
 
 
 class ControllerError(Exception):
-    """Raised if a controller raises an exception, which is the ``__cause__``. The message has a single line."""
+    """Raised if a controller raises an exception, which becomes the ``__cause__``. The message has a single line."""
 
     def __init__(self, name: str, error: BaseException) -> None:
         text = next(iter(str(error).splitlines()), "")

@@ -22,7 +22,7 @@ def planner_numbers(controller: Any) -> Numbers:
 
 
 def task_numbers(env: Env) -> Numbers:
-    """Return the parameters of a task that are floats, including the weights of the reward."""
+    """Return those parameters of a task that are floats, including the weights of reward terms."""
     known = env.task.params
     return tuple((n, v) for n, v in known.items() if isinstance(v, float) and n not in ("dt", "substep_dt"))
 

@@ -206,7 +206,7 @@ class Stage:
         """
         planners = [each for each in self.controllers.values() if isinstance(each, WorldControl)]
         if of == "planner":
-            if not isinstance(self.control, WorldControl):  # the mode has changed since the command
+            if not isinstance(self.control, WorldControl):  # the mode may have changed since the user gave the command
                 raise ValueError(f"{name} was not changed: no planner is in use")
             planners = [self.control]
             self.control.controller = rebuilt_planner(self.control.controller, name, value)

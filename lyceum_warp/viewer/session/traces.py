@@ -120,7 +120,7 @@ class TraceRollouts:
         self._parts = env.state_space.parts
         self._states = self.env.get_state()
         self._positions = self.env.field(point.field)
-        for _ in range(3):  # capture the graphs here, because the thread must not
+        for _ in range(3):  # capture CUDA graphs here, because the thread must not
             self.env.set_state(self._states, check=False)
             self.env.step()
             self.env.get_state(out=self._states)

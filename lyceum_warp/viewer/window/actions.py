@@ -45,7 +45,7 @@ class Actions:
         self.scroll_down = False
         """Whether the list of messages must scroll down to a new message."""
         self._keys = key_table()
-        self._steering = (0.0, 0.0, 0.0)  # the last command from keys
+        self._steering = (0.0, 0.0, 0.0)  # the last command that the keys gave
 
     @property
     def status(self) -> Status:

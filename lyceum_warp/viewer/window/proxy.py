@@ -263,14 +263,14 @@ class Proxy:
             raise web.HTTPBadRequest(text="the Host header is missing or malformed\n")
         name = match[1].strip("[]")
         try:
-            ipaddress.ip_address(name)  # DNS rebinding cannot change an IP address
+            ipaddress.ip_address(name)  # DNS rebinding needs a name, so an IP address is safe
         except ValueError:
             if name not in self._names:
                 text = f"{name} is not a name of this machine; use its address instead\n"
                 raise web.HTTPMisdirectedRequest(text=text) from None
         own = (f"http://{host}", f"https://{host}")
         foreign = any(origin.lower() not in own for origin in request.headers.getall("Origin", []))
-        # allow links on other pages and frames on pages of this host name, because both need the token
+        # allow links on any page, and frames on pages of this host name; both work only with the token
         site, mode, use = (request.headers.get(f"Sec-Fetch-{name}") for name in ("Site", "Mode", "Dest"))
         linked = mode == "navigate" and (use == "document" or (site == "same-site" and use == "iframe"))
         if foreign or (_is_cross_site(request) and not linked):
