@@ -78,7 +78,7 @@ SHOWS = {
         camera=FreeCamera(track=1, distance=3.5, azimuth=90.0, elevation=-8.0),
     ),
     "arm_hand_pickup": Show(replan_every=2),
-    "dm/acrobot_swingup": Show(start=6.0, seconds=3.0, replan_every=2),
+    "dm/acrobot_swingup": Show(start=6.0, seconds=3.0, seed=1),
     "dm/acrobot_swingup_sparse": Show(start=6.0, seconds=3.0, replan_every=2),
     "dm/ball_in_cup_catch": Show(seconds=2.5),
     "dm/cartpole_balance": Show(seconds=2.5),
@@ -185,10 +185,13 @@ def training(name: str, run: Path, config: dict[str, Any]) -> str:
     algorithm = config["algorithm"]
     rows = (run / "metrics.csv").read_text().splitlines()
     flags = {"algorithm": algorithm} | ({"device": "cuda"} if config["device"].startswith("cuda") else {})
+    flags |= {"nworld": config["nworld"]} if algorithm == "sac" else {}
     flags |= {"iterations": rows[-1].partition(",")[0]} | ({"seed": config["seed"]} if config["seed"] else {})
     suggested = find_task(name).training
-    settings = suggested.settings if suggested.algorithm == algorithm else {}
-    defaults = json.loads(json.dumps(vars(ALGORITHMS[algorithm][1](**settings))))
+    default = ALGORITHMS[algorithm][1](**(suggested.settings if suggested.algorithm == algorithm else {}))
+    if isinstance(default, lw.SACConfig):
+        default = default.resolved(config["nworld"])
+    defaults = json.loads(json.dumps(vars(default)))
     flags |= {
         flag: value for flag, value in config[algorithm].items()
         if flag != "mean_every" and defaults[flag] not in (None, value)
