@@ -1,15 +1,13 @@
 """Update plans by the cross-entropy method (CEM): fit a normal distribution to the best samples.
 
-In CEM, the planner's noise (``planner.py``) has a standard deviation s_t for each element of the plan. The n best
-samples (the elites) u_t^1, ..., u_t^n determine the next plan and its noise:
+CEM was proposed by Rubinstein (1999, "The cross-entropy method for combinatorial and continuous optimization"). The
+noise has a standard deviation s_t for each element of the plan. The n best samples (the elites) u_t^1, ..., u_t^n
+determine the next plan and the next noise:
 
     u_t = 1/n sum_k u_t^k,    s_t = max(sqrt(1/n sum_k (u_t^k - u_t)^2), min_noise)
 
-CEM was proposed by Rubinstein (1999, "The cross-entropy method for combinatorial and continuous optimization"). Here,
-as in hydrax, judo and MuJoCo MPC, the covariance is diagonal. When the planner shifts the plan in time, it also shifts
-the standard deviations, and appends initial values at the end. If the noise is smoothed over time, s_t is its standard
-deviation before smoothing. To compute s_t, CEM divides the elites' standard deviation by the standard deviation of
-smoothed unit noise (``spread``).
+The covariance is diagonal, as in hydrax, judo and MuJoCo MPC. If the noise is smoothed over time, s_t is its standard
+deviation before smoothing: the elites' standard deviation is divided by ``spread``.
 """
 
 from collections.abc import Sequence
@@ -23,11 +21,7 @@ from lyceum_warp.kernels import planning
 
 
 class EliteWeights(PlanUpdate):
-    """Give the best samples equal weights, and all other samples the weight 0.
-
-    Args:
-        elites: Number of samples with non-zero weight.
-    """
+    """Give the best samples equal weights, and all other samples the weight 0."""
 
     capturable = True
 
@@ -51,7 +45,7 @@ class CrossEntropy(EliteWeights):
     """Update plans by CEM.
 
     Args:
-        elites: Number of best samples, which determine the new plan and the new noise.
+        elites: Number of best samples.
         min_noise: Lower limit of the standard deviations: one number, or one number for each action.
         smoothing: Weights (b0, b1, b2) that smooth the noise over time.
     """
@@ -63,11 +57,7 @@ class CrossEntropy(EliteWeights):
         self.min_noise, self.smoothing = min_noise, smoothing
 
     def prepare(self, samples: PlanSamples) -> None:
-        """Allocate the ranks, the lower limits and the standard deviations of smoothed noise.
-
-        Raises:
-            ValueError: The number of values in ``min_noise`` differs from the number of actions.
-        """
+        """Allocate buffers."""
         super().prepare(samples)
         count, _, nact = samples.plan.shape
         smallest = np.asarray(self.min_noise)
@@ -82,7 +72,7 @@ class CrossEntropy(EliteWeights):
         )
 
     def fit(self, samples: PlanSamples) -> None:
-        """Fit the standard deviations of the noise to the elites."""
+        """Fit the noise to the elites."""
         weights, actions = by_sample(samples.weights), by_sample(samples.actions)
         plan, before, after = samples.plan, samples.nominal_deviation, samples.deviation
         assert before is not None and after is not None
@@ -91,10 +81,12 @@ class CrossEntropy(EliteWeights):
 
 
 def spread(smoothing: tuple[float, float, float], count: int) -> np.ndarray:
-    """Compute the standard deviation that smoothing gives to standard normal noise in each step, (count,).
+    """Compute the standard deviation of smoothed standard normal noise in each step, (count,).
 
-    For e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2), the variance v_t and the covariance c_t of e_t and e_(t-1) satisfy v_t =
-    b0^2 + b1^2 v_(t-1) + b2^2 v_(t-2) + 2 b1 b2 c_(t-1) and c_t = b1 v_(t-1) + b2 c_(t-1).
+    The smoothed noise is e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2). Its variance v_t, and the covariance c_t of e_t and
+    e_(t-1), satisfy
+
+        v_t = b0^2 + b1^2 v_(t-1) + b2^2 v_(t-2) + 2 b1 b2 c_(t-1),    c_t = b1 v_(t-1) + b2 c_(t-1)
     """
     b0, b1, b2 = smoothing
     variance, covariance = [1.0, 1.0], 0.0
@@ -102,5 +94,5 @@ def spread(smoothing: tuple[float, float, float], count: int) -> np.ndarray:
         new = b0 * b0 + b1 * b1 * variance[-1] + b2 * b2 * variance[-2] + 2 * b1 * b2 * covariance
         covariance = b1 * variance[-1] + b2 * covariance
         variance.append(new)
-    # standard deviations must be positive, because ``fit`` divides by them
+    # ``fit`` divides by these numbers
     return np.sqrt(np.maximum(variance[:count], np.finfo(np.float32).tiny))

@@ -1,8 +1,7 @@
 """Evaluate and differentiate small fully connected networks on the CPU without autograd.
 
 With a hundred units per layer, torch's modules and autograd take longer than the arithmetic itself. This module
-therefore computes only one matrix product per layer, into preallocated buffers. Other networks, and networks on a GPU,
-use torch's modules and autograd.
+computes only one matrix product per layer, into preallocated buffers.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -33,13 +32,10 @@ _ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[[tor
     nn.ReLU: (lambda x: np.maximum(x, 0.0, out=x), lambda d, y: _relu_slope(d, y, 0.0, grad_input=d)),
     nn.ELU: (_elu_, lambda d, y: _elu_slope(d, 1.0, 1.0, 1.0, True, y, grad_input=d)),
 }
-"""Two in-place functions for each supported activation: f(x) applies the activation, and g(d, y) multiplies d by the
-activation's derivative, which it computes from the activation's output y."""
+"""For each activation: an in-place f(x), and g(d, y), which multiplies d by the derivative at the output y = f(x)."""
 
 _FEW = 2**18
-"""Use NumPy if batch size times number of weights in the largest layer is at most this number, and torch otherwise. A
-NumPy call has less overhead than a torch call, in particular with cold caches after a simulation step. Large products
-run faster in torch."""
+"""Use NumPy for small products, up to this number of multiplications: its calls have less overhead than torch's."""
 
 
 class DensePasses:
@@ -49,7 +45,7 @@ class DensePasses:
 
     Args:
         parameters: Weight and bias of the first layer, then of the second layer, and so on.
-        activation: The activation after each layer except the last; a key of ``_ACTIVATIONS``.
+        activation: A key of ``_ACTIVATIONS``.
     """
 
     def __init__(self, parameters: Iterable[torch.Tensor], activation: type[nn.Module]) -> None:
@@ -72,7 +68,7 @@ class DensePasses:
         kind = type(activations[0]) if activations else nn.Tanh
         linear = all(type(layer) is nn.Linear and layer.bias is not None for layer in layers)
         parameters = [p for layer in layers for p in (layer.weight, layer.bias)] if linear else []
-        # reject shared layers and reparametrised weights
+        # shared layers and reparametrised weights are not supported
         if [id(p) for p in network.parameters()] != [id(p) for p in parameters] or kind not in _ACTIVATIONS:
             return None
         if (
@@ -84,12 +80,10 @@ class DensePasses:
         return DensePasses(parameters, kind)
 
     def _allocate(self, rows: int) -> None:
-        """Allocate buffers for each layer's output and derivative, for batches of ``rows`` inputs."""
         widths = [len(bias) for bias in self.biases]
         self._buffers = [[torch.empty(rows, n) for n in widths] for _ in range(2)]
 
     def _resize(self, rows: int) -> None:
-        """Make views of the buffers for a batch of ``rows`` inputs; allocate larger buffers if necessary."""
         if rows > len(self._buffers[0][0]):
             self._allocate(rows)
         self._rows, self._few = rows, rows * max(weight.numel() for weight in self.weights) <= _FEW
@@ -97,7 +91,7 @@ class DensePasses:
         self._arrays = [result.numpy() for result in self.results]
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
-        """Compute outputs (rows, outputs) from inputs (rows, inputs); store the inputs for ``push`` and ``pull``."""
+        """Compute outputs, (rows, outputs), and store the inputs for ``push`` and ``pull``."""
         if len(x) != self._rows:
             self._resize(len(x))
         self._inputs = [x, *self.results[:-1]]
@@ -115,7 +109,7 @@ class DensePasses:
         return self.results[-1]
 
     def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Compute J v (rows, outputs) at the last inputs; v consists of one tensor per parameter, of the same shape."""
+        """Compute J v, (rows, outputs), at the last inputs; v has one tensor for each parameter."""
         last = len(self.weights) - 1
         for i, derivative in enumerate(self.derivatives):
             torch.addmm(parts[2 * i + 1], self._inputs[i], parts[2 * i].t(), out=derivative)
@@ -126,10 +120,10 @@ class DensePasses:
         return self.derivatives[-1]
 
     def pull(self, u: torch.Tensor, out: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
-        """Compute J^T u at the last inputs for u (rows, outputs); write it into ``out``, shaped like the parameters."""
+        """Compute J^T u at the last inputs for u (rows, outputs), and write it into ``out``."""
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
-            # with more outputs than inputs, x^T u is faster than u^T x, because the rows of x^T u are longer
+            # longer rows make the product faster
             if x.shape[1] < u.shape[1]:
                 out[2 * i].copy_((x.t() @ u).t())
             else:
@@ -142,7 +136,7 @@ class DensePasses:
 
 
 class DensePolicy:
-    """Evaluates a ``GaussianPolicy`` without autograd, using ``DensePasses``."""
+    """Evaluates a ``GaussianPolicy`` without autograd."""
 
     def __init__(self, policy: GaussianPolicy, passes: DensePasses) -> None:
         self.policy, self.passes = policy, passes
@@ -151,7 +145,7 @@ class DensePolicy:
 
     @staticmethod
     def of(policy: GaussianPolicy) -> "DensePolicy | None":
-        """Wrap a policy; return None for subclasses, symmetric policies, and unsupported or partly frozen networks."""
+        """Wrap a policy, or return None if its class or network is not supported."""
         plain = (
             type(policy) is GaussianPolicy
             and policy.mirror is None
@@ -165,7 +159,7 @@ class DensePolicy:
         return None if passes is None else DensePolicy(policy, passes)
 
     def __call__(self, obs: torch.Tensor) -> torch.Tensor:
-        """Compute mean actions (rows, nact) from observations (rows, nobs)."""
+        """Compute mean actions, (rows, nact)."""
         normalizer = self.policy.normalizer
         if not isinstance(normalizer, Normalizer):
             return self.passes(obs)
@@ -186,36 +180,35 @@ class DensePolicy:
         return out
 
     def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Compute J v for the network's parameters at the last observations; see ``DensePasses.push``."""
+        """Compute J v; see ``DensePasses.push``."""
         return self.passes.push(parts)
 
     def pull(self, u: torch.Tensor) -> list[torch.Tensor]:
-        """Compute J^T u for the network's parameters at the last observations; see ``DensePasses.pull``."""
+        """Compute J^T u; see ``DensePasses.pull``."""
         self.passes.pull(u, self._pulled)
         return list(self._pulled)
 
 
 class DenseValue:
-    """Evaluates a ``ValueFunction`` without autograd, using ``DensePasses``."""
+    """Evaluates a ``ValueFunction`` without autograd."""
 
     def __init__(self, value: ValueFunction, passes: DensePasses) -> None:
         self.value, self.passes = value, passes
 
     @staticmethod
     def of(value: ValueFunction) -> "DenseValue | None":
-        """Wrap a value function; return None for subclasses of ``ValueFunction`` and for unsupported networks."""
+        """Wrap a value function, or return None if its class or network is not supported."""
         if type(value) is not ValueFunction or _hooked(value):
             return None
         passes = DensePasses.of(value.network)
         return None if passes is None else DenseValue(value, passes)
 
     def __call__(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Predict returns (...,) from observations (..., nobs) and steps since the reset (...,)."""
+        """Predict returns, (...,)."""
         features = self.value.features(obs, step)
         output = self.passes(features.reshape(-1, features.shape[-1])).view(features.shape[:-1])
         return output * self.value.scale.float() + self.value.shift.float()
 
 
 def _hooked(module: nn.Module) -> bool:
-    """Check whether a module has forward hooks."""
     return any(getattr(module, f"_forward{kind}_hooks") for kind in ("", "_pre"))

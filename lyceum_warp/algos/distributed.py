@@ -1,8 +1,7 @@
 """Distribute learning over processes, each of which steps its own worlds and applies the same update.
 
-Sums over worlds are computed in each process and then reduced over the processes. Every process generates the same
-random numbers, for all worlds, and uses the numbers of its own worlds. The number of processes therefore affects only
-the rounding of sums.
+Every process generates the random numbers of all worlds, and uses those of its own worlds. The number of processes
+therefore affects only the rounding of sums.
 """
 
 import contextlib
@@ -17,9 +16,9 @@ from lyceum_warp.graphs.capture import capturing
 
 
 class Team:
-    """Sums and copies tensors across the processes that learn together; a single process does not communicate.
+    """Sums and copies tensors across the processes that learn together.
 
-    All processes must call the methods in the same order, except ``share`` and ``locate``, which do not communicate.
+    All processes must call the methods in the same order. A single process does not communicate.
 
     Args:
         rank: Rank of this process.
@@ -39,13 +38,13 @@ class Team:
 
     @property
     def captures(self) -> bool:
-        """Whether the communication can be captured in a CUDA graph."""
+        """Whether a CUDA graph can capture the communication."""
         return self.size == 1 or distributed.get_backend() == "nccl"
 
     def capture(self, function: Callable[[], object]) -> torch.cuda.CUDAGraph:
-        """Capture torch operations and communication in a CUDA graph, and register the graph for ``release``."""
+        """Capture torch operations and communication in a CUDA graph."""
         graph = torch.cuda.CUDAGraph()
-        # allow other threads, such as NCCL's, to call CUDA during the capture
+        # other threads, such as NCCL's, may call CUDA during the capture
         with capturing(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
             function()
         self.keep(graph)
@@ -56,7 +55,7 @@ class Team:
         self._graphs.add(graph)
 
     def release(self) -> None:
-        """Reset all registered graphs, because NCCL does not shut down while one exists."""
+        """Reset all registered graphs, because NCCL does not shut down while a graph exists."""
         for graph in list(self._graphs):
             graph.reset()
 
@@ -73,7 +72,7 @@ class Team:
         return nworld // self.size
 
     def locate(self, index: torch.Tensor, nworld: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Convert indices of samples in the worlds of all processes to indices of this process's samples.
+        """Convert indices of samples of all processes to indices of this process's samples.
 
         Args:
             index: Indices into a flattened array (steps, worlds of all processes).
@@ -94,7 +93,7 @@ class Team:
         return tensor
 
     def largest(self, *numbers: int) -> tuple[int, ...]:
-        """Compute the elementwise maximum over the processes; with several processes, the host waits for the device."""
+        """Compute the elementwise maximum over the processes."""
         if self.size == 1:
             return numbers
         whole = torch.tensor(numbers, device=self.device)
@@ -102,7 +101,7 @@ class Team:
         return tuple(whole.tolist())
 
     def gather(self, part: torch.Tensor) -> torch.Tensor:
-        """Concatenate the tensors (n, ...) of all processes into a tensor (size * n, ...), by an all-gather."""
+        """Concatenate the tensors (n, ...) of all processes into a tensor (size * n, ...)."""
         if self.size == 1:
             return part
         whole = part.new_empty(self.size * part.shape[0], *part.shape[1:])
@@ -113,8 +112,8 @@ class Team:
     def copy_leader(self, tensors: Iterable[torch.Tensor]) -> None:
         """Broadcast tensors from rank 0, in place.
 
-        If the processes run on different hardware, their parameters differ by rounding errors, and a broadcast prevents
-        these from accumulating. On equal hardware, all processes compute equal parameters.
+        On different hardware, the processes' parameters differ by rounding errors. Broadcasts keep these errors from
+        accumulating.
         """
         if self.size > 1:
             tensors = list(tensors)
@@ -125,7 +124,7 @@ class Team:
 
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
-        """End all processes if the with block raises an error in one of them; only that process reports the error.
+        """End all processes if the with block raises an error in one of them. Only that process reports the error.
 
         The with block must not communicate, because the other processes would wait for the failed process.
 
@@ -146,15 +145,10 @@ class Team:
 
 
 class Captured:
-    """Calls a function of torch operations and communication; on a GPU, replays the function as a CUDA graph.
+    """Calls a function of torch operations and communication, on a GPU as a CUDA graph.
 
-    The first call runs the function directly, so that it allocates its buffers. The second call captures and replays a
-    graph; all later calls replay it. A graph stores addresses, so the function must update tensors in place.
-
-    Args:
-        function: The function.
-        team: The processes.
-        device: Device of the tensors.
+    The first call runs the function directly, and the second call captures it. A graph stores addresses, so the
+    function must update tensors in place.
     """
 
     def __init__(self, function: Callable[[], object], team: Team, device: torch.device) -> None:
@@ -195,11 +189,10 @@ def side_stream() -> Iterator[None]:
 
 @contextlib.contextmanager
 def join(device: str = "cpu") -> Iterator[Team]:
-    """Join the processes that ``torchrun`` started; without ``torchrun``, yield a team of this process only.
+    """Join the processes that ``torchrun`` started.
 
     Args:
-        device: "cpu", or a CUDA device. If there are several processes, each uses the GPU whose index is its local
-            rank.
+        device: "cpu", or a CUDA device. If there are several processes, each uses the GPU of its local rank.
 
     Raises:
         ValueError: There are fewer GPUs than processes on this machine.
@@ -208,8 +201,8 @@ def join(device: str = "cpu") -> Iterator[Team]:
     if size == 1 or "MASTER_ADDR" not in os.environ:
         yield Team(device=device)
         return
-    # The first optimizer imports torch's compiler. If a process group exists during this import, the compiler keeps the
-    # group and its threads alive until Python exits, and these threads sometimes abort the process at its exit.
+    # The first optimizer imports torch's compiler, which keeps an existing process group alive until Python exits. The
+    # group's threads then sometimes abort the process, so import the compiler before making the group.
     torch.optim.SGD([torch.zeros(1)])
     place, neighbours = int(os.environ.get("LOCAL_RANK", "0")), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     if device.startswith("cuda"):
@@ -230,7 +223,7 @@ def join(device: str = "cpu") -> Iterator[Team]:
         clean = True
     finally:
         team.release()
-        # After an error, do not destroy an NCCL group, because NCCL might wait for processes that have exited. Always
-        # destroy a Gloo group: Gloo does not wait, and its threads must end before Python exits.
+        # After an error, NCCL might wait for processes that have exited. Gloo does not wait, and its threads must end
+        # before Python exits.
         if clean or distributed.get_backend() == "gloo":
             distributed.destroy_process_group()

@@ -16,11 +16,11 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_kind, described, whole_number
 
 MEAN_SEED = 2**31 - 1
-"""Seed of the initial states for evaluations of the mean policy during training."""
+"""Seed of the evaluations during training."""
 
 
 def evaluation_seed(seed: int) -> int:
-    """Derive an evaluation's seed from the seed of training, so that the two have different initial states."""
+    """Derive an evaluation's seed from a training seed, so that their initial states differ."""
     return whole_number("seed", seed, low=0) ^ 0x5A17C3E9
 
 
@@ -40,7 +40,7 @@ class Episodes:
     success: torch.Tensor
     """1.0 for each episode that ended with the goal met, otherwise 0.0."""
     terminated: torch.Tensor
-    """1.0 for each episode that ended by termination, 0.0 for each episode that ended by the time limit or a fault."""
+    """1.0 for each episode that ended by termination, otherwise 0.0. Time limits and faults are not terminations."""
     metrics: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
     """The task's metrics by name, each summed over the steps of an episode."""
 
@@ -62,13 +62,13 @@ def evaluate(
 ) -> Episodes:
     """Run a policy without noise for whole episodes from random initial states.
 
-    Every world contributes the same number of episodes. If all finished episodes counted, worlds with short episodes
-    would contribute more episodes and bias the results.
+    Every world contributes the same number of episodes. Otherwise, worlds with short episodes would contribute more
+    episodes and bias the results.
 
     Args:
         env: The environment; its worlds are reset.
-        policy: A module with a method ``act``, or a function, that maps observations (nworld, nobs) to actions (nworld,
-            nact).
+        policy: A function that maps observations (nworld, nobs) to actions (nworld, nact), or a module with such a
+            method ``act``.
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
         seed: Seed of the initial states, which differ from those of an environment made with the same seed. Without a
             seed, the worlds continue their random streams.
@@ -120,7 +120,6 @@ def evaluate(
 
 
 def _first_actions(act: Callable[[torch.Tensor], torch.Tensor], env: Env) -> torch.Tensor:
-    """Compute a policy's first actions, and check them; later actions are not checked."""
     try:
         action = act(env.obs)
     except RuntimeError as error:
@@ -132,11 +131,11 @@ def _first_actions(act: Callable[[torch.Tensor], torch.Tensor], env: Env) -> tor
 
 
 ENDLESS_STEPS = 1000
-"""Number of steps in an episode, for evaluations of a task without a horizon."""
+"""Steps in an evaluated episode of a task without a horizon."""
 
 
 def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
-    """Copy an environment with another number of worlds, and with a horizon of 1,000 steps if it has none.
+    """Copy an environment with another number of worlds, and with a horizon.
 
     Args:
         env: The environment.
@@ -148,10 +147,10 @@ def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
 
 
 class MeanPolicyEvaluation:
-    """Evaluates the mean policy (the policy without noise) during training, in a separate, small environment.
+    """Evaluates the policy without noise during training, in a separate, small environment.
 
-    All evaluations start from the same initial states, so that they differ only in the policy. Training uses different
-    initial states. Rank 0 evaluates; all processes get its results.
+    All evaluations start from the same initial states, so that they differ only in the policy. Rank 0 evaluates, and
+    all processes get its results.
 
     Args:
         env: The training environment; each evaluation uses its current parameters.
@@ -164,7 +163,7 @@ class MeanPolicyEvaluation:
         self._few: Env | None = None
 
     def __call__(self, policy: torch.nn.Module) -> dict[str, float]:
-        """Evaluate the policy, and return the fields of ``Iteration`` that hold means over the episodes."""
+        """Evaluate the policy, and return ``MEAN_STATISTICS`` by name."""
         means = torch.zeros(len(MEAN_STATISTICS), dtype=torch.float64, device=self.env.obs.device)
         if self.team.leads:
             if self._few is None:
@@ -177,11 +176,11 @@ class MeanPolicyEvaluation:
         return dict(zip(MEAN_STATISTICS, means.tolist(), strict=True))
 
     def added(self, statistics: Mapping[str, Any], policy: torch.nn.Module, *, due: bool) -> dict[str, Any]:
-        """Add the results of an evaluation to the statistics; if no evaluation is due, add None for each result."""
+        """Add the results of an evaluation to the statistics, or None for each result if no evaluation is due."""
         mean: dict[str, Any] = self(policy) if due else dict.fromkeys(MEAN_STATISTICS)
         success = self.env.task.functions["success"] is not None
         return {**statistics, **mean} | ({} if success else {"success": math.nan, "mean_success": None})
 
 
 MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")
-"""The fields of ``Iteration`` that hold the results of evaluating the mean policy."""
+"""Fields of ``Iteration`` with results of evaluations."""

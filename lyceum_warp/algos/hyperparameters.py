@@ -16,11 +16,11 @@ LEAST = -math.inf
 def check_fields(config: Any, bounds: Mapping[str, float | tuple[float, float]]) -> None:
     """Check the fields of a frozen dataclass, and convert numbers to their annotated types.
 
-    Supported annotations are numbers, bool, ``Literal``, widths of hidden layers (``tuple[int, ...]``) and the name of
-    a group of observations (``str | None``). None is valid if the annotation includes it.
+    A field is a number, a bool, a ``Literal``, the widths of hidden layers (``tuple[int, ...]``) or the name of a group
+    of observations (``str | None``). None is valid if the annotation includes it.
 
     Args:
-        config: The dataclass; its ``__post_init__`` calls this function.
+        config: The dataclass, whose ``__post_init__`` calls this function.
         bounds: Lower bound, or lower and upper bound, of each number.
 
     Raises:

@@ -15,7 +15,7 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
 
 METRIC_COLUMN, STEP_METRIC_COLUMN = "metrics/", "step_metrics/"
-"""Prefixes of the two columns of a task's metric in metrics.csv: its sum over an episode, and its mean over steps."""
+"""Prefixes of a task's metric in metrics.csv: of its sum over an episode, and of its mean over steps."""
 
 NESTED = ("metrics", "step_metrics", "numbers")
 """Fields of ``Iteration`` that are dicts."""
@@ -69,7 +69,7 @@ class Iteration:
     """Additional numbers of the algorithm, by column name."""
 
     def row(self) -> dict[str, Any]:
-        """Convert the statistics to a row of metrics.csv, without columns whose value is None.
+        """Convert the statistics to a row of metrics.csv, without values that are None.
 
         The metric ``x`` has the columns ``metrics/x`` and ``step_metrics/x``.
         """
@@ -84,8 +84,8 @@ class Learner(abc.ABC):
     """Base class of learning algorithms; a learner is an infinite iterator of ``Iteration``.
 
     A subclass sets ``algorithm``, ``policy`` and ``config``. It implements ``__next__``, which must also increase
-    ``iteration`` and ``samples``. If the algorithm has more state, the subclass extends ``state_dict`` and
-    ``load_state_dict``. docs/learners.md has an example.
+    ``iteration`` and ``samples``. A subclass with more state extends ``state_dict`` and ``load_state_dict``.
+    docs/learners.md has an example.
 
     Args:
         env: The environment, which must not be stepped between iterations.
@@ -98,14 +98,14 @@ class Learner(abc.ABC):
     """
 
     algorithm: str
-    """The name of the algorithm, and the key of its hyperparameters in a run's config.json."""
+    """Name of the algorithm, and the key of its hyperparameters in a run's config.json."""
     env: Env
     """The environment that provides the samples."""
     policy: torch.nn.Module
-    """The policy after the last iteration. Its method ``act`` maps observations (..., nobs), which it normalises
-    itself, to actions without noise (..., nact). The policy has the attributes ``nobs`` and ``nact``."""
+    """The policy after the last iteration. Its method ``act`` maps observations (..., nobs), without normalisation, to
+    actions (..., nact), without noise. The policy has the attributes ``nobs`` and ``nact``."""
     value: torch.nn.Module | None = None
-    """The value function after the last iteration; None for algorithms without one."""
+    """The value function after the last iteration; None for algorithms without a value function."""
     config: Any
     """The hyperparameters, a dataclass."""
     seed: int
@@ -115,8 +115,8 @@ class Learner(abc.ABC):
     generator: torch.Generator | None = None
     """The random generator, if the algorithm has one."""
     replay: Replay | None = None
-    """The replay buffer, if the algorithm has one. ``state_dict`` does not contain the replay buffer, because the
-    buffer is large. A run saves the buffer in separate files."""
+    """The replay buffer, if the algorithm has one. A run saves the buffer in separate files, not in ``state_dict``,
+    because the buffer is large."""
     own_worlds: slice
     """Indices of this process's worlds among the worlds of all processes."""
     iteration: int
@@ -156,15 +156,15 @@ class Learner(abc.ABC):
     def best_by(self) -> str:
         """The field of ``Iteration`` that selects the best policy and is compared with a run's target return.
 
-        "mean_return" is the return of the policy after the iteration's update, without noise; "return_mean" is the
-        return of the policy before the update, with noise. The default is "mean_return", or "return_mean" if the
-        configuration has ``mean_every=0``.
+        "mean_return" is the return of the policy after the update, without noise; "return_mean" is the return of the
+        policy before the update, with noise. The default is "mean_return", or "return_mean" if the configuration has
+        ``mean_every=0``.
         """
         return "return_mean" if getattr(self.config, "mean_every", None) == 0 else "mean_return"
 
     @property
     def title(self) -> str:
-        """Name of the algorithm in messages, with details such as the size of the replay buffer."""
+        """Name of the algorithm in messages."""
         return self.algorithm
 
     def settings(self) -> dict[str, Any]:
@@ -190,10 +190,10 @@ class Learner(abc.ABC):
             state["generator"] = self.generator.get_state()
         if self.replay is not None:
             state["stored"] = self.replay.stored
-        return copy.deepcopy(state)  # copy, because a module's state_dict shares memory with the parameters
+        return copy.deepcopy(state)  # a module's state_dict shares memory with the parameters
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from a result of ``state_dict``; later iterations equal those of an uninterrupted run bit for bit.
+        """Resume from a result of ``state_dict``. Later iterations equal those of an uninterrupted run bit for bit.
 
         Raises:
             ValueError: The state has a different number of worlds, or a counter is not a whole number.
@@ -206,7 +206,7 @@ class Learner(abc.ABC):
             self.value.load_state_dict(state["value"])
         if self.generator is not None:
             self.generator.set_state(state["generator"].cpu())
-        if "shared" in state:  # checkpoints of earlier releases lack the entry "shared"
+        if "shared" in state:  # missing in checkpoints of earlier releases
             self.env.set_shared(state["shared"].to(self.env.obs.device))
         self.env.set_state(state["env"][self.own_worlds].to(self.env.obs.device))
         self.iteration = whole_number("iteration", state["iteration"], low=0)

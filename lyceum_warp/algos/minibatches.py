@@ -12,11 +12,11 @@ Samples = Mapping[str, torch.Tensor]
 """Tensors by name, each with one row per sample."""
 
 _SURE = 6.0
-"""A process's buffer is larger than the mean number of its samples by this number of standard deviations."""
+"""Room in a process's buffer beyond the mean number of samples, in standard deviations."""
 
 
 def room(batch: int, team: Team) -> int:
-    """Compute the size of each process's buffer if all processes together learn from ``batch`` samples at once."""
+    """Compute the size of each process's buffer for a mini-batch of ``batch`` samples of all processes."""
     share = batch / team.size
     return min(batch, math.ceil(share + _SURE * math.sqrt(share)))
 
@@ -24,16 +24,15 @@ def room(batch: int, team: Team) -> int:
 class Minibatches:
     """Shuffles a rollout's samples once, and learns from the same mini-batches in every epoch.
 
-    The mini-batches do not depend on the number of processes. In a random mini-batch, the number of samples from one
-    process's worlds varies. Each process therefore copies its samples into a buffer of fixed size, padded with samples
-    of weight 0. The buffer has room for six standard deviations more than the mean number of samples; samples beyond
-    that are dropped.
+    The mini-batches do not depend on the number of processes. The number of one process's samples in a mini-batch is
+    therefore random. Each process copies its samples into a buffer of fixed size, padded with samples of weight 0. The
+    buffer has room for six standard deviations more than the mean; further samples are dropped.
 
     On a GPU, an epoch runs as a CUDA graph, so ``learn`` must update tensors in place.
 
     Args:
-        learn: Function that learns from a mini-batch. Its arguments are this process's samples and their weights,
-            (samples,). The weights of all processes sum to 1.
+        learn: Function of a mini-batch: this process's samples and their weights, (samples,). The weights of all
+            processes sum to 1.
         steps: Steps per world in a rollout.
         nworld: Number of this process's worlds.
         count: Number of mini-batches.
@@ -60,10 +59,10 @@ class Minibatches:
 
         Args:
             samples: Samples of this process's worlds, each (steps, nworld, ...).
-            generator: Random generator for the permutation of the samples of all processes.
+            generator: Random generator with the same state in every process.
 
         Returns:
-            The mini-batches by name, each tensor (mini-batches, samples, ...).
+            The mini-batches by name, each (mini-batches, samples, ...).
         """
         order = torch.randperm(self.samples, generator=generator, device=self.weight.device)
         places, own = self.team.locate(order[: self.count * self.batch].view(self.count, self.batch), self.nworld)
@@ -80,7 +79,7 @@ class Minibatches:
         return self._parts
 
     def run(self, epochs: int) -> None:
-        """Learn from the shuffled samples for a number of epochs."""
+        """Learn from the shuffled samples."""
         for _ in range(epochs):
             self.epoch()
 

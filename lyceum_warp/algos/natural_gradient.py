@@ -17,7 +17,7 @@ def score_gradient(
     *,
     dense: DensePolicy | None = None,
 ) -> torch.Tensor:
-    """Compute the gradient (parameters,) of sum(weight * log pi(action | obs)) for all trainable parameters.
+    """Compute the gradient (parameters,) of sum(weight * log pi(action | obs)).
 
     Args:
         policy: The policy.
@@ -40,8 +40,8 @@ def score_gradient(
 class FisherProduct:
     """Compute products with the Fisher information of a Gaussian policy, averaged over observations.
 
-    The Fisher information of N(mean(s; theta), diag(sigma^2)) has two blocks: E[J^T diag(1 / sigma^2) J] for theta,
-    with J = d mean / d theta; and a diagonal block with the entry 2 for each log sigma.
+    The Fisher information of N(mean(s; theta), diag(sigma^2)) has two blocks. The block of theta is E[J^T diag(1 /
+    sigma^2) J] with J = d mean / d theta. The block of log sigma is diagonal with the entry 2.
 
     Args:
         policy: The policy.
@@ -75,7 +75,7 @@ class FisherProduct:
         self.jacobian = dense or AutogradJacobian(self.mean, network)
 
     def __call__(self, vector: torch.Tensor) -> torch.Tensor:
-        """Compute the product (F + damping I) v, (parameters,), for a vector v, (parameters,)."""
+        """Compute (F + damping I) v, (parameters,)."""
         parts = [
             part.view_as(p)
             for part, p in zip(vector.split([p.numel() for p in self.parameters]), self.parameters, strict=True)
@@ -83,16 +83,16 @@ class FisherProduct:
         log_std_part = vector if self.log_std_at is None else parts.pop(self.log_std_at)
         pulled = self.jacobian.pull(self.jacobian.push(parts) * self.precision)
         if self.log_std_at is not None:
-            # log_std's term is not a sum over samples, so each process adds an equal share of it
+            # this term is not a sum over samples, so each process adds an equal share
             pulled.insert(self.log_std_at, 2.0 / self.team.size * log_std_part)
         return self.team.sum(flatten(pulled)) + self.damping * vector
 
 
 class AutogradJacobian:
-    """Compute products with any network's Jacobian J = d mean / d parameters by autograd.
+    """Compute products with a network's Jacobian J = d mean / d parameters by autograd.
 
-    A backward pass through the network computes u^T J. Since J v is the derivative of u^T J v with respect to u, a
-    backward pass through the first backward pass computes J v. Both graphs are built only once.
+    A backward pass through the network computes u^T J. J v is the derivative of u^T J v with respect to u, so a
+    backward pass through the first backward pass computes J v.
 
     Args:
         mean: The network's outputs, (samples, nact).
@@ -105,11 +105,11 @@ class AutogradJacobian:
         self.pulled = torch.autograd.grad(mean, parameters, self.probe, create_graph=True)
 
     def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Compute J v (samples, nact); v consists of one tensor per parameter, of the same shape."""
+        """Compute J v, (samples, nact); v has one tensor for each parameter."""
         return torch.autograd.grad(self.pulled, self.probe, parts, retain_graph=True)[0]
 
     def pull(self, u: torch.Tensor) -> list[torch.Tensor]:
-        """Compute J^T u for u (samples, nact); the result is one tensor per parameter, of the same shape."""
+        """Compute J^T u for u (samples, nact); the result has one tensor for each parameter."""
         return list(torch.autograd.grad(self.mean, self.parameters, u, retain_graph=True))
 
 
@@ -118,8 +118,8 @@ def conjugate_gradient(
 ) -> torch.Tensor:
     """Solve A x = target for a symmetric positive definite matrix A, starting from x = 0; ``product`` computes A x.
 
-    The number of iterations is fixed and no branch depends on values, so the host never waits for the device. Once the
-    residual is zero, further iterations change nothing.
+    No branch depends on values, so the host never waits for the device. Once the residual is zero, further iterations
+    change nothing.
     """
     x = torch.zeros_like(target)
     residual = target.clone()

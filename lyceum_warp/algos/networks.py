@@ -18,13 +18,13 @@ from lyceum_warp.support.validate import check_flag, check_kind, check_word, des
 Module = TypeVar("Module", bound=nn.Module)
 
 Activation: TypeAlias = Literal["tanh", "relu", "leaky_relu", "elu", "selu", "gelu", "silu", "softplus"]
-"""Names of the activations of hidden layers."""
+"""Names of activations."""
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "tanh": nn.Tanh, "relu": nn.ReLU, "leaky_relu": nn.LeakyReLU, "elu": nn.ELU, "selu": nn.SELU, "gelu": nn.GELU,
     "silu": nn.SiLU, "softplus": nn.Softplus,
 }  # fmt: skip
-"""Map names of activations to torch modules."""
+"""The torch module of each activation."""
 
 
 def check_memory(sizes: Sequence[int], **arguments: Any) -> None:
@@ -32,7 +32,7 @@ def check_memory(sizes: Sequence[int], **arguments: Any) -> None:
 
     Args:
         sizes: Widths of all layers, including input and output.
-        arguments: The user's arguments that determine the sizes, by name, for the error message.
+        arguments: The user's arguments for the error message, by name.
 
     Raises:
         ValueError: The weights do not fit into memory.
@@ -59,7 +59,7 @@ def mlp(
         generator: Draws the initial weights.
 
     Raises:
-        ValueError: The name of the activation is unknown.
+        ValueError: The activation is unknown.
     """
     check_word("activation", activation, get_args(Activation))
     check_kind("generator", generator, torch.Generator | None, "as torch.Generator()")
@@ -79,7 +79,7 @@ def mlp(
 
 @torch.no_grad()
 def initialize_as_torch(network: nn.Module, generator: torch.Generator | None) -> None:
-    """Initialise all linear layers like ``nn.Linear``: draw weights uniformly in +-1 / sqrt(inputs)."""
+    """Initialise all linear layers like ``nn.Linear``, uniformly in +-1 / sqrt(inputs)."""
     for layer in network.modules():
         if isinstance(layer, nn.Linear):
             bound = 1.0 / math.sqrt(layer.in_features)
@@ -94,7 +94,7 @@ _Applied: TypeAlias = tuple[torch.Tensor, torch.Tensor]
 
 
 class Normalizer(nn.Module):
-    """Normalises observations by their running mean and variance; until the first update, observations stay unchanged.
+    """Normalises observations by their running mean and variance. Before the first update, observations stay unchanged.
 
     Args:
         size: Length of an observation.
@@ -139,12 +139,12 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def interpolate(self, before: _Applied, after: _Applied, part: torch.Tensor) -> None:
-        """Apply a fraction of an update to ``shift`` and ``scale``; mean and variance keep the whole update.
+        """Apply only a fraction of an update to ``shift`` and ``scale``. Mean and variance keep the whole update.
 
         Args:
             before: ``shift`` and ``scale`` before the update.
             after: ``shift`` and ``scale`` after the update.
-            part: The fraction of the update, from 0 to 1.
+            part: The fraction, from 0 to 1.
         """
         self.shift.copy_(torch.lerp(before[0], after[0], part))
         self.scale.copy_(torch.lerp(before[1].log(), after[1].log(), part).exp())
@@ -156,7 +156,7 @@ class Normalizer(nn.Module):
 
 
 class Normalized(nn.Module):
-    """Base class of modules with an optional normaliser of observations; see ``Normalizer``."""
+    """Base class of modules with an optional normaliser of observations."""
 
     normalizer: nn.Module
 
@@ -168,7 +168,7 @@ class Normalized(nn.Module):
         self.normalizer = Normalizer(nobs, limit) if normalize else nn.Identity()
 
     def observe(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
-        """Update the normaliser, if there is one. The update changes the module's outputs.
+        """Update the normaliser, if there is one. This changes the module's outputs.
 
         Args:
             obs: Observations, (..., nobs).
@@ -180,7 +180,7 @@ class Normalized(nn.Module):
 
 
 def moved(module: Module, env: Env) -> Module:
-    """Return a module on the device of an environment's observations: the module itself or a copy."""
+    """Return the module, or a copy of it, on the device of an environment's observations."""
     device = env.obs.device
     if all(parameter.device == device for parameter in module.parameters()):
         return module
@@ -188,7 +188,7 @@ def moved(module: Module, env: Env) -> Module:
 
 
 def trainable(module: Module) -> Module:
-    """Return the module; if all its parameters are frozen, as in a module from ``lw.load``, unfreeze them."""
+    """Return the module; if all its parameters are frozen, unfreeze them. ``lw.load`` returns frozen modules."""
     if isinstance(module, nn.Module) and not any(parameter.requires_grad for parameter in module.parameters()):
         module.requires_grad_(True)
     return module

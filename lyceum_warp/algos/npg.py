@@ -1,8 +1,8 @@
 """Learn policies by natural policy gradient (NPG).
 
 NPG was proposed by Kakade (2002). This implementation follows Rajeswaran et al., 2017 ("Towards Generalization and
-Simplicity in Continuous Control"): generalised advantages, the vanilla policy gradient, conjugate gradient on the
-Fisher information, and a step of fixed length in the Fisher metric.
+Simplicity in Continuous Control"): generalised advantages, conjugate gradient on the Fisher information, and a step of
+fixed length in the Fisher metric.
 """
 
 import copy
@@ -37,16 +37,16 @@ from lyceum_warp.support.docstrings import document_attributes
 log = logging.getLogger(__name__)
 
 _SHORTER = 4
-"""Maximum number of times that NPG shortens a step of the policy or an update of the normaliser."""
+"""Maximum number of times that NPG shortens a step."""
 
 _LARGEST = 1e30
-"""Rewards are clipped to this absolute value, so that an episode's sum does not overflow float32."""
+"""Rewards are clipped to this absolute value, because an episode's sum would overflow float32."""
 
 _PATIENCE = 10
 """Learning ends after this number of consecutive iterations with a non-finite update."""
 
 _DRIFT = 0.2
-"""Maximum KL divergence that an update of the normaliser may cause, as a fraction of the desired KL divergence."""
+"""Maximum KL divergence of a normaliser's update, as a fraction of the desired KL divergence."""
 
 
 @document_attributes
@@ -97,7 +97,7 @@ class NPG(OnPolicyLearner):
         scale = 1.0 / max(1.0 - config.gamma, 1e-3)
         self._make_networks(policy, value, scale=scale, time_orders=config.time_orders)
 
-        # one process on the CPU can branch on the value of a tensor without waiting for a device or another process
+        # one process on the CPU can read a tensor without waiting for a device or another process
         self._reads_numbers = device.type == "cpu" and team.size == 1
 
         # samples
@@ -156,7 +156,7 @@ class NPG(OnPolicyLearner):
         fisher = self.fisher(obs)
 
         # 6. Fit the value function to the samples' returns; with two CPU threads, the fit runs in parallel with step 5.
-        # First update the value function's normaliser: this changes the predictions, and the fit corrects the change.
+        # The fit corrects the change of the predictions by the value function's normaliser.
         self.value.observe(value_obs, team)
         fit = functools.partial(self.fit, value_obs, rollout.step.flatten(), target.flatten(), self.generator)
         with beside(fit, allowed=self._reads_numbers) as fit_result:
