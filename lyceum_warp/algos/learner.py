@@ -102,8 +102,8 @@ class Learner(abc.ABC):
     env: Env
     """The environment that provides the samples."""
     policy: torch.nn.Module
-    """The policy after the last iteration. Its method ``act`` maps observations (..., nobs), without normalisation, to
-    actions (..., nact), without noise. The policy has the attributes ``nobs`` and ``nact``."""
+    """The policy after the last iteration. Its method ``act`` maps unnormalised observations (..., nobs) to actions
+    without noise (..., nact). The policy has the attributes ``nobs`` and ``nact``."""
     value: torch.nn.Module | None = None
     """The value function after the last iteration; None for algorithms without a value function."""
     config: Any

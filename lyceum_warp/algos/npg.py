@@ -166,7 +166,7 @@ class NPG(OnPolicyLearner):
             timer.mark()
             fitted = fit_result()
 
-        # A single copy transfers the statistics of all processes to the host.
+        # one copy transfers the statistics of all processes to the host
         update = UpdateNumbers(
             finite=finite, kl=kl, step_norm=step.norm(), step_fraction=fraction, gradient_norm=gradient.norm(),
             std_mean=self.policy.log_std.detach().exp().mean(), reward=rollout.reward.double().mean(),
@@ -197,7 +197,6 @@ class NPG(OnPolicyLearner):
         )
 
     def _check_updates(self, update: UpdateNumbers) -> None:
-        """Raise an error after too many consecutive iterations with a non-finite update."""
         parts = {"the step of the policy": update.finite, "the fit of the value function": update.fitted}
         skipped = [part for part, finite in parts.items() if not finite]
         self._skipping = self._skipping + 1 if skipped else 0
@@ -210,7 +209,7 @@ class NPG(OnPolicyLearner):
             )
 
     def sample(self) -> None:
-        """Fill the rollout buffer with samples of the current policy, drawn with new noise."""
+        """Fill the rollout buffer with samples of the current policy."""
         with one_thread():
             self.noise.normal_(generator=self.generator)
             self._dense = DensePolicy.of(self.policy)
@@ -224,7 +223,7 @@ class NPG(OnPolicyLearner):
         The returns bootstrap from the value function at time limits and at the end of the rollout. Terminal states have
         the value 0, as in mjrl; Lyceum bootstraps at terminal states too. The standard deviation of the returns becomes
         the value function's scale. Advantages are clipped to ten times this scale, so that a single extreme reward does
-        not dominate the gradient or the fit.
+        not dominate.
 
         Returns:
             Advantages and returns, each (steps, nworld); statistics of the value function's errors; and the number of
@@ -250,12 +249,7 @@ class NPG(OnPolicyLearner):
         return advantage, target, prediction, outliers
 
     def predict(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Predict returns, (...,), and replace non-finite predictions by the mean return of the last fit.
-
-        Args:
-            obs: Observations, (..., nobs).
-            step: Steps since the reset, (...,).
-        """
+        """Predict returns, (...,), and replace non-finite predictions by the mean return of the last fit."""
         value = (DenseValue.of(self.value) or self.value)(obs, step)
         return torch.where(value.isfinite(), value, self.value.shift.float())
 
@@ -264,8 +258,7 @@ class NPG(OnPolicyLearner):
         """Update the normaliser of the policy's observations, and limit the resulting change of the policy.
 
         If an update would change the policy by more than a fifth of the desired KL divergence, only a fraction of the
-        update is applied; later iterations apply the rest. The reported KL divergence includes the change of the
-        normaliser.
+        update is applied. Later iterations apply the rest. The reported KL divergence includes this change.
 
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
@@ -292,17 +285,13 @@ class NPG(OnPolicyLearner):
         return old_mean
 
     def fisher(self, obs: torch.Tensor) -> FisherProduct:
-        """Make a function that multiplies a vector by the Fisher information of a random subset of the samples.
-
-        Args:
-            obs: Observations of this process's worlds, (samples, nobs).
-        """
+        """Make the product with the Fisher information of a random subset of the samples."""
         weight = None
         if self._fisher_count < self.count:
             subset = torch.randperm(self.count, generator=self.generator, device=obs.device)[: self._fisher_count]
             if self.team.size == 1:
                 obs = obs[subset]
-            else:  # give other processes' samples the weight 0: selection by a mask would synchronise
+            else:  # selection by a mask would synchronise
                 places, own = self.team.locate(subset, self.env.nworld)
                 obs, weight = obs[places], own.float()
         return FisherProduct(
@@ -314,13 +303,12 @@ class NPG(OnPolicyLearner):
     def move(
         self, step: torch.Tensor, obs: torch.Tensor, old_mean: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Add a step to the policy's parameters; shorten the step if the KL divergence exceeds its limit.
+        """Add a step to the policy's parameters, and shorten the step if the KL divergence exceeds its limit.
 
         The step's length was computed from the Fisher information, which approximates the KL divergence only to second
-        order and on a subset of the samples. If the measured divergence exceeds its limit, the step is shortened, up to
-        four times. Each time, a second-order estimate gives the new length, which is at most half of the old length. If
-        the divergence still exceeds the limit, or if the step is not finite, the policy does not change. The host does
-        not wait for the device.
+        order and on a subset of the samples. A step that is too long is shortened up to four times, at least by half
+        each time. If the divergence still exceeds the limit, or if the step is not finite, the policy does not change.
+        The host does not wait for the device.
 
         Args:
             step: The step, (parameters,).

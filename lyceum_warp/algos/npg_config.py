@@ -15,9 +15,9 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 _LONG_EPISODE = 20
-"""If an episode lasts longer than this number of iterations, NPG restarts worlds by default (``min_restarts``). If an
-episode of hopper lasted 63 or 31 iterations, NPG's return stayed low for a long time with some seeds; with 16
-iterations, it did not (bench/README.md, "NPG's learning curves")."""
+"""NPG restarts worlds by default (``min_restarts``) if an episode lasts longer than this number of iterations. When an
+episode of hopper lasted 63 or 31 iterations, the return stayed low for a long time with some seeds, but not with 16
+iterations (bench/README.md, "NPG's learning curves")."""
 
 
 @document_attributes
@@ -34,24 +34,23 @@ class NPGConfig:
     steps of every world if that is more."""
     rollout: Literal["auto", "episodes", "segments"] = "auto"
     """"episodes" starts new episodes in every iteration, as in the paper. "segments" continues the last iteration's
-    episodes; this suits many worlds with few steps each. "auto" selects "episodes" if samples / worlds >= horizon, and
+    episodes, which suits many worlds with few steps each. "auto" selects "episodes" if samples / worlds >= horizon, and
     otherwise "segments"."""
     min_restarts: float | None = None
     """Minimum number of worlds that start an episode in each iteration, as a multiple of samples / horizon; 0 turns
-    restarts off. If fewer worlds started an episode in the last iteration, random worlds are restarted. Worlds are
-    restarted only if the rollout is "segments" and episodes have a time limit. Without restarts, worlds that started
-    together also reach the time limit together; in the iterations in between, few samples come from the start of an
-    episode. The statistics exclude interrupted episodes, so a ``min_restarts`` well above 1 biases ``return_mean``
-    towards short episodes. The default is 0.5 if an episode lasts longer than 20 iterations, and 0 otherwise. For
-    example, episodes of 1,000 steps last longer than 20 iterations with 205 or more worlds and the default number of
-    samples."""
+    restarts off. If fewer worlds started an episode in the last iteration, random worlds are restarted. This requires
+    "segments" and a time limit. Without restarts, worlds that started together reach the time limit together, and few
+    samples in between come from the start of an episode. The statistics exclude interrupted episodes, so values well
+    above 1 bias ``return_mean`` towards short episodes. The default is 0.5 if an episode lasts longer than 20
+    iterations, and 0 otherwise. For example, episodes of 1,000 steps last longer than 20 iterations with 205 or more
+    worlds and the default number of samples."""
     gamma: float = 0.995
     """Discount factor."""
     lam: float = 0.97
     """Lambda of the generalised advantage estimate."""
     delta: float = 0.1
-    """Squared length of a step in the Fisher metric. The squared length is twice the KL divergence between the old and
-    the new policy."""
+    """Squared length of a step in the Fisher metric, which is twice the KL divergence between the old and the new
+    policy."""
     whiten: bool = True
     """Whether to normalise advantages to mean 0 and standard deviation 1 (as in mjrl, unlike Lyceum)."""
     cg_iterations: int = 10
@@ -61,8 +60,7 @@ class NPGConfig:
     fisher_fraction: float = 1.0
     """Fraction of the samples used for the Fisher information, drawn at random in each iteration."""
     kl_limit: float = 1.5
-    """Maximum KL divergence of a step, as a multiple of delta / 2, the second-order estimate of the divergence. NPG
-    shortens steps that exceed this limit."""
+    """Maximum KL divergence of a step, as a multiple of delta / 2. NPG shortens steps that exceed this limit."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the policy's hidden layers."""
     activation: Activation = "tanh"
@@ -76,7 +74,7 @@ class NPGConfig:
     value_activation: Activation = "tanh"
     """Activation of the value function's hidden layers."""
     value_group: str | None = None
-    """Group of observations for the value function; by default "critic" if the task has such a group, else "policy"."""
+    """Group of observations for the value function; by default "critic" if the task has this group, else "policy"."""
     value_epochs: int = 2
     """Epochs of the value function's fit."""
     value_batch: int | None = None
@@ -104,19 +102,12 @@ class NPGConfig:
 
 
 def enough_samples(config: NPGConfig, nworld: int) -> int:
-    """Compute the number of samples per iteration; ``nworld`` is the number of worlds of all processes."""
+    """Compute the number of samples per iteration; ``nworld`` counts the worlds of all processes."""
     return max(10_000, 16 * nworld) if config.samples is None else config.samples
 
 
 def least_restarts(config: NPGConfig, nworld: int, steps: int, horizon: int) -> int:
-    """Compute the minimum number of worlds, over all processes, that start an episode in an iteration.
-
-    Args:
-        config: The hyperparameters.
-        nworld: Number of worlds of all processes.
-        steps: Steps of each world in an iteration.
-        horizon: Time limit of an episode, in steps; 0 means no limit.
-    """
+    """Compute the minimum number of worlds, over all processes, that start an episode in an iteration."""
     if horizon == 0:
         return 0
     share = config.min_restarts

@@ -28,7 +28,7 @@ class NPGIteration(OnPolicyIteration):
     """
 
     step_norm: float
-    """Euclidean norm of the step in the policy's parameters, before any shortening."""
+    """Euclidean norm of the full step in the policy's parameters."""
     step_fraction: float
     """Fraction of the full step that was applied; less than 1 if the full step exceeded the limit of the KL
     divergence."""
@@ -39,20 +39,20 @@ class NPGIteration(OnPolicyIteration):
     explained_variance: float
     """Fraction of the returns' variance that the value function explained before the fit."""
     outliers: int
-    """Number of samples with an advantage that was clipped to ten standard deviations of the returns."""
+    """Number of advantages that were clipped to ten standard deviations of the returns."""
     skipped_updates: int
-    """Number of non-finite updates (policy step, value function fit) that were skipped, 0 to 2."""
+    """Number of non-finite updates that were skipped: 0, 1 or 2 (policy, value function)."""
     time_gradient: float
     """Seconds for advantages and the vanilla gradient."""
     time_solve: float
     """Seconds for conjugate gradient and the step."""
     time_value: float
-    """Seconds for the value function's fit. If the fit runs in parallel with the step (two CPU threads), the time of
-    the overlap counts only in ``time_solve``."""
+    """Seconds for the value function's fit. Time that overlaps with the step (on two CPU threads) counts only in
+    ``time_solve``."""
 
 
 class UpdateNumbers(NamedTuple):
-    """Statistics of one update of the policy; the names are those of the fields of ``NPGIteration``."""
+    """Statistics of one update of the policy, named as in ``NPGIteration``."""
 
     # statistics that are equal in all processes
     finite: Scalar  # whether the step is finite
@@ -70,7 +70,7 @@ class UpdateNumbers(NamedTuple):
 
 
 class ValueSums(NamedTuple):
-    """Moments of the discounted returns and of the value function's errors (return minus prediction) in one process."""
+    """Moments of one process's discounted returns, and of the value function's errors (return minus prediction)."""
 
     return_mean: Scalar
     return_square: Scalar  # sum of the squared deviations from the mean
@@ -79,7 +79,7 @@ class ValueSums(NamedTuple):
 
 
 class ProcessNumbers(NamedTuple):
-    """What one process contributes to the statistics of an iteration."""
+    """One process's part of the statistics of an iteration."""
 
     update: UpdateNumbers
     values: ValueSums
@@ -88,12 +88,12 @@ class ProcessNumbers(NamedTuple):
     """The result of ``metric_sums``."""
 
     def pack(self) -> torch.Tensor:
-        """Pack all numbers into one float64 tensor, so that one copy to other processes or to the host suffices."""
+        """Pack all numbers into one float64 tensor, which needs only one copy to the host."""
         return torch.stack([number.double() for part in self for number in part])
 
     @classmethod
     def unpack(cls, numbers: Iterable[float]) -> "ProcessNumbers":
-        """Unpack the result of ``pack`` into floats on the host."""
+        """Unpack the result of ``pack``."""
         rest = iter(numbers)
         return cls(
             update=UpdateNumbers(*itertools.islice(rest, len(UpdateNumbers._fields))),
@@ -104,7 +104,7 @@ class ProcessNumbers(NamedTuple):
 
 
 def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> ValueSums:
-    """Compute the moments of returns and of prediction errors, as scalar tensors on the device."""
+    """Compute the moments of returns and of prediction errors."""
     target, error = returns.double(), (returns - predicted).double()
     return ValueSums(
         return_mean=(return_mean := target.mean()),
@@ -115,10 +115,10 @@ def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> ValueSums
 
 
 def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence[str] = ()) -> dict[str, Any]:
-    """Combine the numbers of all processes into the values of fields of ``NPGIteration``.
+    """Combine the numbers of all processes into fields of ``NPGIteration``.
 
     Args:
-        processes: The ``ProcessNumbers`` of each process, as floats.
+        processes: Each process's numbers, as floats.
         samples: Number of samples of each process.
         metrics: Names of the task's metrics.
     """
@@ -142,7 +142,7 @@ def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence
 
 
 def value_statistics(sums: Sequence[ValueSums], samples: int) -> dict[str, float]:
-    """Compute ``value_error`` and ``explained_variance`` from each process's sums over its ``samples`` samples."""
+    """Compute the statistics of the value function; each process has ``samples`` samples."""
     n, mean, square = pooled([Moments(samples, part.return_mean, part.return_square) for part in sums])
     _, error_mean, error_square = pooled([Moments(samples, part.error_mean, part.error_square) for part in sums])
     error, size = error_square + n * error_mean**2, square + n * mean**2

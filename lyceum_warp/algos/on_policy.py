@@ -22,11 +22,11 @@ from lyceum_warp.support.validate import check_kind
 
 @document_attributes
 class OnPolicyLearner(Learner):
-    """Base class of NPG and PPO: learn a Gaussian policy and a value function from a rollout buffer.
+    """Base class of NPG and PPO, which learn a Gaussian policy and a value function from a rollout.
 
     Raises:
-        ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy
-            is not trainable (``lyceum_warp.algos.policy_check``).
+        ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy is not
+            trainable (``lyceum_warp.algos.policy_check``).
     """
 
     config_type: ClassVar[type]
@@ -76,7 +76,6 @@ class OnPolicyLearner(Learner):
         limit: float = LIMIT,
         as_torch: bool = False,
     ) -> None:
-        """Use the given networks, or make new ones, and seed the generator."""
         env, config, device = self.env, self.config, self.env.obs.device
         nobs, nact = env.obs_space.size, env.action_space.size
         group = value_group(env, config.value_group) if value is None else value.group
@@ -95,11 +94,10 @@ class OnPolicyLearner(Learner):
         self.value.discount = config.gamma
         self.policy.to(device)
         self.value.to(device)
-        # draw a separate seed, so that weights and noise are independent
+        # a separate seed makes the noise independent of the weights
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
 
     def _make_rollout(self, steps: int, *, first_only: bool = False) -> None:
-        """Allocate the rollout buffer, and the buffers of advantages and returns."""
         self.count = steps * self.env.nworld * self.team.size
         self.rollout = Rollout(self.env, steps, groups=(self.value.group,), first_only=first_only)
         self._advantage, self._return = (torch.empty_like(self.rollout.reward) for _ in range(2))
@@ -108,7 +106,7 @@ class OnPolicyLearner(Learner):
     def _estimate(
         self, reward: torch.Tensor, value: torch.Tensor, next_value: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Compute generalised advantages and discounted returns (steps, nworld) with ``kernels/returns.py``."""
+        """Compute generalised advantages and discounted returns, each (steps, nworld)."""
         arrays = (reward, value, next_value, self.rollout.terminated, self.rollout.done)
         outputs = [wp.from_torch(self._advantage), wp.from_torch(self._return)]
         args = [*map(wp.from_torch, arrays), self.config.gamma, self.config.lam, *outputs]
@@ -116,7 +114,6 @@ class OnPolicyLearner(Learner):
         return self._advantage, self._return
 
     def _with_mean_policy(self, statistics: dict[str, Any]) -> dict[str, Any]:
-        """Evaluate the mean policy every ``mean_every`` iterations, and add the results to the statistics."""
         every = self.config.mean_every
         return self._evaluate_mean.added(statistics, self.policy, due=every > 0 and self.iteration % every == 0)
 

@@ -1,7 +1,7 @@
 """Define the interface of plan updates, which weight the samples, and may fit the plan and its noise to them.
 
-The planner (``planner.py``) rolls out the samples and computes their weighted mean. The modules ``mppi.py``, ``cem.py``
-and ``predictive_sampling.py`` implement three updates.
+The planner (``planner.py``) rolls out the samples and computes their weighted mean. Three updates are in ``mppi.py``,
+``cem.py`` and ``predictive_sampling.py``.
 """
 
 import abc
@@ -18,25 +18,23 @@ from lyceum_warp.support.docstrings import document_attributes
 @document_attributes
 @dataclasses.dataclass(frozen=True)
 class PlanSamples:
-    """The samples of one planning iteration: the tensors that a plan update reads and writes.
+    """The samples of one planning iteration.
 
-    Plans and samples have one row per step of the horizon, or one row per knot if the planner uses knots. All tensors
-    are float32 on the device of the planner's worlds. The tensors' addresses are fixed, so write into the tensors
-    instead of replacing them.
+    Plans and samples have one row for each step of the horizon, or for each knot if the planner uses knots. All tensors
+    are float32 on the device of the planner's worlds. A plan update must write into the tensors and must not replace
+    them.
     """
 
     returns: torch.Tensor
     """The samples' returns, (plants, samples); minus infinity for failed samples."""
     weights: torch.Tensor
-    """The samples' weights, (plants, samples). The method ``weigh`` writes the weights; the weights for each plant sum
-    to 1."""
+    """The samples' weights, (plants, samples), written by ``weigh``. The weights for each plant sum to 1."""
     actions: torch.Tensor
     """The samples' actions, (rows, plants, samples, nact)."""
     nominal: torch.Tensor
-    """The plans around which the planner drew the samples, (rows, plants, nact)."""
+    """The plans around which the samples were drawn, (rows, plants, nact)."""
     plan: torch.Tensor
-    """The new plans, (rows, plants, nact). The planner writes the weighted means of the samples, which ``fit`` may
-    change."""
+    """The new plans, (rows, plants, nact): the weighted means of the samples. ``fit`` may change them."""
     nominal_deviation: torch.Tensor | None
     """Standard deviations of the samples' noise before smoothing, (rows, plants, nact); None if ``adapts_noise`` is
     False."""
@@ -57,13 +55,11 @@ class PlanUpdate(abc.ABC):
     """
 
     capturable: ClassVar[bool] = False
-    """Whether a CUDA graph can capture ``weigh`` and ``fit``. This requires that both consist of Warp launches on
-    arrays at fixed addresses. If False, ``weigh`` and ``fit`` may use torch, and the planner calls them between two
-    graphs."""
+    """Whether a CUDA graph can capture ``weigh`` and ``fit``. Both must then consist of Warp launches on arrays at
+    fixed addresses. Otherwise they may use torch, and the planner calls them between two graphs."""
     adapts_noise: ClassVar[bool] = False
-    """Whether the noise has a separate standard deviation for each element of a plan. ``fit`` adapts these standard
-    deviations, and the planner shifts them in time. If False, the standard deviations are those of the planner's
-    setting ``noise``."""
+    """Whether ``fit`` adapts a separate standard deviation of the noise for each element of a plan. Otherwise, the
+    planner's setting ``noise`` gives the standard deviations."""
 
     def prepare(self, samples: PlanSamples) -> None:
         """Check sizes and allocate buffers; called once, when the planner is made."""

@@ -28,7 +28,7 @@ class GaussianPolicy(Normalized):
         nobs: Length of an observation.
         nact: Length of an action.
         hidden: Widths of the hidden layers.
-        network: A module that replaces the default network. The network maps observations (..., nobs), normalised if
+        network: A module that replaces the default network. It maps observations (..., nobs), normalised if
             ``normalize`` is set, to mean actions (..., nact), in float32 and independently for each observation. For
             NPG, the network must be twice differentiable.
         activation: Activation of the hidden layers.
@@ -43,7 +43,7 @@ class GaussianPolicy(Normalized):
     """
 
     shape: dict[str, Any]
-    """Arguments for ``like``, which makes a policy with the same structure."""
+    """Arguments of ``like``."""
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class GaussianPolicy(Normalized):
             self.shape["limit"] = limit
         if network is None:
             self.shape |= {"hidden": layer_sizes(hidden), "activation": activation}
-            # a last layer near zero makes initial mean actions near zero (as in mjrl)
+            # make initial mean actions near zero (as in mjrl)
             network = mlp([nobs, *hidden, nact], activation=activation, last_scale=1e-2, generator=generator)
         elif isinstance(network, nn.Module):
             self.shape["own"] = _class_name(network)
@@ -96,7 +96,7 @@ class GaussianPolicy(Normalized):
         """Make a new policy with the given ``shape``.
 
         Raises:
-            ValueError: The shape is that of a custom policy class or of a policy with a custom network.
+            ValueError: The policy or its network has a custom class.
         """
         if (own := shape.get("own")) is not None:
             normalize = ", normalize=True" if shape["normalize"] else ""
@@ -156,7 +156,7 @@ Policy: TypeAlias = nn.Module | Callable[[torch.Tensor], torch.Tensor]
 
 
 def acting(policy: Policy) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Get the function that maps observations to actions: a policy's ``act``, or the function itself."""
+    """Return the policy's method ``act``, or the policy itself if it is a function."""
     act: Callable[[torch.Tensor], torch.Tensor] = getattr(policy, "act", policy)
     return act
 

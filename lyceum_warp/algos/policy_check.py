@@ -10,15 +10,15 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.validate import check_group, described
 
 _ROWS = 4
-"""Number of observations in the test batch."""
+"""Observations in the test batch."""
 
 
 def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
     """Check that an algorithm can train a policy in an environment.
 
-    The policy must be a ``GaussianPolicy``. The policy must map observations (..., nobs) to mean actions (..., nact)
-    deterministically, and independently for each observation. The policy must be differentiable with respect to its
-    trainable parameters.
+    The policy must be a ``GaussianPolicy``. It must map observations (..., nobs) to mean actions (..., nact)
+    deterministically, and independently for each observation. It must be differentiable with respect to its trainable
+    parameters.
 
     Args:
         policy: The policy.
@@ -67,7 +67,6 @@ def _check_output(policy: GaussianPolicy, obs: torch.Tensor) -> None:
 
 
 def _called(policy: GaussianPolicy, obs: torch.Tensor) -> torch.Tensor:
-    """Call the policy, and check the type and shape of the mean actions, (rows, nact)."""
     shape = (len(obs), policy.nact)
     try:
         mean: object = policy(obs)
@@ -131,5 +130,4 @@ def check_value(value: ValueFunction, env: Env) -> None:
 
 
 def _first_line(error: BaseException) -> str:
-    """Shorten an error message to its first sentence; torch's messages can fill a page."""
     return (str(error).strip() or type(error).__name__).splitlines()[0].split(". ")[0][:200]

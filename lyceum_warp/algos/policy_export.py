@@ -28,7 +28,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
     """Export a policy's ``act`` to a file that runs without this package.
 
     The exported file includes the normaliser. It maps float32 observations (n, nobs), with any n, to actions without
-    noise. The exported file does not clip controls to the actuators' ranges, as environments do.
+    noise. Unlike environments, it does not clip controls to the actuators' ranges.
 
     ===========  ======================================================================================
     ``.onnx``    input ``obs``, output ``action``; for ONNX Runtime, TensorRT, OpenVINO, ...
@@ -131,7 +131,7 @@ class _Acting(torch.nn.Module):
 
 
 def check_export(path: Path) -> None:
-    """Check a file's suffix, and whether the packages for its format are installed; see ``export_policy``."""
+    """Check a file's suffix, and whether the packages for its format are installed."""
     if path.suffix not in _SUFFIXES:
         raise ValueError(f"{path} must end with {' or '.join(_SUFFIXES)}")
     missing = [name for name in ("onnx", "onnxscript") if importlib.util.find_spec(name) is None]
@@ -141,7 +141,6 @@ def check_export(path: Path) -> None:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence the warnings of torch's exporter about its internals and about optional packages."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

@@ -43,7 +43,7 @@ _EPS = 1e-2
 _SMALLEST_STD = 1e-6
 
 _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
-"""The lower and upper limit of the adaptive learning rate, and the factor by which a change raises or lowers it."""
+"""Limits of the adaptive learning rate, and the factor of a change."""
 
 
 @document_attributes
@@ -52,7 +52,7 @@ class PPOIteration(OnPolicyIteration):
     """Statistics of one iteration of PPO.
 
     Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended. If ``stagger``
-    is set, the statistics exclude each world's first episode, because it starts at a random step.
+    is set, they exclude each world's first episode, which starts at a random step.
     """
 
     return_recent: float
@@ -117,8 +117,7 @@ class PPO(OnPolicyLearner):
                 f"{config.minibatches} mini-batches need at least {config.minibatches} samples, not {count}: use more "
                 "worlds or fewer mini-batches"
             )
-        # use torch's initial weights: with NPG's last layer near zero, the adaptive learning rate would be much too
-        # high at first
+        # with NPG's last layer near zero, the adaptive learning rate would be much too high at first
         limit = math.inf if config.normalize else LIMIT
         self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)
         self._make_mirror()
@@ -136,7 +135,7 @@ class PPO(OnPolicyLearner):
         self.rate = torch.tensor(config.learning_rate, device=device)
         self._cuda = device.type == "cuda"
         self.optimizer = torch.optim.Adam(self._parameters, lr=self.rate, fused=True, capturable=self._cuda)
-        # store gradients, KL divergence and losses in one tensor, so that one all-reduce suffices
+        # one tensor for gradients, KL divergence and losses needs only one all-reduce
         sizes = [p.numel() for p in self._parameters]
         self._sums = self._parameters[0].new_zeros(sum(sizes) + 4)
         for parameter, part in zip(self._parameters, self._sums[:-4].split(sizes), strict=True):
@@ -153,9 +152,8 @@ class PPO(OnPolicyLearner):
             self.rollout.stagger(self.generator, team)
 
     def _make_mirror(self) -> None:
-        """Make the functions that mirror observations and actions, if ``config.symmetry`` is not "none"."""
         config, env = self.config, self.env
-        if self.policy.mirror is not None:  # a policy from another run may already be symmetric
+        if self.policy.mirror is not None:  # a policy of another run
             config = self.config = dataclasses.replace(config, symmetry="exact")
         self._mirror: PolicyMirror | None = None
         if config.symmetry == "none":
@@ -180,12 +178,11 @@ class PPO(OnPolicyLearner):
             samples = self.evaluated_samples()
             timer.mark()
 
-            # 3. Run epochs of mini-batches, each for one gradient step on the clipped surrogate, the value loss and the
-            # entropy.
+            # 3. Run epochs of mini-batches.
             self.update(samples)
             kl = self.divergence()
 
-        # One copy transfers the statistics of all processes to the host, and another copy transfers the returns.
+        # one copy transfers the statistics of all processes to the host
         losses = self._losses / (config.epochs * config.minibatches)
         finite = torch.stack([numbers.isfinite().all() for numbers in (losses, *self._parameters)]).all()
         numbers = [
@@ -235,10 +232,9 @@ class PPO(OnPolicyLearner):
 
     @torch.no_grad()
     def sample(self) -> None:
-        """Fill the rollout buffer with samples of the current policy, drawn with new noise.
+        """Fill the rollout buffer with samples of the current policy.
 
-        After each step, the normalisers are updated with the step's observations. Values and densities are computed
-        later, by ``evaluated_samples`` for all steps at once.
+        After each step, the normalisers are updated with the step's observations.
         """
         env, rollout, std = self.env, self.rollout, self.policy.log_std.exp()
         with one_thread():
@@ -258,10 +254,9 @@ class PPO(OnPolicyLearner):
     def evaluated_samples(self) -> dict[str, torch.Tensor]:
         """Compute the update's inputs, each (steps, nworld, ...), with the networks from before the update.
 
-        Advantages bootstrap from the observation after each step but before the task's events, such as a push or a new
-        command. An event changes the value of the state, but no action caused this change, so advantages and targets
-        exclude it. At time limits, at faults and at the end of the rollout, they bootstrap from the same observation.
-        The value function's targets are its predictions plus the advantages.
+        The value function's targets are its predictions plus the advantages. Advantages bootstrap from the observation
+        after each step but before the task's events, such as a push or a new command, because no action caused these
+        events. They also bootstrap at time limits, at faults and at the end of the rollout.
         """
         rollout, config, team = self.rollout, self.config, self.team
         obs, final_obs = rollout.obs_groups[self.value.group], rollout.final_obs_groups[self.value.group]
@@ -280,7 +275,7 @@ class PPO(OnPolicyLearner):
         }  # fmt: skip
 
     def update(self, samples: Samples) -> None:
-        """Run the epochs of mini-batches on the results of ``evaluated_samples``."""
+        """Run the epochs of mini-batches."""
         config, team = self.config, self.team
         parts = self.minibatches.shuffle(samples, self.generator)
         if config.whiten_minibatches:
@@ -321,7 +316,7 @@ class PPO(OnPolicyLearner):
             assert self._mirror is not None
             image = self._mirror.action(self.policy(self._mirror.obs(samples["obs"])))
             loss = loss + config.symmetry_coef * (weight * (mean - image).square().mean(-1)).sum()
-        # do not use backward(): it accumulates gradients on the CUDA stream of its first call
+        # backward() would accumulate gradients on the CUDA stream of its first call
         gradients = torch.autograd.grad(loss, self._parameters)
 
         with torch.no_grad():
@@ -338,7 +333,7 @@ class PPO(OnPolicyLearner):
     def _with_images(self, samples: Samples) -> dict[str, torch.Tensor]:
         """Append the mirror images of samples.
 
-        A mirrored sample keeps the density of the original sample: the mirrored policy would draw it with this density.
+        An image has the same density under the mirrored policy as the original sample under the policy.
         """
         assert self._mirror is not None
         images = dict(samples)
@@ -348,14 +343,12 @@ class PPO(OnPolicyLearner):
         return {name: torch.cat([part, images[name]]) for name, part in samples.items()}
 
     def _adapt(self, kl: torch.Tensor) -> None:
-        """Adapt the learning rate to a KL divergence, without waiting for the device."""
         wanted = self.config.desired_kl
         lower, higher = (self.rate / _FACTOR).clamp_min(_SLOWEST), (self.rate * _FACTOR).clamp_max(_FASTEST)
         raised = torch.where((kl < wanted / 2.0) & (kl > 0.0), higher, self.rate)
         self.rate.copy_(torch.where(kl > wanted * 2.0, lower, raised))
 
     def _log_std(self) -> torch.Tensor:
-        """Return the logarithms of the standard deviations, (nact,)."""
         if self.config.std_type == "log":
             log_std = self.std.clamp_min(math.log(_SMALLEST_STD))
         else:
@@ -375,7 +368,7 @@ class PPO(OnPolicyLearner):
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
-        """Get the returns of the episodes that ended in all processes, without excluded episodes, ordered by step."""
+        """Get the returns of the episodes that ended in all processes, ordered by step."""
         ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
         ended = self.team.gather(ended.T).T
         found: list[float] = ended[~ended.isnan()].tolist()
@@ -401,4 +394,4 @@ class PPO(OnPolicyLearner):
             self.std.copy_(state["std"])
         self._recent.clear()
         self._recent.extend(state["recent"])
-        self.minibatches.epoch.forget()  # discard the graph: it contains the addresses of Adam's old moments
+        self.minibatches.epoch.forget()  # the graph contains the addresses of Adam's old moments

@@ -29,18 +29,16 @@ class PPOConfig:
     epochs: int = 5
     """Number of passes over an iteration's samples."""
     minibatches: int = 4
-    """Number of equal mini-batches per epoch. If the number of samples is not a multiple of this number, the remaining
-    samples are not used."""
+    """Number of mini-batches of equal size per epoch. The remaining samples are not used."""
     gamma: float = 0.99
     """Discount factor."""
     lam: float = 0.95
     """Lambda of the generalised advantage estimate."""
     clip: float = 0.2
-    """Clipping range of the probability ratio around 1. If clip_value_loss is set, values are clipped to the same
-    distance from the old values."""
+    """Clipping range of the probability ratio around 1. If clip_value_loss is set, it is also the range of values
+    around the old values."""
     clip_value_loss: bool = True
-    """Whether to clip the value loss: it is then the larger of the errors of the prediction and the clipped
-    prediction."""
+    """Whether the value loss is the larger of the errors of the prediction and of the clipped prediction."""
     value_coef: float = 1.0
     """Coefficient of the value loss."""
     entropy_coef: float = 0.01
@@ -61,8 +59,7 @@ class PPOConfig:
     max_grad_norm: float = 1.0
     """Maximum Euclidean norm of the gradient, for the policy and the value function separately."""
     whiten_minibatches: bool = False
-    """Whether to normalise advantages to mean 0 and standard deviation 1 within each mini-batch instead of over all
-    samples."""
+    """Whether to normalise advantages within each mini-batch instead of over all samples."""
     hidden: tuple[int, ...] = (512, 256, 128)
     """Widths of the policy's hidden layers."""
     activation: Activation = "elu"
@@ -76,7 +73,7 @@ class PPOConfig:
     value_activation: Activation = "elu"
     """Activation of the value function's hidden layers."""
     value_group: str | None = None
-    """Group of observations for the value function; by default "critic" if the task has such a group, else "policy"."""
+    """Group of observations for the value function; by default "critic" if the task has this group, else "policy"."""
     symmetry: Literal["none", "exact", "loss", "augment"] = "none"
     """How to use the mirror symmetry that a task declares (``lw.Mirror``). "exact" averages the policy with its mirror
     image. "loss" adds symmetry_coef times the squared difference between the policy and its mirror image to the loss.
@@ -86,8 +83,8 @@ class PPOConfig:
     normalize: bool = True
     """Whether to normalise observations by their running mean and variance, updated in every step."""
     stagger: bool = True
-    """Whether the first episodes start at random steps, so that time limits are spread over time. The Warp engine
-    starts all worlds together nevertheless if the task sets ``lw.Task.settle``."""
+    """Whether the first episodes start at random steps, so that time limits are spread over time. On the Warp engine,
+    this has no effect if the task sets ``lw.Task.settle``."""
     tf32: bool = True
     """Whether matrix products on a GPU use TensorFloat-32."""
     mean_every: int = 20
@@ -111,7 +108,6 @@ class PPOConfig:
 
 
 def _iterations(name: str, value: Any) -> tuple[int, int]:
-    """Check a pair of increasing iteration numbers."""
     try:
         first, last = value
     except (TypeError, ValueError):

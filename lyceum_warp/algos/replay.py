@@ -11,11 +11,10 @@ from lyceum_warp.support.machine import free_memory
 from lyceum_warp.support.validate import check_kind, finite_number, whole_number
 
 Rows: TypeAlias = dict[str, torch.Tensor]
-"""The contents of consecutive steps (rewards, actions, ...) by name; each tensor is (steps, nworld, ...)."""
+"""The contents of consecutive steps (rewards, actions, ...) by name, each (steps, nworld, ...)."""
 
 _TRANSITIONS, _STEPS = 1_000_000, 1_024
-"""The default capacity is the first number of transitions, or the second number of steps of every world if that is
-more."""
+"""The default capacity: this number of transitions, or of steps of every world if that is more."""
 
 _SHARE = 0.3
 """Largest fraction of the device's free memory that the default capacity takes."""
@@ -26,26 +25,24 @@ class Transitions(NamedTuple):
     """Sampled transitions. A learner's target is ``reward + discount * value(next_obs)``."""
 
     obs: dict[str, torch.Tensor]
-    """Observations before the first step by group, each (batch, size of the group)."""
+    """Observations before the first step, by group, each (batch, size of the group)."""
     action: torch.Tensor
     """Actions of the first step, (batch, nact)."""
     reward: torch.Tensor
     """Discounted sums of the rewards of up to ``n_step`` steps, (batch,)."""
     discount: torch.Tensor
-    """Factors that multiply the value of ``next_obs``, (batch,): gamma^k after k steps, or 0 if the episode was
-    terminated."""
+    """Factors that multiply the value of ``next_obs``, (batch,): gamma^k after k steps, or 0 after a termination."""
     next_obs: dict[str, torch.Tensor]
-    """Observations of each group after the last step and before any reset."""
+    """Observations after the last step and before any reset, by group."""
 
 
 @document_attributes
 class Replay:
     """Ring buffer of the transitions of every world, on the device of the environment's observations.
 
-    ``step`` steps the environment and stores its transitions; ``sample`` draws some of the stored transitions. Sampling
-    frees all memory that it allocates except the batch, and the host does not wait for the device. A fault truncates an
-    episode: the transition has the reward 0 and the last valid observations as ``next_obs``. Non-finite actions are
-    stored as 0, so all contents are finite.
+    ``step`` steps the environment and stores its transitions; ``sample`` draws some of the stored transitions. A fault
+    truncates an episode: the transition has the reward 0 and the last valid observations as ``next_obs``. Non-finite
+    actions are stored as 0, so all contents are finite.
 
     Example:
         >>> replay = Replay(env)
@@ -64,13 +61,13 @@ class Replay:
     env: Env
     """The environment."""
     steps: int
-    """Number of steps that the buffer holds; ``steps * env.nworld`` is its capacity."""
+    """Number of steps for which the buffer has room; its capacity is ``steps * env.nworld``."""
     nbytes: int
     """Size of the full buffer in bytes."""
     stored: int
     """Number of steps stored so far, including overwritten steps."""
     obs: dict[str, torch.Tensor]
-    """Observations before each step by group, each (steps, nworld, size). Row ``t % steps`` stores step t."""
+    """Observations before each step, by group, each (steps, nworld, size). Row ``t % steps`` stores step t."""
     action: torch.Tensor
     """Actions, (steps, nworld, nact)."""
     reward: torch.Tensor
@@ -80,7 +77,7 @@ class Replay:
     truncated: torch.Tensor
     """Whether the time limit or a fault ended the episode, (steps, nworld) bool."""
     next_obs: dict[str, torch.Tensor]
-    """Observations of each group after each step and before any reset."""
+    """Observations after each step and before any reset, by group."""
 
     def __init__(self, env: Env, capacity: int | None = None) -> None:
         check_kind("env of Replay", env, Env, "as lw.make(...) makes it")
@@ -93,7 +90,7 @@ class Replay:
         self.steps = steps = -(-whole_number("capacity", capacity, low=1, high=2**62) // n)
         self.nbytes = each * steps * n
         check_fit(each * steps, n, env.device, model=f"{steps} steps in a replay buffer")
-        # store all observations in two tensors, so that sampling needs few kernels
+        # with only two tensors of observations, sampling needs few kernels
         self._before = torch.zeros(steps, n, sum(sizes) + nact, device=device)
         self._after = torch.zeros(steps, n, sum(sizes), device=device)
         self.reward = torch.zeros(steps, n, device=device)
@@ -101,7 +98,7 @@ class Replay:
         self._sizes = sizes
         self.obs, self.next_obs = self._groups(self._before), self._groups(self._after)
         self.action = self._before[..., sum(sizes) :]
-        # keep the number of steps and the row of the oldest step on the device, so that a graph can capture sampling
+        # a graph can capture sampling only if these numbers are on the device
         self._count, self._oldest = torch.zeros(2, dtype=torch.long, device=device)
         self.stored = 0
 
@@ -144,7 +141,7 @@ class Replay:
             batch: Number of transitions.
             n_step: Maximum number of rewards in a return; see ``at``.
             gamma: Discount factor.
-            generator: Draws the transitions, on the buffer's device; by default torch's global generator.
+            generator: Random generator on the buffer's device; by default torch's global generator.
 
         Raises:
             ValueError: The buffer is empty, or an argument is out of range.
@@ -160,12 +157,12 @@ class Replay:
     def at(self, index: torch.Tensor, *, n_step: int, gamma: float) -> Transitions:
         """Get transitions by index; a CUDA graph can capture this method.
 
-        A return has fewer than ``n_step`` rewards if the episode ends earlier or no further steps are stored. Such a
-        return also bootstraps from its last observation, except after a termination.
+        A return has fewer than ``n_step`` rewards if the episode ends earlier or no further steps are stored. It then
+        also bootstraps from its last observation, except after a termination.
 
         Args:
-            index: Indices of the transitions, (batch,) int64; the transition of world w in the k-th oldest step has
-                index k * nworld + w.
+            index: Indices of the transitions, (batch,) int64. World w has the index k * nworld + w in the k-th oldest
+                step.
             n_step: Maximum number of rewards in a return.
             gamma: Discount factor.
         """
@@ -187,25 +184,24 @@ class Replay:
         )  # fmt: skip
 
     def _groups(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Get a view of each observation group; the groups are stored one after another in the first columns."""
         parts = rows[..., : sum(self._sizes)].split(self._sizes, dim=-1)
         return dict(zip(self.env.obs_groups, parts, strict=True))
 
     # the state
 
     def rows(self, first: int, end: int) -> Rows:
-        """Copy the contents of steps ``first`` to ``end - 1``, counted from the first step ever stored (step 0)."""
+        """Copy the contents of steps ``first`` to ``end - 1``; the first step ever stored is step 0."""
         place = torch.arange(first, end, device=self.reward.device) % self.steps
         return {name: array[place] for name, array in self._arrays().items()}
 
     def set_rows(self, first: int, rows: Rows) -> None:
-        """Write the contents of consecutive steps, beginning with step ``first``; afterwards, call ``restore``."""
+        """Write the contents of consecutive steps, beginning with step ``first``. Call ``restore`` afterwards."""
         place = torch.arange(first, first + len(rows["reward"]), device=self.reward.device) % self.steps
         for name, array in self._arrays().items():
             array[place] = rows[name].to(array.device)
 
     def restore(self, stored: int) -> None:
-        """Set the number of steps stored so far; call this after the last ``set_rows``."""
+        """Set the number of steps stored so far, after the last ``set_rows``."""
         self._set_stored(whole_number("stored", stored, low=0, high=2**62))
 
     def state_dict(self) -> dict[str, Any]:
@@ -213,7 +209,7 @@ class Replay:
         return {"stored": self.stored, "rows": self.rows(self.stored - self.count, self.stored)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a result of ``state_dict``. Sampling with equal random numbers then gives equal transitions.
+        """Restore a result of ``state_dict``. Equal random numbers then draw equal transitions.
 
         Raises:
             ValueError: The state belongs to a buffer of a different size.
@@ -244,13 +240,12 @@ def default_capacity(env: Env, processes: int = 1) -> int:
 
     Args:
         env: The environment.
-        processes: Number of processes; each stores an equal part of the default number of transitions.
+        processes: Number of processes; each stores an equal part of the transitions.
     """
     wanted, free = max(-(-_TRANSITIONS // processes), _STEPS * env.nworld), free_memory(env.device)
     return wanted if free is None else max(min(wanted, int(_SHARE * free) // _transition_bytes(env)), env.nworld)
 
 
 def _transition_bytes(env: Env) -> int:
-    """Compute the size of one transition in bytes."""
     nobs = sum(space.size for space in env.obs_spaces.values())
     return 4 * (2 * nobs + env.action_space.size + 1) + 2

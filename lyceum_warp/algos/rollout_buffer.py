@@ -17,7 +17,7 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_group, check_kind, whole_number
 
 _LARGE = 1e18
-"""Maximum absolute observation whose square still fits into float32, with a margin."""
+"""Maximum absolute observation; its square fits into float32, with a margin."""
 
 
 class Sampler(Protocol):
@@ -37,7 +37,7 @@ class Rollout:
         steps: Number of steps.
         groups: Groups of observations to store in addition to "policy", such as ``("critic",)``.
         first_only: Whether the statistics include only each world's first episode since ``restart``. If all worlds
-            start together, statistics of all finished episodes would be biased towards short episodes.
+            start together, statistics of all finished episodes are biased towards short episodes.
 
     Raises:
         ValueError: The task has no group of observations of this name.
@@ -48,20 +48,19 @@ class Rollout:
     action: torch.Tensor
     """Actions, (steps, nworld, nact)."""
     step: torch.Tensor
-    """Number of steps between the reset and each step, (steps, nworld)."""
+    """Number of steps since the reset, before each step, (steps, nworld)."""
     final_obs: torch.Tensor
     """Observations after each step, before any reset, (steps, nworld, nobs)."""
     obs_groups: dict[str, torch.Tensor]
-    """Observations before each step by group; the entry "policy" is the tensor ``obs``."""
+    """Observations before each step by group; the entry "policy" is ``obs``."""
     final_obs_groups: dict[str, torch.Tensor]
-    """Observations after each step by group; the entry "policy" is the tensor ``final_obs``."""
+    """Observations after each step by group; the entry "policy" is ``final_obs``."""
     reward: torch.Tensor
     """Rewards, (steps, nworld)."""
     eval: torch.Tensor
     """Evaluation metric after each step, (steps, nworld)."""
     terminated: torch.Tensor
-    """Whether the task ended the episode, (steps, nworld) bool. A fault counts as truncation: learners bootstrap from
-    the last valid observation."""
+    """Whether the task ended the episode, (steps, nworld) bool. A fault is a truncation, not a termination."""
     done: torch.Tensor
     """Whether the episode ended for any reason, (steps, nworld) bool."""
     success: torch.Tensor
@@ -78,7 +77,7 @@ class Rollout:
     running_return: torch.Tensor
     """Sum of the rewards of each world's current episode, (nworld,); NaN in episodes that the statistics exclude."""
     faults: torch.Tensor
-    """Number of faults of each world within the buffer's steps, (nworld,) int32."""
+    """Number of faults of each world in these steps, (nworld,) int32."""
 
     def __init__(self, env: Env, steps: int, *, groups: Collection[str] = (), first_only: bool = False) -> None:
         check_kind("env of Rollout", env, Env, "as lw.make(...) makes it")
@@ -127,7 +126,6 @@ class Rollout:
         self._after_step = graphs.sequence([Phase("store outputs", self._launch_outputs)])
 
     def _stored(self, source: torch.Tensor, into: list["_Rows"]) -> torch.Tensor:
-        """Allocate a tensor (steps, nworld, size) for a copy of ``source`` at each step."""
         into.append(_Rows(source, self.steps, self.env.device))
         return into[-1].stored
 
@@ -148,17 +146,17 @@ class Rollout:
             self.store_outputs()
 
     def begin(self) -> None:
-        """Start to fill the buffer, if the caller steps the environment itself instead of calling ``collect``."""
+        """Start to fill the buffer, if the caller steps the environment instead of calling ``collect``."""
         self._index.zero_()
         self._fault.zero_()
 
     def store_inputs(self) -> None:
-        """Store the observations, the action and the step counters before a step."""
+        """Store the observations, the actions and the step counters before a step."""
         for call in self._before_step:
             call()
 
     def store_outputs(self) -> None:
-        """Store the results of a step, and advance the index."""
+        """Store the results of a step."""
         for call in self._after_step:
             call()
 
@@ -170,13 +168,12 @@ class Rollout:
     def stagger(self, generator: torch.Generator, team: Team | None = None) -> None:
         """Set the worlds' step counters to random values, so that time limits are spread over time.
 
-        Worlds that start together and never terminate would otherwise all reach their time limits in the same rollout.
-        The statistics exclude the shortened episodes. If ``lw.Task.settle`` is set and the engine is Warp, this method
-        does nothing: while one world settles after a reset, all others wait, so all worlds should reset at the same
-        time.
+        Otherwise, worlds that start together and never terminate reach their time limits in the same rollout. The
+        statistics exclude the shortened episodes. On the Warp engine, this method does nothing if the task sets
+        ``lw.Task.settle``, because all worlds wait while one world settles after a reset.
 
         Args:
-            generator: Random generator for the values; its state must be the same in every process.
+            generator: Random generator with the same state in every process.
             team: The processes.
         """
         env, team = self.env, team or Team()
@@ -197,7 +194,7 @@ class Rollout:
 
         Args:
             least: Minimum number of such worlds, over all processes.
-            generator: Random generator for the choice of worlds; its state must be the same in every process.
+            generator: Random generator with the same state in every process.
             team: The processes.
         """
         env, team = self.env, team or Team()
@@ -212,8 +209,8 @@ class Rollout:
     def explain_not_finite(self) -> str:
         """Describe in one sentence the first number that is infinite, NaN or too large for float32, and a remedy.
 
-        The host waits for the device. A task's rewards and observations can be too large, but never infinite or NaN,
-        because the environment treats such values as faults.
+        A task's rewards and observations can be too large, but never infinite or NaN, because the environment treats
+        such values as faults.
         """
         kinds: list[tuple[str, torch.Tensor, float, Mapping[str, slice]]] = [("reward", self.reward, torch.inf, {})]
         for groups in (self.obs_groups, self.final_obs_groups):
@@ -265,6 +262,6 @@ class _Rows:
         self.stored = torch_view(self._rows)
 
     def store(self, index: wp.array) -> None:
-        """Launch a copy of the environment's tensor into the row with the given index."""
+        """Copy the environment's tensor into the row with the given index."""
         args = [index, self._source, self._rows]
         wp.launch(collect.store_rows, self._source.shape, args, device=self._rows.device)

@@ -12,7 +12,7 @@ from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.support.docstrings import document_attributes
 
 Scalar: TypeAlias = Any
-"""A scalar tensor on the device, or a float after the transfer to the host."""
+"""A scalar tensor, or a float after the transfer to the host."""
 
 
 @document_attributes
@@ -33,7 +33,7 @@ class SampledIteration(Iteration):
     """Samples per second of sampling; with SAC, per second of sampling and updates."""
 
     def row(self) -> dict[str, Any]:
-        """Convert the statistics to a row of metrics.csv, including columns whose value is None."""
+        """Convert the statistics to a row of metrics.csv, including values that are None."""
         names = [field.name for field in dataclasses.fields(self) if field.name not in NESTED]
         return {name: getattr(self, name) for name in names} | super().row()
 
@@ -67,13 +67,13 @@ class EpisodeSums(NamedTuple):
     terminal_reward: Scalar
     """Sum of the episodes' last rewards."""
     eval: Scalar
-    """Sum of the evaluation metrics at the episodes' ends."""
+    """Sum of the evaluation metrics in the episodes' last steps."""
     success: Scalar
     """Number of episodes that ended with the goal met."""
 
 
 class Moments(NamedTuple):
-    """Moments of a set of numbers: count, mean, and sum of squared deviations from the mean."""
+    """Number, mean and sum of squared deviations from the mean of a set of numbers."""
 
     n: float
     mean: float
@@ -81,7 +81,7 @@ class Moments(NamedTuple):
 
 
 def finished(rollout: Rollout) -> EpisodeSums:
-    """Compute sums over the episodes that ended in a rollout, as scalar tensors on the rollout's device."""
+    """Compute sums over the episodes that ended in a rollout."""
     ended = _ended(rollout)
     returns = rollout.episode_return.double()
     infinity = torch.inf
@@ -105,7 +105,7 @@ def finished(rollout: Rollout) -> EpisodeSums:
 
 
 def metric_sums(rollout: Rollout) -> tuple[torch.Tensor, ...]:
-    """Sum the task's metrics over a rollout, as scalar tensors on the rollout's device.
+    """Sum the task's metrics over a rollout.
 
     The result has first each metric's sum over ended episodes, and then each metric's mean over all samples. Non-finite
     metrics count as zero.
@@ -116,12 +116,12 @@ def metric_sums(rollout: Rollout) -> tuple[torch.Tensor, ...]:
 
 
 def _ended(rollout: Rollout) -> torch.Tensor:
-    """Compute a mask of the steps that ended an episode, without excluded episodes, (steps, nworld) bool."""
+    """Mark the steps that ended an episode, without excluded episodes, (steps, nworld) bool."""
     return rollout.done & ~rollout.episode_return.isnan()
 
 
 def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Any]:
-    """Compute ``Iteration.metrics`` (NaN if no episode ended) and ``Iteration.step_metrics``.
+    """Compute ``Iteration.metrics`` and ``Iteration.step_metrics``.
 
     Args:
         episodes: Number of ended episodes in all processes.
@@ -137,7 +137,7 @@ def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequen
 
 
 def episode_statistics(sums: Sequence[EpisodeSums]) -> dict[str, float]:
-    """Compute statistics of the finished episodes from each process's sums; NaN if no episode ended."""
+    """Compute statistics of the finished episodes of all processes; NaN if no episode ended."""
     episodes, mean, square = pooled([Moments(part.episodes, part.return_mean, part.return_square) for part in sums])
     if not episodes:
         return dict.fromkeys(_EPISODE_STATISTICS, math.nan)
@@ -160,7 +160,7 @@ _EPISODE_STATISTICS = (
 
 
 def pooled(parts: Sequence[Moments]) -> Moments:
-    """Compute the moments of the union of several sets from each set's moments."""
+    """Compute the moments of the union of several sets."""
     n = sum(part.n for part in parts)
     mean = sum(part.n * part.mean for part in parts) / n if n else 0.0
     return Moments(n, mean, sum(part.square + part.n * (part.mean - mean) ** 2 for part in parts))

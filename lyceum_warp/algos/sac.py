@@ -40,7 +40,7 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_kind
 
 _EPS = 1e-2
-"""Constant that is added to the normalisers' standard deviations, as in PPO."""
+"""Constant that is added to the normalisers' standard deviations."""
 
 
 @document_attributes
@@ -50,8 +50,8 @@ class SACIteration(SampledIteration):
 
     Losses, values and entropy are means over the iteration's updates, or NaN without an update.
 
-    Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended. The statistics
-    exclude each world's first episode, because it starts at a random step.
+    Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended. They exclude
+    each world's first episode, which starts at a random step.
     """
 
     critic_loss: float
@@ -72,8 +72,8 @@ class SACIteration(SampledIteration):
 class SAC(Learner):
     """Learns a policy by SAC, as an infinite iterator of ``SACIteration``.
 
-    In an iteration, every world makes ``num_steps`` steps. Each step is followed by as many updates as the setting
-    ``updates`` says; on a GPU, they run as one CUDA graph, including the sampling of their batches.
+    In an iteration, every world makes ``num_steps`` steps, and each step is followed by ``updates`` updates. On a GPU,
+    the updates after a step run as one CUDA graph, including the sampling of their batches.
 
     Example:
         >>> for it in SAC(env):
@@ -104,11 +104,11 @@ class SAC(Learner):
     config: Any
     """Hyperparameters: an ``SACConfig`` with defaults in place of None."""
     replay: Replay
-    """Replay buffer with the samples of this process's worlds."""
+    """The samples of this process's worlds."""
     generator: torch.Generator
     """Random generator for actions and updates."""
     rollout: Rollout
-    """The samples of the last iteration, used only for its statistics."""
+    """The samples of the last iteration, used for its statistics."""
     log_temperature: torch.Tensor
     """Logarithm of the temperature."""
 
@@ -156,7 +156,7 @@ class SAC(Learner):
         self.temperature_step = GradientStep([self.log_temperature], rate, team)
 
         # samples
-        (least,) = team.largest(-default_capacity(env, team.size))  # the buffers of all processes have the same size
+        (least,) = team.largest(-default_capacity(env, team.size))  # the same size in all processes
         self.replay = Replay(env, -least if given.replay is None else -(-given.replay // team.size))
         own, critics = self.policy.shape, self.value.shape
         self.config = dataclasses.replace(
@@ -166,7 +166,7 @@ class SAC(Learner):
         )  # fmt: skip
         self.rollout = Rollout(env, given.num_steps)
         self.count = given.num_steps * nworld
-        # draw a separate seed, so that weights and noise are independent
+        # a separate seed makes the noise independent of the weights
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
         self._all_worlds, self._act_noise = nworld, torch.empty(nworld, nact, device=device)
 
@@ -185,9 +185,8 @@ class SAC(Learner):
         self.rollout.stagger(self.generator, team)
 
     def _make_mirror(self, config: SACConfig) -> None:
-        """Make the functions that mirror observations and actions, if ``config.symmetry`` is not "none"."""
         self._mirror: PolicyMirror | None = None
-        if config.symmetry == "none" or self.policy.mirror is not None:  # of another run
+        if config.symmetry == "none" or self.policy.mirror is not None:  # a policy of another run
             return
         found, device = reflections(self.env), self.env.obs.device
         if config.symmetry == "exact":
@@ -223,7 +222,7 @@ class SAC(Learner):
         parameters = [self.log_temperature, *self.policy.parameters(), *self.value.parameters()]
         team.copy_leader([*parameters, *self.target.parameters()])
 
-        # One copy transfers the statistics of all processes to the host.
+        # one copy transfers the statistics of all processes to the host
         finite = torch.stack([numbers.isfinite().all() for numbers in (self._sums, *parameters)]).all()
         numbers = [
             *finished(rollout), *metric_sums(rollout), rollout.reward.double().mean(), rollout.faults.sum(), finite,
@@ -289,13 +288,13 @@ class SAC(Learner):
 
     @torch.no_grad()
     def draw(self) -> None:
-        """Draw the indices of samples and the noise for the updates after a step, and select this process's samples."""
+        """Draw the indices of samples and the noise for the updates after a step."""
         team, nworld, batch = self.team, self.env.nworld, self.config.batch
         shape = len(self._index), batch
         random: dict[str, Any] = dict(generator=self.generator, device=self._index.device)
         index = torch.randint(self.replay.count * nworld * team.size, shape, **random)
         noise = torch.randn((*shape, self._noise.shape[-1]), **random)
-        # as in Minibatches, move this process's samples to the front, and drop those that do not fit into the buffer
+        # as in Minibatches, move this process's samples to the front, and drop those without room
         if team.size > 1:
             index, own = team.locate(index, nworld)
             first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self._index.shape[1]]
@@ -305,7 +304,7 @@ class SAC(Learner):
         self._noise.copy_(noise)
 
     def learn(self) -> None:
-        """Make the updates after a step, with the indices and noise from ``draw``."""
+        """Make the updates after a step."""
         config, nact = self.config, self.policy.nact
         critic_loss, actor_loss = self._losses
         for i in range(config.updates):
@@ -322,13 +321,12 @@ class SAC(Learner):
                     loss, *numbers = actor_loss(batch, weight, noise)
                 actor_loss_mean, entropy = self.actor_step(loss, *numbers)
                 self._sums[2:] += config.actor_every * torch.stack([actor_loss_mean, entropy])
-                # the step raises the temperature if the entropy is below its target
+                # this raises the temperature if the entropy is below its target
                 share = (entropy - config.target_entropy * nact) / self.team.size
                 self.temperature_step(self.log_temperature * share)
             self._follow(list(self.target.parameters()), list(self.value.parameters()), None)
 
     def _with_images(self, batch: Transitions) -> Transitions:
-        """Append the mirror images of transitions."""
         assert self._mirror is not None
         images = {"policy": self._mirror.obs, self.value.group: self._mirror_value}
 
@@ -385,7 +383,6 @@ class SAC(Learner):
         return (weight * loss).sum(), -(weight * log_prob.detach()).sum()
 
     def _bound(self, values: torch.Tensor) -> torch.Tensor:
-        """Combine the two critics' predictions, (2, rows), into values of the actions, (rows,)."""
         return values.amin(0) if self.config.critic_bound == "min" else values.mean(0)
 
     def state_dict(self) -> dict[str, Any]:
@@ -407,7 +404,7 @@ class SAC(Learner):
         self.rollout.running_return.copy_(state["returns"][self.own_worlds])
         for step, saved in zip(self._steps, state["optimizers"], strict=True):
             step.optimizer.load_state_dict(saved)
-        self._learn.forget()  # discard the graph: it contains the addresses of Adam's old moments
+        self._learn.forget()  # the graph contains the addresses of Adam's old moments
 
     @property
     def _steps(self) -> "tuple[GradientStep, ...]":
@@ -429,8 +426,8 @@ class GradientStep:
         self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=cuda)
 
     def __call__(self, loss: torch.Tensor, *numbers: torch.Tensor) -> torch.Tensor:
-        """Make a gradient step; return the loss and the numbers, summed over all processes, (1 + len(numbers),)."""
-        # do not use backward(): it accumulates gradients on the CUDA stream of its first call
+        """Make a gradient step; return the loss and the numbers, summed over all processes."""
+        # backward() would accumulate gradients on the CUDA stream of its first call
         gradients = torch.autograd.grad(loss, self.parameters)
         parts = [*gradients, *(number.detach() for number in (loss, *numbers))]
         sums = self.team.sum(torch.cat([part.reshape(-1).float() for part in parts]))
@@ -442,7 +439,7 @@ class GradientStep:
 
 
 def action_bounds(env: Env, limit: float) -> tuple[list[float], list[float]]:
-    """Get lower and upper bounds of actions, each (nact,); for unbounded actions, use -limit and limit."""
+    """Get lower and upper bounds of actions, each (nact,). The bounds of unbounded actions are -limit and limit."""
     space = env.action_space
     assert space.low is not None and space.high is not None
     return tuple(  # type: ignore[return-value]
@@ -452,7 +449,6 @@ def action_bounds(env: Env, limit: float) -> tuple[list[float], list[float]]:
 
 
 def _check_sizes(policy: SquashedPolicy, value: TwinCritic, env: Env, low: list[float], high: list[float]) -> None:
-    """Check that given networks fit the environment."""
     name, nact = env.task.name, env.action_space.size
     for module, space in ((policy, env.obs_space), (value, env.obs_spaces[value_group(env, value.group)])):
         sizes, wanted = (module.shape["nobs"], module.shape["nact"]), (space.size, nact)

@@ -14,7 +14,7 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 MANY_WORLDS = 256
-"""With this number of worlds or more, the defaults for many worlds apply."""
+"""From this number of worlds on, the defaults for many worlds apply."""
 
 _FEW: dict[str, Any] = {
     "batch": 256, "actor_every": 1, "gamma": 0.99, "tau": 0.005, "temperature": 1.0, "target_entropy": -1.0,
@@ -26,7 +26,7 @@ _MANY: dict[str, Any] = {
     "batch": 8192, "actor_every": 4, "gamma": 0.97, "tau": 0.125, "temperature": 1e-3, "target_entropy": 0.0,
     "critic_bound": "mean", "hidden": (512, 256, 128), "value_hidden": (512, 512, 512),
 }  # fmt: skip
-"""Defaults for 256 worlds or more. These defaults are close to the settings of Seo et al., 2025, for humanoids."""
+"""Defaults for 256 worlds or more, close to the settings of Seo et al., 2025, for humanoids."""
 
 
 @document_attributes
@@ -34,9 +34,9 @@ _MANY: dict[str, Any] = {
 class SACConfig:
     """Hyperparameters of SAC.
 
-    If a hyperparameter is None, the method ``resolved`` sets a default that depends on the number of worlds. Defaults
-    for fewer than 256 worlds follow Haarnoja et al., 2018 ("Soft Actor-Critic Algorithms and Applications"). Defaults
-    for 256 worlds or more are close to Seo et al., 2025 ("Learning Sim-to-Real Humanoid Locomotion in 15 Minutes").
+    If a hyperparameter is None, its default depends on the number of worlds. Defaults for fewer than 256 worlds follow
+    Haarnoja et al., 2018 ("Soft Actor-Critic Algorithms and Applications"). Defaults for 256 worlds or more are close
+    to Seo et al., 2025 ("Learning Sim-to-Real Humanoid Locomotion in 15 Minutes").
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.
@@ -54,8 +54,8 @@ class SACConfig:
     """Number of updates of the critics after each step of all worlds. The default is the number of worlds, but at most
     8."""
     actor_every: int | None = None
-    """Number of updates of the critics for each update of the actor. This number must divide ``updates``. The default
-    is 1, or 4 with 256 or more worlds."""
+    """Number of updates of the critics for each update of the actor; must divide ``updates``. The default is 1, or 4
+    with 256 or more worlds."""
     batch: int | None = None
     """Number of samples in an update. The default is 8,192 samples with 256 or more worlds, and otherwise 256."""
     n_step: int = 1
@@ -63,8 +63,8 @@ class SACConfig:
     gamma: float | None = None
     """Discount factor. The default is 0.97 with 256 or more worlds, and otherwise 0.99."""
     tau: float | None = None
-    """Step size of the target critics: each update moves the target critics by this fraction towards the critics
-    (Polyak averaging). The default is 0.125 with 256 or more worlds, and otherwise 0.005."""
+    """Fraction by which each update moves the target critics towards the critics (Polyak averaging). The default is
+    0.125 with 256 or more worlds, and otherwise 0.005."""
     critic_bound: Literal["min", "mean"] | None = None
     """Value of an action: the minimum or the mean of the two critics' predictions. The default is "mean" with 256 or
     more worlds, and otherwise "min"."""
@@ -74,10 +74,10 @@ class SACConfig:
     """Initial temperature, the learned weight of the entropy. The default is 0.001 with 256 or more worlds, and
     otherwise 1."""
     target_entropy: float | None = None
-    """Target entropy of the policy, per element of the action scaled to [-1, 1]. SAC adapts the temperature so that the
-    policy's entropy reaches the target. The default is 0 with 256 or more worlds, and otherwise -1."""
+    """Target entropy of the policy, per element of the action scaled to [-1, 1]. SAC adapts the temperature to reach
+    it. The default is 0 with 256 or more worlds, and otherwise -1."""
     action_limit: float = 1.0
-    """Limit of the absolute value of actions for which the task gives no bounds."""
+    """Limit of the absolute value of actions without bounds in the task."""
     hidden: tuple[int, ...] | None = None
     """Widths of the policy's hidden layers. The default widths are 512 256 128 with 256 or more worlds, and otherwise
     256 256."""
@@ -89,7 +89,7 @@ class SACConfig:
     value_activation: Activation = "relu"
     """Activation of the critics' hidden layers."""
     value_group: str | None = None
-    """Group of observations for the critics; by default "critic" if the task has such a group, else "policy"."""
+    """Group of observations for the critics; by default "critic" if the task has this group, else "policy"."""
     layer_norm: bool = True
     """Whether to apply layer normalisation to the critics' hidden layers."""
     symmetry: Literal["none", "exact", "loss", "augment"] = "none"

@@ -13,7 +13,7 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import layer_sizes, whole_number
 
 _LOWEST, _HIGHEST = -5.0, 2.0
-"""Bounds of the logarithm of the Gaussian's standard deviations."""
+"""Bounds of the logarithm of the standard deviations."""
 
 
 @document_attributes
@@ -108,7 +108,7 @@ class SquashedPolicy(Normalized):
         return mean, _LOWEST + 0.5 * (_HIGHEST - _LOWEST) * (1.0 + torch.tanh(spread))
 
     def _outputs(self, obs: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        return self.network(self.normalizer(obs)).float().chunk(2, dim=-1)  # compute in float32 even under autocast
+        return self.network(self.normalizer(obs)).float().chunk(2, dim=-1)  # float32 even under autocast
 
     def act(self, obs: torch.Tensor) -> torch.Tensor:
         """Compute actions without noise, (..., nact)."""
@@ -129,7 +129,7 @@ class SquashedPolicy(Normalized):
         return torch.tanh(u), (gaussian - slope).sum(-1)
 
     def scaled(self, unit: torch.Tensor) -> torch.Tensor:
-        """Convert unit actions, between -1 and 1, to actions."""
+        """Convert unit actions to actions."""
         return self.low + 0.5 * self.width * (1.0 + unit)
 
     def unit(self, action: torch.Tensor) -> torch.Tensor:

@@ -33,11 +33,7 @@ class Reflected(nn.Module):
 
 
 class PolicyMirror(nn.Module):
-    """Computes the mirror images of a policy's observations and actions.
-
-    Args:
-        reflections: The reflections of ``obs`` and ``action``.
-    """
+    """Computes the mirror images of a policy's observations and actions."""
 
     def __init__(self, reflections: Mapping[str, Reflection]) -> None:
         super().__init__()
@@ -45,7 +41,7 @@ class PolicyMirror(nn.Module):
         self.obs, self.action = Reflected(reflections["obs"]), Reflected(reflections["action"])
 
     def average(self, function: Callable[[torch.Tensor], torch.Tensor], obs: torch.Tensor) -> torch.Tensor:
-        """Compute symmetric actions: average actions with those for mirrored observations, mirrored back.
+        """Average actions with those for mirrored observations, mirrored back.
 
         Mirrored observations then give exactly the mirror images of the actions, bit for bit.
         """

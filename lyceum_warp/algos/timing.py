@@ -14,7 +14,7 @@ Result = TypeVar("Result")
 class PhaseTimer:
     """Measures the seconds between calls of ``mark``, starting at construction.
 
-    On a GPU, ``mark`` only records a CUDA event; the host waits for the device in ``seconds``.
+    On a GPU, the host waits for the device only in ``seconds``.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -59,19 +59,16 @@ def one_thread() -> Iterator[None]:
 def beside(function: Callable[[], Result], *, allowed: bool) -> Iterator[Callable[[], Result]]:
     """Run a function and the ``with`` block in parallel if torch has exactly two threads.
 
-    The function and the ``with`` block then use one thread each. This is faster than running them one after the other
-    on two threads, because mini-batches do not benefit from a second thread, and large products speed up by less than a
-    factor of two.
-
-    With any other number of threads, or if ``allowed`` is False, the function runs when the ``with`` block asks for its
-    result.
+    Each then uses one thread. This is faster than one after the other on two threads: mini-batches do not benefit from
+    a second thread, and large products speed up by less than a factor of two. With any other number of threads, the
+    function runs when the ``with`` block asks for its result.
 
     Args:
-        function: The function, which must not share state with the with block.
+        function: The function, which must not share state with the ``with`` block.
         allowed: Whether the function may run in parallel with the ``with`` block.
 
     Yields:
-        A function that waits until ``function`` has returned, and returns its result.
+        A function that waits for ``function``, and returns its result.
     """
     if not allowed or torch.get_num_threads() != 2:
         yield function

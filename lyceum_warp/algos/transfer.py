@@ -29,16 +29,16 @@ class Difference:
     """A quantity's means in two simulations, and the difference of the means with a 95 % confidence interval."""
 
     quantity: str
-    """Name of the quantity: "return", "length" (in steps) or "terminated" (the fraction of episodes that ended by
-    termination, for example by a fall)."""
+    """"return", "length" (in steps) or "terminated" (the fraction of episodes that ended by termination, such as a
+    fall)."""
     first: float
     """The quantity's mean in the first simulation."""
     second: float
     """The quantity's mean in the second simulation."""
     low: float
-    """Lower end of the confidence interval of the difference (second mean minus first mean)."""
+    """Lower end of the confidence interval of the second mean minus the first mean."""
     high: float
-    """Upper end of the confidence interval of the difference (second mean minus first mean)."""
+    """Upper end of the confidence interval of the second mean minus the first mean."""
     margin: float
     """The largest difference at which the two means count as equal."""
 
@@ -67,11 +67,11 @@ class Comparison:
     faults: tuple[int, int]
     """Number of faults in each simulation."""
     differences: tuple[Difference, ...]
-    """Differences of returns, lengths and, if the task can terminate episodes, fractions of terminated episodes."""
+    """Differences of returns, of lengths and, if the task can terminate episodes, of terminated fractions."""
 
     @property
     def verdict(self) -> str:
-        """Return "different" if any quantity's verdict is, "same" if all verdicts are, and otherwise "not shown"."""
+        """Return "different" if any quantity differs, "same" if all are the same, and otherwise "not shown"."""
         verdicts = {difference.verdict for difference in self.differences}
         return "different" if "different" in verdicts else "same" if verdicts == {"same"} else "not shown"
 
@@ -100,7 +100,7 @@ class Transfer:
         return "; ".join(found)
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert the result, including the verdicts, to values that JSON supports."""
+        """Convert the result to values that JSON supports."""
         made = dataclasses.asdict(self) | {"line": self.line}
         for comparison, entry in zip(self.comparisons, made["comparisons"], strict=True):
             entry["verdict"] = comparison.verdict
@@ -124,23 +124,22 @@ def transfer(
 ) -> Transfer:
     """Play and compare pairs of episodes, on both engines and with each of the task's physics options.
 
-    There are two kinds of comparisons. The Warp engine is compared with the C engine, both with the environment's
-    physics options. On the C engine, the task's exact physics is compared with each other set of physics options of the
-    task, and with the environment's set. Both episodes of a pair have equal initial states, randomized model fields,
-    pushes and commands. The intervals of returns and lengths use Student's t over the pairs; the interval of the
-    terminated fraction uses Agresti and Min's method.
+    The Warp engine is compared with the C engine, both with the environment's physics options. On the C engine, the
+    task's exact physics is compared with its other sets of physics options, and with the environment's set. Both
+    episodes of a pair have equal initial states, randomized model fields, pushes and commands. The intervals of returns
+    and lengths use Student's t over the pairs; the interval of the terminated fraction uses Agresti and Min's method.
 
     Args:
         env: An environment of the task; its worlds do not change.
-        policy: A module with a method ``act``, or a function from observations to actions, without noise.
+        policy: A function from observations to actions, without noise, or a module with such a method ``act``.
         episodes: Number of pairs of episodes, each in a separate world.
         seed: Seed of the initial states.
         margin: Largest difference at which two means count as equal. For returns and lengths, the margin is a fraction
-            of the mean absolute return or mean length in the first simulation; for terminations, it is an absolute
+            of the mean absolute return or mean length in the first simulation. For terminations, it is an absolute
             difference of fractions.
-        device: Device of the Warp engine; by default the environment's GPU, or else another GPU, or else the CPU, on
-            which Warp's kernels may take minutes to compile.
-        warp: Whether to play episodes on the Warp engine, too.
+        device: Device of the Warp engine. The default is the environment's GPU, or else another GPU, or else the CPU,
+            on which Warp's kernels may take minutes to compile.
+        warp: Whether to play episodes on the Warp engine.
         physics: Whether to play episodes with each set of physics options of the task. If False, play only with the
             environment's physics options and with the exact physics.
         progress: Called every 50 steps with the number of steps so far and the maximum number.

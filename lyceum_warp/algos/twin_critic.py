@@ -15,7 +15,7 @@ from lyceum_warp.support.validate import layer_sizes, whole_number
 
 @document_attributes
 class TwinCritic(Normalized):
-    """Two independent networks of the same shape, evaluated together, layer by layer.
+    """Two independent networks of the same shape, evaluated together.
 
     Args:
         nobs: Length of an observation.
@@ -89,12 +89,12 @@ class TwinLinear(nn.Module):
         )
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Apply each of the two layers to its half of the input."""
+        """Apply both layers."""
         return torch.baddbmm(self.bias, x, self.weight)
 
 
 class TwinLayerNorm(nn.Module):
-    """Two layer normalisations, one for each half of an input (2, rows, m)."""
+    """Two layer normalisations of inputs (2, rows, m)."""
 
     def __init__(self, m: int) -> None:
         super().__init__()

@@ -23,8 +23,8 @@ class ValueFunction(Normalized):
         activation: Activation of the hidden layers.
         scale: Initial factor on the network's output; ``rescale`` later fits the factor to returns.
         time_orders: Highest power of the time features t, t^2, ... with t = step / 1000 (as in mjrl); 0 means no time
-            features. Time features help if the observations do not contain the time that is left in the episode,
-            because returns depend on this time.
+            features. Time features help if returns depend on the time that is left in the episode, and observations do
+            not contain this time.
         normalize: Whether to normalise observations by their running mean and variance.
         limit: Normalised observations are clipped to [-limit, limit]; inf means no limit.
         discount: Discount factor of the predicted returns, if known.
@@ -36,12 +36,12 @@ class ValueFunction(Normalized):
     """
 
     LATER = ("shift", "scale")
-    """Names of buffers that a checkpoint of an earlier release may lack; they then keep their initial values."""
+    """Buffers that a checkpoint of an earlier release may lack."""
 
     group: str
     """The group of observations that the value function uses."""
     shift: torch.Tensor
-    """Number that is added to the scaled output: the mean of the returns."""
+    """The mean of the returns, which is added to the scaled output."""
     scale: torch.Tensor
     """Factor on the network's output: the standard deviation of the returns."""
     discount: float | None
@@ -78,7 +78,7 @@ class ValueFunction(Normalized):
         if limit != LIMIT:  # checkpoints of earlier releases lack a limit
             self._shape["limit"] = limit
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)
-        # a last layer of zeros makes initial predictions equal to the mean return
+        # initial predictions are equal to the mean return
         self.network = mlp(sizes, activation=activation, last_scale=0.0, generator=generator)
         self.register_buffer("shift", torch.zeros((), dtype=torch.float64))
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
@@ -156,7 +156,7 @@ BOUND = 10.0
 
 
 def value_group(env: Env, given: str | None) -> str:
-    """Select the observations of a new value function: by default the group "critic" if it exists, else "policy".
+    """Select a value function's observations: by default the group "critic" if it exists, else "policy".
 
     Raises:
         ValueError: The task has no observation group of this name.

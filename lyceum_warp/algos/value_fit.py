@@ -25,7 +25,7 @@ class ValueFit:
         rate: Learning rate.
         epochs: Number of passes over the samples.
         batch: Number of samples in a mini-batch.
-        team: The processes that fit the value function together.
+        team: The processes.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class ValueFit:
         self.parameters = list(value.parameters())
         self.cuda = self.parameters[0].is_cuda
         self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=self.cuda)
-        # store all gradients in one tensor, so that one all-reduce suffices
+        # one tensor for all gradients needs only one all-reduce
         self.gradient = torch.zeros(sum(p.numel() for p in self.parameters), device=self.parameters[0].device)
         for parameter, part in zip(self.parameters, self._split(self.gradient), strict=True):
             parameter.grad = part.view_as(parameter)
@@ -49,14 +49,14 @@ class ValueFit:
     def __call__(
         self, obs: torch.Tensor, step: torch.Tensor, target: torch.Tensor, generator: torch.Generator
     ) -> torch.Tensor:
-        """Fit to returns; if a parameter or a moment of Adam becomes non-finite, restore all of them.
+        """Fit to returns. If a parameter or a moment of Adam becomes non-finite, restore all of them.
 
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
             step: Steps since the reset, (samples,).
-            target: Returns, (samples,). Returns are clipped to the value function's shift plus or minus ``BOUND`` times
+            target: Returns, (samples,). They are clipped to the value function's shift plus or minus ``BOUND`` times
                 its scale.
-            generator: Random generator for the order of all processes' samples.
+            generator: Random generator with the same state in every process.
 
         Returns:
             Whether the fit is finite, as a bool tensor.
@@ -94,7 +94,7 @@ class ValueFit:
 
     @torch.no_grad()
     def _keep_if_finite(self) -> torch.Tensor:
-        """Back up the parameters and moments if all are finite; the host does not wait for the device."""
+        """Back up the parameters and moments if all are finite, without waiting for the device."""
         present = torch.cat([numbers.reshape(-1) for numbers in self._numbers()])
         # Adam's initial moments are zero
         good = torch.nn.functional.pad(self._good, (0, len(present) - len(self._good)))
@@ -104,17 +104,16 @@ class ValueFit:
 
     @torch.no_grad()
     def _restore(self) -> None:
-        """Restore the last finite parameters and moments."""
         numbers = self._numbers()
         for tensor, part in zip(numbers, self._good.split([tensor.numel() for tensor in numbers]), strict=True):
             tensor.copy_(part.view_as(tensor))
 
     def _own(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | float]:
-        """Select this process's samples of a mini-batch, and compute their weights in the mini-batch's mean."""
+        """Select this process's samples of a mini-batch, and compute their weights."""
         if self.team.size == 1:
             return index, 1.0 / len(index)
         places, own = self.team.locate(index, self.nworld)
-        # on a GPU, give other processes' samples the weight 0, because selection by a mask would synchronise
+        # on a GPU, selection by a mask would synchronise
         if self.cuda:
             return places, own.unsqueeze(-1) / len(index)
         return places[own], 1.0 / len(index)
@@ -136,14 +135,13 @@ class ValueFit:
         self.optimizer.load_state_dict(state)
         for group in self.optimizer.param_groups:
             group["capturable"] = self.cuda
-        self.captured = None  # discard the graph: it contains the addresses of Adam's old moments
+        self.captured = None  # the graph contains the addresses of Adam's old moments
 
 
 class DenseSteps:
     """Makes the mini-batch steps of a ``ValueFit`` on the CPU, without autograd or torch's Adam.
 
-    The steps change flat copies of the parameters and moments. ``store`` writes them back into the value function and
-    the optimizer.
+    The steps change flat copies of the parameters and moments. ``store`` writes them back.
     """
 
     def __init__(self, fit: ValueFit, passes: DensePasses) -> None:
@@ -163,7 +161,6 @@ class DenseSteps:
         self.gradients = self._shaped(self.gradient)
 
     def _shaped(self, flat: torch.Tensor) -> list[torch.Tensor]:
-        """Split a vector into views of the parameters' shapes."""
         sizes = [p.numel() for p in self.fit.parameters]
         return [part.view_as(p) for part, p in zip(flat.split(sizes), self.fit.parameters, strict=True)]
 
@@ -212,8 +209,7 @@ class DenseSteps:
 class CapturedStep:
     """Makes the mini-batch steps of a ``ValueFit`` as a CUDA graph.
 
-    A counter on the device is the index of the next mini-batch. The constructor uses only the shapes and the device of
-    ``features`` and ``target``, not their values.
+    A counter on the device is the index of the next mini-batch.
     """
 
     def __init__(self, fit: ValueFit, features: torch.Tensor, target: torch.Tensor) -> None:
@@ -242,7 +238,7 @@ class CapturedStep:
             self.graph.replay()
 
     def load(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
-        """Start an epoch: copy the samples, and the indices and weights of the mini-batches."""
+        """Copy the samples, and the indices and weights of the mini-batches."""
         self.features.copy_(features)
         self.target.copy_(target)
         filled = torch.nn.functional.pad(order, (0, self.places.numel() - len(order))).view_as(self.places)
