@@ -21,19 +21,19 @@ from lyceum_warp.support.docstrings import document_attributes
 class Engine(abc.ABC):
     """Many worlds of one model, stepped together.
 
-    An engine does not depend on a task. The fields of an engine are Warp arrays with a leading ``nworld`` axis. The
-    addresses of the fields never change, so graphs that read fields are captured once.
+    An engine does not depend on a task. The fields of an engine are Warp arrays with a leading ``nworld`` axis, whose
+    addresses never change.
 
     In each step, the caller writes ``ctrl`` and other inputs, calls ``step`` and ``find_faults``, and reads fields and
     ``fault``. For worlds that restart, the caller then calls ``reset``, writes state fields and model fields, and calls
-    ``commit``, ``apply_model``, optionally ``settle``, and ``refresh``. A new engine holds no state: reset all worlds
-    first. Model fields start at the model's values, and resets do not change them.
+    ``commit``, ``apply_model``, optionally ``settle``, and ``refresh``. A new engine holds no state, so reset all
+    worlds first. Model fields start at the model's values, and resets do not change them.
 
     Args:
         model: The compiled model, which the engine does not change.
         nworld: Number of worlds.
         device: The device of the arrays.
-        fields: The fields to provide, from ``fields.describe``. The engine provides no other fields.
+        fields: The fields to provide, from ``fields.describe``.
         dynamics: The model fields that differ between worlds, from ``model_fields.describe_model_field``.
         initial: The initial state for ``reset``, (integration_size,); None for the model's initial state.
 
@@ -47,10 +47,10 @@ class Engine(abc.ABC):
     launch_threads: int = 1
     """The number of threads that launch kernels before and after a step, each for a part of the worlds.
 
-    An engine with several threads must launch kernels only through ``lyceum_warp.support.arrays``.
+    With several threads, an engine must launch kernels only through ``lyceum_warp.support.arrays``.
     """
     capturable: bool
-    """Whether every method consists of Warp launches, so that a whole step can be captured as one graph.
+    """Whether every method consists of Warp launches, so that one graph can capture a whole step.
 
     On other engines, only methods documented as Warp launches are captured.
     """
@@ -69,14 +69,13 @@ class Engine(abc.ABC):
     initial: np.ndarray
     """The initial state of worlds after ``reset``, (integration_size,), float64."""
     arrays: dict[str, wp.array]
-    """The live arrays of the fields and model fields, (nworld, ...), by name; the engine's constructor fills this
-    dict."""
+    """The arrays of the fields and model fields, (nworld, ...), by name, filled by the engine's constructor."""
     ctrl: wp.array
     """The controls of the next step, ``arrays["ctrl"]``, (nworld, nu), float32; part of the state."""
     fault: wp.array
     """The faults of each world as bits of ``Done``, (nworld,), int32; set by ``find_faults``."""
     stage: Stage
-    """The stage up to which MuJoCo's forward pass must run after the substeps, so that fields match the new state."""
+    """The stage up to which MuJoCo's forward pass must run after the substeps."""
     reset_stage: Stage
     """The stage up to which MuJoCo's forward pass must run after a reset."""
     snapshots: list[Field]
@@ -112,7 +111,6 @@ class Engine(abc.ABC):
         self._everyone = wp.full(nworld, True, dtype=bool, device=device)
 
     def _nominal_rows(self, field: ModelField, rows: int) -> wp.array:
-        """Make an array of a model field. Every row has the model's own value."""
         value = np.tile(field.value(self.model).astype(np.float32).reshape(-1), (rows, 1))
         array: wp.array = wp.zeros((rows, *field.shape), dtype=field.dtype, device=self.device)
         if value.size:
@@ -123,15 +121,12 @@ class Engine(abc.ABC):
     def bytes_per_world(
         cls, model: mujoco.MjModel, fields: Iterable[Field], dynamics: Iterable[ModelField] = (), **options: Any
     ) -> int:
-        """Estimate the bytes of memory per world, from the constructor's arguments.
-
-        The base class counts a float64 state and one float32 array for each field.
-        """
+        """Estimate the bytes of memory per world, from the constructor's arguments."""
         floats = sum(field.size for field in fields) + sum(field.size for field in dynamics)
         return 8 * _integration_size(model) + 4 * floats + 8
 
     def prepare_capture(self) -> None:  # noqa: B027
-        """Allocate memory for graphs; called after all kernels have been compiled, before the first capture.
+        """Allocate memory for graphs, after all kernels have been compiled and before the first capture.
 
         Raises:
             ValueError: The memory is too small for this many worlds.
@@ -141,17 +136,13 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def step(self, nstep: int) -> None:
-        """Advance every world by ``nstep`` substeps under ``ctrl`` and the other inputs, and update the fields.
+        """Advance every world by ``nstep`` substeps, and update the fields.
 
-        At the start of the step, the engine reads the arrays of ``ctrl`` and of the other fields whose ``written`` is
-        True.
+        The step reads ``ctrl`` and the other fields whose ``written`` is True.
         """
 
     def step_phases(self, nstep: int) -> list[Phase]:
-        """Return ``step`` as a list of phases, which ``Graphs`` can capture separately.
-
-        An engine that is not ``capturable`` can capture some of its phases, such as its copies of fields.
-        """
+        """Return ``step`` as a list of phases, which ``Graphs`` can capture separately."""
         return [Phase("physics", partial(self.step, nstep), engine=True)]
 
     @abc.abstractmethod
@@ -166,23 +157,25 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def reset(self, mask: wp.array) -> None:
-        """Put the masked worlds and their state fields into the initial state.
+        """Put the masked worlds into the initial state, by Warp launches on every engine.
 
-        The method consists of Warp launches on every engine. The caller must then update derived fields by ``refresh``.
+        The caller must then update derived fields by ``refresh``.
         """
 
     @abc.abstractmethod
     def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
-        """Copy the state fields of the masked worlds, by default of all worlds, into the engine.
+        """Copy the state fields of the masked worlds into the engine, by Warp launches.
 
-        The method consists of Warp launches.
+        Args:
+            mask: The mask of the worlds.
+            names: The fields; None for all state fields.
         """
 
     def apply_model(self, mask: wp.array) -> None:
         """Apply the masked worlds' model fields, and recompute the constants derived from them.
 
         The cost is negligible for unchanged values. The caller must then update derived fields by ``refresh`` or
-        ``refresh_current``. An engine that accepts ``dynamics`` must implement this method.
+        ``refresh_current``.
         """
         if self.dynamics:
             raise NotImplementedError(f"the {self.name} engine does not let model fields differ between worlds")
@@ -190,8 +183,8 @@ class Engine(abc.ABC):
     def settle(self, mask: wp.array, nstep: int) -> None:
         """Advance only the masked worlds by ``nstep`` substeps from their committed states, and update state fields.
 
-        Afterwards, the time of the masked worlds is 0, and the caller must update derived fields by ``refresh``. No bit
-        of any other world changes.
+        The time of the masked worlds is then 0, and the caller must update derived fields by ``refresh``. No bit of any
+        other world changes.
         """
         raise NotImplementedError(f"the {self.name} engine cannot settle individual worlds")
 
@@ -207,25 +200,25 @@ class Engine(abc.ABC):
     def refresh_current(self, mask: wp.array) -> None:
         """Compute the derived fields and sensors of the masked worlds, except those of the acceleration stage.
 
-        Fields and sensors of the acceleration stage keep their values from the last substep. Other worlds do not
-        change, nor do the histories of sensors.
+        Fields and sensors of the acceleration stage keep their values from the last substep. Other worlds and the
+        histories of sensors do not change.
         """
 
     # rollouts
 
     def rollout(self, state: wp.array, controls: wp.array, nstep: int, buffers: Mapping[str, wp.array]) -> None:
-        """Roll out every world from a given state under given controls, and copy fields into buffers at each step.
+        """Roll out every world from a given state, and copy fields into buffers at each step.
 
-        The state fields and ``find_faults`` then describe the final state; derived fields may be stale.
+        The state fields and ``find_faults`` then describe the final state. Derived fields may be stale.
 
         Args:
-            state: States to start from, (nworld, state_size or more) float64, such as those of ``get_state``.
+            state: Initial states, (nworld, state_size or more) float64, such as those of ``get_state``.
             controls: Controls of each step, (steps, nworld, nu) float32.
             nstep: Substeps in a step.
             buffers: Destinations of fields and model fields, by name, (steps + 1, nworld, ...); row 0 is the initial
                 state.
         """
-        self.reset(self._everyone)  # clear what the last rollout left, such as warm starts
+        self.reset(self._everyone)  # clear the last rollout's warm starts
         self.set_state(state, self._everyone)
         self._copy_fields(buffers, 0)
         for t in range(len(controls)):
@@ -235,13 +228,7 @@ class Engine(abc.ABC):
             self._copy_fields(buffers, t + 1)
 
     def rollout_bytes_per_world(self, steps: int, nstep: int, fields: Iterable[Field]) -> int:
-        """Estimate the bytes of memory per world that ``rollout`` needs in addition to its arguments.
-
-        Args:
-            steps: Number of steps in the horizon.
-            nstep: Substeps in a step.
-            fields: Fields that are copied into buffers.
-        """
+        """Estimate the bytes of memory per world that ``rollout`` needs in addition to its arguments."""
         return 0
 
     def _copy_fields(self, buffers: Mapping[str, wp.array], t: int) -> None:
@@ -275,18 +262,16 @@ class Engine(abc.ABC):
         self._read_columns(state, mask, self.snapshots, self.integration_size)
 
     def _read_columns(self, state: wp.array, mask: wp.array, fields: Iterable[Field | ModelField], start: int) -> None:
-        """Copy consecutive columns of a state into the masked worlds' fields, rounded to float32."""
         for field in fields:
             launch_rows(narrow, mask, state[:, start : start + field.size], flat(self.arrays[field.name]))
             start += field.size
 
     def _saved(self) -> list[Field | ModelField]:
-        """The fields that follow the integration state in a state vector, in order."""
+        """The fields after the integration state in a state vector."""
         return [*self.snapshots, *self.dynamics.values()]
 
     @property
     def _dynamics_size(self) -> int:
-        """The number of columns of the model fields, which come last in a state."""
         return sum(field.size for field in self.dynamics.values())
 
     @abc.abstractmethod
@@ -309,7 +294,6 @@ def _integration_size(model: mujoco.MjModel) -> int:
 
 
 def _initial_state(model: mujoco.MjModel) -> np.ndarray:
-    """Return the integration state of a new MjData."""
     state = np.empty(_integration_size(model))
     mujoco.mj_getState(model, mujoco.MjData(model), state, mujoco.mjtState.mjSTATE_INTEGRATION.value)
     return state

@@ -1,4 +1,4 @@
-"""Check whether a batch of worlds fits into memory, given the estimated bytes per world."""
+"""Check whether a batch of worlds fits into memory."""
 
 import gc
 
@@ -16,7 +16,7 @@ class NotEnoughMemoryError(ValueError):
 
 
 def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: str = "", held: int = 0) -> None:
-    """Refuse a batch that does not fit into the free memory, before its arrays are allocated.
+    """Check that a batch of worlds fits into the free memory, before its arrays are allocated.
 
     Args:
         bytes_per_world: The memory that each world takes.
@@ -30,9 +30,9 @@ def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: 
     """
     free = free_memory(device)
     if free is not None and nworld > _most(bytes_per_world, free + held):
-        gc.collect()  # collect garbage, to free environments that are no longer used
+        gc.collect()  # free environments that are no longer used
         if device.is_cuda:
-            torch.cuda.empty_cache()  # release free memory that torch has cached
+            torch.cuda.empty_cache()
         free = free_memory(device)
     if free is None or nworld <= (most := _most(bytes_per_world, free + held)):
         return

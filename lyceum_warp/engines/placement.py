@@ -26,16 +26,15 @@ _DETERMINISTIC = "lyceum_warp.engines.deterministic.deterministic_engine", "Dete
 """The engine that replaces "warp" on a CUDA device with deterministic=True."""
 
 _SAMPLES_PER_CORE = 40
-"""The number of samples per CPU core below which the C engine plans faster than an H100. Measured on 16 cores, the
+"""The C engine plans faster than an H100 with fewer samples per CPU core than this. Measured on 16 cores, the
 break-even points are 27 samples per core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah
 (bench/README.md)."""
 
 _MOST_CORES = 16
-"""The maximum number of CPU cores that the choice takes into account. More cores were not measured, and only the
-rollouts of a plan run on several cores."""
+"""Further CPU cores do not count. They were not measured, and only the rollouts of a plan run on several cores."""
 
 _NOSLIP = 6
-"""The factor by which the noslip solver, which is slow on a GPU, raises the break-even point."""
+"""The noslip solver, which is slow on a GPU, raises the break-even point by this factor."""
 
 
 def find_device(device: str | None) -> wp.Device:
@@ -94,8 +93,8 @@ def open_engine(
         dynamics: The model fields that differ between worlds, from ``model_fields.describe_model_field``.
         initial: The initial state for resets; None for the model's initial state.
         reserved: The bytes per world that the caller allocates.
-        options: Keyword-only arguments of the engine's constructor. None stands for the engine's default. An unknown
-            option is ignored if its value is True or False.
+        options: Options of the engine; None stands for the default. An unknown option is ignored if its value is True
+            or False.
 
     Raises:
         ValueError: The engine does not exist, the worlds do not fit into memory, or the engine does not support the
@@ -120,10 +119,10 @@ def bytes_per_world(
 
 
 def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
-    """Return the options to change for an environment with few worlds, such as the environment of an evaluation.
+    """Return the options to change for an environment with few worlds, such as that of an evaluation.
 
-    On a GPU, a step of a few worlds takes nearly as long as a step of thousands of worlds. If the engine is "auto", an
-    environment with few worlds therefore uses the C engine, on CPU cores and in double precision.
+    On a GPU, a step of a few worlds takes nearly as long as a step of thousands of worlds. With the engine "auto", few
+    worlds therefore run on the C engine.
     """
     return options_on_cores() if engine == "auto" and engine_name(engine, device) == "warp" else {}
 
@@ -131,8 +130,7 @@ def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device 
 def options_for_plant(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
     """Return the options to change for a world that a planner controls in real time.
 
-    On a GPU, the world's steps would wait for the planner's launches. The world therefore runs on the C engine, on a
-    CPU core.
+    On a GPU, the world's steps would wait for the planner's launches. The world therefore runs on the C engine.
     """
     name = device.alias if isinstance(device, wp.Device) else device
     on_gpu = engine in ("auto", "warp") and find_device(name).is_cuda
@@ -172,7 +170,7 @@ def place_samples(
 
 
 def options_on_cores() -> dict[str, Any]:
-    """Return the options that move an environment to the C engine; options that the C engine lacks become None."""
+    """Return the options that move an environment to the C engine. Options that the C engine lacks become None."""
     known = _options_of(_engine_class("mujoco", wp.get_device("cpu"), False)) or []
     defaults = EnvOptions().for_engine()
     others = {name: None for name, default in defaults.items() if default is None and name not in known}
@@ -182,7 +180,6 @@ def options_on_cores() -> dict[str, Any]:
 def _resolved(
     engine: str | EngineFactory, device: wp.Device, options: dict[str, Any]
 ) -> tuple[EngineFactory, dict[str, Any]]:
-    """Return the engine's class or factory, and the options to pass to it."""
     name = engine_name(engine, device.alias)
     factory = engine if callable(engine) else _engine_class(name, device, bool(options.get("deterministic")))
     given = {key: value for key, value in options.items() if value is not None and value is not False}
@@ -214,6 +211,6 @@ def _options_of(factory: EngineFactory) -> list[str] | None:
 
 
 def _model_name(model: mujoco.MjModel) -> str:
-    """Return the model's name, which is empty if its file has none."""
+    """Return the model's name; empty if its file has none."""
     name = model.names[: model.names.index(b"\0")].decode(errors="replace")
     return "" if name == "MuJoCo Model" else name

@@ -1,8 +1,7 @@
 """Capture the phases of a step, a reset or a plan as graphs, and replay them.
 
 ``Graphs.sequence`` turns a list of phases into calls. Consecutive phases that consist of Warp launches become one
-graph, which is captured once and replayed. If the engine's calls consist of launches as well, a whole step is one
-graph. Otherwise, the engine's calls run between the graphs of the phases.
+graph. The calls of an engine without Warp launches run between the graphs.
 
 On the CPU, Warp runs each launch in one thread. Phases that process every world independently therefore become several
 graphs, one for each part of the worlds, and threads replay the graphs in parallel.
@@ -24,7 +23,7 @@ from lyceum_warp.support.arrays import part_of_worlds
 from lyceum_warp.support.upstream import TILES_ON_CPU, separate_captures, separate_tiles, tiles
 
 Calls = tuple[Callable[[], None], ...]
-"""The result of ``Graphs.sequence``: functions to call in order."""
+"""Functions to call in order."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,12 +37,11 @@ class Phase:
     name: str
     """Name of the phase, for ``lyceum_warp.testing``."""
     run: Callable[[], object]
-    """The function to run, without arguments."""
     engine: bool = False
-    """Whether the phase calls the engine; such a call consists of Warp launches only on some engines."""
+    """Whether the phase calls the engine, which consists of Warp launches only on some engines."""
     by_world: bool = False
-    """Whether the worlds can be divided among threads. The division requires that the phase launches kernels only
-    through functions such as ``arrays.launch_worlds``, and that no world depends on another world."""
+    """Whether the worlds can be divided among threads. The phase must launch kernels only through functions such as
+    ``arrays.launch_worlds``, and no world may depend on another world."""
 
 
 class Graphs:
@@ -51,10 +49,9 @@ class Graphs:
 
     Args:
         device: Device of the launches; Warp can also capture graphs on the CPU.
-        enabled: Whether to capture graphs; False calls every phase directly.
+        enabled: Whether to capture graphs.
         capture_engine: Whether calls of the engine consist of launches, so that graphs can include them.
-        workers: Threads for phases with ``by_world``. The threads replay the graphs of these phases; by default, the
-            caller's thread replays them alone.
+        workers: Threads that replay the graphs of phases with ``by_world``; by default only the caller's thread.
     """
 
     def __init__(
@@ -105,7 +102,7 @@ SECONDS_A_THREAD = 5e-4
 TIMED = 8
 """Number of timed calls. Only the fastest call counts, because other programs may slow some calls down."""
 _CAPTURING = threading.RLock()
-"""Lock that allows one capture at a time, because controllers and viewers use environments in separate threads."""
+"""Controllers and viewers use environments in separate threads, but only one thread may capture at a time."""
 separate_captures()
 separate_tiles()
 
@@ -129,9 +126,8 @@ def capturing() -> Iterator[None]:
 class _Graph:
     """Captures functions that consist of launches, in one graph, or in one graph per thread if they take long.
 
-    The first call runs the functions directly, and loads their modules. The second call captures and replays the
-    functions; later calls only replay. If there are workers, the first replays are timed, and the shortest time
-    determines how many threads share the work.
+    The first call runs the functions directly, and loads their modules. The second call captures the functions. If
+    there are workers, the first replays are timed, and the shortest time determines how many threads share the work.
     """
 
     def __init__(
@@ -165,7 +161,6 @@ class _Graph:
             self._share(shortest)
 
     def _share(self, seconds: float) -> None:
-        """Split the graph among workers if it takes long enough on one thread."""
         assert self._workers is not None
         parts = min(self._workers.nthread, int(seconds / SECONDS_A_THREAD))
         if parts > 1:

@@ -1,7 +1,7 @@
 """Compile kernels ahead of time, on all cores, with progress on stderr.
 
 Warp compiles a module silently at the first launch of one of its kernels. On a new GPU, compilation takes a minute or
-more per task. ``compile_ahead`` rehearses the launches of a step, and compiles in parallel the modules that are not in
+more per task. ``compile_ahead`` finds the launches of a step, and compiles in parallel the modules that are not in
 Warp's cache.
 """
 
@@ -23,22 +23,19 @@ from lyceum_warp.support.upstream import is_compiled
 
 @dataclasses.dataclass(frozen=True)
 class Built:
-    """Result of compiling kernels ahead of time."""
+    """Numbers of modules that were compiled and that were already in the cache, and the seconds of compilation."""
 
     modules: int = 0
-    """Number of modules that were compiled."""
     known: int = 0
-    """Number of modules that were already in the cache."""
     seconds: float = 0.0
-    """Wall-clock time of the compilation."""
 
 
 def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str) -> Built:
     """Compile the uncached kernels that a function launches, and report progress on stderr.
 
     Args:
-        function: Function that consists of launches. The function runs with kernel launches disabled, so the function's
-            arrays may contain garbage afterwards.
+        function: Function that consists of launches. It runs without its kernels, so its arrays may contain garbage
+            afterwards.
         device: Device on which the kernels will run.
         purpose: Purpose of the kernels for the report, such as "hopper".
     """
@@ -56,7 +53,7 @@ def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str)
             for future in concurrent.futures.as_completed(futures):
                 report(*future.result())
         finally:
-            pool.shutdown(cancel_futures=True)  # cancel remaining modules after an error or Ctrl-C
+            pool.shutdown(cancel_futures=True)  # after an error or Ctrl-C
     return Built(len(missing), len(wanted) - len(missing), time.perf_counter() - start)
 
 

@@ -21,7 +21,7 @@ class Rehearsal:
 
     def launch(self, kernel: Any, dim: Any = None, *args: Any, block_dim: int | None = None, **kwargs: Any) -> None:
         """Add a kernel's module to the list."""
-        # skip generic kernels, which are compiled for argument types, and empty launches, which load no module
+        # empty launches load no module, and generic kernels are compiled for argument types
         if np.prod(dim) and not kernel.is_generic:
             self.modules[kernel.module, block_dim] = None
 
@@ -30,13 +30,13 @@ class Rehearsal:
 def rehearse() -> Iterator[Rehearsal]:
     """List this thread's launches instead of running the kernels; graph branches and loops run once.
 
-    Copies and allocations still run, so arrays may contain garbage afterwards. Other threads launch kernels as usual,
-    but only one thread can rehearse at a time.
+    Copies and allocations still run, so arrays may contain garbage afterwards. Only one thread can do this at a time;
+    other threads launch kernels as usual.
     """
     rehearsal = Rehearsal()
     functions: dict[str, Callable[..., None]] = {"launch": rehearsal.launch, "launch_tiled": rehearsal.launch}
     functions |= {"capture_while": _loop, "capture_if": _branch}
-    # do not run sorts and scans, which would read garbage
+    # sorts and scans would read garbage
     functions |= dict.fromkeys(("radix_sort_pairs", "segmented_sort_pairs", "array_scan"), _nothing)
     with _lock, replaced_in_this_thread(functions):
         yield rehearsal

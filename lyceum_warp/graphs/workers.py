@@ -5,11 +5,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 
 class Workers:
-    """Pool of threads that start on demand and end when the pool is garbage-collected.
-
-    Args:
-        nthread: Maximum number of threads, including the caller's thread.
-    """
+    """Pool of threads that start on demand and end when the pool is garbage-collected."""
 
     def __init__(self, nthread: int) -> None:
         self.nthread = nthread
@@ -18,8 +14,7 @@ class Workers:
     def run(self, calls: Sequence[Callable[[], object]]) -> None:
         """Call functions that release Python's GIL in parallel, and wait until all functions have returned.
 
-        Args:
-            calls: The functions, at most ``nthread``; the caller's thread runs the first function.
+        The caller's thread runs the first of at most ``nthread`` functions.
 
         Raises:
             BaseException: Any exception that a function raised; all other functions have ended.

@@ -14,12 +14,8 @@ _COUNTED_AS = mujoco.mjtWarning.mjWARN_INERTIA.value
 class ErrorsAsWarnings:
     """A context manager that turns errors of individual worlds into warnings, so that ``find_faults`` finds them.
 
-    After an error in a world, MuJoCo restores the state that the world had before the call, and steps the other worlds.
-    All steps share one instance of this class, because a generator-based context manager takes four times as long to
-    enter.
-
-    Args:
-        batch: The worlds.
+    After an error in a world, MuJoCo restores the world's state before the call, and steps the other worlds. All steps
+    share one instance, because a generator-based context manager takes four times as long to enter.
     """
 
     def __init__(self, batch: Batch) -> None:

@@ -54,7 +54,7 @@ class MujocoEngine(Engine):
     Args:
         model, nworld, fields, dynamics: See ``Engine``.
         device: Must be the CPU.
-        initial: The initial state for ``reset``; None for the model's initial state. The engine rounds it to float32.
+        initial: The initial state for ``reset``, rounded to float32; None for the model's initial state.
         nthread: Threads of the pool; 0 for all cores.
 
     Raises:
@@ -82,15 +82,14 @@ class MujocoEngine(Engine):
         super().__init__(model, nworld, device, fields, dynamics, initial)
         quiet()
         self.nthread = whole_number("nthread", nthread, low=0)
-        # subclasses use one thread: if they launch kernels over all worlds, every thread would repeat these launches
+        # if a subclass launches kernels over all worlds, every thread would repeat the launches
         self.launch_threads = (self.nthread or cpu_cores()) if type(self) is MujocoEngine else 1
         self.native_model = copy.copy(model)
-        """The model that the batch steps."""
-        # autoreset would hide a fault, because MuJoCo would silently reset the world within a step
+        # autoreset would hide a fault: MuJoCo would silently reset the world within a step
         self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        # The batch is not persistent (it has no MjData for each world). A persistent batch could reuse the stages
-        # computed after the last step. However, one MjData per world does not fit into the CPU's caches: the six tasks
-        # that need such stages were 4 to 33 % slower with a persistent batch (128 and 1,024 worlds on two cores).
+        # A persistent batch, with one MjData per world, could reuse the stages computed after the last step. But it
+        # does not fit into the CPU's caches: the six tasks that need such stages were 4 to 33 % slower with 128 and
+        # 1,024 worlds on two cores.
         self.batch = Batch(self.native_model, nworld, self.nthread)
         self._errors_as_warnings = ErrorsAsWarnings(self.batch)
         self._rows = self._alias(self.batch.state)
@@ -113,10 +112,10 @@ class MujocoEngine(Engine):
         self._before_stage = [field for field in late if field.name not in STATE_FIELDS]
         """The fields to copy before the call of ``forward``, because the call may use the MjData of another world."""
         self._after_stage = [field for field in self._before_stage if field in computed]
-        """Those of ``_before_stage`` that ``forward`` computes in part, such as the sensors of early stages."""
+        """The fields of ``_before_stage`` that ``forward`` computes in part, such as the sensors of early stages."""
         self._last = [field for field in shown if field not in self._before_stage]
-        """The fields that kernel launches copy at the end of a step."""
-        # skip collision detection, the slowest part of the position stage: positions do not depend on contacts
+        """The fields to copy at the end of a step."""
+        # positions do not depend on contacts, so skip collision detection, the slowest part of this stage
         without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if positions and computed else 0
         self._disabled = self.batch.expand("opt.disableflags") if without else np.zeros(0, dtype=int)
         self._step_flags, self._stage_flags = self._disabled.copy(), self._disabled | without
@@ -134,10 +133,7 @@ class MujocoEngine(Engine):
         self._models.apply(self._values)
 
     def _on_host(self, mask: wp.array) -> np.ndarray:
-        """Return a mask's memory as a NumPy array.
-
-        The view is cached, because creating a view takes longer than reading it.
-        """
+        """Return a mask's memory as a NumPy array, cached because creating a view takes longer than reading it."""
         if (kept := self._masks.get(id(mask))) is not None:  # the dict keeps the mask alive, so the id stays unique
             return kept[1]
         view: np.ndarray = mask.numpy()
@@ -149,17 +145,15 @@ class MujocoEngine(Engine):
         return wp.array(rows, dtype=wp.float64, device=self.device, copy=False)
 
     def _rounded_initial(self) -> wp.array:
-        """Round the initial state to float32, the precision of the fields."""
         initial = self.initial.copy()
         for name in STATE_FIELDS:
             if name in READ_ONLY:
-                continue  # rounding the time would shift the time stamps of delayed sensor samples
+                continue  # rounding would shift the time stamps of delayed sensor samples
             columns = state_columns(self.model, name)
             initial[columns] = initial[columns].astype(np.float32)
         return wp.array(initial, dtype=wp.float64, device=self.device)
 
     def _bind(self, field: Field) -> None:
-        """Allocate a field's float32 array, and find the engine's float64 array from which it is copied."""
         array = wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
         self.arrays[field.name] = array
         if field.name in STATE_FIELDS:
@@ -222,13 +216,7 @@ class MujocoEngine(Engine):
         self._read(self._last, self._everyone)
 
     def _copy(self, fields: list[Field], mask: np.ndarray | None = None, *, early: bool = False) -> None:
-        """Copy fields of the masked worlds from the engine's float64 arrays into their float32 arrays.
-
-        Args:
-            fields: The fields to copy.
-            mask: The mask of the worlds; None for all worlds.
-            early: Whether to skip the sensors of the acceleration stage.
-        """
+        """Copy the masked worlds' fields into float32 arrays; ``early`` skips sensors of the acceleration stage."""
         with np.errstate(over="ignore"):  # a world with a fault may hold numbers outside the range of float32
             for field in fields:
                 target, source = self._copies[field.name]
@@ -290,7 +278,6 @@ class MujocoEngine(Engine):
         self._read(self._state_fields, mask)
 
     def _read(self, fields: Iterable[Field], mask: wp.array) -> None:
-        """Copy the masked worlds' field values from the engine into the float32 arrays, by kernel launches."""
         numbers = []
         for field in fields:
             array, source = self.arrays[field.name], self._sources[field.name]

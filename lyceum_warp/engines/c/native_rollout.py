@@ -17,9 +17,9 @@ def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
     """Whether ``Batch.rollout`` returns exactly the same values as a loop of ``Batch.step``.
 
     Each row of a native rollout holds the values in MjData after an ``mj_step``. The state in a row is the state after
-    the substep. Quantities of the position and velocity stages belong to the state before that substep; their values
-    for the new state are in the next row. With RK4, quantities of the position and velocity stages belong to an
-    intermediate stage. Sensor data come from several stages, so a native rollout cannot return them exactly.
+    the substep, but quantities of the position and velocity stages belong to the state before the substep. With RK4,
+    they belong to an intermediate stage. Sensor data come from several stages, so a native rollout cannot return them
+    exactly.
     """
     current = [field for field in fields if field.refresh > Stage.NONE]
     if any(field.snapshot for field in current):
@@ -35,7 +35,7 @@ class NativeRollout:
         steps: Number of steps in the horizon.
         nstep: Number of substeps in a step.
         fields: The fields to copy into buffers.
-        snapshots: The fields that follow the integration state in a state vector, in order.
+        snapshots: The fields that follow the integration state in a state vector.
         dynamics: The model fields that follow the snapshots.
     """
 
@@ -68,7 +68,6 @@ class NativeRollout:
             column += field.size
         self.models = WorldModels(batch, dynamics)
         self.model_columns: dict[str, slice] = {}
-        """The columns of the state vector that hold the model fields."""
         for varied in dynamics:
             self.model_columns[varied.name] = slice(column, column + varied.size)
             column += varied.size
@@ -86,14 +85,13 @@ class NativeRollout:
         self._outputs: dict[str, Any] = {"record": list(self.rows), "out": self.rows}
 
     def run(self, *given: Any) -> None:
-        """Roll out the worlds, and copy the fields; the final states and the warnings stay in the batch.
+        """Roll out the worlds with the state, the controls and the buffers of ``Engine.rollout``.
 
-        Args:
-            given: The state, the controls and the buffers of ``Engine.rollout``.
+        The final states and the warnings stay in the batch.
         """
         if self._given is None or any(a is not b for a, b in zip(given, self._given, strict=True)):
             self._given, (start, held, arrays) = given, given
-            # cache the views, because making views of Warp arrays takes longer than filling them
+            # making views of Warp arrays takes longer than filling them
             self._views = start.numpy(), held.numpy(), {name: buffer.numpy() for name, buffer in arrays.items()}
         state, controls, buffers = self._views
         batch = self.batch
@@ -102,7 +100,7 @@ class NativeRollout:
         if self.model_columns:
             self.models.apply({name: state[:, part].astype(np.float32) for name, part in self.model_columns.items()})
         np.copyto(self.by_step, controls.transpose(1, 0, 2)[:, :, None])
-        # after a warning, a world stops and repeats its last row, so the caller must read the warnings
+        # after a warning, a world stops and repeats its last row
         with ErrorsAsWarnings(batch):
             batch.rollout(nstep=self.control.shape[1], control=self.control, **self._outputs)
         if self.stage > Stage.NONE:

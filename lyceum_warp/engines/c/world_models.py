@@ -13,12 +13,7 @@ from lyceum_warp.model_fields import ModelField
 class WorldModels:
     """Writes values of model fields into a batch, and recomputes the constants derived from them.
 
-    A value that equals the model's value, rounded to float32, is replaced by the model's float64 value. All other
-    values are written unchanged.
-
-    Args:
-        batch: The worlds.
-        fields: The model fields.
+    A value that equals the model's value, rounded to float32, is replaced by the model's float64 value.
     """
 
     def __init__(self, batch: Batch, fields: Iterable[ModelField]) -> None:
@@ -36,7 +31,7 @@ class WorldModels:
             self._rounded[field.name] = self._own[field.name].astype(np.float32)
             if field.name in self._follows:
                 self._applied[field.name] = self._rows[field.name].astype(np.float32)
-        # call set_const at first even in worlds with the model's own values, so that equal values give equal constants
+        # at first, call set_const in all worlds, so that equal values give equal constants
         self._stale = np.full(batch.nsim, bool(self._follows))
 
     def apply(self, values: Mapping[str, np.ndarray], mask: np.ndarray | None = None) -> None:
@@ -64,7 +59,7 @@ class WorldModels:
             self._set_const(chosen)
 
     def _set_const(self, worlds: np.ndarray) -> None:
-        """Recompute constants; if MuJoCo rejects a world's values, count a warning and try again next time."""
+        """Recompute constants. If MuJoCo rejects a world's values, count a warning and try again next time."""
         counted = self.batch.warning[:, :, 1].sum(axis=1)
         with ErrorsAsWarnings(self.batch):
             self.batch.set_const(worlds)
@@ -77,6 +72,6 @@ def bytes_per_world(model: mujoco.MjModel, fields: Iterable[ModelField]) -> int:
     batch = Batch(model, 1, 1)
     models = WorldModels(batch, fields)
     moved = {field.name: 1.001 * field.value(model).reshape(1, -1).astype(np.float32) for field in models.fields}
-    models.apply(moved)  # a constant takes memory only if it differs between worlds
+    models.apply(moved)  # constants take memory only if they differ between worlds
     expanded = [rows for name in MODEL_FIELDS if (rows := batch.expanded(name)) is not None]
     return sum(rows.nbytes for rows in expanded) + 4 * sum(field.size for field in fields)

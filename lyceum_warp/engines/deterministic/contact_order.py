@@ -16,8 +16,8 @@ class CanonicalOrder:
     """Sorts a Data's contacts and constraint rows in every forward pass, through MuJoCo Warp's callbacks.
 
     MuJoCo Warp's own deterministic mode makes sums of atomic additions reproducible, but does not sort contacts and
-    rows. One callback runs after collision detection. The other runs after the constraint rows are made, before they
-    are solved. ``order_kernels`` describes the order.
+    rows. One callback runs after collision detection, the other between the creation and the solution of constraint
+    rows.
 
     Args:
         model: MuJoCo Warp's model, whose callbacks this class sets.
@@ -46,7 +46,7 @@ class CanonicalOrder:
         for name in order.Rows.vars:  # type: ignore[attr-defined]
             array = getattr(data.efc, name)
             setattr(self._rows, name, array)
-            if name == "J" and model.is_sparse:  # the kernels do not move the entries of a sparse Jacobian
+            if name == "J" and model.is_sparse:  # entries of a sparse Jacobian do not move
                 array = wp.empty((0, 0, 0), dtype=float)
             elif name != "jtdaj_nblock":
                 array = wp.empty_like(array)

@@ -19,8 +19,8 @@ from lyceum_warp.graphs.capture import capturing
 from lyceum_warp.model_fields import ModelField
 
 _TIMES_THE_MEMORY = 5
-"""This engine's memory per world, divided by the plain Warp engine's estimate. Measured factors are 4.9 on
-humanoid, 6.1 on half_cheetah and 6.3 on hopper. ``prepare_capture`` later measures the memory for the given model."""
+"""This engine's memory per world, divided by the Warp engine's estimate. Measured factors are 4.9 on humanoid, 6.1 on
+half_cheetah and 6.3 on hopper. ``prepare_capture`` later measures the memory for the given model."""
 
 _FEW = 256
 """With fewer worlds than this, scratch memory fits on any device and is allocated on demand."""
@@ -30,10 +30,10 @@ class DeterministicEngine(WarpEngine):
     """A Warp engine whose steps are reproducible bit for bit on a CUDA device, not only on the CPU.
 
     The engine sorts contacts and constraint rows, makes MuJoCo Warp sum in a fixed order, and uses the same scratch
-    memory for all launches. The constructor takes the same arguments as ``WarpEngine``.
+    memory for all launches.
     """
 
-    __signature__ = inspect.signature(WarpEngine)  # placement.py reads the option names from here
+    __signature__ = inspect.signature(WarpEngine)  # placement.py reads the options' names here
 
     partial_refresh = False
 
@@ -52,8 +52,8 @@ class DeterministicEngine(WarpEngine):
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
         """Make another Model and Data with the same options and sizes, to benchmark MuJoCo Warp alone.
 
-        All launches of this engine share scratch memory. Launches on the returned Model and Data allocate separate
-        memory, so a graph of their step takes about a hundred times as much.
+        They do not share the scratch memory of this engine's launches, so a graph of their step takes about a hundred
+        times as much memory.
         """
         model, data = super().bare()
         with wp.ScopedDevice(self.device):

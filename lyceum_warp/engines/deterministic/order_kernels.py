@@ -1,8 +1,8 @@
 """Define kernels that sort contacts and constraint rows into an order that does not depend on thread timing.
 
-MuJoCo Warp assigns indices to contacts and constraint rows by atomic counters. On a GPU, the order of contacts and rows
-therefore varies. Sums over contacts or rows are rounded differently in each run, and runs diverge. These kernels sort
-contacts by (world, geoms, index within the pair), and each world's rows by (type, object, index within the constraint).
+MuJoCo Warp assigns indices to contacts and constraint rows by atomic counters, so their order varies on a GPU. Sums
+over contacts or rows are then rounded differently in each run, and runs diverge. These kernels sort contacts by (world,
+geoms, index within the pair), and each world's rows by (type, object, index within the constraint).
 """
 
 import warp as wp

@@ -9,22 +9,19 @@ import warp as wp
 from lyceum_warp.engines.warp.group import Reserve, aligned
 
 LARGEST_BUFFER = 2**31 - 1
-"""The size of the largest byte array that Warp can make, because an axis has fewer than 2**31 elements."""
+"""The size of the largest byte array in Warp, whose axes have fewer than 2**31 elements."""
 
 _PROBED = 1024, 2048
-"""Memory is extrapolated from these two numbers of worlds. With either number of worlds, all of Warp's buffers exceed
-their minimum size."""
+"""Memory is extrapolated from these two numbers of worlds, with which all of Warp's buffers exceed their minimum
+size."""
 
 
 class Scratch(Reserve):
     """An allocator that places the buffers of all launches in the same memory.
 
-    By default, Warp allocates separate buffers for each launch in a graph. These buffers take about a hundred times as
-    much memory as the worlds. Launches can share buffers, because they run one after another and clear the buffers
-    first. Warp also clears the buffers during a capture, so no graph may run then.
-
-    Args:
-        device: A CUDA device.
+    By default, each launch in a graph has its own buffers, which take about a hundred times as much memory as the
+    worlds. Launches can share buffers, because they run one after another and clear the buffers first. Warp also clears
+    the buffers during a capture, so no graph may run then.
     """
 
     def __init__(self, device: wp.Device) -> None:
@@ -33,7 +30,6 @@ class Scratch(Reserve):
         self.peak = 0
         """The largest number of bytes allocated between two calls of ``open``."""
         self.largest = 0
-        """The largest single allocation, bytes."""
 
     def open(self) -> None:
         """Let the following launches reuse the memory from its start."""
@@ -41,15 +37,14 @@ class Scratch(Reserve):
 
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
-        """Return a context in which captured launches allocate from the reserve."""
+        """Return a context in which captured launches allocate from the shared memory."""
         self.open()
         with wp.ScopedAllocator(self.device, self):
             yield
 
     def allocate(self, size_in_bytes: int) -> int:
-        """Allocate memory from the reserve, or from a new block if the reserve is used up, and return its address."""
-        # Warp allocates buffers for sorting on a separate stream, outside the capture; all other memory belongs to the
-        # graph
+        """Allocate shared memory, and return its address."""
+        # Warp allocates buffers for sorting on another stream, outside the capture; the graph owns all other memory
         if not self.device.is_capturing or self.device.stream.is_capturing:
             return int(self.below.allocate(size_in_bytes))
         size = aligned(size_in_bytes)
@@ -79,8 +74,7 @@ class ScratchSizes:
         """Extrapolate from the scratch memory measured for two numbers of worlds.
 
         Args:
-            capture: A function that captures a step of a number of worlds, and returns the scratch memory that the step
-                used.
+            capture: A function that captures a step of a number of worlds, and returns the scratch memory.
         """
         few, more = (capture(nworld) for nworld in _PROBED)
         fixed, each = _line(few.peak, more.peak)
@@ -93,6 +87,6 @@ class ScratchSizes:
 
 
 def _line(few: int, more: int) -> tuple[int, int]:
-    """Compute fixed bytes and bytes per world from the total bytes for two numbers of worlds."""
+    """Compute fixed bytes and bytes per world from the bytes for two numbers of worlds."""
     each = -(-(more - few) // (_PROBED[1] - _PROBED[0]))
     return max(0, few - _PROBED[0] * each), each

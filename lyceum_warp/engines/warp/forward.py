@@ -22,17 +22,11 @@ Part = Callable[[mjw.Model, mjw.Data], None]
 """A part of a forward pass, for every world of a Data."""
 
 POSITION: tuple[Part, ...] = (mjw.kinematics, mjw.com_pos, mjw.camlight, mjw.flex, mjw.tendon)
-"""The parts with which substeps and forward passes begin; they depend only on positions."""
+"""The first parts of substeps and forward passes, which depend only on positions."""
 
 
 def step(model: mjw.Model, data: mjw.Data, done: Collection[Part] = ()) -> None:
-    """Advance every world of a Data by one substep.
-
-    Args:
-        model: MuJoCo Warp's model.
-        data: MuJoCo Warp's data.
-        done: The parts of ``POSITION`` that are already computed for the current state.
-    """
+    """Advance every world of a Data by one substep, without the parts of ``POSITION`` in ``done``."""
     _without(frozenset(done))["step"](model, data)
 
 
@@ -51,11 +45,10 @@ def inertia(model: mjw.Model, data: mjw.Data) -> None:
 def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
     """Make versions of MuJoCo Warp's functions that skip the parts in ``done`` in their first forward pass.
 
-    The functions are copies in which some global names are replaced, so MuJoCo Warp itself does not change. The copy of
-    ``step`` computes the same results as MuJoCo Warp's ``step``.
+    The functions are copies with other global names, so MuJoCo Warp itself does not change.
 
     For connect and weld constraints, ``mjw.make_constraint`` reads body velocities before MuJoCo Warp has computed
-    them, so it reads stale values of the last forward pass or, after a fault, NaN. In the copies, ``com_vel`` runs
+    them. It thus reads stale values of the last forward pass or, after a fault, NaN. In the copies, ``com_vel`` runs
     right after the positions, in every stage of a Runge-Kutta step.
     """
     own_smooth = vars(forward_functions()["smooth"])
@@ -99,7 +92,7 @@ _NEEDS: dict[Part, tuple[Part, ...]] = {
     mjw.fwd_velocity: (mjw.com_pos, mjw.flex, mjw.tendon, mjw.transmission),
     mjw.subtree_vel: (mjw.com_vel,),
 }
-"""All parts except collisions and constraints, in order, each with the parts that it needs. ``fwd_velocity`` includes
+"""The parts that each part needs, in order. Collisions and constraints are missing. ``fwd_velocity`` includes
 ``com_vel``."""
 
 _FIELDS: dict[Part, str] = {
@@ -132,8 +125,7 @@ _SENSORS: dict[str, tuple[Part, ...]] = {
     "VELOCIMETER GYRO FRAMELINVEL FRAMEANGVEL SUBTREELINVEL SUBTREEANGMOM": (mjw.com_vel,),
     "TENDONVEL ACTUATORVEL": (mjw.fwd_velocity,),
 }
-"""The parts that sensors of the position and velocity stages need, by sensor type; all other types need a full forward
-pass."""
+"""The parts that sensors of the position and velocity stages need. Other sensors need a full forward pass."""
 
 _PARTS_OF_SENSOR = {
     int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}")): parts
@@ -143,16 +135,9 @@ _PARTS_OF_SENSOR = {
 
 
 def forward_parts(model: mujoco.MjModel, names: Collection[str]) -> tuple[Part, ...] | None:
-    """Return the parts of a forward pass that compute the named fields, in order.
+    """Return the parts of a forward pass that compute the named fields, or None if they need collisions or constraints.
 
     For ``sensordata``, the parts compute the sensors of the position and velocity stages.
-
-    Args:
-        model: The compiled model.
-        names: The fields.
-
-    Returns:
-        The parts, or None if the fields need collisions or constraints.
     """
     wanted: set[Part] = set()
     for name in names:
@@ -193,13 +178,12 @@ def _parts_of_sensors(model: mujoco.MjModel) -> set[Part] | None:
 
 
 def _last_stage(model: mujoco.MjModel) -> Stage:
-    """Return the last stage, position or velocity, to which any sensor belongs."""
     stages = [int(stage) for stage in model.sensor_needstage if stage < Stage.ACCELERATION]
     return Stage(max(stages, default=0))
 
 
 def _touching(model: mujoco.MjModel) -> bool:
-    """Whether contacts affect actuators or passive forces, such as adhesion or a flex's passive contacts."""
+    """Whether contacts affect actuators or passive forces, such as adhesion."""
     by_body = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()
     return bool(by_body or model.flg_adhesion or model.flex_passive.any())
 
@@ -252,7 +236,7 @@ class PartialForward:
             self._run(mask, work)
 
     def settle(self, mask: wp.array, nstep: int) -> None:
-        """Step the worlds in the mask ``nstep`` times, and set their time to 0. All work consists of Warp launches."""
+        """Step the masked worlds ``nstep`` times, and set their time to 0, by Warp launches only."""
 
         def work() -> None:
             for _ in range(nstep):
@@ -266,7 +250,7 @@ class PartialForward:
             mjw.set_state(self._rows.whole, self._data, self._states, _SPEC, mask)
 
     def _run(self, mask: wp.array, work: Callable[[], None]) -> None:
-        """For each group of masked worlds, copy states and model fields into the scratch worlds, and call ``work``."""
+        """Call ``work`` for each group of masked worlds, with their states and model fields in the scratch worlds."""
         model, group = self._rows.model, self._group
 
         def turn() -> None:

@@ -15,20 +15,17 @@ class Reserve:
     """Holds blocks of memory to which graphs refer by address; the blocks live as long as this object.
 
     Subclasses implement ``allocate`` and can then serve as Warp allocators.
-
-    Args:
-        device: The device.
     """
 
     def __init__(self, device: wp.Device) -> None:
         self.device = device
         self.below = device.get_allocator()
-        """The device's allocator, for the blocks and for memory that is not reserved."""
+        """The device's allocator."""
         self.blocks: list[wp.array] = []
 
     def add_block(self, size: int) -> None:
         """Allocate a block of at least ``size`` bytes."""
-        rows = aligned(max(size, 1)) // _ALIGNED  # use two axes, because an axis has fewer than 2**31 elements
+        rows = aligned(max(size, 1)) // _ALIGNED  # an axis has fewer than 2**31 elements
         with wp.ScopedAllocator(self.device, self.below):
             self.blocks.append(wp.empty((rows, _ALIGNED), dtype=wp.uint8, device=self.device))
 
@@ -54,15 +51,13 @@ def group_size(nworld: int, device: wp.Device) -> int:
 class Turns:
     """Copies the masked worlds into a group and back, one group at a time, by Warp launches only.
 
-    If the mask is empty, ``run`` does nothing (unless ``loop`` is False).
-
     Args:
         nworld: Number of worlds.
         size: Number of worlds in the group.
         device: The device of the worlds.
         loop: Whether ``run`` loops over as many groups as the mask needs. If False, the group must have room for every
-            world, and ``run`` processes a single group even if the mask is empty. Deterministic launches require
-            ``loop=False``, because they cannot allocate within a graph's loop.
+            world, and ``run`` processes it even if the mask is empty. Deterministic launches require ``loop=False``,
+            because they cannot allocate within a graph's loop.
     """
 
     def __init__(self, nworld: int, size: int, device: wp.Device, *, loop: bool = True) -> None:
@@ -105,7 +100,7 @@ class Turns:
             wp.launch(kernels.return_rows, rows.shape, [self._world, self._left, rows, flat(target)])
 
     def give_bits(self, source: wp.array, target: wp.array) -> None:
-        """Add the bits of the group's rows (size,) to the bits of the same worlds (nworld,) by bitwise or."""
+        """Add the bits of the group's rows, (size,), to the bits of the same worlds, (nworld,)."""
         wp.launch(kernels.return_bits, self.size, [self._world, self._left, source, target])
 
 
@@ -113,10 +108,8 @@ class Arena(Reserve):
     """An allocator for loops and branches of CUDA graphs, where Warp cannot allocate.
 
     A run outside a graph allocates from the device, counts the bytes, and reserves the same number. A graph allocates
-    from the reserve. Graphs share the reserve, because they never run at the same time.
-
-    Args:
-        device: The device of the launches; on the CPU, nothing is reserved.
+    from the reserve. Graphs share the reserve, because they never run at the same time. On the CPU, nothing is
+    reserved.
     """
 
     def __init__(self, device: wp.Device) -> None:
@@ -161,9 +154,6 @@ class Conditional:
     """Skips launches within a graph if a mask is empty.
 
     Outside a graph, the launches always run, because reading the mask would wait for the device.
-
-    Args:
-        device: The device of the launches.
     """
 
     def __init__(self, device: wp.Device) -> None:

@@ -22,9 +22,8 @@ log = logging.getLogger(__name__)
 _WORLDS, _HOLDS, _SUBSTEPS = 32, 25, 20
 
 _LEAST, _LEAST_WITH_FLEX = (8, 8), (256, 512)
-"""The smallest (nconmax, njmax) for a model without a flex, and for a model with a flex. In a model with a flex, a
-probe may miss many contacts, because a geom that is pressed into the flex touches up to 50 of its elements. The second
-pair is MuJoCo Warp's default."""
+"""The smallest (nconmax, njmax) without and with a flex. A geom that is pressed into a flex touches up to 50 of its
+elements, so a probe may miss many contacts. The second pair is MuJoCo Warp's default."""
 
 _FIRST = 32
 """The maximum number of worlds whose initial states are checked."""
@@ -137,7 +136,7 @@ def _equalities(model: mujoco.MjModel) -> int:
 
 
 def _limits(model: mujoco.MjModel, varied: Collection[str]) -> int:
-    """Count all limits of joints and tendons if the task randomizes fields that affect limits; otherwise return 0."""
+    """Count all limits of joints and tendons if the task randomizes fields that affect limits."""
     drawn = not _LIMITS.isdisjoint(varied)
     return int(model.jnt_limited.sum() + model.tendon_limited.sum()) if drawn else 0
 
@@ -153,7 +152,7 @@ def _probe_once(model: mujoco.MjModel) -> tuple[int, int]:
 
 def _probe(model: mujoco.MjModel) -> tuple[int, int]:
     with wp.ScopedDevice("cpu"):
-        mjw.put_model(model)  # refuse an unsupported model now, because the probe may take a minute
+        mjw.put_model(model)  # refuse an unsupported model before the probe, which may take a minute
     batch = Batch(model, _WORLDS)
     rng = np.random.default_rng(0)
     ncon, nefc = batch.bind("ncon"), batch.bind("nefc")
@@ -165,7 +164,7 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
     for _ in range(_HOLDS):
         batch.ctrl[:] = rng.uniform(low, high, size=(_WORLDS, model.nu))
         for _ in range(_SUBSTEPS):
-            # ignore errors: the counts are correct even if the memory is too small
+            # the counts are correct even if the memory is too small
             with contextlib.suppress(SimulationError):
                 batch.step()
             contacts, constraints = max(contacts, int(ncon.max())), max(constraints, int(nefc.max()))
@@ -176,9 +175,9 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 _TEMPORARIES = 1.25
-"""The memory of a world, divided by the memory of a world in MuJoCo Warp's Data. In measurements, a step's temporary
-arrays took 1 to 9 %; the rest of the margin is for graphs and for the group of a partial forward pass. CPU graphs keep
-all temporary arrays alive and take up to three times as much."""
+"""The memory of a world, divided by its memory in MuJoCo Warp's Data. In measurements, a step's temporary arrays took 1
+to 9 %; the rest is for graphs and for the group of a partial forward pass. CPU graphs keep all temporary arrays alive
+and take up to three times as much."""
 
 _TEMPORARIES_CONVEX = 3.5
 """The same factor for models with convex collisions or the noslip solver. On adroit_pen, the temporary arrays take 1.5
@@ -189,7 +188,7 @@ _CONVEX = {mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_CYLINDER, mujo
 
 
 def data_bytes(model: mujoco.MjModel, nconmax: int, njmax: int) -> int:
-    """Estimate the bytes per world of MuJoCo Warp's Data for given capacities, including temporary arrays."""
+    """Estimate the bytes per world of MuJoCo Warp's Data, including temporary arrays."""
     sizes = []
     for nworld in (1, 2):
         with wp.ScopedDevice("cpu"):
@@ -199,7 +198,6 @@ def data_bytes(model: mujoco.MjModel, nconmax: int, njmax: int) -> int:
 
 
 def _bytes_of(data: Any) -> int:
-    """Count the bytes of all arrays in a dataclass, including nested dataclasses."""
     total = 0
     for field in dataclasses.fields(data):
         value = getattr(data, field.name)
@@ -211,7 +209,6 @@ def _bytes_of(data: Any) -> int:
 
 
 def _margin(model: mujoco.MjModel) -> float:
-    """Return the memory of a world, divided by the memory of MuJoCo Warp's Data."""
     collides = (model.geom_contype | model.geom_conaffinity) != 0
     kinds = [int(kind) for kind in model.geom_type[collides]]
     convex = not _CONVEX.isdisjoint(kinds) or kinds.count(int(mujoco.mjtGeom.mjGEOM_BOX)) > 1

@@ -17,13 +17,7 @@ _POSED_BY = {"geom_pos", "geom_quat", "body_pos", "body_quat"}
 
 
 class StaticGeoms:
-    """Computes the poses of static geoms if model fields that determine them differ between worlds.
-
-    Args:
-        model: The compiled model.
-        varied: The names of the model fields that differ between worlds.
-        device: The device of the worlds.
-    """
+    """Computes the poses of static geoms if model fields that determine them differ between worlds."""
 
     def __init__(self, model: mujoco.MjModel, varied: Iterable[str], device: wp.Device) -> None:
         body = model.geom_bodyid
@@ -35,7 +29,7 @@ class StaticGeoms:
         """Compute the poses in the masked worlds of a Data, by Warp launches only."""
         if self._geoms.size:
             fields = [model.geom_bodyid, model.body_parentid]
-            # MuJoCo stores a quaternion as (w, x, y, z), unlike Warp's type
+            # MuJoCo's quaternions are (w, x, y, z), unlike Warp's type
             geom_quat, body_quat = model.geom_quat.view(wp.vec4), model.body_quat.view(wp.vec4)
             fields += [model.geom_pos, geom_quat, model.body_pos, body_quat]
             args = [mask, self._geoms, *fields, data.geom_xpos, data.geom_xmat]
@@ -71,7 +65,7 @@ def outputs_of(fields: Collection[ModelField]) -> list[str]:
 
 
 def owner(model: mjw.Model, name: str) -> mjw.Model | mjw.Option:
-    """Return the object that has a model field as an attribute: the model or its options."""
+    """Return the model or its options, whichever has the field as an attribute."""
     return model if hasattr(model, name) else model.opt
 
 
@@ -114,8 +108,8 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
 class ModelRows:
     """Make the model of a group of worlds.
 
-    The group's model has its own rows of the fields that differ between worlds, and shares all other fields. In the
-    model of all worlds, row w belongs to world w; for world w of the group, MuJoCo Warp would read another world's row.
+    The group's model has its own rows of the fields that differ between worlds, and shares all other fields. With the
+    model of all worlds, MuJoCo Warp would read row w for world w of the group, which belongs to another world.
 
     Args:
         whole: The model of all worlds.
@@ -143,13 +137,13 @@ class ModelRows:
             setattr(self.model, name, wp.clone(getattr(whole, name)))
 
     def take(self, turns: Turns) -> None:
-        """Copy the rows of the group's worlds from the model of all worlds into the group's model."""
+        """Copy the rows of the group's worlds into the group's model."""
         if self.model is not self.whole:
             for source, group in self._pairs.values():
                 turns.take(source, group)
 
     def give(self, turns: Turns, names: Iterable[str]) -> None:
-        """Copy the group's rows of the given fields back into the rows of all worlds."""
+        """Copy the group's rows of the given fields back into the model of all worlds."""
         for name in names:
             if name in self._pairs:
                 source, group = self._pairs[name]
@@ -201,7 +195,7 @@ class ModelConstants:
             self._rows = ModelRows(put, [*names, *self._outputs], size, written - set(self._outputs))
             self._scratch = mjw.make_data(model, nworld=size, nconmax=1, njmax=1)
             self._given = [flat(getattr(owner(put, name), name)).view(wp.int32) for name in names]
-            # start with the bits of a NaN that no computation produces, so that all worlds count as changed
+            # with the bits of a NaN that no computation produces, all worlds count as changed at first
             self._applied = [wp.full_like(given, -1) for given in self._given]
             self._changed = wp.zeros(nworld, dtype=bool)
             self._everyone = wp.full(size, True, dtype=bool)

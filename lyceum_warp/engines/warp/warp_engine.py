@@ -57,7 +57,7 @@ class WarpEngine(Engine):
     capturable = True
 
     partial_refresh = True
-    """Whether a forward pass after restarts covers only the restarting worlds, and is skipped if there are none."""
+    """Whether a forward pass after restarts computes only the restarting worlds."""
 
     def __init__(
         self,
@@ -92,7 +92,7 @@ class WarpEngine(Engine):
             self.arrays[varied.name] = self._alias_model(varied)
         self._static = StaticGeoms(model, self.dynamics, device)
         self._constants = self._model_constants()
-        # MuJoCo Warp's reset would derive a different initial state for each world from these model fields
+        # from these model fields, MuJoCo Warp would derive a different initial state for each world
         self._start: wp.array | None = None
         if initial is not None or self.dynamics.keys() & {"qpos0", "body_pos", "body_quat"}:
             self._start = wp.array(self.initial, dtype=float, device=device)
@@ -107,9 +107,8 @@ class WarpEngine(Engine):
         moved = any(field.written for name, field in self.fields.items() if name in ("mocap_pos", "mocap_quat"))
         current_parts = () if moved else self._current_parts or ()
         self._shared = tuple(part for part in current_parts if part in forward.POSITION)
-        # A geom whose position is NaN has contacts with every element of a flex. The NaN in the Jacobian rows of these
-        # contacts would survive a reset, because the solver multiplies unused rows by zero. Therefore a reset clears
-        # the Jacobian rows.
+        # A geom whose position is NaN has contacts with every element of a flex. The NaN in their Jacobian rows would
+        # survive a reset, because the solver multiplies unused rows by zero. Therefore a reset clears these rows.
         self._jacobian = flat(self.d.efc.J if model.nflex else wp.zeros((nworld, 0), dtype=float, device=device))
         self._zeros = wp.zeros(self._jacobian.shape[1], dtype=float, device=device)
         self._conditional = Conditional(device)
@@ -120,15 +119,13 @@ class WarpEngine(Engine):
     # hooks for subclasses
 
     def _put_model(self) -> mjw.Model:
-        """MuJoCo Warp's model with the engine's options."""
         with wp.ScopedDevice(self.device):
             model = put_varied_model(self.model, list(self.dynamics.values()), self.nworld)
-        # kernels must not print: each world reports its overflows, and printed messages could fill the disk
+        # each world reports its overflows; messages printed by kernels could fill the disk
         model.opt.warn_overflow = 0
         return model
 
     def _on_device(self) -> contextlib.AbstractContextManager[object]:
-        """Return the context for calls of MuJoCo Warp."""
         return wp.ScopedDevice(self.device)
 
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
@@ -158,14 +155,12 @@ class WarpEngine(Engine):
     # fields
 
     def _alias_model(self, field: ModelField) -> wp.array:
-        """Return a model field's memory as an array of the type in ``model_fields``."""
         source = getattr(owner(self.m, field.name), field.name)
         if not field.size:
             return wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
         return alias(source, field.dtype, (self.nworld, *field.shape))
 
     def _model_constants(self) -> ModelConstants | None:
-        """Make the object that computes derived constants, or return None if no constant depends on the fields."""
         fields = [field for field in self.dynamics.values() if field.size and constants_of([field])]
         if not fields:
             return None
@@ -173,7 +168,7 @@ class WarpEngine(Engine):
         return ModelConstants(self.model, self.m, fields, self._static, self.nworld, self.device, loop=loop)
 
     def _alias(self, field: Field) -> wp.array:
-        """Return a view of a field's memory with the type in ``fields``; MuJoCo Warp's types differ only in name."""
+        """Return a view of a field's memory. MuJoCo Warp's types differ only in name."""
         return alias(getattr(self.d, field.name), field.dtype, (self.nworld, *field.shape))
 
     def _copy_snapshots(self, mask: wp.array, fields: Iterable[Field]) -> None:
@@ -212,7 +207,7 @@ class WarpEngine(Engine):
                 if stage == Stage.VELOCITY:
                     mjw.fwd_velocity(m, d)
                     mjw.sensor_vel(m, d)
-                if "energy" in self.fields:  # the model has no sensor that computes this field
+                if "energy" in self.fields:  # no sensor of the model computes this field
                     mjw.energy_pos(m, d)
                     mjw.energy_vel(m, d)
 
@@ -294,10 +289,9 @@ class WarpEngine(Engine):
 
     def _forward_group(self, model: mjw.Model, group: mjw.Data) -> None:
         self._forward(None, self.reset_stage, group, model)
-        self._forward(self._shared, self.reset_stage)  # the next step skips the parts that are already computed
+        self._forward(self._shared, self.reset_stage)  # the next step skips these parts
 
     def _refresh(self, mask: wp.array) -> None:
-        """Run a forward pass of all worlds; the fields of worlds outside the mask do not change."""
         with self._histories_kept():
             self._forward(self._reset_parts, self.reset_stage)
         self._copy_snapshots(mask, [field for field in self.snapshots if field.reset > Stage.NONE])
@@ -306,7 +300,7 @@ class WarpEngine(Engine):
 
     def _is_partial(self) -> bool:
         """Whether a group of worlds can be stepped separately."""
-        # the broadphase of large models, sweep-and-prune, needs memory that cannot be reserved within a graph
+        # sweep-and-prune, the broadphase of large models, cannot allocate memory within a graph
         return self.partial_refresh and self.m.opt.broadphase == mjw.BroadphaseType.NXN
 
     def _partial_forward(self) -> PartialForward | None:
@@ -323,7 +317,7 @@ class WarpEngine(Engine):
 
     @contextlib.contextmanager
     def _histories_kept(self) -> Iterator[None]:
-        """Return a context that restores sensor histories at its end, because the next step adds the same samples."""
+        """Restore the sensor histories afterwards, because the next step adds the same samples."""
         if self.d.history.size:
             wp.copy(self._history, self.d.history)
         yield
@@ -356,7 +350,6 @@ def _refusals() -> Iterator[None]:
 
 
 def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied: Collection[str]) -> tuple[int, int]:
-    """Return the contact and constraint capacities per world: the given numbers, or else probed numbers."""
     given = {"nconmax": nconmax, "njmax": njmax}
     sizes = [size if size is None else whole_number(name, size, low=1) for name, size in given.items()]
     with _refusals():
@@ -367,7 +360,7 @@ def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied
 
 
 def _check_sdf_plugins(model: mujoco.MjModel) -> None:
-    """Refuse SDF plugins unless MuJoCo Warp has a registered distance function; by default there is none."""
+    """Refuse SDF plugins without a registered distance function."""
     if (model.geom_plugin >= 0).any() and not has_sdf_functions():
         raise NotImplementedError("SDF plugins need a registered distance function")
 
